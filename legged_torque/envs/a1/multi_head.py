@@ -1,0 +1,91 @@
+"""Multi-head control: position and torque actions, mixed with weights that change in training (paper, III-C, IV-E)."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from legged_torque.envs.a1.a1_config import A1Cfg, A1CfgPPO
+from legged_torque.envs.base.curriculum import LinearCurriculum
+from legged_torque.envs.base.legged_robot import LeggedRobot
+
+
+class MultiHeadRobot(LeggedRobot):
+    """A robot with two actions per joint: a position residual, then a torque.
+
+    Attributes:
+        mixing: theta_pd and theta_torque of eq. 7. Shape: (2,).
+    """
+
+    def _init_buffers(self) -> None:
+        """Allocate the mixing weights as well."""
+        super()._init_buffers()
+        settings = self.cfg.control.mixing
+        self._mixing_curriculum = LinearCurriculum([settings.pd, settings.torque], self.device)
+        self.mixing = self._tensor([0.0, 0.0])
+        self.update_curriculum()
+
+    def update_curriculum(self) -> None:
+        """Set the mixing weights by eq. 1, at the last multiple of the update interval."""
+        interval = self.cfg.control.mixing.update_interval
+        self.mixing.copy_(self._mixing_curriculum(self.total_steps // interval * interval))
+
+    def _compute_torques(self, actions: Tensor) -> Tensor:
+        """tau = theta_pd tau_pd(a[:n]) + theta_torque torque_scale a[n:] (eq. 7) [N m]. Shape: (num_envs, n)."""
+        theta_pd, theta_torque = self.mixing
+        torque = self.cfg.control.torque_scale * actions[:, self.num_dof :]
+        return theta_pd * self._pd_torques(actions[:, : self.num_dof]) + theta_torque * torque
+
+    def curriculum_values(self) -> dict[str, Tensor]:
+        """Return the mixing weights too."""
+        return super().curriculum_values() | {"mixing_pd": self.mixing[0], "mixing_torque": self.mixing[1]}
+
+
+class A1TorqueMultiHeadCfg(A1Cfg):
+    """Settings of ``a1_torque_multihead``: the weight of the PD part ends at 0."""
+
+    class env(A1Cfg.env):
+        num_actions = 24
+
+    class control(A1Cfg.control):
+        class mixing:
+            update_interval = 64_000  # [total steps]; weights change between rollouts only
+
+            class pd:
+                start = 1.0
+                end = 0.0
+                t_start = 0
+                t_end = 50_000_000
+
+            class torque:
+                start = 1.0
+                end = 1.0
+                t_start = 0
+                t_end = 50_000_000
+
+
+class A1MultiHeadCfg(A1TorqueMultiHeadCfg):
+    """Settings of ``a1_multihead``: the weight of the PD part ends at 0.1."""
+
+    class control(A1TorqueMultiHeadCfg.control):
+        class mixing(A1TorqueMultiHeadCfg.control.mixing):
+            class pd(A1TorqueMultiHeadCfg.control.mixing.pd):
+                end = 0.1
+
+
+class A1TorqueMultiHeadCfgPPO(A1CfgPPO):
+    """Training of ``a1_torque_multihead``."""
+
+    class runner(A1CfgPPO.runner):
+        experiment_name = "a1_torque_multihead"
+
+    class actor(A1CfgPPO.actor):
+        class_name = "legged_torque.learning.multi_head:MultiHeadModel"
+        hidden_dims = [512, 256]  # shared by both heads
+        head_hidden_dims = [128]
+
+
+class A1MultiHeadCfgPPO(A1TorqueMultiHeadCfgPPO):
+    """Training of ``a1_multihead``."""
+
+    class runner(A1TorqueMultiHeadCfgPPO.runner):
+        experiment_name = "a1_multihead"

@@ -1,0 +1,27 @@
+"""Default torque control: the policy's actions are joint torques (paper, section III and Figure 1)."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from legged_torque.envs.a1.a1_config import A1Cfg, A1CfgPPO
+from legged_torque.envs.base.legged_robot import LeggedRobot
+
+
+class TorqueRobot(LeggedRobot):
+    """A robot whose actions are torques."""
+
+    def _compute_torques(self, actions: Tensor) -> Tensor:
+        """tau = torque_scale a [N m]. Shapes: (num_envs, num_dof)."""
+        return self.cfg.control.torque_scale * actions
+
+
+class A1TorqueCfg(A1Cfg):
+    """Settings of ``a1_torque``: those of the A1."""
+
+
+class A1TorqueCfgPPO(A1CfgPPO):
+    """Training of ``a1_torque``."""
+
+    class runner(A1CfgPPO.runner):
+        experiment_name = "a1_torque"

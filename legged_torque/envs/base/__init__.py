@@ -1,0 +1,1 @@
+"""The base task of all robots."""

@@ -1,0 +1,367 @@
+"""The batched task: a legged robot that follows velocity commands."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged_torque import ROOT_DIR
+from legged_torque.envs.base.curriculum import LinearCurriculum
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.envs.base.rewards import RewardTerms
+from legged_torque.envs.base.task_log import TaskLog
+from legged_torque.envs.base.validation import check_env_cfg
+from legged_torque.sim.graph import CudaGraph
+from legged_torque.sim.model import build_model, geoms_matching, read_spec
+from legged_torque.sim.simulator import Simulator
+from legged_torque.utils.config import section_keys, to_dict
+from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.math import quat_from_euler, quat_rotate_inverse
+
+
+class LeggedRobot(RewardTerms, VecEnv):
+    """A batch of robots with position control, and what all approaches share.
+
+    An approach overrides :meth:`_compute_torques`, adds ``_reward_<term>`` methods, or overrides the curriculum hook
+    :meth:`update_curriculum`. A control step is replayed as one CUDA graph on a GPU, hence the rules for everything
+    that runs inside :meth:`_step`: fixed shapes, masks instead of lists of ids, nothing read back to the host, and
+    what is kept from step to step is written in place (``copy_``, ``masked_fill_``), never bound to a new tensor.
+
+    Attributes:
+        base_pos: Trunk position in the world [m]. Shape: (num_envs, 3).
+        base_quat: Trunk orientation (w, x, y, z). Shape: (num_envs, 4).
+        base_lin_vel: Trunk velocity in its own frame [m/s]. Shape: (num_envs, 3).
+        base_ang_vel: Trunk angular velocity in its own frame [rad/s]. Shape: (num_envs, 3).
+        projected_gravity: Unit gravity vector in the trunk's frame. Shape: (num_envs, 3).
+        dof_pos: Joint positions [rad]. Shape: (num_envs, num_dof).
+        dof_vel: Joint velocities [rad/s]. Shape: (num_envs, num_dof).
+        torques: Torques of the last physics step [N m]. Shape: (num_envs, num_dof).
+        actions: Last actions. Shape: (num_envs, num_actions).
+        commands: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
+        contacts: 1 for each sensed geom that touches the ground, else 0. Shape: (num_envs, geoms).
+        feet_contact: The same for the feet. Shape: (num_envs, feet).
+        total_steps: Environment steps so far over all worlds: t of eq. 1. Scalar, int64.
+    """
+
+    cfg: LeggedRobotCfg
+
+    def __init__(self, cfg: LeggedRobotCfg, device: str = "cpu") -> None:
+        """Create the worlds and put each into a random initial state.
+
+        Args:
+            cfg: Settings of the task.
+            device: "cpu" or "cuda:N".
+
+        Raises:
+            UserError: If a setting makes no sense or names something that does not exist.
+        """
+        check_env_cfg(cfg)
+        self.cfg = cfg
+        self.device = device
+        self.num_envs = cfg.env.num_envs
+        self.num_actions = cfg.env.num_actions
+        self.dt = cfg.sim.dt * cfg.control.decimation
+        self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
+        self._create_sim()
+        self._init_buffers()
+        self._prepare_reward_functions()
+        self._step_graph = CudaGraph(self._step, device)
+        self.reset()
+
+    # ---- what rsl_rl calls -------------------------------------------------------------------------------------------
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+        """Apply actions for one control step.
+
+        Args:
+            actions: Shape: (num_envs, num_actions). Worlds with an action that is not finite are reset.
+
+        Returns:
+            Observations (a copy); rewards (num_envs,); dones (num_envs,), bool; extras with "time_outs" (num_envs,),
+            bool. Rewards, dones and extras are buffers that the next step overwrites.
+        """
+        self._given_actions.copy_(actions)
+        self._step_graph()
+        return self.get_observations(), self.rew_buf, self.reset_buf, self.extras
+
+    def get_observations(self) -> TensorDict:
+        """Return a copy of the current observations: groups "policy" and "critic", each (num_envs, size)."""
+        return self.obs_buf.clone()
+
+    def reset(self) -> TensorDict:
+        """Start a new episode in every world and return the observations."""
+        self.reset_buf.fill_(True)
+        self._reset_worlds()
+        self.compute_observations()
+        return self.get_observations()
+
+    @property
+    def episode_length_buf(self) -> Tensor:
+        """Control steps since the start of each world's episode. Shape: (num_envs,), int64."""
+        return self._episode_length_buf
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: Tensor) -> None:
+        """Write the counters in place: rsl_rl sets them to random values when training starts."""
+        self._episode_length_buf.copy_(value)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what a checkpoint must keep of the task: its counters, on which all curricula depend."""
+        return {"total_steps": self.total_steps.clone(), "num_diverged": self.num_diverged.clone()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from the counters of a checkpoint."""
+        self.total_steps.copy_(state["total_steps"])
+        self.num_diverged.copy_(state["num_diverged"])
+        self.update_curriculum()
+
+    # ---- hooks of the approaches -------------------------------------------------------------------------------------
+
+    def _compute_torques(self, actions: Tensor) -> Tensor:
+        """Return joint torques for actions; called at every physics step. This is position control (eq. 8).
+
+        Args:
+            actions: Shape: (num_envs, num_actions).
+
+        Returns:
+            Torques before clipping to the limits [N m]. Shape: (num_envs, num_dof).
+        """
+        return self._pd_torques(actions)
+
+    def _pd_torques(self, actions: Tensor) -> Tensor:
+        """tau = Kp (q_nominal + scale a - q) - Kd qd (eq. 8). Shapes: (num_envs, num_dof)."""
+        control = self.cfg.control
+        target = self.default_dof_pos + control.action_scale * actions
+        return control.stiffness * (target - self.dof_pos) - control.damping * self.dof_vel
+
+    def update_curriculum(self) -> None:
+        """Curriculum hook for what may only change between rollouts; the runner calls it before each of them."""
+
+    def curriculum_values(self) -> dict[str, Tensor]:
+        """Return the scalars that curricula set, for logging: here the weights of reward terms that have one."""
+        weights = self._reward_scales / self.dt * self._reward_curriculum(self.total_steps)
+        curricula = section_keys(self.cfg.rewards.curriculum)
+        return {f"weight_{name}": weights[i] for i, name in enumerate(self.reward_names) if name in curricula}
+
+    # ---- one control step --------------------------------------------------------------------------------------------
+
+    def _step(self) -> None:
+        """Physics, rewards, resets and observations of one control step."""
+        self.sim.clear_diverged()
+        self.sim.flag_diverged()
+        self.sim.diverged.logical_or_(~torch.isfinite(self._given_actions).all(dim=1))
+        clip = self.cfg.normalization.clip_actions
+        self.actions.copy_(self._given_actions.nan_to_num().clamp(-clip, clip))
+        for i in range(self.cfg.control.decimation):
+            if i == 0 or self.cfg.control.refresh_torques:
+                torques = self._compute_torques(self.actions)
+                torch.clamp(torques, -self.torque_limits, self.torque_limits, out=self.torques)
+            self.sim.step()
+        self.sim.flag_diverged()
+        self.post_physics_step()
+
+    def post_physics_step(self) -> None:
+        """Do what follows the physics: termination, rewards, resets, commands, observations."""
+        self._episode_length_buf += 1
+        self.total_steps += self.num_envs
+        self._update_state()
+        self.check_termination()
+        self.compute_reward()
+        self.log.add_step(self)
+        self._update_feet_air_time()
+        self._reset_worlds()
+        self.compute_observations()
+        self.last_actions.copy_(self.actions)
+        self.last_dof_vel.copy_(self.dof_vel)
+
+    def _update_state(self) -> None:
+        """Compute what follows from the simulator's state."""
+        self.base_lin_vel.copy_(quat_rotate_inverse(self.base_quat, self.sim.qvel[:, :3]))
+        self.projected_gravity.copy_(quat_rotate_inverse(self.base_quat, self._gravity))
+        self.contacts.copy_(self.sim.contact_found > 0)
+        self.feet_contact.copy_(self.contacts[:, self.feet_indices])
+
+    def check_termination(self) -> None:
+        """End episodes whose trunk touches the ground, whose state diverged, or whose time is over."""
+        touching = self.contacts[:, self.termination_contact_indices].any(dim=1)
+        torch.logical_or(touching, self.sim.diverged, out=self.reset_buf)
+        torch.ge(self._episode_length_buf, self.max_episode_length, out=self.time_out_buf)
+        self.time_out_buf.logical_and_(~self.reset_buf)
+        self.reset_buf.logical_or_(self.time_out_buf)
+        self.num_diverged += self.sim.diverged.sum()
+
+    def compute_reward(self) -> None:
+        """Compute the sum of all terms (Table III); 0 for worlds that diverged."""
+        terms = torch.stack([function() for function in self._reward_functions])
+        terms = torch.where(self.sim.diverged, 0.0, terms)
+        terms *= self.reward_weights().unsqueeze(1)
+        self.episode_sums += terms
+        reward = terms.sum(dim=0)
+        if self.cfg.rewards.only_positive_rewards:
+            reward = reward.clamp(min=0.0)
+        self.rew_buf.copy_(reward)
+        self.episode_return += reward
+
+    def reward_weights(self) -> Tensor:
+        """Return the weights of the terms at this moment of training, Delta t included. Shape: (terms,)."""
+        return self._reward_scales * self._reward_curriculum(self.total_steps)
+
+    def compute_observations(self) -> None:
+        """Compute the observations of section 5 of the design: what a real robot can measure, and all for the critic."""
+        scales = self.cfg.normalization.obs_scales
+        policy = torch.cat(
+            [
+                self.projected_gravity,
+                self.base_ang_vel * scales.ang_vel,
+                self.commands * self._command_scales,
+                (self.dof_pos - self.default_dof_pos) * scales.dof_pos,
+                self.dof_vel * scales.dof_vel,
+                self.actions,
+            ],
+            dim=1,
+        )
+        critic = torch.cat(
+            [policy, self.base_lin_vel * scales.lin_vel, self.base_pos[:, 2:], self.feet_contact], dim=1
+        )
+        clip = self.cfg.normalization.clip_observations
+        torch.clamp(policy, -clip, clip, out=self.obs_buf["policy"])
+        torch.clamp(critic, -clip, clip, out=self.obs_buf["critic"])
+
+    def _update_feet_air_time(self) -> None:
+        """Count the time of each foot since it left the ground."""
+        self.feet_air_time.copy_((self.feet_air_time + self.dt) * (1.0 - self.feet_contact))
+
+    # ---- resets and commands, by mask --------------------------------------------------------------------------------
+
+    def _reset_worlds(self) -> None:
+        """Start a new episode in the worlds of ``reset_buf``, and draw new commands where they are due."""
+        mask = self.reset_buf
+        self.sim.reset(mask)
+        self._reset_dofs(mask)
+        self._reset_root_states(mask)
+        column = mask.unsqueeze(1)
+        for buffer in (self.actions, self.feet_air_time, self.contacts, self.feet_contact):
+            buffer.masked_fill_(column, 0.0)
+        self._episode_length_buf.masked_fill_(mask, 0)
+        self.episode_sums.masked_fill_(mask, 0.0)
+        self.episode_return.masked_fill_(mask, 0.0)
+        due = torch.rand(self.num_envs, device=self.device) < self.cfg.commands.resampling_probability
+        self._resample_commands(mask | due)
+        self._update_state()
+
+    def _reset_dofs(self, mask: Tensor) -> None:
+        """Draw joint positions around q_nominal for the worlds in ``mask``; joints start at rest."""
+        low, high = self.cfg.domain_rand.init_dof_pos_scale
+        scale = torch.empty_like(self.dof_pos).uniform_(low, high)
+        drawn = (self.default_dof_pos * scale).clamp(self._hard_dof_pos_limits[:, 0], self._hard_dof_pos_limits[:, 1])
+        self.dof_pos.copy_(torch.where(mask.unsqueeze(1), drawn, self.dof_pos))
+
+    def _reset_root_states(self, mask: Tensor) -> None:
+        """Draw the trunk's orientation for the worlds in ``mask``, at the initial position and at rest."""
+        rand = self.cfg.domain_rand
+        ranges = (rand.init_roll, rand.init_pitch, rand.init_yaw)
+        angles = [torch.empty_like(self.rew_buf).uniform_(*limits) for limits in ranges]
+        column = mask.unsqueeze(1)
+        self.base_pos.copy_(torch.where(column, self._init_pos, self.base_pos))
+        self.base_quat.copy_(torch.where(column, quat_from_euler(*angles), self.base_quat))
+
+    def _resample_commands(self, mask: Tensor) -> None:
+        """Draw new commands for the worlds in ``mask``."""
+        drawn = self._command_low + self._command_span * torch.rand_like(self.commands)
+        self.commands.copy_(torch.where(mask.unsqueeze(1), drawn, self.commands))
+
+    # ---- construction ------------------------------------------------------------------------------------------------
+
+    def _create_sim(self) -> None:
+        """Load the robot and build the simulator and its views."""
+        asset = self.cfg.asset
+        file = Path(asset.file) if Path(asset.file).is_absolute() else ROOT_DIR / asset.file
+        spec = read_spec(file)
+        geoms = geoms_matching(spec, [asset.foot_name, *asset.penalize_contacts_on, *asset.terminate_after_contacts_on])
+        model = build_model(spec, geoms)
+        model.opt.timestep = self.cfg.sim.dt
+        self.sim = Simulator(
+            model, self.num_envs, self.device, self.cfg.sim.solver_iterations, self.cfg.sim.ls_iterations
+        )
+        self.dof_names = [model.joint(i).name for i in range(1, model.njnt)]
+        self.num_dof = len(self.dof_names)
+        self.base_pos, self.base_quat = self.sim.qpos[:, :3], self.sim.qpos[:, 3:7]
+        self.dof_pos, self.dof_vel = self.sim.qpos[:, 7:], self.sim.qvel[:, 6:]
+        self.base_ang_vel = self.sim.qvel[:, 3:6]
+        self.torques = self.sim.ctrl
+        self.torque_limits = self._tensor(model.actuator_forcerange[:, 1])
+        self._hard_dof_pos_limits = self._tensor(model.jnt_range[1:])
+        middle = self._hard_dof_pos_limits.mean(dim=1, keepdim=True)
+        self.dof_pos_limits = middle + self.cfg.rewards.soft_dof_pos_limit * (self._hard_dof_pos_limits - middle)
+
+        def indices(parts: list[str]) -> Tensor:
+            chosen = [i for i, name in enumerate(geoms) if any(part in name for part in parts)]
+            return torch.tensor(chosen, dtype=torch.long, device=self.device)
+
+        self.feet_indices = indices([asset.foot_name])
+        self.penalized_contact_indices = indices(asset.penalize_contacts_on)
+        self.termination_contact_indices = indices(asset.terminate_after_contacts_on)
+
+    def _init_buffers(self) -> None:
+        """Allocate everything that is written in place, and constants."""
+        n, cfg = self.num_envs, self.cfg
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(*shape, dtype=dtype, device=self.device)
+
+        self._given_actions, self.actions, self.last_actions = (zeros(n, self.num_actions) for _ in range(3))
+        self.base_lin_vel, self.projected_gravity, self.commands = (zeros(n, 3) for _ in range(3))
+        self.last_dof_vel = zeros(n, self.num_dof)
+        self.contacts = zeros(*self.sim.contact_found.shape)
+        self.feet_contact, self.feet_air_time = (zeros(n, len(self.feet_indices)) for _ in range(2))
+        self.rew_buf, self.episode_return = zeros(n), zeros(n)
+        self.reset_buf, self.time_out_buf = zeros(n, dtype=torch.bool), zeros(n, dtype=torch.bool)
+        self._episode_length_buf = zeros(n, dtype=torch.long)
+        self.total_steps, self.num_diverged = zeros((), dtype=torch.long), zeros((), dtype=torch.long)
+        self.extras = {"time_outs": self.time_out_buf}
+        num_obs = 9 + 2 * self.num_dof + self.num_actions
+        self.obs_buf = TensorDict(
+            {"policy": zeros(n, num_obs), "critic": zeros(n, num_obs + 4 + len(self.feet_indices))},
+            batch_size=[n],
+            device=self.device,
+        )
+        angles = cfg.init_state.default_joint_angles
+        for name in angles:
+            if name not in self.dof_names:
+                raise unknown_name("joint in init_state.default_joint_angles", name, self.dof_names)
+        for name in self.dof_names:
+            if name not in angles:
+                raise UserError(f"init_state.default_joint_angles lacks the joint '{name}'")
+        self.default_dof_pos = self._tensor([angles[name] for name in self.dof_names])
+        self._init_pos = self._tensor(cfg.init_state.pos)
+        self._gravity = self._tensor([0.0, 0.0, -1.0]).expand(n, 3)
+        ranges, scales = cfg.commands.ranges, cfg.normalization.obs_scales
+        limits = self._tensor([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw])
+        self._command_low, self._command_span = limits[:, 0], limits[:, 1] - limits[:, 0]
+        self._command_scales = self._tensor([scales.lin_vel, scales.lin_vel, scales.ang_vel])
+
+    def _prepare_reward_functions(self) -> None:
+        """Collect the functions of all terms with a scale that is not zero, and their weights."""
+        scales = {name: scale for name, scale in to_dict(self.cfg.rewards.scales).items() if scale != 0.0}
+        known = [name.removeprefix("_reward_") for name in dir(self) if name.startswith("_reward_")]
+        curricula = self.cfg.rewards.curriculum
+        for name in [*scales, *section_keys(curricula)]:
+            if not hasattr(self, f"_reward_{name}"):
+                raise unknown_name("reward term", name, known)
+        self.reward_names = list(scales)
+        self._reward_functions = [getattr(self, f"_reward_{name}") for name in self.reward_names]
+        self._reward_scales = self._tensor(list(scales.values())) * self.dt
+        self._reward_curriculum = LinearCurriculum(
+            [getattr(curricula, name, None) for name in self.reward_names], self.device
+        )
+        self.episode_sums = torch.zeros(len(self.reward_names), self.num_envs, device=self.device)
+        self.log = TaskLog(self.reward_names, self.device)
+
+    def _tensor(self, values) -> Tensor:
+        """Return values as a float tensor on the task's device."""
+        return torch.as_tensor(values, dtype=torch.float32, device=self.device).clone()

@@ -1,0 +1,168 @@
+"""The settings of a task and of its training, with legged_gym's names. A variant inherits and overrides."""
+
+from __future__ import annotations
+
+from legged_torque.utils.config import BaseConfig
+
+
+class LeggedRobotCfg(BaseConfig):
+    """Settings of :class:`~legged_torque.envs.base.legged_robot.LeggedRobot`."""
+
+    class env:
+        num_envs = 4096
+        num_envs_cpu = 64  # default on a CPU, where a world-step costs about a millisecond
+        num_actions = 12
+        episode_length_s = 20.0
+
+    class asset:
+        file = ""  # MJCF, relative to the repository's root or absolute
+        foot_name = "foot"  # collision geoms whose name contains this are feet
+        penalize_contacts_on: list[str] = []  # likewise: those of the collision term
+        terminate_after_contacts_on: list[str] = []  # likewise: those that end an episode
+
+    class sim:
+        dt = 0.005  # [s] physics step
+        solver_iterations = 5
+        ls_iterations = 8  # line search
+
+    class init_state:
+        pos = [0.0, 0.0, 0.4]  # [m] of the trunk at a reset: high enough for stretched legs
+        default_joint_angles: dict[str, float] = {}  # [rad] q_nominal, by joint name
+
+    class domain_rand:
+        # initial state, drawn uniformly at every reset
+        init_roll = [-0.19635, 0.19635]  # [rad] +-pi/16
+        init_pitch = [-0.19635, 0.19635]  # [rad] +-pi/16
+        init_yaw = [-3.14159, 3.14159]  # [rad]
+        init_dof_pos_scale = [0.5, 1.5]  # times q_nominal, then inside the joint limits
+
+    class commands:
+        resampling_probability = 0.002  # per control step: about every 10 s at 50 Hz
+
+        class ranges:
+            lin_vel_x = [-1.0, 1.0]  # [m/s]
+            lin_vel_y = [-1.0, 1.0]  # [m/s]
+            ang_vel_yaw = [-1.0, 1.0]  # [rad/s]
+
+    class control:
+        decimation = 4  # physics steps per control step: 50 Hz
+        refresh_torques = True  # whether torques are computed anew at every physics step
+        stiffness = 20.0  # [N m/rad] Kp
+        damping = 0.5  # [N m s/rad] Kd
+        action_scale = 0.25  # [rad] per unit of a position action
+        torque_scale = 4.0  # [N m] per unit of a torque action
+
+    class rewards:
+        only_positive_rewards = True  # clip the sum at 0 from below
+        tracking_temperature = 4.0  # gamma of both tracking terms
+        soft_dof_pos_limit = 0.9  # share of a joint's range, beyond which dof_pos_limits acts
+        base_height_target = 0.303  # [m] above the ground
+
+        class scales:
+            """Weights of Table III; the task multiplies them by the control step."""
+
+            tracking_lin_vel = 1.0
+            tracking_ang_vel = 1.0
+            lin_vel_z = -2.0
+            ang_vel_xy = -0.05
+            orientation = -0.2
+            dof_pos_limits = -10.0
+            dof_acc = -2.5e-7
+            torques = -2e-4
+            action_rate = -1e-6
+            collision = -1.0
+            base_height = -30.0
+            feet_air_time = 0.1
+            symmetry = -0.5
+
+        class curriculum:
+            """Factors on the scales: linear from start to end between two total step counts (eq. 1)."""
+
+            class tracking_lin_vel:
+                start = 4.0
+                end = 2.0
+                t_start = 0
+                t_end = 10_000_000
+
+            class tracking_ang_vel:
+                start = 0.1
+                end = 1.0
+                t_start = 0
+                t_end = 10_000_000
+
+    class normalization:
+        clip_observations = 100.0
+        clip_actions = 100.0
+
+        class obs_scales:
+            lin_vel = 2.0
+            ang_vel = 0.25
+            dof_pos = 1.0
+            dof_vel = 0.05
+
+
+class LeggedRobotCfgPPO(BaseConfig):
+    """Settings of the training: the ``parallel`` preset, made for thousands of worlds."""
+
+    seed = 1
+
+    class runner:
+        class_name = "legged_torque.learning.runner:OnPolicyRunner"
+        num_steps_per_env = 24
+        total_steps = 110_000_000  # over all worlds; --max_iterations overrides it
+        save_interval = 50  # iterations between checkpoints
+        experiment_name = "legged_robot"
+        run_name = ""
+        logger = "tensorboard"
+        wandb_project = "legged_torque"
+
+    class obs_groups:
+        actor = ["policy"]
+        critic = ["critic"]
+
+    class actor:
+        class_name = "MLPModel"
+        hidden_dims = [512, 256, 128]
+        activation = "elu"
+
+        class distribution_cfg:
+            class_name = "GaussianDistribution"
+            init_std = 1.0
+            std_type = "log"
+
+    class critic:
+        class_name = "MLPModel"
+        hidden_dims = [512, 256, 128]
+        activation = "elu"
+
+    class algorithm:
+        class_name = "legged_torque.learning.ppo:OnDevicePPO"
+        num_learning_epochs = 5
+        num_mini_batches = 4
+        clip_param = 0.2
+        gamma = 0.99
+        lam = 0.95
+        value_loss_coef = 1.0
+        entropy_coef = 5e-4
+        learning_rate = 1e-3
+        max_grad_norm = 1.0
+        schedule = "adaptive"
+        desired_kl = 0.01
+        use_clipped_value_loss = True
+
+    presets = {
+        "parallel": {},
+        "paper": {  # Table II to the letter
+            "env": {"num_envs": 16, "num_envs_cpu": 16},
+            "runner": {"num_steps_per_env": 2000},
+            "algorithm": {
+                "num_mini_batches": 32,
+                "clip_param": 0.1,
+                "lam": 0.9,
+                "entropy_coef": 5e-4,
+                "learning_rate": 1e-4,
+                "max_grad_norm": 5.0,
+                "schedule": "fixed",
+            },
+        },
+    }

@@ -1,0 +1,67 @@
+"""Sums over many steps, kept on the device and read once per iteration."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+if TYPE_CHECKING:
+    from legged_torque.envs.base.legged_robot import LeggedRobot
+
+
+class TaskLog:
+    """What happened in a task since the last :meth:`read`."""
+
+    def __init__(self, reward_names: list[str], device: str) -> None:
+        """Start with empty sums.
+
+        Args:
+            reward_names: Names of the reward terms, in the order of the task's ``episode_sums``.
+            device: Name of the device.
+        """
+        self._names = [*reward_names, "steps", "episodes", "length", "return", "diverged", "error_xy", "error_yaw"]
+        self._num_terms = len(reward_names)
+        self._sums = torch.zeros(len(self._names), device=device)
+
+    def add_step(self, task: LeggedRobot) -> None:
+        """Add one control step, after its rewards and before its resets."""
+        error_xy = (task.commands[:, :2] - task.base_lin_vel[:, :2]).square().sum(dim=1)
+        error_yaw = (task.commands[:, 2] - task.base_ang_vel[:, 2]).square()
+        finished = task.reset_buf.float()
+        diverged = task.sim.diverged
+        rows = torch.stack(
+            [
+                torch.ones_like(finished),
+                finished,
+                finished * task.episode_length_buf,
+                finished * task.episode_return,
+                diverged.float(),
+                torch.where(diverged, 0.0, error_xy),
+                torch.where(diverged, 0.0, error_yaw),
+            ]
+        )
+        self._sums += torch.cat([task.episode_sums * finished, rows]).sum(dim=1)
+
+    def read(self, max_episode_length_s: float) -> dict[str, float]:
+        """Return the means since the last call and start anew. Waits for the device.
+
+        Args:
+            max_episode_length_s: Length of a full episode [s], by which episode rewards are divided, as legged_gym does.
+
+        Returns:
+            Per finished episode: "Episode_Reward/<term>", "return", "length" (absent if none has finished). Per step:
+            "Tracking/error_xy" [m^2/s^2], "Tracking/error_yaw" [rad^2/s^2]. "Health/diverged_worlds": worlds that were
+            reset because their state was not finite.
+        """
+        sums = dict(zip(self._names, self._sums.tolist(), strict=True))
+        self._sums.zero_()
+        result = {}
+        if sums["episodes"]:
+            for name in self._names[: self._num_terms]:
+                result[f"Episode_Reward/{name}"] = sums[name] / sums["episodes"] / max_episode_length_s
+            result |= {key: sums[key] / sums["episodes"] for key in ("return", "length")}
+        if sums["steps"]:
+            result |= {f"Tracking/{key}": sums[key] / sums["steps"] for key in ("error_xy", "error_yaw")}
+        result["Health/diverged_worlds"] = sums["diverged"]
+        return result

@@ -1,0 +1,38 @@
+"""Settings that make no sense are refused before anything is built."""
+
+from __future__ import annotations
+
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.utils.config import section_keys
+from legged_torque.utils.errors import UserError
+
+
+def check_env_cfg(cfg: LeggedRobotCfg) -> None:
+    """Check the settings of a task.
+
+    Raises:
+        UserError: Naming the first setting that makes no sense.
+    """
+    for key, value in {
+        "env.num_envs": cfg.env.num_envs,
+        "env.num_actions": cfg.env.num_actions,
+        "control.decimation": cfg.control.decimation,
+        "sim.solver_iterations": cfg.sim.solver_iterations,
+        "sim.ls_iterations": cfg.sim.ls_iterations,
+    }.items():
+        if value < 1:
+            raise UserError(f"{key} must be at least 1, not {value}")
+    for key, value in {"sim.dt": cfg.sim.dt, "env.episode_length_s": cfg.env.episode_length_s}.items():
+        if not value > 0.0:
+            raise UserError(f"{key} must be greater than 0, not {value}")
+    if not 0.0 <= cfg.commands.resampling_probability <= 1.0:
+        raise UserError(f"commands.resampling_probability must be from 0 to 1, not {cfg.commands.resampling_probability}")
+    for name, section in {"commands.ranges": cfg.commands.ranges, "domain_rand": cfg.domain_rand}.items():
+        for key in section_keys(section):
+            _check_range(f"{name}.{key}", getattr(section, key))
+
+
+def _check_range(key: str, limits: list[float]) -> None:
+    """Refuse what is not a pair of a minimum and a maximum."""
+    if len(limits) != 2 or not limits[0] <= limits[1]:
+        raise UserError(f"{key} must be [minimum, maximum], not {limits}")

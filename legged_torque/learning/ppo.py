@@ -1,0 +1,181 @@
+"""rsl_rl's PPO with an update that runs on the device from end to end."""
+
+from __future__ import annotations
+
+from itertools import chain
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from legged_torque.sim.graph import CudaGraph
+from legged_torque.utils.errors import UserError, unknown_name
+
+MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2
+"""Bounds of the adaptive learning rate, those of rsl_rl."""
+
+LOSS_NAMES = ("value", "surrogate", "entropy", "kl", "gradient_norm", "skipped_updates")
+"""What an update reports: means over its minibatches, except the last, which is a count."""
+
+
+class OnDevicePPO(PPO):
+    """PPO whose minibatch update has fixed shapes and never waits for the host, so that it replays as a CUDA graph.
+
+    The losses are rsl_rl's. The adaptive learning rate is a tensor. A minibatch whose gradient norm is not finite
+    leaves the networks and the optimizer untouched and is counted.
+    """
+
+    def __init__(
+        self,
+        actor: MLPModel,
+        critic: MLPModel,
+        storage: RolloutStorage,
+        learning_rate: float = 1e-3,
+        optimizer: str = "adam",
+        **kwargs,
+    ) -> None:
+        """Create the algorithm; arguments are those of rsl_rl's PPO.
+
+        Args:
+            actor: The policy.
+            critic: The value function.
+            storage: Where rollouts are kept.
+            learning_rate: Learning rate, the first one if it adapts.
+            optimizer: "adam" or "adamw", which torch can skip on the device.
+            kwargs: All other settings of rsl_rl's PPO.
+
+        Raises:
+            UserError: If a setting makes no sense.
+        """
+        if optimizer not in ("adam", "adamw"):
+            raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
+        super().__init__(actor, critic, storage, learning_rate=learning_rate, optimizer=optimizer, **kwargs)
+        self._batch_size = storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches
+        if self._batch_size < 1:
+            raise UserError(
+                f"algorithm.num_mini_batches is {self.num_mini_batches}, more than the samples of a rollout "
+                f"({storage.num_envs} worlds x {storage.num_transitions_per_env} steps)"
+            )
+        self.learning_rate = torch.tensor(learning_rate, device=self.device)
+        self.optimizer = type(self.optimizer)(
+            chain(self.actor.parameters(), self.critic.parameters()),
+            lr=self.learning_rate,
+            fused=True,
+            capturable=True,
+        )
+        self._skip = torch.zeros((), device=self.device)
+        self.optimizer.found_inf = self._skip  # where torch's own gradient scaler tells a fused optimizer to skip
+        self._losses = torch.zeros(len(LOSS_NAMES), device=self.device)
+        self._indices = torch.zeros(self._batch_size, dtype=torch.long, device=self.device)
+        self._update_graph = CudaGraph(self._update_minibatch, self.device)
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Sample actions and keep the transition; observations are buffers that the next step overwrites."""
+        return super().act(obs.clone())
+
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Compute returns and advantages (GAE) in place, with rsl_rl's formulas."""
+        advantages = self.storage.advantages
+        super().compute_returns(obs)
+        self.storage.advantages = advantages.copy_(self.storage.advantages)
+
+    def update(self) -> dict[str, float]:
+        """Learn from the stored rollout: every epoch goes through it in random order, a minibatch at a time.
+
+        Returns:
+            The numbers of :data:`LOSS_NAMES`. Reading them is the only time that the host waits.
+        """
+        self._losses.zero_()
+        for _ in range(self.num_learning_epochs):
+            order = torch.randperm(self._batch_size * self.num_mini_batches, device=self.device)
+            for indices in order.split(self._batch_size):
+                self._indices.copy_(indices)
+                self._update_graph()
+        self.storage.clear()
+        losses = dict(zip(LOSS_NAMES, self._losses.tolist(), strict=True))
+        updates = self.num_learning_epochs * self.num_mini_batches
+        return {name: loss if name == "skipped_updates" else loss / updates for name, loss in losses.items()}
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Load as rsl_rl does, and keep the learning rate the tensor that it was."""
+        learning_rate = self.learning_rate
+        load_iteration = super().load(loaded_dict, load_cfg, strict)
+        self.learning_rate = learning_rate.copy_(torch.as_tensor(self.learning_rate))
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate
+        self._update_graph = CudaGraph(self._update_minibatch, self.device)  # the optimizer's tensors are new
+        return load_iteration
+
+    def _update_minibatch(self) -> None:
+        """Take one gradient step on the samples of ``_indices``."""
+        batch = self._gather()
+        self.actor(batch.observations, stochastic_output=True)
+        log_prob = self.actor.get_output_log_prob(batch.actions)
+        values = self.critic(batch.observations)
+        entropy = self.actor.output_entropy.mean()
+        kl = self._adapt_learning_rate(batch)
+        surrogate_loss = self._surrogate_loss(batch, log_prob)
+        value_loss = self._value_loss(batch, values)
+        loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
+        self.optimizer.zero_grad()
+        loss.backward()
+        gradient_norm = self._clip_gradients()
+        self._skip.copy_(~torch.isfinite(gradient_norm))
+        self.optimizer.step()
+        numbers = torch.stack([value_loss, surrogate_loss, entropy, kl, gradient_norm]).detach()
+        kept = torch.where(self._skip.bool(), 0.0, numbers)
+        self._losses += torch.cat([kept, self._skip.unsqueeze(0)])
+
+    def _gather(self) -> RolloutStorage.Batch:
+        """Return the samples of ``_indices`` from the stored rollout."""
+        storage, indices = self.storage, self._indices
+
+        def pick(tensor: Tensor) -> Tensor:
+            return tensor.flatten(0, 1)[indices]
+
+        advantages = pick(storage.advantages)
+        if self.normalize_advantage_per_mini_batch:
+            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        return RolloutStorage.Batch(
+            observations=TensorDict({key: pick(value) for key, value in storage.observations.items()}, [len(indices)]),
+            actions=pick(storage.actions),
+            values=pick(storage.values),
+            advantages=advantages,
+            returns=pick(storage.returns),
+            old_actions_log_prob=pick(storage.actions_log_prob),
+            old_distribution_params=tuple(pick(params) for params in storage.distribution_params),
+        )
+
+    @torch.no_grad()
+    def _adapt_learning_rate(self, batch: RolloutStorage.Batch) -> Tensor:
+        """Return the mean KL divergence from the policy that acted, and steer the learning rate by it."""
+        kl = self.actor.get_kl_divergence(batch.old_distribution_params, self.actor.output_distribution_params).mean()
+        if self.schedule == "adaptive":
+            lower = kl > 2.0 * self.desired_kl
+            higher = (kl < 0.5 * self.desired_kl) & (kl > 0.0)
+            factor = torch.where(lower, 1.0 / 1.5, torch.where(higher, 1.5, 1.0))
+            self.learning_rate.mul_(factor).clamp_(MIN_LEARNING_RATE, MAX_LEARNING_RATE)
+        return kl
+
+    def _surrogate_loss(self, batch: RolloutStorage.Batch, log_prob: Tensor) -> Tensor:
+        """Return PPO's clipped policy loss."""
+        ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze(1))
+        advantages = batch.advantages.squeeze(1)
+        clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        return torch.max(-advantages * ratio, -advantages * clipped).mean()
+
+    def _value_loss(self, batch: RolloutStorage.Batch, values: Tensor) -> Tensor:
+        """Return the squared error of the values, clipped as rsl_rl does if asked for."""
+        error = (values - batch.returns).square()
+        if self.use_clipped_value_loss:
+            change = (values - batch.values).clamp(-self.clip_param, self.clip_param)
+            error = torch.max(error, (batch.values + change - batch.returns).square())
+        return error.mean()
+
+    def _clip_gradients(self) -> Tensor:
+        """Clip the gradients of actor and critic, each to ``max_grad_norm``; return the norm over both before that."""
+        norms = [nn.utils.clip_grad_norm_(m.parameters(), self.max_grad_norm) for m in (self.actor, self.critic)]
+        return torch.linalg.vector_norm(torch.stack(norms))

@@ -1,0 +1,174 @@
+"""rsl_rl's on-policy runner, with rollouts that never wait for the host and training that is never lost."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import time
+from pathlib import Path
+
+import torch
+from rsl_rl import runners
+
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.learning.ppo import OnDevicePPO
+from legged_torque.sim.graph import CudaGraph
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.interrupt import StopRequest
+
+
+class OnPolicyRunner(runners.OnPolicyRunner):
+    """Trains a policy in a :class:`~legged_torque.envs.base.legged_robot.LeggedRobot` task.
+
+    On a GPU a whole rollout replays as one CUDA graph. Iterations are counted when they are complete:
+    ``model_<n>.pt`` is the state after n iterations, from which training continues as if it had not stopped.
+    """
+
+    env: LeggedRobot
+    alg: OnDevicePPO
+
+    def __init__(self, env: LeggedRobot, train_cfg: dict, log_dir: str | None = None, device: str = "cpu") -> None:
+        """Create the runner.
+
+        Args:
+            env: The task.
+            train_cfg: Settings in rsl_rl's layout.
+            log_dir: Folder of the run, created when training starts; None keeps nothing.
+            device: "cpu" or "cuda:N", that of the task.
+        """
+        torch.set_float32_matmul_precision("high")  # TF32 on a GPU
+        super().__init__(env, train_cfg, log_dir, device)
+        self.log_dir = log_dir
+        self._rollout = CudaGraph(self._collect, device)
+
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
+        """Train; Ctrl-C ends training after the current iteration, and a checkpoint is always left behind.
+
+        Args:
+            num_learning_iterations: How many iterations to add.
+            init_at_random_ep_len: Whether to start as if episodes were running for random times already, so that they
+                do not all end at once.
+        """
+        if init_at_random_ep_len:
+            high = int(self.env.max_episode_length)
+            self.env.episode_length_buf = torch.randint_like(self.env.episode_length_buf, high=high)
+        self.alg.train_mode()
+        self.logger.init_logging_writer()
+        start_it = self.current_learning_iteration
+        total_it = start_it + num_learning_iterations
+        with StopRequest() as stop:
+            while self.current_learning_iteration < total_it and not stop.requested:
+                start = time.perf_counter()
+                self.env.update_curriculum()
+                self._rollout()
+                self._wait()
+                collected = time.perf_counter()
+                losses = self.alg.update()
+                learned = time.perf_counter()
+                self._log(start_it, total_it, collected - start, learned - collected, losses)
+                self.current_learning_iteration += 1
+                if self.current_learning_iteration % self.cfg["save_interval"] == 0:
+                    self._save_checkpoint()
+        self._save_checkpoint()
+        self.logger.stop_logging_writer()
+
+    def save(self, path: str, infos: dict | None = None) -> None:
+        """Save everything that training needs to continue, atomically.
+
+        Args:
+            path: The file; it is either complete or absent.
+            infos: More to keep, of plain values and tensors.
+        """
+        state = self.alg.save()
+        state["iter"] = self.current_learning_iteration
+        state["infos"] = {
+            **(infos or {}),
+            "task": self.env.state_dict(),
+            "total_timesteps": self.logger.tot_timesteps,
+        }
+        part = f"{path}.part"
+        torch.save(state, part)
+        os.replace(part, path)
+        self.logger.save_model(path, self.current_learning_iteration)
+
+    def load(
+        self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
+    ) -> dict:
+        """Continue from a checkpoint: networks, optimizer, counters and with them all curricula.
+
+        Args:
+            path: The file.
+            load_cfg: What to load, see rsl_rl; None loads everything.
+            strict: Whether the networks must match exactly.
+            map_location: Device to load to; None is the runner's.
+
+        Returns:
+            The checkpoint's infos.
+
+        Raises:
+            UserError: If the file is not a checkpoint or belongs to another kind of policy.
+        """
+        try:
+            state = torch.load(path, weights_only=True, map_location=map_location or self.device)
+            load_iteration = self.alg.load(state, load_cfg, strict)
+            if load_iteration:
+                self.current_learning_iteration = state["iter"]
+            self.env.load_state_dict(state["infos"]["task"])
+            self.logger.tot_timesteps = state["infos"]["total_timesteps"]
+        except (OSError, EOFError, pickle.UnpicklingError) as error:
+            raise UserError(f"'{path}' is not a readable checkpoint: {first_line(error)}") from None
+        except (RuntimeError, KeyError, TypeError, ValueError) as error:
+            raise UserError(f"checkpoint '{path}' does not fit this task: {first_line(error)}") from None
+        return state["infos"]
+
+    def _collect(self) -> None:
+        """Fill the storage with one rollout and compute its returns."""
+        with torch.no_grad():
+            obs = self.env.get_observations()
+            for _ in range(self.cfg["num_steps_per_env"]):
+                actions = self.alg.act(obs)
+                obs, rewards, dones, extras = self.env.step(actions)
+                self.alg.process_env_step(obs, rewards, dones, extras)
+            self.alg.compute_returns(obs)
+
+    def _wait(self) -> None:
+        """Wait until the device has done what was asked of it."""
+        if torch.device(self.device).type == "cuda":
+            torch.cuda.synchronize(self.device)
+
+    def _log(self, start_it: int, total_it: int, collect_time: float, learn_time: float, losses: dict) -> None:
+        """Hand the numbers of one iteration to rsl_rl's logger, which prints and writes them."""
+        numbers = self.env.log.read(self.env.max_episode_length * self.env.dt)
+        if self.logger.writer is None:
+            return
+        if "return" in numbers:
+            self.logger.rewbuffer.append(numbers.pop("return"))
+            self.logger.lenbuffer.append(numbers.pop("length"))
+        curricula = self.env.curriculum_values()
+        values = torch.stack(list(curricula.values())).tolist() if curricula else []
+        numbers |= {f"Curriculum/{name}": value for name, value in zip(curricula, values, strict=True)}
+        self.logger.ep_extras.append(numbers)
+        self.logger.log(
+            it=self.current_learning_iteration,
+            start_it=start_it,
+            total_it=total_it,
+            collect_time=collect_time,
+            learn_time=learn_time,
+            loss_dict=losses,
+            learning_rate=float(self.alg.learning_rate),
+            action_std=self.alg.get_policy().output_std,
+            rnd_weight=None,
+        )
+
+    def _save_checkpoint(self) -> None:
+        """Save into the run's folder, and warn if the simulator had too little room."""
+        if self.logger.writer is not None:
+            self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
+        warning = self.env.sim.check_buffers()
+        if warning:
+            print(f"Warning: {warning}.")
+
+
+def first_line(error: Exception) -> str:
+    """Return the part of an error's message that fits into a line."""
+    return str(error).strip().splitlines()[-1].strip() if str(error).strip() else type(error).__name__

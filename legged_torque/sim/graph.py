@@ -1,0 +1,79 @@
+"""Replaying a function as one CUDA graph, with torch and Warp on the same stream."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+import warp as wp
+
+_STREAMS: dict[str, tuple[torch.cuda.Stream, wp.Stream]] = {}
+
+
+def use_shared_stream(device: str) -> None:
+    """Make one stream current for both torch and Warp, on which everything runs and is captured.
+
+    A CUDA graph cannot be captured on the default stream, and Warp knows a stream only as long as the object lives
+    that wraps it: therefore one pair per device, kept for the life of the process.
+
+    Args:
+        device: Name of the device, e.g. "cuda:0". Nothing is done for the CPU.
+    """
+    if torch.device(device).type != "cuda":
+        return
+    if device not in _STREAMS:
+        torch.cuda.set_device(device)
+        stream = torch.cuda.Stream(device)
+        stream.wait_stream(torch.cuda.current_stream(device))
+        _STREAMS[device] = (stream, wp.stream_from_torch(stream))
+    stream, warp_stream = _STREAMS[device]
+    torch.cuda.set_stream(stream)
+    wp.set_stream(warp_stream, device)
+
+
+def is_capturing(device: str) -> bool:
+    """Return whether work on the device is being captured into a graph rather than run."""
+    return torch.device(device).type == "cuda" and torch.cuda.is_current_stream_capturing()
+
+
+class CudaGraph:
+    """A function without arguments that is run once, then captured, then replayed.
+
+    The function must read and write tensors of fixed address and shape and never wait for the host. Its first call
+    runs it as it is, which compiles kernels and allocates what is allocated once; the second captures it. On the CPU,
+    and while another graph is being captured, every call runs it as it is.
+    """
+
+    def __init__(self, function: Callable[[], None], device: str, enabled: bool = True) -> None:
+        """Prepare the graph; nothing runs yet.
+
+        Args:
+            function: What to replay.
+            device: Name of the device.
+            enabled: Whether to capture; if not, every call runs the function.
+        """
+        self._function = function
+        self._device = device
+        self._enabled = enabled and torch.device(device).type == "cuda"
+        self._calls = 0
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self) -> None:
+        """Do what the function does."""
+        if self._graph is not None and not is_capturing(self._device):
+            self._graph.replay()
+        elif not self._enabled or is_capturing(self._device) or self._calls == 0:
+            self._calls += 1
+            self._function()
+        else:
+            self._capture()
+            self._graph.replay()
+
+    def _capture(self) -> None:
+        """Record the function into a graph; the recorded work does not run."""
+        stream, warp_stream = _STREAMS[self._device]
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+            with wp.ScopedCapture(stream=warp_stream, external=True):
+                self._function()
+        self._graph = graph

@@ -1,0 +1,90 @@
+"""From a robot's MJCF file to the model that is simulated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+
+from legged_torque.utils.errors import UserError, unknown_name
+
+CONTACT_DATA = 4
+"""Numbers per contact sensor: number of contacts, then the net force (x, y, z) in the world frame [N]."""
+
+_DATASPEC = sum(1 << int(f) for f in (mujoco.mjtConDataField.mjCONDATA_FOUND, mujoco.mjtConDataField.mjCONDATA_FORCE))
+_REDUCE_NETFORCE = 3
+
+def read_spec(file: Path) -> mujoco.MjSpec:
+    """Read a MJCF file.
+
+    Raises:
+        UserError: If it is missing or cannot be read.
+    """
+    try:
+        return mujoco.MjSpec.from_file(str(file))
+    except ValueError as error:
+        raise UserError(f"cannot load the robot '{file}': {' '.join(str(error).split())}") from None
+
+
+def geoms_matching(spec: mujoco.MjSpec, parts: list[str]) -> list[str]:
+    """Return the colliding geoms whose names contain one of ``parts``, in the file's order.
+
+    Raises:
+        UserError: If a part matches no geom.
+    """
+    names = [geom.name for geom in spec.geoms if geom.name and (geom.contype or geom.conaffinity)]
+    for part in parts:
+        if not any(part in name for name in names):
+            raise unknown_name("collision geom (part of its name)", part, names)
+    return [name for name in names if any(part in name for part in parts)]
+
+
+def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = "floor") -> mujoco.MjModel:
+    """Compile the model to simulate: without what is only there to be seen, and with contact sensors.
+
+    Args:
+        spec: The robot and its ground.
+        contact_geoms: Names of the geoms whose contacts with the floor are sensed, one contact sensor each, in this
+            order. They are the only sensors of the model.
+        floor: Name of the ground's geom.
+    """
+    spec.compiler.discardvisual = True
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
+    for name in contact_geoms:
+        spec.add_sensor(
+            name=f"{name}_contact",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_GEOM,
+            objname=floor,  # first, since the force is the one that the first geom exerts on the second
+            reftype=mujoco.mjtObj.mjOBJ_GEOM,
+            refname=name,
+            intprm=[_DATASPEC, _REDUCE_NETFORCE, 1],
+        )
+    return spec.compile()
+
+
+def max_contacts(model: mujoco.MjModel) -> int:
+    """Return the most contacts that one world can have: four per box or pair, two per capsule, one per sphere."""
+    per_type = {int(mujoco.mjtGeom.mjGEOM_SPHERE): 1, int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2}
+    total = 0
+    for first in range(model.ngeom):
+        for second in range(first + 1, model.ngeom):
+            if _collide(model, first, second):
+                total += min(per_type.get(int(model.geom_type[geom]), 4) for geom in (first, second))
+    return total
+
+
+def max_constraints(model: mujoco.MjModel, contacts: int) -> int:
+    """Return the most constraint rows that one world can have with that many contacts (pyramidal friction cones)."""
+    rows_per_contact = 2 * (int(model.geom_condim.max()) - 1)
+    friction = int((model.dof_frictionloss > 0).sum())
+    return contacts * rows_per_contact + friction + int(model.jnt_limited.sum())
+
+
+def _collide(model: mujoco.MjModel, first: int, second: int) -> bool:
+    """Return whether two geoms can touch by their collision masks, as MuJoCo defines it."""
+    return bool(
+        (model.geom_contype[first] & model.geom_conaffinity[second])
+        | (model.geom_contype[second] & model.geom_conaffinity[first])
+    )

@@ -1,0 +1,1 @@
+"""What every part uses: configuration, errors, the task registry, run folders, math. Imports no other part."""

@@ -1,0 +1,159 @@
+"""The command line of the scripts, with legged_gym's names."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import re
+import sys
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+import torch
+
+from legged_torque.utils.config import section_keys, set_by_path, update_from_dict
+from legged_torque.utils.errors import UserError, unknown_name
+
+DEFAULT_TASK = "a1_torque_multihead"
+PRESET_NAMES = ("parallel", "paper")
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line with the nearest valid name."""
+
+    def __init__(self, description: str) -> None:
+        """Create a parser; abbreviations of options are not accepted."""
+        super().__init__(
+            description=description, allow_abbrev=False, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+        )
+
+    def error(self, message: str) -> NoReturn:
+        """Report a mistake in the arguments."""
+        raise UserError(message)
+
+    def parse_args(self, args: list[str] | None = None, namespace: argparse.Namespace | None = None):
+        """Parse the command line.
+
+        Raises:
+            UserError: If it cannot be parsed.
+        """
+        namespace, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            options = [option for action in self._actions for option in action.option_strings]
+            raise unknown_name("option", unknown[0], options)
+        return namespace
+
+
+def add_task_args(parser: argparse.ArgumentParser) -> None:
+    """Add what all scripts that build a task take."""
+    parser.add_argument("--task", default=DEFAULT_TASK, help="name of the task; train.py --list prints all")
+    parser.add_argument("--num_envs", type=int, help="number of worlds; default: that of the task")
+    parser.add_argument("--seed", type=int, help="random seed; default: that of the training settings")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda:N; auto takes the GPU if there is one")
+    parser.add_argument("--experiment_name", help="folder of the run below logs/; default: name of the task")
+    parser.add_argument("--load_run", help="run to load: name of its folder or a path; default: the last one")
+    parser.add_argument("--checkpoint", type=int, help="checkpoint to load; default: the last one")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="change a config entry by its dotted path, e.g. rewards.scales.torques=-1e-4; may be repeated",
+    )
+
+
+def add_train_args(parser: argparse.ArgumentParser) -> None:
+    """Add what only training takes."""
+    parser.add_argument("--max_iterations", type=int, help="iterations in all; default: 110e6 environment steps")
+    parser.add_argument("--headless", action="store_true", help="accepted for legged_gym's sake: training has no window")
+    parser.add_argument("--resume", action="store_true", help="continue a run, with its settings")
+    parser.add_argument("--run_name", help="added to the name of the run's folder")
+    parser.add_argument("--preset", choices=PRESET_NAMES, default="parallel", help="training settings")
+    parser.add_argument("--logger", choices=("tensorboard", "wandb", "none"), help="where curves are written")
+
+
+def apply_args(env_cfg: Any, train_cfg: Any, args: argparse.Namespace) -> None:
+    """Change settings as the command line asks; what is more explicit wins.
+
+    In this order: the preset, the number of worlds that suits the device, the settings of a resumed run
+    (``args.run_config``, if present), single options, ``--set``.
+
+    Raises:
+        UserError: If an argument makes no sense.
+    """
+    apply_preset(env_cfg, train_cfg, getattr(args, "preset", "parallel"))
+    if resolve_device(args.device) == "cpu":
+        env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
+    run_config = getattr(args, "run_config", None)
+    if run_config:
+        update_from_dict(env_cfg, run_config["env"])
+        update_from_dict(train_cfg, run_config["train"])
+    given = {
+        "env.num_envs": args.num_envs,
+        "seed": args.seed,
+        "runner.experiment_name": args.experiment_name,
+        "runner.run_name": getattr(args, "run_name", None),
+        "runner.logger": getattr(args, "logger", None),
+    }
+    for path, value in given.items():
+        if value is not None:
+            set_entry_of_either(env_cfg, train_cfg, path, value)
+    for item in args.set:
+        path, separator, value = item.partition("=")
+        if not separator:
+            raise UserError(f"--set takes KEY=VALUE, not '{item}'")
+        set_entry_of_either(env_cfg, train_cfg, path, value)
+    if getattr(args, "max_iterations", None) is not None and args.max_iterations < 1:
+        raise UserError(f"--max_iterations must be at least 1, not {args.max_iterations}")
+
+
+def apply_preset(env_cfg: Any, train_cfg: Any, name: str) -> None:
+    """Apply the named changes that the training settings list as their presets."""
+    for section, values in copy.deepcopy(train_cfg.presets)[name].items():
+        update_from_dict(env_cfg if section in section_keys(env_cfg) else train_cfg, {section: values})
+
+
+def set_entry_of_either(env_cfg: Any, train_cfg: Any, path: str, value: Any) -> None:
+    """Set an entry by its dotted path in the task's or the training's settings, whose sections differ in name.
+
+    Raises:
+        UserError: If neither has such an entry.
+    """
+    section = path.split(".")[0]
+    sections = {key: cfg for cfg in (env_cfg, train_cfg) for key in section_keys(cfg)}
+    if section not in sections:
+        raise unknown_name("config section", section, sections)
+    set_by_path(sections[section], path, value)
+
+
+def resolve_device(device: str | None) -> str:
+    """Return the name of the device to use.
+
+    Args:
+        device: "auto", "cpu" or "cuda:N"; None is "auto".
+
+    Raises:
+        UserError: If there is no such device.
+    """
+    available = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    if device in (None, "auto"):
+        return available[1] if len(available) > 1 else "cpu"
+    if device == "cuda":
+        device = "cuda:0"
+    if device not in available:
+        if re.fullmatch(r"cuda:\d+", device):
+            raise UserError(f"there is no device '{device}'; available: {', '.join(available)}")
+        raise unknown_name("device", device, ["auto", *available])
+    return device
+
+
+def run_script(main: Callable[[], None]) -> None:
+    """Run a script's main function; a user's mistake ends it with one line and exit status 2, Ctrl-C with 130."""
+    try:
+        main()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)

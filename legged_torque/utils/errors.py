@@ -1,0 +1,27 @@
+"""Errors that a user can act on."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(Exception):
+    """A mistake in what the user gave: one line that says what, what is allowed and the nearest match.
+
+    Scripts print the line and exit with status 2; no traceback is shown.
+    """
+
+
+def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
+    """Return the error for a name that does not exist.
+
+    Args:
+        kind: What the name stands for, e.g. "task".
+        given: The name that was given.
+        allowed: All names that exist.
+    """
+    allowed = sorted(allowed)
+    match = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
+    hint = f" did you mean '{match[0]}'?" if match else ""
+    return UserError(f"unknown {kind} '{given}';{hint} allowed: {', '.join(allowed)}")

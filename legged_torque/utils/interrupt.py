@@ -1,0 +1,42 @@
+"""Stopping long work without losing it."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType, TracebackType
+
+
+class StopRequest:
+    """While this context is open, the first Ctrl-C or SIGTERM only asks to stop; the second one stops at once.
+
+    Attributes:
+        requested: Whether it was asked to stop.
+    """
+
+    _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self) -> None:
+        """Nothing was asked yet."""
+        self.requested = False
+
+    def __enter__(self) -> StopRequest:
+        """Take over the signals, which only a process's main thread can."""
+        self._old = {}
+        if threading.current_thread() is threading.main_thread():
+            self._old = {number: signal.signal(number, self._handle) for number in self._SIGNALS}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Give the signals back."""
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        """Remember the first signal, obey the second."""
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+        print("\nStopping after this iteration and saving; once more to stop at once.", flush=True)

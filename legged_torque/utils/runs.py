@@ -1,0 +1,95 @@
+"""Run folders: ``logs/<experiment>/<date and time>[_<run name>]`` with checkpoints, events and ``config.yaml``."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from legged_torque.utils.config import parse_yaml
+from legged_torque.utils.errors import UserError, unknown_name
+
+CONFIG_FILE = "config.yaml"
+_PACKAGES = ("legged_torque", "torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib", "numpy")
+
+
+def new_run_dir(log_root: Path, run_name: str) -> Path:
+    """Return the folder for a run that starts now; it is not created yet."""
+    name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    return log_root / (f"{name}_{run_name}" if run_name else name)
+
+
+def find_run(log_root: Path, load_run: str | None) -> Path:
+    """Return the folder of a run.
+
+    Args:
+        log_root: Folder of the experiment.
+        load_run: Name of the run's folder, or a path to it; None is the newest one that has a checkpoint.
+
+    Raises:
+        UserError: If there is no such run.
+    """
+    if load_run and Path(load_run).is_dir():
+        return Path(load_run)
+    runs = sorted(path.name for path in log_root.glob("*") if list(path.glob("model_*.pt")))
+    if not runs:
+        raise UserError(f"there is no run with a checkpoint in '{log_root}'; train first")
+    if load_run and load_run not in runs:
+        raise unknown_name("run", load_run, runs)
+    return log_root / (load_run or runs[-1])
+
+
+def find_checkpoint(run_dir: Path, checkpoint: int | None) -> Path:
+    """Return the file of a checkpoint.
+
+    Args:
+        run_dir: Folder of the run.
+        checkpoint: Number of iterations after which it was saved; None is the last one.
+
+    Raises:
+        UserError: If there is no such checkpoint.
+    """
+    numbers = sorted(int(path.stem.removeprefix("model_")) for path in run_dir.glob("model_*.pt"))
+    if not numbers:
+        raise UserError(f"there is no checkpoint in '{run_dir}'")
+    if checkpoint is not None and checkpoint not in numbers:
+        raise unknown_name("checkpoint", str(checkpoint), map(str, numbers))
+    return run_dir / f"model_{numbers[-1] if checkpoint is None else checkpoint}.pt"
+
+
+def save_config(run_dir: str | Path, config: dict[str, Any]) -> None:
+    """Write the settings of a run and the versions of the packages that it uses."""
+    run_dir = Path(run_dir)
+    run_dir.mkdir(parents=True, exist_ok=True)
+    text = yaml.safe_dump({**config, "versions": package_versions()}, sort_keys=False)
+    (run_dir / CONFIG_FILE).write_text(text, encoding="utf-8")
+
+
+def load_config(run_dir: Path) -> dict[str, Any]:
+    """Return what :func:`save_config` has written.
+
+    Raises:
+        UserError: If the file is missing or broken.
+    """
+    file = run_dir / CONFIG_FILE
+    if not file.is_file():
+        raise UserError(f"the run '{run_dir}' has no {CONFIG_FILE}")
+    config = parse_yaml(file.read_text(encoding="utf-8", errors="replace"), f"'{file}'")
+    if not isinstance(config, dict) or not {"task", "env", "train"} <= config.keys():
+        raise UserError(f"'{file}' lacks the entries task, env and train")
+    return config
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide how a training goes."""
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    return versions

@@ -1,0 +1,162 @@
+"""The registry of tasks, in legged_gym's manner."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from rsl_rl.env import VecEnv
+from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.utils import resolve_callable
+
+from legged_torque import ROOT_DIR
+from legged_torque.utils.args import apply_args, resolve_device
+from legged_torque.utils.config import BaseConfig, to_dict
+from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.runs import find_checkpoint, find_run, new_run_dir
+
+
+class TaskRegistry:
+    """Tasks by name: a task class, its settings, and the settings of its training."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._tasks: dict[str, tuple[type[VecEnv], BaseConfig, BaseConfig]] = {}
+
+    def register(self, name: str, task_class: type[VecEnv], env_cfg: BaseConfig, train_cfg: BaseConfig) -> None:
+        """Make a task known.
+
+        Args:
+            name: What ``--task`` calls it.
+            task_class: Created as ``task_class(env_cfg, device)``.
+            env_cfg: Settings of the task.
+            train_cfg: Settings of its training.
+        """
+        self._tasks[name] = (task_class, env_cfg, train_cfg)
+
+    def names(self) -> list[str]:
+        """Return the names of all tasks, in the order of their registration."""
+        return list(self._tasks)
+
+    def get_task_class(self, name: str) -> type[VecEnv]:
+        """Return the class of a task.
+
+        Raises:
+            UserError: If there is no such task.
+        """
+        return self._get(name)[0]
+
+    def get_cfgs(self, name: str, args: argparse.Namespace | None = None) -> tuple[Any, Any]:
+        """Return copies of the settings of a task and of its training, changed by the command line.
+
+        Raises:
+            UserError: If there is no such task or an argument makes no sense.
+        """
+        env_cfg, train_cfg = copy.deepcopy(self._get(name)[1:])
+        if args is not None:
+            apply_args(env_cfg, train_cfg, args)
+        return env_cfg, train_cfg
+
+    def make_env(
+        self, name: str, args: argparse.Namespace | None = None, env_cfg: Any | None = None
+    ) -> tuple[VecEnv, Any]:
+        """Create a task.
+
+        Args:
+            name: Name of the task.
+            args: Parsed command line; gives the device, and settings if ``env_cfg`` is not given.
+            env_cfg: Settings to use as they are; None takes the registered ones with ``args`` applied.
+
+        Returns:
+            The task and its settings.
+        """
+        task_class = self.get_task_class(name)
+        if env_cfg is None:
+            env_cfg, _ = self.get_cfgs(name, args)
+        return task_class(env_cfg, resolve_device(getattr(args, "device", None))), env_cfg
+
+    def make_alg_runner(
+        self,
+        env: VecEnv,
+        name: str | None = None,
+        args: argparse.Namespace | None = None,
+        train_cfg: Any | None = None,
+        log_root: str | Path | None = "default",
+    ) -> tuple[OnPolicyRunner, Any]:
+        """Create the runner that trains or holds a policy.
+
+        Args:
+            env: The task.
+            name: Name of the task; may be left out if ``train_cfg`` is given.
+            args: Parsed command line; its ``resume``, ``load_run`` and ``checkpoint`` say what to load.
+            train_cfg: Settings to use as they are; None takes the registered ones with ``args`` applied.
+            log_root: Folder of the experiment's runs; "default" is ``logs/<experiment name>``, None keeps nothing.
+
+        Returns:
+            The runner and its settings. Nothing is written before training starts.
+        """
+        if train_cfg is None:
+            if name is None:
+                raise ValueError("make_alg_runner needs a task's name or its train_cfg")
+            _, train_cfg = self.get_cfgs(name, args)
+        root = experiment_dir(train_cfg) if log_root == "default" else log_root and Path(log_root)
+        log_dir = str(new_run_dir(root, train_cfg.runner.run_name)) if root else None
+        runner_class = resolve_callable(train_cfg.runner.class_name)
+        runner = runner_class(env, to_rsl_rl(train_cfg), log_dir, env.device)
+        if args is not None and getattr(args, "resume", False):
+            run_dir = find_run(root or experiment_dir(train_cfg), args.load_run)
+            runner.load(str(find_checkpoint(run_dir, args.checkpoint)))
+        return runner, train_cfg
+
+    def _get(self, name: str) -> tuple[type[VecEnv], BaseConfig, BaseConfig]:
+        """Return what was registered under a name."""
+        if name not in self._tasks:
+            raise unknown_name("task", name, self._tasks)
+        return self._tasks[name]
+
+
+def experiment_dir(train_cfg: Any) -> Path:
+    """Return the folder that holds the runs of an experiment."""
+    return ROOT_DIR / "logs" / train_cfg.runner.experiment_name
+
+
+def num_iterations(env: VecEnv, train_cfg: Any) -> int:
+    """Return how many iterations a whole training takes."""
+    return math.ceil(train_cfg.runner.total_steps / (env.num_envs * train_cfg.runner.num_steps_per_env))
+
+
+def to_rsl_rl(train_cfg: Any) -> dict[str, Any]:
+    """Return training settings in the layout that rsl_rl's runner takes."""
+    settings = to_dict(train_cfg)
+    settings.pop("presets")
+    return {**settings.pop("runner"), **settings, "logger": _logger_cfg(train_cfg.runner)}
+
+
+def _logger_cfg(runner: Any) -> dict[str, str]:
+    """Return rsl_rl's settings of the logging backend."""
+    backends = {
+        "tensorboard": {"class_name": "tensorboard"},
+        "wandb": {"class_name": "WandbLogWriter", "project_name": runner.wandb_project},
+        "none": {"class_name": "legged_torque.learning.log_writer:NoLogWriter"},
+    }
+    if runner.logger not in backends:
+        raise unknown_name("logger", runner.logger, backends)
+    if runner.logger == "wandb":
+        try:
+            import wandb  # noqa: F401
+        except ImportError:
+            raise UserError("--logger wandb needs the extra: pip install -e .[wandb]") from None
+    return backends[runner.logger]
+
+
+def set_seed(seed: int) -> None:
+    """Seed every random number that a training draws."""
+    torch.manual_seed(seed)
+
+
+task_registry = TaskRegistry()
+"""The registry that scripts use; :mod:`legged_torque.envs` fills it."""
