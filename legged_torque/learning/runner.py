@@ -59,8 +59,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         with StopRequest() as stop:
             while self.current_learning_iteration < total_it and not stop.requested:
                 start = time.perf_counter()
-                self.env.update_curriculum()
-                self._rollout()
+                self.collect_rollout()
                 self._wait()
                 collected = time.perf_counter()
                 losses = self.alg.update()
@@ -121,8 +120,13 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             raise UserError(f"checkpoint '{path}' does not fit this task: {first_line(error)}") from None
         return state["infos"]
 
+    def collect_rollout(self) -> None:
+        """Let curricula that hold for a rollout move on, and fill the storage with one rollout and its returns."""
+        self.env.update_curriculum()
+        self._rollout()
+
     def _collect(self) -> None:
-        """Fill the storage with one rollout and compute its returns."""
+        """Act for one rollout; runs as a CUDA graph."""
         with torch.no_grad():
             obs = self.env.get_observations()
             for _ in range(self.cfg["num_steps_per_env"]):

@@ -2,4 +2,4 @@
 
 import warp as wp
 
-wp.config.quiet = True  # before anything initializes Warp: no banner, no line per loaded kernel
+wp.config.log_level = wp.LOG_WARNING  # before anything initializes Warp: no banner, no line per loaded kernel
