@@ -21,6 +21,7 @@ def use_shared_stream(device: str) -> None:
     """
     if torch.device(device).type != "cuda":
         return
+    wp.init()
     if device not in _STREAMS:
         torch.cuda.set_device(device)
         stream = torch.cuda.Stream(device)

@@ -126,7 +126,7 @@ class LeggedRobotCfgPPO(BaseConfig):
         activation = "elu"
 
         class distribution_cfg:
-            class_name = "GaussianDistribution"
+            class_name = "legged_torque.learning.distribution:GaussianDistribution"
             init_std = 1.0
             std_type = "log"
 
