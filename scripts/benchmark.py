@@ -5,12 +5,11 @@ import os
 os.environ["MUJOCO_GL"] = "disable"
 
 import json
-import sys
 from pathlib import Path
 
 from legged_torque.envs import task_registry
-from legged_torque.evaluation.benchmark import device_name, summarize, time_parts
-from legged_torque.utils.args import DEFAULT_TASK, Parser, resolve_device, run_script
+from legged_torque.evaluation.benchmark import summarize, time_parts
+from legged_torque.utils.args import DEFAULT_TASK, Parser, device_name, resolve_device, run_script
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import package_versions
 
@@ -48,9 +47,7 @@ def main() -> None:
         env_cfg, train_cfg = task_registry.get_cfgs(args.task)
         env_cfg.env.num_envs = num_envs
         env = task_registry.get_task_class(args.task)(env_cfg, device)
-        stdout, sys.stdout = sys.stdout, sys.stderr  # rsl_rl describes its networks when they are made
         runner, _ = task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=None)
-        sys.stdout = stdout
         rows.append(summarize(time_parts(runner, args.rounds), num_envs, train_cfg.runner.num_steps_per_env))
         print(" | ".join(f"{rows[-1][key]:>{len(title)}.{digits(rows[-1][key])}f}" for key, title in COLUMNS.items()))
     if args.json:

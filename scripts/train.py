@@ -5,11 +5,11 @@ import os
 os.environ["MUJOCO_GL"] = "disable"  # training draws nothing, and MuJoCo must not look for a renderer
 
 from legged_torque.envs import task_registry
-from legged_torque.utils.args import Parser, add_task_args, add_train_args, run_script
+from legged_torque.utils.args import Parser, add_task_args, add_train_args, device_name, run_script
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.runs import find_run, load_config, save_config
-from legged_torque.utils.task_registry import experiment_dir, num_iterations, set_seed
+from legged_torque.utils.runs import find_checkpoint, save_config
+from legged_torque.utils.task_registry import load_run, num_iterations, set_seed
 
 
 def main() -> None:
@@ -23,8 +23,11 @@ def main() -> None:
         print("\n".join(task_registry.names()))
         return
     if args.resume:
-        load_settings_of_run(args)
-    env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
+        run_dir, env_cfg, train_cfg = load_run(args)
+        args.load_run = str(run_dir)
+        find_checkpoint(run_dir, args.checkpoint)  # a mistake is told before anything is built
+    else:
+        env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
     set_seed(train_cfg.seed)
     env, _ = task_registry.make_env(args.task, args, env_cfg)
     runner, _ = task_registry.make_alg_runner(env, args.task, args, train_cfg)
@@ -33,19 +36,12 @@ def main() -> None:
     if remaining < 1:
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
     settings = {"task": args.task, "preset": args.preset, "device": env.device, "max_iterations": total}
+    print(f"Training {args.task} on {device_name(env.device)}: {env.num_envs} worlds, {total} iterations.")
+    print("The first run on a machine compiles kernels before its first iteration, for about a minute.")
+    print(f"Curves: tensorboard --logdir {runner.log_dir}", flush=True)
     save_config(runner.log_dir, settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     runner.learn(remaining, init_at_random_ep_len=True)
     print(f"The run is in {runner.log_dir}\nSee it walk: python scripts/play.py --task={args.task}")
-
-
-def load_settings_of_run(args) -> None:
-    """Make the settings of the run that is to be resumed the ones that the command line changes."""
-    _, train_cfg = task_registry.get_cfgs(args.task)
-    train_cfg.runner.experiment_name = args.experiment_name or train_cfg.runner.experiment_name
-    run_dir = find_run(experiment_dir(train_cfg), args.load_run)
-    args.load_run, args.run_config = str(run_dir), load_config(run_dir)
-    if args.run_config["task"] != args.task:
-        raise UserError(f"the run '{run_dir}' is of task '{args.run_config['task']}', not '{args.task}'")
 
 
 if __name__ == "__main__":

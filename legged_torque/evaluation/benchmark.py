@@ -66,13 +66,6 @@ def summarize(times: dict[str, float], num_envs: int, num_steps: int) -> dict[st
     }
 
 
-def device_name(device: str) -> str:
-    """Return what the machine calls the device."""
-    if torch.device(device).type == "cuda":
-        return torch.cuda.get_device_name(device)
-    return f"CPU, {torch.get_num_threads()} threads"
-
-
 def _milliseconds(function: Callable[[], object], count: int, task: LeggedRobot) -> float:
     """Return the mean time of one call of a function that is called ``count`` times."""
     _wait(task)

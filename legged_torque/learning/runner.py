@@ -84,6 +84,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             **(infos or {}),
             "task": self.env.state_dict(),
             "total_timesteps": self.logger.tot_timesteps,
+            "seconds": self.logger.tot_time,
         }
         part = f"{path}.part"
         torch.save(state, part)

@@ -14,6 +14,7 @@ CONTACT_DATA = 4
 _DATASPEC = sum(1 << int(f) for f in (mujoco.mjtConDataField.mjCONDATA_FOUND, mujoco.mjtConDataField.mjCONDATA_FORCE))
 _REDUCE_NETFORCE = 3
 
+
 def read_spec(file: Path) -> mujoco.MjSpec:
     """Read a MJCF file.
 

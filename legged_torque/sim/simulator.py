@@ -7,7 +7,6 @@ import operator
 
 import mujoco
 import mujoco_warp as mjw
-import torch
 import warp as wp
 from torch import Tensor
 
@@ -71,9 +70,7 @@ class Simulator:
         with wp.ScopedDevice(self._wp_device):
             self.model = mjw.put_model(model)
             self.model.opt.warn_overflow = 0  # it prints from inside kernels; check_buffers tells instead
-            self.data = mjw.make_data(
-                model, nworld=num_envs, nconmax=contacts, njmax=max_constraints(model, contacts)
-            )
+            self.data = mjw.make_data(model, nworld=num_envs, nconmax=contacts, njmax=max_constraints(model, contacts))
             self._diverged = wp.zeros(num_envs, dtype=wp.bool)
             self._reset_mask = wp.zeros(num_envs, dtype=wp.bool)
             self._overflow = wp.zeros(num_envs, dtype=wp.int32)
@@ -106,7 +103,7 @@ class Simulator:
         self.diverged.zero_()
 
     def flag_diverged(self) -> None:
-        """Mark in ``diverged`` each world whose state is not finite or absurdly large (MuJoCo Warp has no such check)."""
+        """Mark the worlds whose state is not finite or absurdly large; MuJoCo Warp has no such check."""
         wp.launch(
             _flag_diverged,
             dim=self.num_envs,

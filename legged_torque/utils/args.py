@@ -15,7 +15,6 @@ from legged_torque.utils.config import section_keys, set_by_path, update_from_di
 from legged_torque.utils.errors import UserError, unknown_name
 
 DEFAULT_TASK = "a1_torque_multihead"
-PRESET_NAMES = ("parallel", "paper")
 
 
 class Parser(argparse.ArgumentParser):
@@ -65,11 +64,13 @@ def add_task_args(parser: argparse.ArgumentParser) -> None:
 def add_train_args(parser: argparse.ArgumentParser) -> None:
     """Add what only training takes."""
     parser.add_argument("--max_iterations", type=int, help="iterations in all; default: 110e6 environment steps")
-    parser.add_argument("--headless", action="store_true", help="accepted for legged_gym's sake: training has no window")
+    parser.add_argument(
+        "--headless", action="store_true", help="accepted for legged_gym's sake: training has no window"
+    )
     parser.add_argument("--resume", action="store_true", help="continue a run, with its settings")
     parser.add_argument("--run_name", help="added to the name of the run's folder")
-    parser.add_argument("--preset", choices=PRESET_NAMES, default="parallel", help="training settings")
-    parser.add_argument("--logger", choices=("tensorboard", "wandb", "none"), help="where curves are written")
+    parser.add_argument("--preset", default="parallel", help="training settings: parallel or paper (Table II)")
+    parser.add_argument("--logger", help="where curves are written: tensorboard, wandb or none")
 
 
 def apply_args(env_cfg: Any, train_cfg: Any, args: argparse.Namespace) -> None:
@@ -108,7 +109,13 @@ def apply_args(env_cfg: Any, train_cfg: Any, args: argparse.Namespace) -> None:
 
 
 def apply_preset(env_cfg: Any, train_cfg: Any, name: str) -> None:
-    """Apply the named changes that the training settings list as their presets."""
+    """Apply the named changes that the training settings list as their presets.
+
+    Raises:
+        UserError: If there is no such preset.
+    """
+    if name not in train_cfg.presets:
+        raise unknown_name("preset", name, train_cfg.presets)
     for section, values in copy.deepcopy(train_cfg.presets)[name].items():
         update_from_dict(env_cfg if section in section_keys(env_cfg) else train_cfg, {section: values})
 
@@ -145,6 +152,13 @@ def resolve_device(device: str | None) -> str:
             raise UserError(f"there is no device '{device}'; available: {', '.join(available)}")
         raise unknown_name("device", device, ["auto", *available])
     return device
+
+
+def device_name(device: str) -> str:
+    """Return what the machine calls the device."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"CPU, {torch.get_num_threads()} threads"
 
 
 def run_script(main: Callable[[], None]) -> None:

@@ -53,12 +53,18 @@ def find_checkpoint(run_dir: Path, checkpoint: int | None) -> Path:
     Raises:
         UserError: If there is no such checkpoint.
     """
-    numbers = sorted(int(path.stem.removeprefix("model_")) for path in run_dir.glob("model_*.pt"))
+    numbers = checkpoint_numbers(run_dir)
     if not numbers:
         raise UserError(f"there is no checkpoint in '{run_dir}'")
     if checkpoint is not None and checkpoint not in numbers:
         raise unknown_name("checkpoint", str(checkpoint), map(str, numbers))
     return run_dir / f"model_{numbers[-1] if checkpoint is None else checkpoint}.pt"
+
+
+def checkpoint_numbers(run_dir: Path) -> list[int]:
+    """Return the iterations after which a run has saved checkpoints, in rising order."""
+    stems = (path.stem.removeprefix("model_") for path in run_dir.glob("model_*.pt"))
+    return sorted(int(stem) for stem in stems if stem.isdecimal())
 
 
 def save_config(run_dir: str | Path, config: dict[str, Any]) -> None:

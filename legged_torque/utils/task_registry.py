@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import copy
+import io
 import math
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ from legged_torque import ROOT_DIR
 from legged_torque.utils.args import apply_args, resolve_device
 from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.runs import find_checkpoint, find_run, new_run_dir
+from legged_torque.utils.runs import find_checkpoint, find_run, load_config, new_run_dir
 
 
 class TaskRegistry:
@@ -106,7 +108,8 @@ class TaskRegistry:
         root = experiment_dir(train_cfg) if log_root == "default" else log_root and Path(log_root)
         log_dir = str(new_run_dir(root, train_cfg.runner.run_name)) if root else None
         runner_class = resolve_callable(train_cfg.runner.class_name)
-        runner = runner_class(env, to_rsl_rl(train_cfg), log_dir, env.device)
+        with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints its networks at length
+            runner = runner_class(env, to_rsl_rl(train_cfg), log_dir, env.device)
         if args is not None and getattr(args, "resume", False):
             run_dir = find_run(root or experiment_dir(train_cfg), args.load_run)
             runner.load(str(find_checkpoint(run_dir, args.checkpoint)))
@@ -117,6 +120,22 @@ class TaskRegistry:
         if name not in self._tasks:
             raise unknown_name("task", name, self._tasks)
         return self._tasks[name]
+
+
+def load_run(args: argparse.Namespace) -> tuple[Path, Any, Any]:
+    """Return the folder of the run that the command line names, and its settings changed by the command line.
+
+    Raises:
+        UserError: If there is no such run, it is of another task, or its settings cannot be read.
+    """
+    _, train_cfg = task_registry.get_cfgs(args.task)
+    train_cfg.runner.experiment_name = args.experiment_name or train_cfg.runner.experiment_name
+    run_dir = find_run(experiment_dir(train_cfg), args.load_run)
+    config = load_config(run_dir)
+    if config["task"] != args.task:
+        raise UserError(f"the run '{run_dir}' is of task '{config['task']}', not '{args.task}'")
+    args.run_config = config
+    return run_dir, *task_registry.get_cfgs(args.task, args)
 
 
 def experiment_dir(train_cfg: Any) -> Path:

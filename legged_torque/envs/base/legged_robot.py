@@ -212,7 +212,7 @@ class LeggedRobot(RewardTerms, VecEnv):
         return self._reward_scales * self._reward_curriculum(self.total_steps)
 
     def compute_observations(self) -> None:
-        """Compute the observations of section 5 of the design: what a real robot can measure, and all for the critic."""
+        """Compute what a real robot can measure for the policy, and what only a simulator knows for the critic."""
         scales = self.cfg.normalization.obs_scales
         policy = torch.cat(
             [
@@ -225,9 +225,7 @@ class LeggedRobot(RewardTerms, VecEnv):
             ],
             dim=1,
         )
-        critic = torch.cat(
-            [policy, self.base_lin_vel * scales.lin_vel, self.base_pos[:, 2:], self.feet_contact], dim=1
-        )
+        critic = torch.cat([policy, self.base_lin_vel * scales.lin_vel, self.base_pos[:, 2:], self.feet_contact], dim=1)
         clip = self.cfg.normalization.clip_observations
         torch.clamp(policy, -clip, clip, out=self.obs_buf["policy"])
         torch.clamp(critic, -clip, clip, out=self.obs_buf["critic"])

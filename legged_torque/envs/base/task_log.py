@@ -47,7 +47,7 @@ class TaskLog:
         """Return the means since the last call and start anew. Waits for the device.
 
         Args:
-            max_episode_length_s: Length of a full episode [s], by which episode rewards are divided, as legged_gym does.
+            max_episode_length_s: Length of a full episode [s]; rewards of episodes are divided by it, as in legged_gym.
 
         Returns:
             Per finished episode: "Episode_Reward/<term>", "return", "length" (absent if none has finished). Per step:

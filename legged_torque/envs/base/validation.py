@@ -26,7 +26,9 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
         if not value > 0.0:
             raise UserError(f"{key} must be greater than 0, not {value}")
     if not 0.0 <= cfg.commands.resampling_probability <= 1.0:
-        raise UserError(f"commands.resampling_probability must be from 0 to 1, not {cfg.commands.resampling_probability}")
+        raise UserError(
+            f"commands.resampling_probability must be from 0 to 1, not {cfg.commands.resampling_probability}"
+        )
     for name, section in {"commands.ranges": cfg.commands.ranges, "domain_rand": cfg.domain_rand}.items():
         for key in section_keys(section):
             _check_range(f"{name}.{key}", getattr(section, key))

@@ -1,0 +1,83 @@
+"""Recording a robot and drawing it afterwards."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from legged_torque import ROOT_DIR
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.rendering import INSTALL_HINT
+
+WIDTH, HEIGHT = 960, 540
+COMMAND_COLOR = (0.1, 0.8, 0.2, 0.9)
+VELOCITY_COLOR = (0.1, 0.4, 1.0, 0.9)
+
+
+class Recorder:
+    """Keeps what one world does, to draw it as a video."""
+
+    def __init__(self, task: LeggedRobot, world: int = 0) -> None:
+        """Record ``world`` of ``task``."""
+        self._task = task
+        self._world = world
+        self._frames: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def add_step(self) -> None:
+        """Keep the state after a control step."""
+        task, world = self._task, self._world
+        parts = (task.sim.qpos, task.commands, task.base_lin_vel)
+        self._frames.append(tuple(part[world].double().cpu().numpy() for part in parts))
+
+    def save(self, file: Path) -> None:
+        """Draw what was recorded and write it as mp4, in real time, every second control step.
+
+        A green arrow is the commanded velocity, a blue one the actual velocity.
+
+        Raises:
+            UserError: If there is no renderer or no video encoder.
+        """
+        try:
+            import imageio
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError:
+            raise UserError("videos need the extra: pip install -e .[video]") from None
+        model = mujoco.MjModel.from_xml_path(str(ROOT_DIR / self._task.cfg.asset.file))
+        model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
+        data = mujoco.MjData(model)
+        try:
+            renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
+        except Exception as error:  # whatever the graphics driver raises
+            raise UserError(f"the renderer does not start: {error} ({INSTALL_HINT})") from None
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with renderer, imageio.get_writer(file, fps=round(0.5 / self._task.dt), macro_block_size=1) as writer:
+            for qpos, command, velocity in self._frames[::2]:
+                data.qpos[:] = qpos
+                mujoco.mj_forward(model, data)
+                renderer.update_scene(data, camera=_follow(qpos))
+                rotation = data.xmat[1].reshape(3, 3)
+                for vector, color in ((command, COMMAND_COLOR), (velocity, VELOCITY_COLOR)):
+                    _add_arrow(renderer.scene, qpos[:3], rotation @ [vector[0], vector[1], 0.0], color)
+                writer.append_data(renderer.render())
+
+
+def _follow(qpos: np.ndarray) -> mujoco.MjvCamera:
+    """Return a camera that looks at the robot from the side and keeps its direction."""
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = (qpos[0], qpos[1], 0.25)
+    camera.distance, camera.azimuth, camera.elevation = 1.6, 130.0, -18.0
+    return camera
+
+
+def _add_arrow(scene: mujoco.MjvScene, base: np.ndarray, vector: np.ndarray, color: tuple[float, ...]) -> None:
+    """Draw a velocity [m/s] as an arrow above the robot, 0.4 m long for 1 m/s."""
+    if np.linalg.norm(vector) < 1e-3 or scene.ngeom >= scene.maxgeom:
+        return
+    start = base + [0.0, 0.0, 0.2]
+    geom = scene.geoms[scene.ngeom]
+    mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.zeros(9), np.float32(color))
+    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.012, start, start + 0.4 * vector)
+    scene.ngeom += 1

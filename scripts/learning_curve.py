@@ -1,0 +1,54 @@
+"""Measure every checkpoint of a run with mean actions: ``python scripts/learning_curve.py --task=a1_position``."""
+
+import os
+
+os.environ["MUJOCO_GL"] = "disable"
+
+import json
+from pathlib import Path
+
+from legged_torque.envs import task_registry
+from legged_torque.evaluation.metrics import measure
+from legged_torque.utils.args import Parser, add_task_args, device_name, run_script
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
+from legged_torque.utils.task_registry import load_run, set_seed
+
+
+def main() -> None:
+    """Evaluate the checkpoints in the order of training, print a line for each, write JSON."""
+    parser = Parser(__doc__)
+    add_task_args(parser)
+    parser.set_defaults(num_envs=256)
+    parser.add_argument("--steps", type=int, default=1000, help="control steps per checkpoint; 1000 are an episode")
+    parser.add_argument("--json", type=Path, help="file to write; default: curve.json in the run's folder")
+    args = parser.parse_args()
+    if args.steps < 1:
+        raise UserError(f"--steps must be at least 1, not {args.steps}")
+    run_dir, env_cfg, train_cfg = load_run(args)
+    env, _ = task_registry.make_env(args.task, args, env_cfg)
+    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
+    points = []
+    for number in checkpoint_numbers(run_dir):
+        infos = runner.load(str(find_checkpoint(run_dir, number)))
+        set_seed(train_cfg.seed + 1000)  # the same worlds for every checkpoint, others than in training
+        numbers = measure(env, runner.get_inference_policy(env.device), args.steps)
+        points.append({"steps": infos["total_timesteps"], "seconds": infos["seconds"], **numbers})
+        print(
+            f"{points[-1]['steps']:>12,} steps", *(f"{name} {value:.4f}" for name, value in numbers.items()), sep="  "
+        )
+    result = {
+        "task": args.task,
+        "seed": train_cfg.seed,
+        "trained_with": args.run_config["train"],
+        "trained_num_envs": args.run_config["env"]["env"]["num_envs"],
+        "device": device_name(env.device),
+        "evaluation": {"num_envs": env.num_envs, "num_steps": args.steps, "actions": "mean"},
+        "versions": package_versions(),
+        "points": points,
+    }
+    (args.json or run_dir / "curve.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    run_script(main)
