@@ -135,7 +135,7 @@ def _flag_diverged(
 ):
     """Check one world; comparisons are written so that NaN fails them."""
     world = wp.tid()
-    good = bool(True)
+    good = bool(True)  # a variable; Warp would take True for a constant
     for i in range(qpos.shape[1]):
         good = good and wp.abs(qpos[world, i]) <= wp.static(MAX_POSITION)
     for i in range(qvel.shape[1]):
