@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import copy
 import re
 import sys
 from collections.abc import Callable
@@ -109,14 +108,15 @@ def apply_args(env_cfg: Any, train_cfg: Any, args: argparse.Namespace) -> None:
 
 
 def apply_preset(env_cfg: Any, train_cfg: Any, name: str) -> None:
-    """Apply the named changes that the training settings list as their presets.
+    """Apply the named changes that the training settings offer as their presets.
 
     Raises:
         UserError: If there is no such preset.
     """
-    if name not in train_cfg.presets:
-        raise unknown_name("preset", name, train_cfg.presets)
-    for section, values in copy.deepcopy(train_cfg.presets)[name].items():
+    presets = train_cfg.presets()
+    if name not in presets:
+        raise unknown_name("preset", name, presets)
+    for section, values in presets[name].items():
         update_from_dict(env_cfg if section in section_keys(env_cfg) else train_cfg, {section: values})
 
 

@@ -151,7 +151,6 @@ def num_iterations(env: VecEnv, train_cfg: Any) -> int:
 def to_rsl_rl(train_cfg: Any) -> dict[str, Any]:
     """Return training settings in the layout that rsl_rl's runner takes."""
     settings = to_dict(train_cfg)
-    settings.pop("presets")
     return {**settings.pop("runner"), **settings, "logger": _logger_cfg(train_cfg.runner)}
 
 

@@ -150,9 +150,9 @@ class LeggedRobotCfgPPO(BaseConfig):
         desired_kl = 0.01
         use_clipped_value_loss = True
 
-    presets = {
-        "parallel": {},
-        "paper": {  # Table II to the letter
+    def presets(self) -> dict[str, dict]:
+        """Return the named changes to the settings of task and training that ``--preset`` chooses from."""
+        paper = {  # Table II to the letter
             "env": {"num_envs": 16, "num_envs_cpu": 16},
             "runner": {"num_steps_per_env": 2000},
             "algorithm": {
@@ -164,5 +164,5 @@ class LeggedRobotCfgPPO(BaseConfig):
                 "max_grad_norm": 5.0,
                 "schedule": "fixed",
             },
-        },
-    }
+        }
+        return {"parallel": {}, "paper": paper}

@@ -1,0 +1,36 @@
+"""Metadata of the package."""
+
+import re
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+ROOT = Path(__file__).parent
+VERSION = re.search(r'__version__ = "(.+?)"', (ROOT / "legged_torque" / "__init__.py").read_text("utf-8")).group(1)
+
+setup(
+    name="legged_torque",
+    version=VERSION,
+    description="Massively parallel training of torque-controlled legged robots on MuJoCo Warp and rsl_rl",
+    long_description=(ROOT / "README.md").read_text("utf-8"),
+    long_description_content_type="text/markdown",
+    license="BSD-3-Clause",
+    packages=find_packages(include=["legged_torque", "legged_torque.*"]),
+    python_requires=">=3.10",
+    install_requires=[
+        "torch>=2.6",
+        "rsl-rl-lib>=5.5,<6",
+        "warp-lang>=1.19,<2",
+        "mujoco>=3.17,<5",
+        "mujoco-warp>=3.17,<5",
+        "tensordict",
+        "numpy",
+        "pyyaml",
+    ],
+    extras_require={
+        "video": ["imageio", "imageio-ffmpeg"],
+        "plots": ["matplotlib"],
+        "wandb": ["wandb"],
+        "test": ["pytest", "imageio", "imageio-ffmpeg"],
+    },
+)
