@@ -18,7 +18,7 @@ setup(
     packages=find_packages(include=["legged_torque", "legged_torque.*"]),
     python_requires=">=3.10",
     install_requires=[
-        "torch>=2.6",
+        "torch>=2.6,<2.14",
         "rsl-rl-lib>=5.5,<6",
         "warp-lang>=1.19,<2",
         "mujoco>=3.17,<5",

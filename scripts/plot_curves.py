@@ -1,4 +1,4 @@
-"""Draw learning curves (the paper's Figure 3): ``python scripts/plot_curves.py docs/learning/*.json --out curves.png``."""
+"""Draw learning curves, the paper's Figure 3: ``python scripts/plot_curves.py docs/learning/*.json --out curves.png``."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,15 @@ PANELS = {
     "track_xy": "mean squared error of v_xy [m²/s²]",
     "cost_of_transport": "cost of transport",
 }
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9")  # told apart by colour-blind eyes
+COLORS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#000000",
+    "#E69F00",
+    "#56B4E9",
+)  # told apart by colour-blind eyes
 LINES = ("-", "--", ":", "-.")
 
 

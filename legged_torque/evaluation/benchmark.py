@@ -28,8 +28,9 @@ def time_parts(runner: OnPolicyRunner, rounds: int) -> dict[str, float]:
     actions = 0.5 * torch.randn(task.num_envs, task.num_actions, device=task.device)
 
     def physics() -> None:
-        for _ in range(task.cfg.control.decimation):
-            task.sim.step()
+        decimation = task.cfg.control.decimation
+        for i in range(decimation):
+            task.sim.step(sense=i == decimation - 1)
 
     def iteration() -> None:
         runner.collect_rollout()

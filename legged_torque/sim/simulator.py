@@ -19,6 +19,7 @@ MAX_VELOCITY = 1e4
 """Largest velocity [m/s, rad/s] of a world that is still believed."""
 MAX_ACCELERATION = 1e10
 """Largest acceleration [m/s^2, rad/s^2] of a world that is still believed."""
+_NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _BUFFER_FLAGS = (
     mjw.OverflowType.NEFC,
     mjw.OverflowType.NJMAX_NNZ,
@@ -40,7 +41,8 @@ class Simulator:
             Shape: (num_envs, nv).
         qacc_warmstart: Accelerations from which the constraint solver starts. Shape: (num_envs, nv).
         ctrl: Joint torques [N m]. Shape: (num_envs, nu).
-        contact_found: Number of contacts of each sensed geom with the floor, as of the start of the last physics step.
+        contact_found: Number of contacts of each sensed geom with the floor, as of the start of the last physics step
+            that sensed.
             Shape: (num_envs, geoms).
         contact_force: Net contact force on each sensed geom in the world frame [N]. Shape: (num_envs, geoms, 3).
         diverged: Worlds whose state was seen to be not finite or absurdly large since the last :meth:`clear_diverged`.
@@ -70,6 +72,9 @@ class Simulator:
         with wp.ScopedDevice(self._wp_device):
             self.model = mjw.put_model(model)
             self.model.opt.warn_overflow = 0  # it prints from inside kernels; check_buffers tells instead
+            if self._wp_device.is_cuda:
+                self.model.opt.graph_conditional = False  # unrolled solver iterations are faster than a device loop
+            self._flags = self.model.opt.disableflags
             self.data = mjw.make_data(model, nworld=num_envs, nconmax=contacts, njmax=max_constraints(model, contacts))
             self._diverged = wp.zeros(num_envs, dtype=wp.bool)
             self._reset_mask = wp.zeros(num_envs, dtype=wp.bool)
@@ -83,8 +88,13 @@ class Simulator:
         self.contact_found = sensors[:, :, 0]
         self.contact_force = sensors[:, :, 1:]
 
-    def step(self) -> None:
-        """Advance every world by one physics step under the torques in ``ctrl``."""
+    def step(self, sense: bool = True) -> None:
+        """Advance every world by one physics step under the torques in ``ctrl``.
+
+        Args:
+            sense: Whether to update the contact sensors; of several steps, only the last one needs to.
+        """
+        self.model.opt.disableflags = self._flags if sense else self._flags | _NO_SENSORS
         with wp.ScopedDevice(self._wp_device):
             mjw.step(self.model, self.data)
 

@@ -157,11 +157,12 @@ class LeggedRobot(RewardTerms, VecEnv):
         self.sim.diverged.logical_or_(~torch.isfinite(self._given_actions).all(dim=1))
         clip = self.cfg.normalization.clip_actions
         self.actions.copy_(self._given_actions.nan_to_num().clamp(-clip, clip))
-        for i in range(self.cfg.control.decimation):
+        decimation = self.cfg.control.decimation
+        for i in range(decimation):
             if i == 0 or self.cfg.control.refresh_torques:
                 torques = self._compute_torques(self.actions)
                 torch.clamp(torques, -self.torque_limits, self.torque_limits, out=self.torques)
-            self.sim.step()
+            self.sim.step(sense=i == decimation - 1)
         self.sim.flag_diverged()
         self.post_physics_step()
 

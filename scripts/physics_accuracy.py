@@ -1,0 +1,49 @@
+"""Compare solver settings with converged mj_step on a walking robot: ``python scripts/physics_accuracy.py``."""
+
+import os
+
+os.environ["MUJOCO_GL"] = "disable"
+
+import torch
+
+from legged_torque.envs import task_registry
+from legged_torque.evaluation.accuracy import copy_state, reference_velocities, velocity_errors
+from legged_torque.sim.simulator import Simulator
+from legged_torque.utils.args import Parser, add_task_args, run_script
+from legged_torque.utils.runs import find_checkpoint
+from legged_torque.utils.task_registry import load_run, set_seed
+
+SETTINGS = ((10, 20), (5, 8), (4, 8), (3, 8), (3, 6), (3, 4), (2, 6), (1, 6))
+
+
+def main() -> None:
+    """Let a trained policy walk, keep its states, and step each with every setting."""
+    parser = Parser(__doc__)
+    add_task_args(parser)
+    parser.set_defaults(num_envs=32, seed=1)
+    parser.add_argument(
+        "--steps", type=int, default=100, help="control steps to walk; one physics step of each is compared"
+    )
+    args = parser.parse_args()
+    run_dir, env_cfg, train_cfg = load_run(args)
+    set_seed(args.seed)
+    env, _ = task_registry.make_env(args.task, args, env_cfg)
+    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
+    runner.load(str(find_checkpoint(run_dir, args.checkpoint)))
+    policy = runner.get_inference_policy(env.device)
+    states = []
+    obs = env.get_observations()
+    with torch.inference_mode():
+        for _ in range(args.steps):
+            obs = env.step(policy(obs))[0]
+            states.append(copy_state(env.sim))
+    reference = reference_velocities(env.sim.mj_model, states)
+    print("iterations | line search | rms error | 99.9% | max | rms change in a step   [m/s, rad/s]")
+    for iterations, ls_iterations in SETTINGS:
+        sim = Simulator(env.sim.mj_model, env.num_envs, env.device, iterations, ls_iterations)
+        errors = velocity_errors(sim, states, reference)
+        print(f"{iterations:>10} | {ls_iterations:>11} |", " | ".join(f"{value:.2e}" for value in errors.values()))
+
+
+if __name__ == "__main__":
+    run_script(main)
