@@ -16,6 +16,9 @@ from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
 
+MAX_CAPTURED_STEPS = 64
+"""Longer rollouts replay step by step: capturing them would take minutes and gigabytes."""
+
 
 class OnPolicyRunner(runners.OnPolicyRunner):
     """Trains a policy in a :class:`~legged_torque.envs.base.legged_robot.LeggedRobot` task.
@@ -39,7 +42,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         torch.set_float32_matmul_precision("high")  # TF32 on a GPU
         super().__init__(env, train_cfg, log_dir, device)
         self.log_dir = log_dir
-        self._rollout = CudaGraph(self._collect, device)
+        self._rollout = CudaGraph(self._collect, device, enabled=self.cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS)
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train; Ctrl-C ends training after the current iteration, and a checkpoint is always left behind.
