@@ -1,4 +1,4 @@
-"""Draw learning curves, the paper's Figure 3: ``python scripts/plot_curves.py docs/learning/*.json --out curves.png``."""
+"""Draw learning curves (Figure 3): ``python scripts/plot_curves.py docs/learning/*.json --out curves.png``."""
 
 import json
 from pathlib import Path

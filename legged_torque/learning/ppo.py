@@ -94,6 +94,7 @@ class OnDevicePPO(PPO):
             for indices in order.split(self._batch_size):
                 self._indices.copy_(indices)
                 self._update_graph()
+        self._update_normalization()
         self.storage.clear()
         losses = dict(zip(LOSS_NAMES, self._losses.tolist(), strict=True))
         updates = self.num_learning_epochs * self.num_mini_batches
@@ -108,6 +109,15 @@ class OnDevicePPO(PPO):
             group["lr"] = self.learning_rate
         self._update_graph = CudaGraph(self._update_minibatch, self.device)  # the optimizer's tensors are new
         return load_iteration
+
+    def _update_normalization(self) -> None:
+        """Let models that normalize observations learn from the rollout; graphs need the tensors to stay the same."""
+        observations = self.storage.observations.flatten(0, 1)
+        for model in (self.actor, self.critic):
+            if model.obs_normalization:
+                std = model.obs_normalizer._std
+                model.update_normalization(observations)
+                model.obs_normalizer._std = std.copy_(model.obs_normalizer._std)
 
     def _update_minibatch(self) -> None:
         """Take one gradient step on the samples of ``_indices``."""

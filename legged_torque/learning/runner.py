@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import time
 from pathlib import Path
 
@@ -42,6 +41,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         torch.set_float32_matmul_precision("high")  # TF32 on a GPU
         super().__init__(env, train_cfg, log_dir, device)
         self.log_dir = log_dir
+        self._seconds_before = 0.0  # training time before this process
         self._rollout = CudaGraph(self._collect, device, enabled=self.cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS)
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
@@ -87,7 +87,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             **(infos or {}),
             "task": self.env.state_dict(),
             "total_timesteps": self.logger.tot_timesteps,
-            "seconds": self.logger.tot_time,
+            "seconds": self._seconds_before + self.logger.tot_time,
         }
         part = f"{path}.part"
         torch.save(state, part)
@@ -113,15 +113,17 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         """
         try:
             state = torch.load(path, weights_only=True, map_location=map_location or self.device)
+        except Exception as error:  # torch raises about anything for a file that is not its own
+            raise UserError(f"'{path}' is not a readable checkpoint: {last_line(error)}") from None
+        try:
             load_iteration = self.alg.load(state, load_cfg, strict)
             if load_iteration:
                 self.current_learning_iteration = state["iter"]
             self.env.load_state_dict(state["infos"]["task"])
             self.logger.tot_timesteps = state["infos"]["total_timesteps"]
-        except (OSError, EOFError, pickle.UnpicklingError) as error:
-            raise UserError(f"'{path}' is not a readable checkpoint: {first_line(error)}") from None
-        except (RuntimeError, KeyError, TypeError, ValueError) as error:
-            raise UserError(f"checkpoint '{path}' does not fit this task: {first_line(error)}") from None
+            self._seconds_before = state["infos"]["seconds"]
+        except (RuntimeError, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+            raise UserError(f"checkpoint '{path}' does not fit this task: {last_line(error)}") from None
         return state["infos"]
 
     def collect_rollout(self) -> None:
@@ -177,6 +179,6 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             print(f"Warning: {warning}.")
 
 
-def first_line(error: Exception) -> str:
-    """Return the part of an error's message that fits into a line."""
+def last_line(error: Exception) -> str:
+    """Return the line of an error's message that says most."""
     return str(error).strip().splitlines()[-1].strip() if str(error).strip() else type(error).__name__

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import os
+from collections.abc import Callable, Iterator
 
 import torch
 import warp as wp
@@ -10,16 +12,18 @@ import warp as wp
 _STREAMS: dict[str, tuple[torch.cuda.Stream, wp.Stream]] = {}
 
 
-def use_shared_stream(device: str) -> None:
-    """Make one stream current for both torch and Warp, on which everything runs and is captured.
+def prepare_device(device: str) -> None:
+    """Initialize Warp and make one stream current for both torch and Warp, on which everything runs and is captured.
 
     A CUDA graph cannot be captured on the default stream, and Warp knows a stream only as long as the object lives
     that wraps it: therefore one pair per device, kept for the life of the process.
 
     Args:
-        device: Name of the device, e.g. "cuda:0". Nothing is done for the CPU.
+        device: "cpu", which has no streams, or "cuda:N".
     """
     if torch.device(device).type != "cuda":
+        with _silent_stderr():  # on a machine without a GPU, Warp's native code complains that it finds no driver
+            wp.init()
         return
     wp.init()
     if device not in _STREAMS:
@@ -30,6 +34,19 @@ def use_shared_stream(device: str) -> None:
     stream, warp_stream = _STREAMS[device]
     torch.cuda.set_stream(stream)
     wp.set_stream(warp_stream, device)
+
+
+@contextlib.contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """Drop what native code writes to standard error."""
+    kept = os.dup(2)
+    with open(os.devnull, "wb") as nothing:
+        os.dup2(nothing.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def is_capturing(device: str) -> bool:

@@ -66,13 +66,13 @@ def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = "flo
 
 
 def max_contacts(model: mujoco.MjModel) -> int:
-    """Return the most contacts that one world can have: four per box or pair, two per capsule, one per sphere."""
+    """Return the most contacts that one world can have: one per sphere, two per capsule, eight per other geom."""
     per_type = {int(mujoco.mjtGeom.mjGEOM_SPHERE): 1, int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2}
     total = 0
     for first in range(model.ngeom):
         for second in range(first + 1, model.ngeom):
             if _collide(model, first, second):
-                total += min(per_type.get(int(model.geom_type[geom]), 4) for geom in (first, second))
+                total += min(per_type.get(int(model.geom_type[geom]), 8) for geom in (first, second))
     return total
 
 

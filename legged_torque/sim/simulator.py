@@ -10,7 +10,7 @@ import mujoco_warp as mjw
 import warp as wp
 from torch import Tensor
 
-from legged_torque.sim.graph import use_shared_stream
+from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
 
 MAX_POSITION = 1e4
@@ -41,10 +41,9 @@ class Simulator:
             Shape: (num_envs, nv).
         qacc_warmstart: Accelerations from which the constraint solver starts. Shape: (num_envs, nv).
         ctrl: Joint torques [N m]. Shape: (num_envs, nu).
-        contact_found: Number of contacts of each sensed geom with the floor, as of the start of the last physics step
-            that sensed.
-            Shape: (num_envs, geoms).
-        contact_force: Net contact force on each sensed geom in the world frame [N]. Shape: (num_envs, geoms, 3).
+        contact_found: Number of contacts of each sensed geom with the floor, as of the start of the last physics step;
+            0 after a step that did not sense. Shape: (num_envs, geoms).
+        contact_force: Net contact force on each sensed geom in the world frame [N], likewise. Shape: (num_envs, geoms, 3).
         diverged: Worlds whose state was seen to be not finite or absurdly large since the last :meth:`clear_diverged`.
             Shape: (num_envs,), bool.
     """
@@ -64,7 +63,7 @@ class Simulator:
         self.mj_model = model
         self.num_envs = num_envs
         self.device = device
-        use_shared_stream(device)
+        prepare_device(device)
         self._wp_device = wp.get_device(device)
         contacts = max_contacts(model)
         self.mj_model.opt.iterations = solver_iterations

@@ -114,7 +114,7 @@ def convert(value: Any, old: Any, path: str) -> Any:
     """
     if isinstance(value, str) and not isinstance(old, str):
         value = parse_value(value)
-    if old is None or value is None:
+    if old is None:
         return value
     if isinstance(old, bool) or isinstance(value, bool):
         matches = isinstance(old, bool) and isinstance(value, bool)
@@ -158,5 +158,5 @@ def parse_yaml(text: str, what: str) -> Any:
     """
     try:
         return yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # a date such as 2026-99-99 is a ValueError
         raise UserError(f"{what} is not valid YAML: {' '.join(str(error).split())}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from types import FrameType, TracebackType
@@ -39,4 +40,5 @@ class StopRequest:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
-        print("\nStopping after this iteration and saving; once more to stop at once.", flush=True)
+        # print would fail if the signal came in the middle of a print
+        os.write(2, b"\nStopping after this iteration and saving; once more to stop at once.\n")

@@ -20,6 +20,7 @@ from legged_torque.utils.args import apply_args, resolve_device
 from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.runs import find_checkpoint, find_run, load_config, new_run_dir
+from legged_torque.utils.validation import check_train_cfg
 
 
 class TaskRegistry:
@@ -61,6 +62,8 @@ class TaskRegistry:
         env_cfg, train_cfg = copy.deepcopy(self._get(name)[1:])
         if args is not None:
             apply_args(env_cfg, train_cfg, args)
+            check_train_cfg(train_cfg)
+            to_rsl_rl(train_cfg)  # refuses an unknown logger
         return env_cfg, train_cfg
 
     def make_env(

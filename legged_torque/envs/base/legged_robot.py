@@ -98,6 +98,7 @@ class LeggedRobot(RewardTerms, VecEnv):
         self.reset_buf.fill_(True)
         self._reset_worlds()
         self.compute_observations()
+        self._keep_last()
         return self.get_observations()
 
     @property
@@ -177,8 +178,7 @@ class LeggedRobot(RewardTerms, VecEnv):
         self._update_feet_air_time()
         self._reset_worlds()
         self.compute_observations()
-        self.last_actions.copy_(self.actions)
-        self.last_dof_vel.copy_(self.dof_vel)
+        self._keep_last()
 
     def _update_state(self) -> None:
         """Compute what follows from the simulator's state."""
@@ -230,6 +230,11 @@ class LeggedRobot(RewardTerms, VecEnv):
         clip = self.cfg.normalization.clip_observations
         torch.clamp(policy, -clip, clip, out=self.obs_buf["policy"])
         torch.clamp(critic, -clip, clip, out=self.obs_buf["critic"])
+
+    def _keep_last(self) -> None:
+        """Keep what the next step's rewards compare with."""
+        self.last_actions.copy_(self.actions)
+        self.last_dof_vel.copy_(self.dof_vel)
 
     def _update_feet_air_time(self) -> None:
         """Count the time of each foot since it left the ground."""

@@ -25,6 +25,8 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     for key, value in {"sim.dt": cfg.sim.dt, "env.episode_length_s": cfg.env.episode_length_s}.items():
         if not value > 0.0:
             raise UserError(f"{key} must be greater than 0, not {value}")
+    if len(cfg.init_state.pos) != 3:
+        raise UserError(f"init_state.pos must be [x, y, z], not {cfg.init_state.pos}")
     if not 0.0 <= cfg.commands.resampling_probability <= 1.0:
         raise UserError(
             f"commands.resampling_probability must be from 0 to 1, not {cfg.commands.resampling_probability}"

@@ -1,0 +1,27 @@
+"""What all tests share: tasks on the CPU, small and seeded."""
+
+import argparse
+import os
+
+os.environ["MUJOCO_GL"] = "disable"  # before anything imports mujoco: no test renders
+
+import pytest
+import torch
+
+from legged_torque.envs import task_registry
+from legged_torque.utils.config import set_by_path
+
+
+@pytest.fixture(scope="session")
+def make_task():
+    """Factory of tasks: ``make_task("a1_torque", num_envs=2, **{"control.decimation": 2})``."""
+
+    def make(name, num_envs=4, seed=1, **overrides):
+        """Build a registered task on the CPU, all random numbers seeded; ``overrides`` go by dotted path."""
+        env_cfg, _ = task_registry.get_cfgs(name)
+        for path, value in {"env.num_envs": num_envs, **overrides}.items():
+            set_by_path(env_cfg, path, value)
+        torch.manual_seed(seed)
+        return task_registry.make_env(name, argparse.Namespace(device="cpu"), env_cfg)[0]
+
+    return make

@@ -1,0 +1,263 @@
+"""The multi-head actor: its architecture counted by hand, its gradients, what it exports and what it saves."""
+
+import math
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx.reference import ReferenceEvaluator
+from tensordict import TensorDict
+
+from legged_torque.envs import task_registry
+from legged_torque.learning.multi_head import MultiHeadMLP, MultiHeadModel
+from legged_torque.utils.errors import UserError
+
+TASKS = ["a1_torque_multihead", "a1_multihead"]
+NUM_DOF = 12
+NUM_ACTIONS = 2 * NUM_DOF
+NUM_OBS = 3 + 3 + 3 + NUM_DOF + NUM_DOF + NUM_ACTIONS
+"""Gravity, angular velocity, command, joint positions, joint velocities, last action."""
+
+SHAPES = {
+    "trunk": [(512, NUM_OBS), (256, 512)],
+    "position_head": [(128, 256), (12, 128)],
+    "torque_head": [(128, 268), (12, 128)],
+}
+"""Weights of every linear layer as (outputs, inputs), in order."""
+
+
+@pytest.fixture(scope="module")
+def make_runner(make_task):
+    """Factory of runners of small tasks, with weights that depend on the seed."""
+
+    def make(name, seed=0):
+        _, train_cfg = task_registry.get_cfgs(name)
+        train_cfg.runner.num_steps_per_env = 4
+        task = make_task(name, num_envs=2)
+        torch.manual_seed(seed)
+        return task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=None)[0]
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def runner(make_runner):
+    """The runner of ``a1_torque_multihead``, for tests that only read."""
+    return make_runner("a1_torque_multihead")
+
+
+@pytest.fixture(scope="module")
+def actor(runner):
+    """The actor of ``a1_torque_multihead``, for tests that only read."""
+    return runner.alg.get_policy()
+
+
+def make_obs(num=7, seed=0):
+    """Observations of the policy, standard normal."""
+    generator = torch.Generator().manual_seed(seed)
+    return TensorDict({"policy": torch.randn(num, NUM_OBS, generator=generator)}, [num])
+
+
+def make_model(num_actions=4, **kwargs):
+    """A model for observations of five numbers."""
+    obs = TensorDict({"policy": torch.zeros(1, 5)}, [1])
+    return MultiHeadModel(obs, {"actor": ["policy"]}, "actor", num_actions, **kwargs)
+
+
+def dense(x, weights, name, last_activation):
+    """Linear layers with ELU between them, in numpy."""
+    layers = [key.removesuffix(".weight") for key in weights if key.startswith(f"mlp.{name}.") and "weight" in key]
+    for layer in layers:
+        x = x @ weights[f"{layer}.weight"].T + weights[f"{layer}.bias"]
+        if layer != layers[-1] or last_activation:
+            x = np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0)))
+    return x
+
+
+def forward_by_hand(actor, obs):
+    """Figure 2 of the paper in double precision: positions from the trunk, torques from the trunk and positions."""
+    weights = {key: value.double().numpy() for key, value in actor.state_dict().items()}
+    features = dense(obs["policy"].double().numpy(), weights, "trunk", last_activation=True)
+    positions = dense(features, weights, "position_head", last_activation=False)
+    torques = dense(np.concatenate([features, positions], axis=1), weights, "torque_head", last_activation=False)
+    return np.concatenate([positions, torques], axis=1)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_layers_of_the_paper(make_runner, name):
+    """Trunk 512-256, heads of 128, the torque head on 256 + 12 inputs; every parameter is accounted for."""
+    runner = make_runner(name)
+    state = runner.alg.get_policy().state_dict()
+    for part, shapes in SHAPES.items():
+        weights = [tuple(v.shape) for k, v in state.items() if k.startswith(f"mlp.{part}.") and k.endswith("weight")]
+        assert weights == shapes
+        biases = [tuple(v.shape) for k, v in state.items() if k.startswith(f"mlp.{part}.") and k.endswith("bias")]
+        assert biases == [shape[:1] for shape in shapes]
+    counted = sum(rows * columns + rows for shapes in SHAPES.values() for rows, columns in shapes)
+    assert sum(value.numel() for value in state.values()) == counted + NUM_ACTIONS  # and a deviation per action
+    critic = [tuple(v.shape) for k, v in runner.alg.critic.state_dict().items() if k.endswith("weight")]
+    assert [rows for rows, _ in critic] == [512, 256, 128, 1]
+    assert [columns for _, columns in critic[1:]] == [512, 256, 128]
+
+
+@pytest.mark.parametrize("name", ["a1_position", "a1_torque", "a1_torque_curriculum"])
+def test_the_other_approaches_have_one_head(make_runner, name):
+    """Their actor is 512-256-128-12, the same for all of them."""
+    state = make_runner(name).alg.get_policy().state_dict()
+    shapes = [tuple(value.shape) for key, value in state.items() if key.endswith("weight")]
+    assert shapes == [(512, NUM_OBS - NUM_DOF), (256, 512), (128, 256), (12, 128)]
+
+
+@pytest.mark.parametrize("num", [1, 7])
+def test_output_by_hand(actor, num):
+    """The output is that of Figure 2, positions first, with nothing after the last layers."""
+    obs = make_obs(num)
+    output = actor(obs).detach()
+    assert output.shape == (num, NUM_ACTIONS)
+    np.testing.assert_allclose(output, forward_by_hand(actor, obs), rtol=1e-4, atol=1e-5)
+
+
+def test_sizes_are_settings():
+    """Layers of other sizes and numbers fit together."""
+    model = make_model(6, hidden_dims=[8, 7, 6], head_hidden_dims=[5, 4])
+    shapes = {key: tuple(value.shape) for key, value in model.state_dict().items() if key.endswith("weight")}
+    assert list(shapes.values()) == [(8, 5), (7, 8), (6, 7), (5, 6), (4, 5), (3, 4), (5, 9), (4, 5), (3, 4)]
+    obs = TensorDict({"policy": torch.randn(3, 5)}, [3])
+    np.testing.assert_allclose(model(obs).detach(), forward_by_hand(model, obs), rtol=1e-4, atol=1e-6)
+
+
+def gradients(network, part):
+    """Largest absolute gradient of each part of a network, from a loss on positions or on torques only."""
+    network.zero_grad()
+    output = network(torch.randn(8, NUM_OBS, generator=torch.Generator().manual_seed(1)))
+    (output[:, :NUM_DOF] if part == "positions" else output[:, NUM_DOF:]).square().sum().backward()
+    modules = {"trunk": network.trunk, "position": network.position_head, "torque": network.torque_head}
+    return {
+        name: [0.0 if p.grad is None else float(p.grad.abs().max()) for p in module.parameters()]
+        for name, module in modules.items()
+    }
+
+
+def test_gradient_paths():
+    """Torques teach all layers, the position head included; positions teach everything but the torque head."""
+    torch.manual_seed(0)
+    network = MultiHeadMLP(NUM_OBS, NUM_ACTIONS, [32, 16], [8], "elu")
+    of_torques, of_positions = gradients(network, "torques"), gradients(network, "positions")
+    for largest in (*of_torques.values(), of_positions["trunk"], of_positions["position"]):
+        assert min(largest) > 1e-4
+    assert of_positions["torque"] == [0.0] * 4
+
+
+@pytest.mark.parametrize(
+    "parameter",
+    ["trunk.0.weight", "trunk.2.bias", "position_head.0.weight", "position_head.2.weight", "torque_head.0.weight"],
+)
+def test_gradient_by_finite_differences(parameter):
+    """The gradient of a loss on torques alone equals central differences in double precision."""
+    torch.manual_seed(0)
+    network = MultiHeadMLP(NUM_OBS, NUM_ACTIONS, [16, 16], [8], "elu").double()
+    obs = torch.randn(5, NUM_OBS, dtype=torch.float64)
+
+    def loss():
+        return network(obs)[:, NUM_DOF:].square().sum()
+
+    values = network.get_parameter(parameter)
+    (gradient,) = torch.autograd.grad(loss(), [values])
+    step = 1e-6
+    for index in range(0, values.numel(), values.numel() // 7):
+        with torch.no_grad():
+            entry = values.view(-1)[index : index + 1]
+            numbers = []
+            for sign in (1.0, -1.0):
+                entry += sign * step
+                numbers.append(float(loss()))
+                entry -= sign * step
+        expected = (numbers[0] - numbers[1]) / (2.0 * step)
+        assert float(gradient.view(-1)[index]) == pytest.approx(expected, rel=1e-6, abs=1e-7)
+    assert float(gradient.abs().max()) > 1e-3
+
+
+def test_deterministic_output(runner):
+    """The inference policy answers the same observation with the same actions, the mean of what training samples."""
+    policy, obs = runner.get_inference_policy("cpu"), make_obs()
+    with torch.no_grad():
+        first, second = policy(obs), policy(obs)
+        policy(obs, stochastic_output=True)
+    assert torch.equal(first, second)
+    torch.testing.assert_close(policy.output_mean, first)
+
+
+def test_stochastic_output(actor):
+    """Samples scatter about the output by hand with the standard deviation of 1 that all actions start with."""
+    num = 20_000
+    row = make_obs(1)
+    obs = TensorDict({"policy": row["policy"].expand(num, -1)}, [num])
+    torch.manual_seed(0)
+    with torch.no_grad():
+        samples = actor(obs, stochastic_output=True).double().numpy()
+        log_prob = actor.get_output_log_prob(torch.tensor(samples)).numpy()
+    assert samples.shape == (num, NUM_ACTIONS)
+    deviations = samples - forward_by_hand(actor, row)
+    error = 5.0 / math.sqrt(num)
+    np.testing.assert_allclose(deviations.mean(axis=0), 0.0, atol=error)
+    np.testing.assert_allclose(deviations.std(axis=0), 1.0, atol=error)
+    np.testing.assert_allclose(np.corrcoef(deviations.T), np.eye(NUM_ACTIONS), atol=error)
+    expected = (-0.5 * deviations**2 - 0.5 * math.log(2.0 * math.pi)).sum(axis=1)
+    np.testing.assert_allclose(log_prob, expected, rtol=1e-3)
+
+
+def test_exported_to_torch_jit(runner, actor, tmp_path):
+    """The scripted file needs no Python class and gives the model's numbers."""
+    runner.export_policy_to_jit(str(tmp_path))
+    exported = torch.jit.load(tmp_path / "policy.pt")
+    obs = make_obs()
+    with torch.no_grad():
+        torch.testing.assert_close(exported(obs["policy"]), actor(obs), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(exported(obs["policy"]).detach(), forward_by_hand(actor, obs), rtol=1e-4, atol=1e-5)
+
+
+def test_exported_to_onnx(runner, actor, tmp_path):
+    """The ONNX file is valid and gives the model's numbers in ONNX's own reference implementation."""
+    runner.export_policy_to_onnx(str(tmp_path))
+    file = tmp_path / "policy.onnx"
+    onnx.checker.check_model(str(file))
+    session = ReferenceEvaluator(str(file))
+    obs = make_obs(3)
+    rows = [session.run(["actions"], {"obs": row.numpy()})[0] for row in obs["policy"].split(1)]
+    np.testing.assert_allclose(np.concatenate(rows), forward_by_hand(actor, obs), rtol=1e-4, atol=1e-5)
+
+
+def test_checkpoint_round_trip(make_runner, tmp_path):
+    """A saved policy is plain tensors, and a runner that has loaded it acts as the one that has saved it."""
+    saved, loaded = make_runner("a1_torque_multihead", seed=1), make_runner("a1_torque_multihead", seed=2)
+    with torch.no_grad():
+        saved.alg.actor.distribution.log_std_param.copy_(torch.linspace(-1.0, 1.0, NUM_ACTIONS))
+    path, obs = str(tmp_path / "model_0.pt"), make_obs()
+    expected = forward_by_hand(saved.alg.get_policy(), obs)
+    assert not np.allclose(loaded.alg.get_policy()(obs).detach(), expected, atol=1e-3)
+    saved.save(path)
+    state = torch.load(path, weights_only=True)["actor_state_dict"]
+    assert all(torch.equal(state[key], value) for key, value in saved.alg.get_policy().state_dict().items())
+    loaded.load(path)
+    policy = loaded.get_inference_policy("cpu")
+    np.testing.assert_allclose(policy(obs).detach(), expected, rtol=1e-4, atol=1e-5)
+    policy(obs, stochastic_output=True)
+    deviations = np.exp(np.linspace(-1.0, 1.0, NUM_ACTIONS))
+    np.testing.assert_allclose(policy.output_std[0].detach(), deviations, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"num_actions": 5}, "a multi-head actor needs an even number of actions, env.num_actions is 5"),
+        ({"hidden_dims": [8]}, "needs two actor.hidden_dims or more"),
+        ({"hidden_dims": []}, "needs two actor.hidden_dims or more"),
+        ({"head_hidden_dims": []}, "one of actor.head_hidden_dims"),
+    ],
+)
+def test_sizes_that_make_no_sense(kwargs, message):
+    """An odd number of actions or a missing layer is refused by name."""
+    with pytest.raises(UserError) as error:
+        make_model(**kwargs)
+    assert message in str(error.value)

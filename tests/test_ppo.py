@@ -1,0 +1,457 @@
+"""The update against stock rsl_rl, returns and formulas against numpy, and updates that must not happen."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+
+from legged_torque.learning.distribution import GaussianDistribution
+from legged_torque.learning.ppo import OnDevicePPO
+from legged_torque.utils.errors import UserError
+
+STEPS, WORLDS, NUM_ACTIONS = 16, 4, 3
+SAMPLES = STEPS * WORLDS
+SIZES = {"policy": 5, "critic": 7}
+SETTINGS = {
+    "num_learning_epochs": 1,
+    "num_mini_batches": 4,
+    "gamma": 0.99,
+    "lam": 0.95,
+    "learning_rate": 1e-3,
+    "schedule": "fixed",
+}
+
+
+def random_obs(num=WORLDS):
+    """Observations of both groups, standard normal."""
+    return TensorDict({name: torch.randn(num, size) for name, size in SIZES.items()}, [num])
+
+
+def make_ppo(kind=OnDevicePPO, steps=STEPS, worlds=WORLDS, seed=0, obs_normalization=False, **settings):
+    """An algorithm with small networks, and room for a rollout of ``steps`` x ``worlds``."""
+    torch.manual_seed(seed)
+    distribution = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "log"}
+    if kind is OnDevicePPO:
+        distribution["class_name"] = GaussianDistribution
+    obs, groups = random_obs(worlds), {"actor": ["policy"], "critic": ["critic"]}
+    actor = MLPModel(obs, groups, "actor", NUM_ACTIONS, [16, 16], "elu", obs_normalization, distribution)
+    critic = MLPModel(obs, groups, "critic", 1, [16, 16], "elu", obs_normalization)
+    storage = RolloutStorage("rl", worlds, steps, obs, [NUM_ACTIONS])
+    return kind(actor, critic, storage, **{**SETTINGS, **settings})
+
+
+def record_rollout(alg, seed=1, poison=None):
+    """Let the algorithm act for one rollout of random numbers, as a runner does; return what the task has told it."""
+    torch.manual_seed(seed)
+    told = {"rewards": [], "dones": [], "time_outs": []}
+    for step in range(alg.storage.num_transitions_per_env):
+        obs = random_obs(alg.storage.num_envs)
+        alg.act(obs)
+        rewards = torch.randn(alg.storage.num_envs)
+        if poison is not None and step == poison[0]:
+            rewards[poison[1]] = math.nan
+        dones = torch.rand(alg.storage.num_envs) < 0.3
+        time_outs = dones & (torch.rand(alg.storage.num_envs) < 0.5)
+        for obs_group in obs.values():
+            obs_group.fill_(math.nan)  # the task reuses its buffers: a rollout that kept no copy is spoiled
+        alg.process_env_step(random_obs(alg.storage.num_envs), rewards, dones, {"time_outs": time_outs})
+        for name, value in (("rewards", rewards), ("dones", dones), ("time_outs", time_outs)):
+            told[name].append(value.double().numpy())
+    last_obs = random_obs(alg.storage.num_envs)
+    alg.compute_returns(last_obs)
+    return {name: np.stack(values) for name, values in told.items()}, last_obs
+
+
+def copy_rollout(source, target, samples=None):
+    """Give ``target`` the stored rollout of ``source``, or only some of its samples, each as a step of one world."""
+
+    def put(old, new):
+        new.copy_(old if samples is None else old.flatten(0, 1)[samples].unsqueeze(1))
+
+    for name in SIZES:
+        put(source.observations[name], target.observations[name])
+    for name in ("actions", "rewards", "dones", "values", "actions_log_prob", "returns", "advantages"):
+        put(getattr(source, name), getattr(target, name))
+    target.distribution_params = tuple(torch.zeros(*target.actions.shape) for _ in source.distribution_params)
+    for old, new in zip(source.distribution_params, target.distribution_params, strict=True):
+        put(old, new)
+    target.step = target.num_transitions_per_env
+
+
+def parameters(alg):
+    """All parameters, actor's and critic's, by name."""
+    models = {"actor": alg.actor, "critic": alg.critic}
+    return {f"{key}.{name}": p.detach() for key, model in models.items() for name, p in model.named_parameters()}
+
+
+def state_of(alg):
+    """Copies of everything that an update changes: networks, Adam's moments and step counters, learning rate."""
+    models = {**alg.actor.state_dict(prefix="actor."), **alg.critic.state_dict(prefix="critic.")}
+    result = {name: value.clone() for name, value in models.items()}
+    for index, entry in alg.optimizer.state_dict()["state"].items():
+        result |= {f"adam.{index}.{name}": torch.as_tensor(value).clone() for name, value in entry.items()}
+    return result | {"lr": torch.as_tensor(alg.learning_rate).clone()}
+
+
+def assert_same_state(actual, expected, rtol=2e-5, atol=2e-7):
+    """Compare two :func:`state_of`."""
+    assert actual.keys() == expected.keys()
+    for name, value in expected.items():
+        torch.testing.assert_close(
+            actual[name], value, rtol=rtol, atol=atol, check_dtype=False, msg=lambda m, n=name: f"{n}: {m}"
+        )
+
+
+def steps_taken(alg):
+    """The step counters of Adam, which must all agree."""
+    (count,) = {int(entry["step"]) for entry in alg.optimizer.state_dict()["state"].values()}
+    return count
+
+
+def shift_policy(alg, amount):
+    """Move the policy away from the one that has acted, as earlier updates would."""
+    with torch.no_grad():
+        alg.actor.mlp[-1].bias += amount
+        alg.actor.distribution.log_std_param += amount
+
+
+def pair_with_rollout(shift=0.0, **settings):
+    """Our and rsl_rl's algorithm with the same weights, the same rollout and the policy moved by ``shift``."""
+    ours, stock = make_ppo(**settings), make_ppo(PPO, **settings)
+    record_rollout(ours)
+    stock.actor.load_state_dict(ours.actor.state_dict())
+    stock.critic.load_state_dict(ours.critic.state_dict())
+    copy_rollout(ours.storage, stock.storage)
+    for alg in (ours, stock):
+        shift_policy(alg, shift)
+    return ours, stock
+
+
+def update_both(ours, stock, seed):
+    """Update both from the same random order of the samples; return what they report."""
+    reports = []
+    for alg in (ours, stock):
+        torch.manual_seed(seed)
+        reports.append(alg.update())
+    return reports
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"num_mini_batches": 1},
+        {"num_mini_batches": 3},
+        {"clip_param": 0.1, "max_grad_norm": 0.05},
+        {"use_clipped_value_loss": False, "value_loss_coef": 0.5, "entropy_coef": 0.1},
+        {"normalize_advantage_per_mini_batch": True},
+        {"optimizer": "adamw"},
+        {"schedule": "adaptive"},
+        {"obs_normalization": True},
+    ],
+    ids=lambda settings: ",".join(settings) or "default",
+)
+def test_updates_equal_those_of_rsl_rl(settings):
+    """Three updates of all minibatches give rsl_rl's parameters, Adam moments, learning rate and losses."""
+    ours, stock = pair_with_rollout(shift=0.1, **settings)
+    before = state_of(ours)
+    for seed in range(3):
+        our_report, stock_report = update_both(ours, stock, seed)
+        assert_same_state(state_of(ours), state_of(stock))
+        for name in ("value", "surrogate", "entropy"):
+            assert our_report[name] == pytest.approx(stock_report[name], rel=1e-4, abs=1e-6)
+        assert our_report["skipped_updates"] == 0
+    assert steps_taken(ours) == 3 * ours.num_mini_batches
+    assert all(not torch.equal(before[name], value) for name, value in parameters(ours).items())
+
+
+def test_every_epoch_sees_every_sample_in_a_new_order():
+    """Each epoch of an update is one pass over all samples, and no two passes have the same order."""
+    alg, order = make_ppo(num_learning_epochs=3), []
+    record_rollout(alg)
+    names = alg.storage.observations["policy"][..., 0].flatten().clone()  # a random number that tells samples apart
+    alg.actor.register_forward_pre_hook(lambda _, inputs: order.append(inputs[0]["policy"][:, 0].clone()))
+    alg.update()
+    epochs = torch.cat(order).view(3, SAMPLES)
+    assert torch.equal(epochs.sort(dim=1).values, names.sort().values.expand(3, -1))
+    assert len({tuple(epoch.tolist()) for epoch in epochs}) == 3
+
+
+def kl_by_hand(alg):
+    """Mean KL divergence of the present policy from the one that has acted, from the formula for normals."""
+    obs = alg.storage.observations.flatten(0, 1)
+    new_mean = alg.actor(obs).detach().double().numpy()
+    new_std = np.exp(alg.actor.distribution.log_std_param.detach().double().numpy())
+    old_mean, old_std = (p.flatten(0, 1).double().numpy() for p in alg.storage.distribution_params)
+    kl = np.log(new_std / old_std) + (old_std**2 + (old_mean - new_mean) ** 2) / (2.0 * new_std**2) - 0.5
+    return kl.sum(axis=1).mean()
+
+
+@pytest.mark.parametrize(
+    ("shift", "old_rate", "new_rate"),
+    [
+        (0.3, 1e-3, 1e-3 / 1.5),
+        (0.3, 1.2e-5, 1e-5),
+        (0.05, 1e-3, 1e-3),
+        (0.04, 1e-3, 1e-3),
+        (0.02, 1e-3, 1.5e-3),
+        (0.02, 9e-3, 1e-2),
+        (0.0, 1e-3, 1e-3),
+    ],
+)
+def test_adaptive_learning_rate(shift, old_rate, new_rate):
+    """A KL over twice the desired one divides the rate by 1.5, one under half multiplies it, within [1e-5, 1e-2]."""
+    ours, stock = pair_with_rollout(
+        shift, num_mini_batches=1, schedule="adaptive", desired_kl=0.01, learning_rate=old_rate
+    )
+    kl = kl_by_hand(ours)
+    assert (kl > 0.02) == (new_rate < old_rate) and (0.0 < kl < 0.005 and shift > 0.0) == (new_rate > old_rate)
+    report, _ = update_both(ours, stock, seed=0)
+    assert report["kl"] == pytest.approx(kl, rel=1e-3, abs=1e-7)
+    for alg in (ours, stock):
+        assert float(alg.learning_rate) == pytest.approx(new_rate, rel=1e-6)
+        assert float(alg.optimizer.param_groups[0]["lr"]) == pytest.approx(new_rate, rel=1e-6)
+
+
+def test_learning_rate_adapts_on_after_loading():
+    """A loaded algorithm changes its learning rate, and steps with it, just as the one that was saved."""
+    saved, loaded = make_ppo(schedule="adaptive"), make_ppo(schedule="adaptive", seed=9)
+    record_rollout(saved)
+    saved.update()
+    loaded.load(copy.deepcopy(saved.save()), None, True)
+    before = float(loaded.learning_rate)
+    assert before == float(saved.learning_rate)
+    for alg in (saved, loaded):
+        record_rollout(alg, seed=2)
+        shift_policy(alg, 0.3)
+        torch.manual_seed(3)
+        alg.update()
+    assert float(loaded.learning_rate) != before
+    assert_same_state(state_of(loaded), state_of(saved), rtol=0.0, atol=0.0)
+
+
+def test_reported_gradient_norm():
+    """The reported norm is over all parameters and before clipping."""
+    alg = make_ppo(num_mini_batches=1, max_grad_norm=1e-3)
+    record_rollout(alg)
+    obs, storage = alg.storage.observations.flatten(0, 1), alg.storage
+    alg.actor(obs, stochastic_output=True)
+    log_prob = alg.actor.get_output_log_prob(storage.actions.flatten(0, 1))
+    ratio = (log_prob - storage.actions_log_prob.flatten()).exp()
+    values = alg.critic(obs).flatten()
+    # nothing has moved yet, so that no clipping is active
+    loss = -(storage.advantages.flatten() * ratio).mean() + (values - storage.returns.flatten()).square().mean()
+    loss = loss - alg.entropy_coef * alg.actor.output_entropy.mean()
+    grads = torch.autograd.grad(loss, [*alg.actor.parameters(), *alg.critic.parameters()])
+    expected = math.sqrt(sum(float(grad.double().square().sum()) for grad in grads))
+    assert alg.update()["gradient_norm"] == pytest.approx(expected, rel=1e-4)
+    assert expected > 0.1
+
+
+@pytest.mark.parametrize("per_mini_batch", [False, True])
+def test_returns_and_advantages(per_mini_batch):
+    """GAE by a loop in numpy: rewards, values after time-outs, and no credit across the end of an episode."""
+    gamma, lam = 0.97, 0.8
+    alg = make_ppo(gamma=gamma, lam=lam, normalize_advantage_per_mini_batch=per_mini_batch)
+    told, last_obs = record_rollout(alg)
+    storage = alg.storage
+    values = storage.values.squeeze(-1).double().numpy()
+    assert told["time_outs"].any() and (told["dones"] > told["time_outs"]).any()
+    with torch.no_grad():
+        last_values = alg.critic(last_obs).squeeze(-1).double().numpy()
+        seen = alg.critic(storage.observations.flatten(0, 1)).view(STEPS, WORLDS).double().numpy()
+    np.testing.assert_allclose(values, seen, rtol=1e-5, atol=1e-6)
+    returns = np.zeros((STEPS, WORLDS))
+    for world in range(WORLDS):
+        advantage, next_value = 0.0, last_values[world]
+        for step in reversed(range(STEPS)):
+            reward = told["rewards"][step, world]
+            if told["time_outs"][step, world]:
+                reward += gamma * values[step, world]  # the episode would have gone on from a state as good as this
+            if told["dones"][step, world]:
+                advantage, next_value = 0.0, 0.0
+            advantage = reward + gamma * next_value - values[step, world] + gamma * lam * advantage
+            returns[step, world] = advantage + values[step, world]
+            next_value = values[step, world]
+    advantages = returns - values
+    if not per_mini_batch:
+        advantages = (advantages - advantages.mean()) / advantages.std(ddof=1)
+    np.testing.assert_allclose(storage.returns.squeeze(-1), returns, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(storage.advantages.squeeze(-1), advantages, rtol=1e-4, atol=1e-5)
+
+
+def poison(storage, field, value, step=5, world=2):
+    """Spoil one sample of a stored rollout; return its number in the flattened rollout."""
+    tensor = storage.observations[field] if field in SIZES else getattr(storage, field)
+    tensor[step, world, 0] = value
+    return step * WORLDS + world
+
+
+POISONS = [
+    ("advantages", math.nan),
+    ("advantages", math.inf),
+    ("returns", math.nan),
+    ("returns", 1e30),  # all gradients are finite, their norm is not
+    ("actions", math.nan),
+    ("policy", math.nan),
+    ("critic", math.nan),
+    ("critic", -math.inf),
+]
+
+
+@pytest.mark.parametrize(("field", "value"), POISONS)
+def test_only_the_spoiled_minibatch_is_skipped(field, value):
+    """The result equals that of rsl_rl learning from the other minibatches only, moments and counters included."""
+    ours = make_ppo()
+    record_rollout(ours)
+    spoiled = poison(ours.storage, field, value)
+    size = SAMPLES // 4
+    torch.manual_seed(3)
+    minibatches = torch.randperm(SAMPLES).split(size)
+    expected = make_ppo(PPO, steps=size, worlds=1, num_mini_batches=1)
+    expected.actor.load_state_dict(ours.actor.state_dict())
+    expected.critic.load_state_dict(ours.critic.state_dict())
+    for samples in minibatches:
+        if spoiled not in samples:
+            copy_rollout(ours.storage, expected.storage, samples)
+            expected.update()
+    torch.manual_seed(3)
+    report = ours.update()
+    assert report["skipped_updates"] == 1
+    assert all(math.isfinite(number) for number in report.values())
+    assert steps_taken(ours) == 3
+    assert_same_state(state_of(ours), state_of(expected))
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "adamw"])
+@pytest.mark.parametrize("reloaded", [False, True])
+def test_skipped_updates_change_nothing_and_later_ones_learn(optimizer, reloaded):
+    """With every minibatch spoiled, nothing moves by a single bit; the next rollout is learned from as if unspoiled."""
+    alg, twin = make_ppo(optimizer=optimizer), make_ppo(optimizer=optimizer)
+    for each in (alg, twin):
+        record_rollout(each, seed=1)
+        torch.manual_seed(4)
+        each.update()
+    if reloaded:
+        state, alg = alg.save(), make_ppo(optimizer=optimizer, seed=9)
+        alg.load(state, None, True)
+    before = state_of(alg)
+    record_rollout(alg, seed=2)
+    alg.storage.returns[::2] = math.nan
+    alg.num_learning_epochs = 2
+    report = alg.update()
+    assert report["skipped_updates"] == 2 * 4
+    assert all(math.isfinite(number) for number in report.values())
+    assert_same_state(state_of(alg), before, rtol=0.0, atol=0.0)
+    alg.num_learning_epochs = 1
+    for each in (alg, twin):
+        record_rollout(each, seed=3)
+        torch.manual_seed(5)
+        assert each.update()["skipped_updates"] == 0
+    assert_same_state(state_of(alg), state_of(twin), rtol=0.0, atol=0.0)
+    assert steps_taken(alg) == 8
+    assert all(not torch.equal(before[name], value) for name, value in parameters(alg).items())
+
+
+@pytest.mark.parametrize("per_mini_batch", [False, True])
+def test_reward_that_is_not_a_number(per_mini_batch):
+    """It spoils the earlier returns of its own world; only if advantages share one normalization, all minibatches."""
+    alg = make_ppo(normalize_advantage_per_mini_batch=per_mini_batch)
+    record_rollout(alg, poison=(2, 1))
+    spoiled = torch.isnan(alg.storage.returns.squeeze(-1))
+    assert spoiled[2, 1] and not spoiled[3:].any() and not spoiled[:, [0, 2, 3]].any()
+    before = state_of(alg)
+    torch.manual_seed(0)
+    minibatches = torch.randperm(SAMPLES).split(SAMPLES // 4)
+    skipped = sum(bool(spoiled.flatten()[samples].any()) for samples in minibatches) if per_mini_batch else 4
+    torch.manual_seed(0)
+    report = alg.update()
+    assert report["skipped_updates"] == skipped and (skipped == 4) != per_mini_batch
+    assert all(math.isfinite(number) for number in report.values())
+    for name, value in parameters(alg).items():
+        assert torch.isfinite(value).all()
+        assert torch.equal(before[name], value) != per_mini_batch
+
+
+def test_learning_rate_ignores_an_undefined_divergence():
+    """A minibatch with observations that are not numbers has no KL and leaves the adaptive learning rate alone."""
+    alg = make_ppo(num_mini_batches=1, schedule="adaptive")
+    record_rollout(alg)
+    poison(alg.storage, "policy", math.nan)
+    assert alg.update()["skipped_updates"] == 1
+    assert float(alg.learning_rate) == pytest.approx(SETTINGS["learning_rate"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"optimizer": "adamm"}, "unknown optimizer 'adamm'; did you mean 'adam'?"),
+        ({"optimizer": "sgd"}, "unknown optimizer 'sgd'; allowed: adam, adamw"),
+        ({"num_mini_batches": SAMPLES + 1}, "num_mini_batches is 65, more than the samples of a rollout"),
+    ],
+)
+def test_settings_that_make_no_sense(settings, message):
+    """They are refused by name."""
+    with pytest.raises(UserError) as error:
+        make_ppo(**settings)
+    assert message in str(error.value)
+
+
+def test_standard_deviation_is_learned_as_its_logarithm():
+    """The parameter is 0 for a standard deviation of 1, and its exponential is what is sampled with."""
+    alg = make_ppo()
+    log_std = alg.actor.state_dict()["distribution.log_std_param"]
+    assert torch.equal(log_std, torch.zeros(NUM_ACTIONS))
+    assert alg.actor.distribution.log_std_param.requires_grad
+    log_std.copy_(torch.tensor([-3.0, 0.5, 2.0]))
+    alg.actor(random_obs(), stochastic_output=True)
+    expected = np.exp([[-3.0, 0.5, 2.0]] * WORLDS)
+    np.testing.assert_allclose(alg.actor.output_std.detach(), expected, rtol=1e-6)
+
+
+def test_statistics_of_samples():
+    """Samples have the mean and the standard deviation asked for, are normal, independent and without gradient."""
+    torch.manual_seed(0)
+    num, mean, log_std = 200_000, [-1.0, 0.0, 3.0], [math.log(0.1), 0.0, math.log(4.0)]
+    distribution = GaussianDistribution(3, std_type="log")
+    with torch.no_grad():
+        distribution.log_std_param.copy_(torch.tensor(log_std))
+    distribution.update(torch.tensor(mean, requires_grad=True).expand(num, 3))
+    samples = distribution.sample()
+    assert not samples.requires_grad
+    standard = (samples.double().numpy() - mean) / np.exp(log_std)
+    error = 5.0 / math.sqrt(num)  # five standard errors
+    np.testing.assert_allclose(standard.mean(axis=0), 0.0, atol=error)
+    np.testing.assert_allclose(standard.std(axis=0), 1.0, atol=error)
+    np.testing.assert_allclose(np.corrcoef(standard.T), np.eye(3), atol=error)
+    for bound, share in ((1.0, 0.682689), (2.0, 0.954500), (3.0, 0.997300)):
+        np.testing.assert_allclose((np.abs(standard) < bound).mean(axis=0), share, atol=error)
+    assert not np.allclose(distribution.sample(), samples)
+
+
+def test_formulas_of_the_distribution():
+    """Log-probability, entropy and KL divergence by their formulas."""
+    rng = np.random.default_rng(0)
+    mean, actions, old_mean = rng.normal(size=(3, 6, 3))
+    std, old_std = np.exp(rng.normal(size=(2, 3)))
+    distribution = GaussianDistribution(3, std_type="log")
+    with torch.no_grad():
+        distribution.log_std_param.copy_(torch.tensor(np.log(std)))
+    distribution.update(torch.tensor(mean))
+    log_prob = -0.5 * ((actions - mean) / std) ** 2 - np.log(std) - 0.5 * np.log(2.0 * np.pi)
+    entropy = 0.5 * np.log(2.0 * np.pi * np.e * std**2).sum()
+    kl = np.log(std / old_std) + (old_std**2 + (old_mean - mean) ** 2) / (2.0 * std**2) - 0.5
+    old = (torch.tensor(old_mean), torch.tensor(old_std).expand(6, 3))
+    pairs = [
+        (distribution.log_prob(torch.tensor(actions)), log_prob.sum(axis=1)),
+        (distribution.entropy, np.full(6, entropy)),
+        (distribution.kl_divergence(old, distribution.params), kl.sum(axis=1)),
+    ]
+    for actual, expected in pairs:
+        np.testing.assert_allclose(actual.detach(), expected, rtol=1e-5)

@@ -1,0 +1,458 @@
+"""The reward terms of Table III by hand, their weights and curricula, and the state that they are computed from."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+LEGS = ("FR", "FL", "RR", "RL")
+SENSED = ["trunk", *(f"{leg}_{part}" for leg in LEGS for part in ("thigh", "calf", "foot"))]
+JOINTS = [f"{leg}_{link}" for leg in LEGS for link in ("hip", "thigh", "calf")]
+
+TABLE_III = {  # weight without Delta t, at the start of training
+    "tracking_lin_vel": 4.0,
+    "tracking_ang_vel": 0.1,
+    "lin_vel_z": -2.0,
+    "ang_vel_xy": -0.05,
+    "orientation": -0.2,
+    "dof_pos_limits": -10.0,
+    "dof_acc": -2.5e-7,
+    "torques": -2e-4,
+    "action_rate": -1e-6,
+    "collision": -1.0,
+    "base_height": -30.0,
+    "feet_air_time": 0.1,
+    "symmetry": -0.5,
+}
+TASKS = ("a1_position", "a1_torque", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead")
+
+
+def contact_flags(*names):
+    """One world's contact flags with the named geoms on the ground."""
+    return torch.tensor([1.0 if name in names else 0.0 for name in SENSED])
+
+
+def joints(**values):
+    """One number per joint: those given, else 0."""
+    return torch.tensor([values.get(name, 0.0) for name in JOINTS])
+
+
+def neutral(task):
+    """Put all worlds into the state in which every term is 0 but the two of tracking, which are 1."""
+    task.commands.zero_()
+    task.base_lin_vel.zero_()
+    task.sim.qvel.zero_()
+    task.last_dof_vel.zero_()
+    task.projected_gravity.copy_(torch.tensor([0.0, 0.0, -1.0]).expand_as(task.projected_gravity))
+    task.dof_pos.copy_(task.default_dof_pos.expand_as(task.dof_pos))
+    task.torques.zero_()
+    task.last_actions.zero_()
+    task.actions.zero_()
+    task.contacts.zero_()
+    task.base_pos.copy_(torch.tensor([7.0, 8.0, 0.303]).expand_as(task.base_pos))
+    task.feet_contact.fill_(1.0)
+    task.feet_air_time.fill_(0.5)
+    task.sim.clear_diverged()
+
+
+def set_tracking_lin_vel(task, world):
+    """An error of (0.25, -0.5) m/s; the vertical velocity does not count: exp(-4 * 0.3125)."""
+    task.commands[world] = torch.tensor([0.5, -0.25, 9.0])
+    task.base_lin_vel[world] = torch.tensor([0.25, 0.25, 9.0])
+
+
+def set_tracking_ang_vel(task, world):
+    """A yaw rate error of 0.5 rad/s; the other axes do not count: exp(-4 * 0.25)."""
+    task.commands[world] = torch.tensor([9.0, 9.0, 0.75])
+    task.sim.qvel[world, 3:6] = torch.tensor([9.0, 9.0, 0.25])
+
+
+def set_lin_vel_z(task, world):
+    """0.3^2, downwards."""
+    task.base_lin_vel[world] = torch.tensor([9.0, 9.0, -0.3])
+
+
+def set_ang_vel_xy(task, world):
+    """3^2 + 4^2."""
+    task.sim.qvel[world, 3:6] = torch.tensor([3.0, -4.0, 9.0])
+
+
+def set_orientation(task, world):
+    """0.48^2 + 0.36^2 of a unit vector."""
+    task.projected_gravity[world] = torch.tensor([0.48, -0.36, -0.8])
+
+
+def set_dof_pos_limits(task, world):
+    """0.05 above a hip's soft limit, 0.1 below a thigh's, 0.02 above a calf's: 90% of the ranges in section 3."""
+    thigh_low = (4.18879 - 1.0472) / 2 - 0.9 * (4.18879 + 1.0472) / 2
+    calf_high = (-2.69653 - 0.916298) / 2 + 0.9 * (2.69653 - 0.916298) / 2
+    for name, angle in {
+        "FR_hip": 0.9 * 0.802851 + 0.05,
+        "RL_hip": 0.9 * 0.802851 - 0.05,  # within
+        "FL_thigh": thigh_low - 0.1,
+        "RL_calf": calf_high + 0.02,
+    }.items():
+        task.dof_pos[world, JOINTS.index(name)] = angle
+
+
+def set_dof_acc(task, world):
+    """Changes by 0.1 and -0.2 rad/s in 0.02 s: 5^2 + 10^2."""
+    task.last_dof_vel[world] = joints(FL_hip=1.0, RL_calf=2.0)
+    task.dof_vel[world] = joints(FL_hip=1.1, RL_calf=1.8)
+
+
+def set_torques(task, world):
+    """3^2 + 4^2."""
+    task.torques[world] = joints(FR_hip=3.0, RL_calf=-4.0)
+
+
+def set_action_rate(task, world):
+    """2^2 + 0.5^2."""
+    task.last_actions[world] = joints(FR_hip=1.0, RR_thigh=0.25)
+    task.actions[world] = joints(FR_hip=-1.0, RR_thigh=0.75)
+
+
+def set_collision(task, world):
+    """A trunk, a calf and two thighs on the ground; feet do not count."""
+    task.contacts[world] = contact_flags("trunk", "FR_calf", "FL_thigh", "RL_thigh", "RL_foot", "FR_foot")
+
+
+def set_base_height(task, world):
+    """0.1 m too low."""
+    task.base_pos[world, 2] = 0.203
+
+
+def set_feet_air_time(task, world):
+    """Swings of 0.75 s and 0.3 s have ended, one foot has been down all the time, one flies: 0.25 - 0.2 - 0.5."""
+    task.feet_contact[world] = torch.tensor([1.0, 1.0, 1.0, 0.0])
+    task.feet_air_time[world] = torch.tensor([0.75, 0.3, 0.0, 0.9])
+
+
+def set_symmetry(task, world):
+    """Both front feet in the air and one rear foot: one pair."""
+    task.feet_contact[world] = torch.tensor([0.0, 0.0, 0.0, 1.0])
+
+
+def set_nominal_position(task, world):
+    """Deviations of 0.6 and 1.2 rad: exp(-0.5 * 1.8)."""
+    task.dof_pos[world] += joints(FR_hip=0.6, RR_calf=-1.2)
+
+
+CASES = {  # constructed state, value in it
+    "tracking_lin_vel": (set_tracking_lin_vel, 0.2865048),
+    "tracking_ang_vel": (set_tracking_ang_vel, 0.3678794),
+    "lin_vel_z": (set_lin_vel_z, 0.09),
+    "ang_vel_xy": (set_ang_vel_xy, 25.0),
+    "orientation": (set_orientation, 0.36),
+    "dof_pos_limits": (set_dof_pos_limits, 0.17),
+    "dof_acc": (set_dof_acc, 125.0),
+    "torques": (set_torques, 25.0),
+    "action_rate": (set_action_rate, 4.25),
+    "collision": (set_collision, 4.0),
+    "base_height": (set_base_height, 0.01),
+    "feet_air_time": (set_feet_air_time, -0.45),
+    "symmetry": (set_symmetry, 1.0),
+    "nominal_position": (set_nominal_position, 0.4065697),
+}
+NEUTRAL_VALUE = {"tracking_lin_vel": 1.0, "tracking_ang_vel": 1.0, "nominal_position": 1.0}
+
+
+@pytest.fixture
+def task(make_task):
+    """The curriculum task, which has every term there is, in the neutral state."""
+    task = make_task("a1_torque_curriculum", 3)
+    neutral(task)
+    return task
+
+
+# --------------------------------------------------------------------------------------------------- terms
+
+
+@pytest.mark.parametrize("term", CASES)
+def test_term_by_hand(task, term):
+    """A term has its by-hand value in the world that was put into its state, and its neutral value in the others."""
+    construct, expected = CASES[term]
+    construct(task, 1)
+    rest = NEUTRAL_VALUE.get(term, 0.0)
+    value = getattr(task, f"_reward_{term}")()
+    np.testing.assert_allclose(value, [rest, expected, rest], rtol=2e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("in_air", "expected"),
+    [
+        ("", 0.0),
+        ("FR", 0.0),
+        ("FR FL", 1.0),
+        ("RR RL", 1.0),
+        ("FR RR", 0.0),
+        ("FL RR", 0.0),
+        ("FR FL RL", 1.0),
+        ("FR FL RR RL", 2.0),
+    ],
+)
+def test_symmetry_pairs(task, in_air, expected):
+    """Only a left and a right foot of the same end make a pair."""
+    task.feet_contact[:] = torch.tensor([0.0 if leg in in_air.split() else 1.0 for leg in LEGS])
+    assert task._reward_symmetry().tolist() == [expected] * 3
+
+
+@pytest.mark.parametrize("part", ["calf", "thigh"])
+@pytest.mark.parametrize("leg", LEGS)
+def test_collision_counts_every_leg(task, leg, part):
+    """Each calf and each thigh counts once, each hip and foot not at all."""
+    task.contacts[:] = contact_flags(f"{leg}_{part}", f"{leg}_foot")
+    assert task._reward_collision().tolist() == [1.0] * 3
+
+
+@pytest.mark.parametrize(
+    ("link", "low", "high"),
+    [
+        ("hip", -0.7225659, 0.7225659),
+        ("thigh", -0.7854005, 3.9269905),
+        ("calf", -2.6075184, -1.0053096),
+    ],
+)
+def test_soft_limits(task, link, low, high):
+    """Soft limits lie at 90% of each joint's range around its middle, on both sides, for all legs."""
+    columns = [JOINTS.index(f"{leg}_{link}") for leg in LEGS]
+    for angle, expected in ((low - 0.03, 0.12), (low + 0.03, 0.0), (high - 0.03, 0.0), (high + 0.03, 0.12)):
+        task.dof_pos[:, columns] = angle
+        np.testing.assert_allclose(task._reward_dof_pos_limits(), [expected] * 3, atol=2e-6)
+
+
+def test_temperatures(make_task):
+    """The tracking and nominal-position temperatures are settings."""
+    task = make_task(
+        "a1_torque_curriculum",
+        1,
+        **{"rewards.tracking_temperature": 1.0, "rewards.nominal_position_temperature": 2.0},
+    )
+    neutral(task)
+    for term, expected in (("tracking_lin_vel", -0.3125), ("tracking_ang_vel", -0.25), ("nominal_position", -3.6)):
+        neutral(task)
+        CASES[term][0](task, 0)
+        assert getattr(task, f"_reward_{term}")().item() == pytest.approx(math.exp(expected), rel=1e-5)
+
+
+# --------------------------------------------------------------------------------------------------- weights and sum
+
+
+@pytest.mark.parametrize("decimation", [4, 2])
+@pytest.mark.parametrize("name", TASKS)
+def test_weights_of_table_iii(make_task, name, decimation):
+    """At the start, every weight is that of Table III times the control step; the curriculum task has one more."""
+    task = make_task(name, 1, **{"control.decimation": decimation})
+    expected = dict(TABLE_III)
+    if name == "a1_torque_curriculum":
+        expected["nominal_position"] = 20.0
+    weights = dict(zip(task.reward_names, task.reward_weights().tolist(), strict=True))
+    assert weights == pytest.approx({term: 0.005 * decimation * weight for term, weight in expected.items()}, rel=1e-6)
+
+
+def test_reward_is_the_weighted_sum(make_task):
+    """With all terms in action at once the reward is the sum over Table III, times Delta t = 0.02 s."""
+    task = make_task("a1_position", 2)
+    neutral(task)
+    values = {term: CASES[term][1] for term in TABLE_III}
+    for term in TABLE_III:
+        if term not in ("lin_vel_z", "tracking_ang_vel", "ang_vel_xy", "symmetry"):
+            CASES[term][0](task, 1)
+    task.base_lin_vel[1, 2] = -0.3  # the other states of velocity, together
+    task.commands[1, 2], task.sim.qvel[1, 3:6] = 0.75, torch.tensor([3.0, -4.0, 0.25])
+    values["symmetry"] = 0.0  # the state of the air time has three feet on the ground
+    task.compute_reward()
+    np.testing.assert_allclose(task.rew_buf, [0.02 * (4.0 + 0.1), 0.0], rtol=1e-5)
+    parts = {term: 0.02 * TABLE_III[term] * value for term, value in values.items()}
+    assert sum(parts.values()) < -0.1
+    sums = dict(zip(task.reward_names, task.episode_sums[:, 1].tolist(), strict=True))
+    assert sums == pytest.approx(parts, rel=2e-5, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("height", "clip", "expected"),
+    [
+        (0.403, True, 0.02 * (4.1 - 30 * 0.01)),
+        (0.703, True, 0.0),
+        (0.703, False, 0.02 * (4.1 - 30 * 0.16)),
+    ],
+)
+def test_negative_sums_are_clipped(make_task, height, clip, expected):
+    """A negative sum becomes 0 and a positive one stays, unless clipping is switched off."""
+    task = make_task("a1_torque", 1, **{"rewards.only_positive_rewards": clip})
+    neutral(task)
+    task.base_pos[:, 2] = height
+    task.compute_reward()
+    assert task.rew_buf.item() == pytest.approx(expected, rel=1e-4, abs=1e-9)
+
+
+def test_a_scale_of_zero_removes_a_term(make_task):
+    """A term whose scale is set to 0 is not part of the reward any more."""
+    task = make_task("a1_torque", 1, **{"rewards.scales.base_height": 0.0})
+    neutral(task)
+    task.base_pos[:, 2] = 0.503
+    task.compute_reward()
+    assert "base_height" not in task.reward_names
+    assert task.rew_buf.item() == pytest.approx(0.02 * 4.1, rel=1e-5)
+
+
+# --------------------------------------------------------------------------------------------------- curricula
+
+MILLION = 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("name", "term", "start", "end", "t_start", "t_end"),
+    [
+        ("a1_position", "tracking_lin_vel", 4.0, 2.0, 0, 10),
+        ("a1_position", "tracking_ang_vel", 0.1, 1.0, 0, 10),
+        ("a1_multihead", "tracking_lin_vel", 4.0, 2.0, 0, 10),
+        ("a1_torque_curriculum", "tracking_lin_vel", 4.0, 2.0, 3, 13),
+        ("a1_torque_curriculum", "tracking_ang_vel", 0.1, 1.0, 3, 13),
+        ("a1_torque_curriculum", "nominal_position", 20.0, 1.0, 0, 5),
+    ],
+)
+def test_reward_curricula(make_task, name, term, start, end, t_start, t_end):
+    """A weight follows eq. 1: constant before and after its knots, on the straight line between them."""
+    task = make_task(name, 1)
+    index = task.reward_names.index(term)
+    points = [(0, start), (t_start, start), (t_end, end), (t_end + 1, end), (110, end)]
+    points += [(t_start + share * (t_end - t_start), start + share * (end - start)) for share in (0.125, 0.5, 0.75)]
+    for millions, expected in points:
+        task.total_steps.fill_(int(millions * MILLION))
+        assert task.reward_weights()[index].item() == pytest.approx(0.02 * expected, rel=1e-6), millions
+        assert task.curriculum_values()[f"weight_{term}"].item() == pytest.approx(expected, rel=1e-6), millions
+
+
+def test_other_weights_stay(make_task):
+    """No other weight depends on the number of steps."""
+    task = make_task("a1_torque_curriculum", 1)
+    task.total_steps.fill_(50 * MILLION)
+    weights = dict(zip(task.reward_names, task.reward_weights().tolist(), strict=True))
+    expected = TABLE_III | {"tracking_lin_vel": 2.0, "tracking_ang_vel": 1.0, "nominal_position": 1.0}
+    assert weights == pytest.approx({term: 0.02 * weight for term, weight in expected.items()}, rel=1e-6)
+
+
+def test_curricula_count_the_steps_of_all_worlds(make_task):
+    """t of eq. 1 grows by the number of worlds with each step, and the step's own reward already uses it."""
+    task = make_task(
+        "a1_torque",
+        3,
+        **{"rewards.curriculum.tracking_lin_vel.t_end": 12, "commands.resampling_probability": 0.0},
+    )
+    tracking = task.reward_names.index("tracking_lin_vel")
+    assert task.total_steps.item() == 0
+    for step, weight in enumerate((3.5, 3.0, 2.5, 2.0, 2.0), start=1):
+        before = task.episode_sums[tracking].clone()
+        task.step(torch.zeros(3, 12))
+        assert task.total_steps.item() == 3 * step
+        gained = (task.episode_sums[tracking] - before) / 0.02
+        np.testing.assert_allclose(gained, weight * task._reward_tracking_lin_vel(), rtol=1e-4, atol=1e-6)
+
+
+# --------------------------------------------------------------------------------------------------- state
+
+
+def random_rotation(rng):
+    """A random unit quaternion (w, x, y, z) and the rotation matrix that takes body into world vectors."""
+    w, x, y, z = quat = (lambda q: q / np.linalg.norm(q))(rng.normal(size=4))
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return quat, np.eye(3) + 2 * w * skew + 2 * skew @ skew
+
+
+def test_velocities_and_gravity_in_the_trunk_frame(make_task):
+    """Turned at random, velocity and gravity are the world's, turned back by the rotation matrix."""
+    task, rng = make_task("a1_torque", 8), np.random.default_rng(0)
+    rotations = [random_rotation(rng) for _ in range(8)]
+    velocity, rate = rng.normal(size=(8, 3)), rng.normal(size=(8, 3))
+    task.base_quat.copy_(torch.tensor(np.array([quat for quat, _ in rotations])))
+    task.sim.qvel[:, :3] = torch.tensor(velocity)
+    task.sim.qvel[:, 3:6] = torch.tensor(rate)
+    task._update_state()
+    for world, (quat, matrix) in enumerate(rotations):
+        np.testing.assert_allclose(task.base_lin_vel[world], matrix.T @ velocity[world], atol=2e-6)
+        np.testing.assert_allclose(task.projected_gravity[world], matrix.T @ (0, 0, -1), atol=1e-6)
+        model, local = task.sim.mj_model, np.zeros(6)
+        data = mujoco.MjData(model)
+        data.qpos[3:7], data.qvel[:3], data.qvel[3:6] = quat, velocity[world], rate[world]
+        mujoco.mj_forward(model, data)
+        trunk = model.body("trunk").id
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, trunk, local, 1)
+        np.testing.assert_allclose(task.base_ang_vel[world], local[:3], atol=2e-6)
+        np.testing.assert_allclose(task.base_lin_vel[world], local[3:], atol=2e-6)
+
+
+def test_air_time_grows_in_flight(make_task):
+    """In free flight every foot's air time is the number of control steps since the reset times Delta t."""
+    task = make_task("a1_torque", 2, **{"init_state.pos": [0.0, 0.0, 2.0]})
+    for step in range(1, 6):
+        task.step(torch.zeros(2, 12))
+        np.testing.assert_allclose(task.feet_air_time, 0.02 * step, rtol=1e-5)
+    assert not task.feet_contact.any()
+
+
+def test_air_time_ends_with_a_touch(make_task):
+    """The touching step is rewarded for the swing that it ends; then the count starts anew."""
+    task = make_task("a1_torque", 1)
+    task.feet_air_time.zero_()
+    seen = []
+    for touches in (0.0, 0.0, 0.0, 1.0, 1.0, 0.0):
+        task.feet_contact.fill_(touches)
+        seen.append(task._reward_feet_air_time().item())
+        task._update_feet_air_time()
+    np.testing.assert_allclose(seen, [0.0, 0.0, 0.0, 4 * (0.06 - 0.5), 4 * -0.5, 0.0], rtol=1e-5)
+    np.testing.assert_allclose(task.feet_air_time, 0.02, rtol=1e-5)
+
+
+def test_actions_and_joint_speeds_of_the_last_step(make_task):
+    """Action rate and joint acceleration compare with the step before, with zero at the start of an episode."""
+    task = make_task("a1_torque", 2, **{"init_state.pos": [0.0, 0.0, 2.0]})
+    last_action, last_speed = torch.zeros(2, 12), torch.zeros(2, 12)
+    rate, acceleration = (task.reward_names.index(term) for term in ("action_rate", "dof_acc"))
+    for _ in range(3):
+        before = task.episode_sums.clone()
+        action = torch.randn(2, 12)
+        task.step(action)
+        gained = task.episode_sums - before
+        np.testing.assert_allclose(gained[rate], -1e-6 * 0.02 * (action - last_action).square().sum(dim=1), rtol=2e-3)
+        speed = task.sim.qvel[:, 6:].clone()
+        change = ((speed - last_speed) / 0.02).square().sum(dim=1)
+        np.testing.assert_allclose(gained[acceleration], -2.5e-7 * 0.02 * change, rtol=1e-3)
+        last_action, last_speed = action, speed
+
+
+def test_log(make_task):
+    """The log gives mean tracking errors per step, and return, length and terms per ended episode, and starts anew."""
+    task = make_task(
+        "a1_torque",
+        3,
+        **{"env.episode_length_s": 0.1, "init_state.pos": [0.0, 0.0, 2.0], "rewards.only_positive_rewards": False},
+    )
+    task.episode_length_buf = torch.tensor([1, 0, 0])  # the first world's episode ends a step earlier
+    returns, errors = torch.zeros(3), []
+    for step in range(1, 6):
+        commands, running = task.commands.clone(), task.episode_length_buf > 0
+        task.step(torch.randn(3, 12))
+        returns += task.rew_buf * (running | (step == 1))
+        if step <= 3:
+            velocity = torch.cat([task.base_lin_vel[:, :2], task.base_ang_vel[:, 2:]], dim=1)
+            errors.append((velocity - commands).square())
+        if step == 3:
+            means = torch.cat(errors).mean(dim=0).tolist()
+            assert task.log.read(0.1) == pytest.approx(
+                {
+                    "Tracking/error_xy": means[0] + means[1],
+                    "Tracking/error_yaw": means[2],
+                    "Health/diverged_worlds": 0.0,
+                },
+                rel=1e-4,
+            )
+    log = task.log.read(0.1)
+    assert log["length"] == 5.0
+    assert log["return"] == pytest.approx(returns.mean().item(), rel=1e-4)
+    terms = {name: value for name, value in log.items() if name.startswith("Episode_Reward/")}
+    assert set(terms) == {f"Episode_Reward/{term}" for term in TABLE_III}
+    assert 0.1 * sum(terms.values()) == pytest.approx(log["return"], rel=1e-4)
+    assert task.log.read(0.1) == {"Health/diverged_worlds": 0.0}

@@ -1,0 +1,405 @@
+"""Training itself: every task learns, a checkpoint brings everything back or is refused, and nothing gets lost."""
+
+import io
+import math
+import signal
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from legged_torque.envs import task_registry
+from legged_torque.utils.config import set_by_path
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.interrupt import StopRequest
+
+WORLDS, STEPS = 4, 4
+BATCH = WORLDS * STEPS
+
+MOVING = {
+    "control.mixing.update_interval": 24,
+    "control.mixing.pd.t_end": 100,
+    "rewards.curriculum.tracking_lin_vel.t_end": 100,
+    "rewards.curriculum.tracking_ang_vel.t_end": 100,
+}
+"""Curricula that are under way after two iterations."""
+
+
+@pytest.fixture(scope="module")
+def make_runner(make_task):
+    """Factory of runners with short rollouts of small tasks; settings of the training go by dotted path."""
+
+    def make(name="a1_torque_multihead", log_root=None, seed=0, env=None, **overrides):
+        _, train_cfg = task_registry.get_cfgs(name)
+        for path, value in {"runner.num_steps_per_env": STEPS, "algorithm.num_mini_batches": 2, **overrides}.items():
+            set_by_path(train_cfg, path, value)
+        task = make_task(name, num_envs=WORLDS, seed=seed, **(env or {}))
+        torch.manual_seed(seed)
+        return task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=log_root)[0]
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def saved(make_runner, tmp_path_factory):
+    """A runner after two iterations with moving curricula, and the checkpoint that it has left."""
+    runner = make_runner(log_root=tmp_path_factory.mktemp("logs"), env=MOVING, **{"runner.logger": "none"})
+    runner.learn(2)
+    return runner, folder(runner) / "model_2.pt"
+
+
+def folder(runner):
+    """The run's folder."""
+    return Path(runner.log_dir)
+
+
+def copies(tensors):
+    """A dictionary of tensors, copied."""
+    return {name: value.detach().clone() for name, value in tensors.items()}
+
+
+def networks(runner):
+    """All parameters of actor and critic."""
+    alg = runner.alg
+    return {**alg.actor.state_dict(prefix="actor."), **alg.critic.state_dict(prefix="critic.")}
+
+
+def error_of(function, *args):
+    """The line that a mistake is told with."""
+    with pytest.raises(UserError) as error:
+        function(*args)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("name", task_registry.names())
+def test_two_iterations_of_every_task(make_runner, tmp_path, name, capsys):
+    """Losses are finite, every parameter is learned, and the run's folder holds the checkpoint and the curves."""
+    runner = make_runner(name, log_root=tmp_path, env={"env.episode_length_s": 0.06})
+    before = copies(networks(runner))
+    runner.learn(2, init_at_random_ep_len=True)
+    for key, value in networks(runner).items():
+        assert torch.isfinite(value).all()
+        assert not torch.equal(value, before[key]), f"{key} has not moved"
+    assert runner.current_learning_iteration == 2
+    assert int(runner.env.total_steps) == runner.logger.tot_timesteps == 2 * BATCH
+    steps = {int(entry["step"]) for entry in runner.alg.optimizer.state_dict()["state"].values()}
+    assert steps == {2 * 5 * 2}  # iterations, epochs, minibatches
+    files = {path.name.split(".tfevents")[0] for path in tmp_path.glob("*/*") if path.is_file()}
+    assert files == {"model_2.pt", "events.out"}
+    runner.logger.writer.flush()
+    events = EventAccumulator(str(folder(runner))).Reload()
+    tags = events.Tags()["scalars"]
+    numbers = {tag: [event.value for event in events.Scalars(tag)] for tag in tags}
+    assert all(math.isfinite(number) for values in numbers.values() for number in values)
+    wanted = {"Loss/value", "Loss/surrogate", "Loss/entropy", "Loss/learning_rate", "Loss/skipped_updates"}
+    wanted |= {"Tracking/error_xy", "Tracking/error_yaw", "Health/diverged_worlds", "Train/mean_reward"}
+    wanted |= {"Curriculum/weight_tracking_lin_vel", "Perf/total_fps", "Episode_Reward/torques"}
+    wanted |= {"Curriculum/mixing_pd", "Curriculum/mixing_torque"} if name.endswith("multihead") else set()
+    assert wanted <= numbers.keys()
+    assert all(len(numbers[tag]) == 2 for tag in wanted)
+    assert numbers["Loss/skipped_updates"] == [0.0, 0.0]
+    output = capsys.readouterr().out
+    assert "Steps per second" in output and "ETA" in output and "Tracking/error_xy" in output
+
+
+def test_two_trainings_with_one_seed_are_equal(make_runner):
+    """A seed fixes every random number, so that on a CPU a training repeats bit by bit."""
+    runners = [make_runner(seed=7), make_runner(seed=7), make_runner(seed=8)]
+    for runner, seed in zip(runners, (7, 7, 8), strict=True):
+        torch.manual_seed(seed)
+        runner.learn(2)
+    first, again, other = (networks(runner) for runner in runners)
+    assert all(torch.equal(again[key], value) for key, value in first.items())
+    assert not any(torch.equal(other[key], value) for key, value in first.items())
+
+
+def test_rollout_is_stored(make_runner):
+    """The storage holds what the policy saw, did and got, step by step, with the value of what a time-out cut off."""
+    runner = make_runner(env={"env.episode_length_s": 0.06})
+    step, obs, told = runner.env.step, [runner.env.get_observations()], []
+
+    def noted_step(actions):
+        result = step(actions)
+        obs.append(result[0].clone())
+        told.append([tensor.clone() for tensor in (actions, *result[1:3], result[3]["time_outs"])])
+        return result
+
+    runner.env.step = noted_step
+    runner.collect_rollout()
+    storage = runner.alg.storage
+    assert len(told) == STEPS and any(time_outs.any() for *_, time_outs in told)
+    for i, (actions, rewards, dones, time_outs) in enumerate(told):
+        for group in ("policy", "critic"):
+            assert torch.equal(storage.observations[group][i], obs[i][group])
+        values = runner.alg.critic(obs[i]).detach().squeeze(-1)
+        assert torch.equal(storage.actions[i], actions)
+        assert torch.equal(storage.dones[i].squeeze(-1).bool(), dones)
+        torch.testing.assert_close(storage.rewards[i].squeeze(-1), rewards + 0.99 * values * time_outs)
+    assert not torch.equal(obs[0]["policy"], obs[1]["policy"])
+
+
+def test_mixing_weights_change_between_rollouts_only(make_runner):
+    """Every physics step of a rollout uses the weights of eq. 1 at its start."""
+    runner = make_runner(env={**MOVING, "control.mixing.update_interval": 1})
+    compute, used = runner.env._compute_torques, []
+
+    def noted_compute(actions):
+        used.append(float(runner.env.mixing[0]))
+        return compute(actions)
+
+    runner.env._compute_torques = noted_compute
+    runner.learn(3)
+    expected = [1.0 - BATCH * iteration / 100 for iteration in range(3) for _ in range(STEPS * 4)]
+    assert used == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("interval", [1, 2, 5])
+def test_checkpoints_are_saved_at_every_interval(make_runner, tmp_path, interval):
+    """Checkpoints carry the number of finished iterations; the last one is always there, and nothing half-written."""
+    runner = make_runner(log_root=tmp_path, **{"runner.save_interval": interval, "runner.logger": "none"})
+    runner.learn(3)
+    files = {path.name for path in tmp_path.glob("*/*") if path.is_file()}
+    assert files == {f"model_{n}.pt" for n in (1, 2, 3) if n % interval == 0 or n == 3}
+    for path in tmp_path.glob("*/*.pt"):
+        assert torch.load(path, weights_only=True)["iter"] == int(path.stem.removeprefix("model_"))
+
+
+def test_without_a_folder_nothing_is_written(make_runner, tmp_path, monkeypatch):
+    """A runner without a log folder trains, and leaves no file behind."""
+    monkeypatch.chdir(tmp_path)
+    runner = make_runner()
+    runner.learn(1)
+    assert runner.current_learning_iteration == 1 and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("error", [OSError("No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize("exists", [True, False])
+def test_crash_while_saving(make_runner, tmp_path, monkeypatch, error, exists):
+    """If saving dies half-way, the old checkpoint is as it was, and there is none where there was none."""
+    runner, path = make_runner(), tmp_path / "model_1.pt"
+    if exists:
+        runner.save(str(path))
+    old = path.read_bytes() if exists else None
+    networks(runner)["actor.mlp.trunk.0.bias"].add_(1.0)
+    save = torch.save
+
+    def save_half(state, file, *args, **kwargs):
+        buffer = io.BytesIO()
+        save(state, buffer, *args, **kwargs)
+        content = buffer.getvalue()[: buffer.tell() // 2]
+        with open(file, "wb") as stream:
+            stream.write(content)
+        raise error
+
+    monkeypatch.setattr(torch, "save", save_half)
+    with pytest.raises(type(error)):
+        runner.save(str(path))
+    assert (path.read_bytes() if path.exists() else None) == old
+    monkeypatch.undo()
+    runner.save(str(path))
+    assert [file.name for file in tmp_path.iterdir()] == ["model_1.pt"]
+    loaded = make_runner(seed=3)
+    loaded.load(str(path))
+    assert all(torch.equal(networks(loaded)[key], value) for key, value in networks(runner).items())
+
+
+def test_load_brings_everything_back(make_runner, saved):
+    """Counters, networks, moments, learning rate, curricula and mixing weights are exactly those of the checkpoint."""
+    runner, path = saved
+    loaded = make_runner(seed=5, env=MOVING)
+    infos = loaded.load(str(path))
+    assert infos["total_timesteps"] == loaded.logger.tot_timesteps == 2 * BATCH
+    assert loaded.current_learning_iteration == 2
+    assert int(loaded.env.total_steps) == 2 * BATCH
+    assert all(torch.equal(networks(loaded)[key], value) for key, value in networks(runner).items())
+    old, new = (each.alg.optimizer.state_dict()["state"] for each in (runner, loaded))
+    assert old.keys() == new.keys() and len(new) == len(list(networks(runner)))
+    for index, entry in old.items():
+        assert int(new[index]["step"]) == 2 * 5 * 2
+        for key in ("exp_avg", "exp_avg_sq"):
+            assert torch.equal(new[index][key], entry[key]) and new[index][key].abs().max() > 0.0
+    assert float(loaded.alg.learning_rate) == float(runner.alg.learning_rate) != 1e-3
+    assert float(loaded.alg.optimizer.param_groups[0]["lr"]) == float(runner.alg.learning_rate)
+    # eq. 1 after 32 of 100 steps; mixing weights move at multiples of 24 steps
+    torch.testing.assert_close(loaded.env.mixing, torch.tensor([1.0 - 24 / 100, 1.0]))
+    values = {name: float(value) for name, value in loaded.env.curriculum_values().items()}
+    assert values == pytest.approx(
+        {
+            "weight_tracking_lin_vel": 4.0 - 2.0 * 0.32,
+            "weight_tracking_ang_vel": 0.1 + 0.9 * 0.32,
+            "mixing_pd": 0.76,
+            "mixing_torque": 1.0,
+        },
+        rel=1e-6,
+    )
+
+
+def test_training_continues_as_if_it_had_not_stopped(make_runner, saved, tmp_path):
+    """From the same rollout, a loaded runner takes the very same next update, and counts on from where it was."""
+    _, path = saved
+    runners = [make_runner(seed=seed, log_root=tmp_path, env=MOVING, **{"runner.logger": "none"}) for seed in (5, 6)]
+    for runner in runners:
+        runner.load(str(path))
+    torch.manual_seed(0)
+    runners[0].collect_rollout()
+    source, target = (runner.alg.storage for runner in runners)
+    for name in ("observations", "actions", "values", "actions_log_prob", "returns", "advantages"):
+        getattr(target, name).copy_(getattr(source, name))
+    target.distribution_params = source.distribution_params
+    for runner in runners:
+        torch.manual_seed(1)
+        runner.alg.update()
+    first, second = (networks(runner) for runner in runners)
+    assert all(torch.equal(first[key], value) for key, value in second.items())
+    assert float(runners[0].alg.learning_rate) == float(runners[1].alg.learning_rate)
+    runners[1].learn(1)
+    assert runners[1].current_learning_iteration == 3 and int(runners[1].env.total_steps) == 3 * BATCH
+    state = torch.load(folder(runners[1]) / "model_3.pt", weights_only=True)
+    assert (state["iter"], state["infos"]["total_timesteps"]) == (3, 3 * BATCH)
+
+
+def test_time_of_training_goes_on(make_runner, saved, tmp_path):
+    """The seconds that a checkpoint reports are those of all the training so far."""
+    _, path = saved
+    runner = make_runner(log_root=tmp_path, env=MOVING, **{"runner.logger": "none"})
+    before = runner.load(str(path))["seconds"]
+    assert before > 0.0
+    runner.learn(1)
+    assert torch.load(folder(runner) / "model_3.pt", weights_only=True)["infos"]["seconds"] > before
+
+
+def test_checkpoint_of_plain_values(saved):
+    """A checkpoint needs no pickled code to be read, so that a foreign one cannot run any."""
+    _, path = saved
+    state = torch.load(path, weights_only=True)
+    assert {"actor_state_dict", "critic_state_dict", "optimizer_state_dict", "iter", "infos"} <= state.keys()
+    assert state["iter"] == 2 and int(state["infos"]["task"]["total_steps"]) == 2 * BATCH
+
+
+class Foreign:
+    """An object that no checkpoint should hold."""
+
+
+def cut(share):
+    """A function that writes the first part of a file."""
+    return lambda content, path: path.write_bytes(content[: int(share * len(content))])
+
+
+BROKEN = {
+    "empty": cut(0.0),
+    "a tenth": cut(0.1),
+    "half": cut(0.5),
+    "all but the end": cut(0.9999),
+    "text": lambda _, path: path.write_text("this is no checkpoint\n"),
+    "foreign object": lambda _, path: torch.save(Foreign(), path),
+    "a tensor": lambda _, path: torch.save(torch.zeros(3), path),
+    "a number": lambda _, path: torch.save(5, path),
+    "no entries": lambda _, path: torch.save({}, path),
+    "a folder": lambda _, path: path.mkdir(),
+    "nothing": lambda _, path: None,
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_broken_checkpoint(make_runner, saved, tmp_path, how):
+    """A file that is no checkpoint is refused in a line that names it; an unreadable one is not called a misfit."""
+    path = tmp_path / "model_2.pt"
+    BROKEN[how](saved[1].read_bytes(), path)
+    runner = make_runner(seed=5)
+    before = copies(networks(runner))
+    line = error_of(runner.load, str(path))
+    assert str(path) in line
+    if how not in ("a tensor", "a number", "no entries"):
+        assert "is not a readable checkpoint" in line
+    assert all(torch.equal(networks(runner)[key], value) for key, value in before.items())
+
+
+@pytest.mark.parametrize(
+    ("saved_task", "task"), [("a1_position", "a1_multihead"), ("a1_torque_multihead", "a1_torque_curriculum")]
+)
+def test_checkpoint_of_another_kind_of_policy(make_runner, tmp_path, saved_task, task):
+    """A policy with other layers is refused, and the line says that it does not fit."""
+    path = tmp_path / "model_0.pt"
+    make_runner(saved_task).save(str(path))
+    assert error_of(make_runner(task).load, str(path)).startswith(f"checkpoint '{path}' does not fit this task: ")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stop_request(number):
+    """The first signal asks, the second one raises, and afterwards the signals do what they did before."""
+    before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.raises(KeyboardInterrupt), StopRequest() as stop:
+        assert not stop.requested
+        assert signal.getsignal(number) not in before  # or raising it would end the tests
+        signal.raise_signal(number)
+        assert stop.requested
+        signal.raise_signal(number)
+        pytest.fail("the second signal did not raise")
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_stop_request_without_a_signal():
+    """Nothing is asked, and the signals are given back."""
+    before = signal.getsignal(signal.SIGINT)
+    with StopRequest() as stop:
+        assert signal.getsignal(signal.SIGINT) != before
+    assert not stop.requested and signal.getsignal(signal.SIGINT) == before
+
+
+def test_stop_request_outside_the_main_thread():
+    """Another thread cannot take over signals, and works without."""
+    results = []
+
+    def work():
+        with StopRequest() as stop:
+            results.append((stop.requested, signal.getsignal(signal.SIGINT)))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert results == [(False, signal.getsignal(signal.SIGINT))]
+
+
+def test_signal_while_printing(monkeypatch):
+    """A signal that arrives while a line is being written asks to stop like any other."""
+
+    class Terminal(io.RawIOBase):
+        """Takes Ctrl-C while it writes the first time."""
+
+        written = b""
+
+        def writable(self):
+            return True
+
+        def write(self, data):
+            if not self.written:
+                self.written = bytes(data)
+                signal.raise_signal(signal.SIGINT)
+            return len(data)
+
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BufferedWriter(Terminal())))
+    with StopRequest() as stop:
+        print("Learning iteration 1", flush=True)
+    assert stop.requested
+
+
+def test_signal_during_an_iteration(make_runner, tmp_path):
+    """The iteration is finished, saved, and training ends; learning can go on afterwards."""
+    runner = make_runner(log_root=tmp_path, **{"runner.logger": "none"})
+    update = runner.alg.update
+
+    def update_with_signal():
+        runner.alg.update = update
+        signal.raise_signal(signal.SIGINT)
+        return update()
+
+    runner.alg.update = update_with_signal
+    runner.learn(1000)
+    assert runner.current_learning_iteration == 1
+    assert [path.name for path in folder(runner).glob("*.pt*")] == ["model_1.pt"]
+    runner.learn(1)
+    assert (folder(runner) / "model_2.pt").is_file()

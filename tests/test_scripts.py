@@ -1,0 +1,339 @@
+"""The scripts as a user runs them: mistakes are told in one line, and training, stopping, resuming and playing fit."""
+
+import contextlib
+import io
+import json
+import math
+import os
+import re
+import runpy
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from legged_torque.utils import task_registry
+
+ROOT = Path(__file__).resolve().parents[1]
+TASKS = ["a1_position", "a1_torque", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
+SMALL = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--set=runner.num_steps_per_env=4", "--max_iterations=2"]
+
+
+def run_here(script, *words, root):
+    """Run a script in this process, with ``root`` in place of the repository for its logs.
+
+    Returns:
+        Exit status, standard output, standard error.
+    """
+    output, error, status = io.StringIO(), io.StringIO(), 0
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(output), contextlib.redirect_stderr(error):
+        patch.setattr(task_registry, "ROOT_DIR", root)
+        patch.setattr(sys, "argv", [script, *words])
+        patch.setenv("MUJOCO_GL", "disable")  # given back afterwards: play.py chooses another one
+        try:
+            runpy.run_path(str(ROOT / "scripts" / script), run_name="__main__")
+        except SystemExit as stop:
+            status = stop.code or 0
+    return status, output.getvalue(), error.getvalue()
+
+
+def start(script, *words):
+    """Start a script as a process of its own, without what the tests have set for themselves."""
+    environment = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
+    environment |= {"PYTHONUNBUFFERED": "1", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(ROOT / "scripts" / script), *words]
+    return subprocess.Popen(
+        command, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+
+
+def finish(process):
+    """Wait for a process; return exit status, standard output, standard error."""
+    with process:
+        output, error = process.communicate(timeout=300)
+    return process.returncode, output, error
+
+
+def contents(folder):
+    """Every file and folder below a folder, with what would give away a change."""
+    return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in folder.rglob("*")}
+
+
+@pytest.fixture
+def experiment():
+    """A name for an experiment in the repository's logs, which is deleted afterwards."""
+    name = f"test_scripts_{os.getpid()}"
+    yield name
+    shutil.rmtree(ROOT / "logs" / name, ignore_errors=True)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """A folder whose logs hold a run of ``a1_position`` and broken copies of it, one experiment each."""
+    root = tmp_path_factory.mktemp("root")
+    status, _, error = run_here("train.py", *SMALL, "--set=runner.save_interval=1", "--run_name=good", root=root)
+    assert (status, error) == (0, "")
+    (run,) = (root / "logs" / "a1_position").iterdir()
+    config = (run / "config.yaml").read_text()
+    broken = {
+        "not_yaml": "task: [a1_position",
+        "no_mapping": "walk",
+        "no_entries": "task: a1_position",
+        "unknown_key": config.replace("num_envs:", "num_env:"),
+        "wrong_type": config.replace("torques: -0.0002", "torques: little"),
+        "no_section": re.sub(r"^env:\n(  .*\n)+", "env: 3\n", config, flags=re.MULTILINE),
+    }
+    for name, text in broken.items():
+        copy = shutil.copytree(run, root / "logs" / name / run.name)
+        assert text != config
+        (copy / "config.yaml").write_text(text)
+    (shutil.copytree(run, root / "logs" / "no_config" / run.name) / "config.yaml").unlink()
+    checkpoint = (run / "model_2.pt").read_bytes()
+    for name, content in {"text": b"this is no checkpoint\n", "half": checkpoint[: len(checkpoint) // 2]}.items():
+        copy = shutil.copytree(run, root / "logs" / f"{name}_checkpoint" / run.name)
+        (copy / "model_2.pt").write_bytes(content)
+    return root
+
+
+MISTAKES = [
+    ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
+    ("--set=rewards.scales.torqes=-1", "config key 'rewards.scales.torqes'; did you mean 'rewards.scales.torques'?"),
+    ("--set=control.stifness=1", "unknown config key 'control.stifness'; did you mean 'control.stiffness'?"),
+    ("--set=controls.stiffness=1", "unknown config section 'controls'; did you mean 'control'?"),
+    ("--set=control.stiffness", "--set takes KEY=VALUE, not 'control.stiffness'"),
+    ("--set=control.stiffness=stiff", "config key 'control.stiffness' takes a value like 20.0, not 'stiff'"),
+    ("--set=control.decimation=2.5", "config key 'control.decimation' takes a value like 4, not 2.5"),
+    ("--set=control.decimation=0", "control.decimation must be at least 1, not 0"),
+    ("--set=control.decimation=[", "the value '[' is not valid YAML"),
+    ("--set=sim.dt=0", "sim.dt must be greater than 0"),
+    (
+        "--set=commands.ranges.lin_vel_x=[1, -1]",
+        "commands.ranges.lin_vel_x must be [minimum, maximum], not [1.0, -1.0]",
+    ),
+    ("--set=asset.file=a1.xml", "a1.xml"),
+    ("--set=algorithm.num_mini_batches=9", "algorithm.num_mini_batches is 9, more than the samples of a rollout"),
+    ("--device=gpu", "unknown device 'gpu'; did you mean 'cpu'?"),
+    ("--device=cuda:99", "there is no device 'cuda:99'; available: cpu"),
+    ("--preset=papr", "unknown preset 'papr'; did you mean 'paper'?"),
+    ("--logger=tensorbord", "unknown logger 'tensorbord'; did you mean 'tensorboard'?"),
+    ("--num_env=3", "unknown option '--num_env=3'; did you mean '--num_envs'?"),
+    ("--resum", "unknown option '--resum'; did you mean '--resume'?"),
+    ("resume", "unknown option 'resume'"),
+    ("--num_envs=0", "num_envs must be at least 1, not 0"),
+    ("--num_envs=-1", "num_envs must be at least 1, not -1"),
+    ("--num_envs=few", "argument --num_envs: invalid int value: 'few'"),
+    ("--max_iterations=0", "--max_iterations must be at least 1, not 0"),
+    ("--resume --load_run=2026", "unknown run '2026'"),
+    ("--resume --checkpoint=7", "unknown checkpoint '7'; allowed: 1, 2"),
+    ("--resume --checkpoint=last", "argument --checkpoint: invalid int value: 'last'"),
+    ("--resume --experiment_name=nothing", "there is no run with a checkpoint in"),
+    ("--resume", "the run has 2 iterations already; raise --max_iterations"),
+    ("--resume --experiment_name=not_yaml", "config.yaml' is not valid YAML"),
+    ("--resume --experiment_name=no_mapping", "config.yaml' lacks the entries task, env and train"),
+    ("--resume --experiment_name=no_entries", "config.yaml' lacks the entries task, env and train"),
+    ("--resume --experiment_name=no_config", "has no config.yaml"),
+    ("--resume --experiment_name=unknown_key", "unknown config key 'env.num_env'; did you mean 'env.num_envs'?"),
+    ("--resume --experiment_name=wrong_type", "'rewards.scales.torques' takes a value like -0.0002, not 'little'"),
+    ("--resume --experiment_name=no_section", "is a section with entries, it cannot be the value 3"),
+    ("--resume --experiment_name=text_checkpoint", "model_2.pt' is not a readable checkpoint"),
+    ("--resume --experiment_name=half_checkpoint", "model_2.pt' is not a readable checkpoint"),
+    ("--resume --experiment_name=a1_position --task=a1_torque", "is of task 'a1_position', not 'a1_torque'"),
+    # values that would only fail somewhere deep inside
+    ("--set=env.num_envs=", "env.num_envs"),
+    ("--set=env.num_envs=null", "env.num_envs"),
+    ("--set=env.num_envs=2026-99-99", "2026-99-99"),
+    ("--set=init_state.pos=[0, 0]", "init_state.pos"),
+    ("--set=algorithm.num_mini_batches=0", "algorithm.num_mini_batches"),
+    ("--set=algorithm.num_learning_epochs=0", "algorithm.num_learning_epochs"),
+    ("--set=runner.save_interval=0", "runner.save_interval"),
+    ("--set=actor.activation=relo", "relo"),
+    ("--set=actor.class_name=MPLModel", "MPLModel"),
+    ("--set=asset.terminate_after_contacts_on=[trnk]", "did you mean 'trunk'?"),
+]
+
+
+def assert_told_in_one_line(result, message):
+    """The exit status is 2 and standard error one line that begins with ``error:`` and holds the message."""
+    status, _, error = result
+    assert error.startswith("error: ") and error.count("\n") == 1 and error.endswith("\n"), error
+    assert message in error
+    assert status == 2
+
+
+@pytest.mark.parametrize(("words", "message"), MISTAKES, ids=[words for words, _ in MISTAKES])
+def test_mistakes_when_training(root, words, message):
+    """Exit status 2, one line that names the mistake and the nearest valid name, and nothing is written."""
+    before = contents(root)
+    result = run_here("train.py", *SMALL, *re.split(r" (?=--)", words), root=root)
+    assert_told_in_one_line(result, message)
+    assert contents(root) == before
+
+
+@pytest.mark.parametrize(
+    ("script", "words", "message"),
+    [
+        ("play.py", "--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
+        ("play.py", "--load_run=2026", "unknown run '2026'"),
+        ("play.py", "--checkpoint=7", "unknown checkpoint '7'; allowed: 1, 2"),
+        ("play.py", "--experiment_name=not_yaml", "config.yaml' is not valid YAML"),
+        ("play.py", "--experiment_name=text_checkpoint", "model_2.pt' is not a readable checkpoint"),
+        (
+            "play.py",
+            "--experiment_name=a1_position --task=a1_multihead",
+            "is of task 'a1_position', not 'a1_multihead'",
+        ),
+        ("play.py", "--num_envs=0", "num_envs must be at least 1, not 0"),
+        ("play.py", "--steps=0", "--steps must be at least 1, not 0"),
+        ("play.py", "--stpes=5", "unknown option '--stpes=5'; did you mean '--steps'?"),
+        ("play.py", "--set=control.stifness=1", "did you mean 'control.stiffness'?"),
+        ("learning_curve.py", "--steps=0", "--steps must be at least 1, not 0"),
+        ("learning_curve.py", "--load_run=2026", "unknown run '2026'"),
+    ],
+)
+def test_mistakes_after_training(root, script, words, message):
+    """The other scripts tell mistakes in the same way."""
+    before = contents(root)
+    result = run_here(script, "--task=a1_position", "--device=cpu", *words.split(), root=root)
+    assert_told_in_one_line(result, message)
+    assert contents(root) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
+        ("--num_envs 0", "num_envs must be at least 1, not 0"),
+        ("--rounds=0", "--rounds must be at least 1, not 0"),
+        ("--device=cup", "unknown device 'cup'; did you mean 'cpu'?"),
+    ],
+)
+def test_mistakes_when_benchmarking(tmp_path, words, message):
+    """So does the benchmark."""
+    small = ["--task=a1_position", "--device=cpu", "--rounds=1"]
+    assert_told_in_one_line(run_here("benchmark.py", *small, *words.split(), root=tmp_path), message)
+
+
+@pytest.mark.parametrize("script", ["train.py", "play.py", "learning_curve.py", "benchmark.py"])
+def test_help(script, tmp_path):
+    """``--help`` describes the options."""
+    status, output, error = run_here(script, "--help", root=tmp_path)
+    assert (status, error) == (0, "")
+    assert "--task" in output and "--num_envs" in output and "--device" in output
+
+
+def test_run_folder(root):
+    """A run leaves its checkpoints, events and settings, in a folder named by its time and name."""
+    (run,) = (root / "logs" / "a1_position").glob("*_good")
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_good", run.name)
+    assert {path.name.split(".tfevents")[0] for path in run.iterdir() if path.is_file()} == {
+        "model_1.pt",
+        "model_2.pt",
+        "events.out",
+        "config.yaml",
+    }
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    assert (config["task"], config["preset"], config["device"], config["max_iterations"]) == (
+        "a1_position",
+        "parallel",
+        "cpu",
+        2,
+    )
+    assert config["env"]["env"]["num_envs"] == 2 and config["train"]["runner"]["num_steps_per_env"] == 4
+    assert config["versions"]["torch"] == torch.__version__
+
+
+def test_resume_in_a_folder_by_its_path(root, tmp_path):
+    """``--load_run`` takes a path, ``--checkpoint`` an earlier checkpoint, and other options still change settings."""
+    (run,) = (root / "logs" / "a1_position").glob("*_good")
+    words = [f"--load_run={run}", "--checkpoint=1", "--resume", "--max_iterations=2", "--logger=none", "--seed=9"]
+    status, _, error = run_here("train.py", "--task=a1_position", "--device=cpu", *words, root=tmp_path)
+    assert (status, error) == (0, "")
+    (new,) = (tmp_path / "logs" / "a1_position").iterdir()
+    assert {path.name for path in new.iterdir() if path.is_file()} == {"config.yaml", "model_2.pt"}
+    state = torch.load(new / "model_2.pt", weights_only=True)
+    assert (state["iter"], state["infos"]["total_timesteps"]) == (2, 2 * 2 * 4)
+    train = yaml.safe_load((new / "config.yaml").read_text())["train"]
+    assert (train["seed"], train["runner"]["logger"], train["runner"]["num_steps_per_env"]) == (9, "none", 4)
+
+
+def test_learning_curve(root, tmp_path):
+    """Every checkpoint is measured, at the number of steps after which it was saved."""
+    words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--steps=3", f"--json={tmp_path / 'curve.json'}"]
+    status, output, error = run_here("learning_curve.py", *words, root=root)
+    assert (status, error) == (0, "") and len(output.splitlines()) == 2
+    curve = json.loads((tmp_path / "curve.json").read_text())
+    assert [point["steps"] for point in curve["points"]] == [8, 16]
+    assert all(math.isfinite(value) for point in curve["points"] for value in point.values())
+
+
+def test_list_of_tasks(tmp_path):
+    """``train.py --list`` prints the names of all tasks, one a line, and writes nothing."""
+    assert run_here("train.py", "--list", root=tmp_path) == (0, "\n".join([*TASKS, ""]), "")
+    assert not list(tmp_path.iterdir())
+
+
+def test_late_mistake_in_a_process_of_its_own(experiment):
+    """A mistake that shows only when the simulator is there is one line too, and leaves no folder."""
+    result = finish(start("train.py", *SMALL, f"--experiment_name={experiment}", "--logger=tensorbord"))
+    assert_told_in_one_line(result, "unknown logger 'tensorbord'; did you mean 'tensorboard'?")
+    assert not (ROOT / "logs" / experiment).exists()
+
+
+def test_train_stop_resume_play(experiment):
+    """Ctrl-C saves and ends with status 0, resuming goes on with all counters, and playing prints how it walks."""
+    task = ["--task=a1_torque_multihead", f"--experiment_name={experiment}", "--device=cpu"]
+    settings = {
+        "runner.num_steps_per_env": 4,
+        "env.episode_length_s": 0.06,  # three steps: there are rewards of whole episodes to print
+        "control.mixing.update_interval": 8,
+        "control.mixing.pd.t_end": 400,
+    }
+    changes = [f"--set={key}={value}" for key, value in settings.items()]
+    process = start("train.py", *task, *changes, "--num_envs=2", "--max_iterations=100000")
+    for line in process.stdout:
+        if "Learning iteration 1/" in line:
+            break
+    process.send_signal(signal.SIGINT)
+    status, output, error = finish(process)
+    assert status == 0 and "Traceback" not in error and "Stopping" in output + error
+    (first,) = (ROOT / "logs" / experiment).iterdir()
+    (checkpoint,) = first.glob("*.pt*")
+    count = int(checkpoint.stem.removeprefix("model_"))
+    state = torch.load(checkpoint, weights_only=True)
+    assert 2 <= count == state["iter"] and state["infos"]["total_timesteps"] == count * 8
+    events = EventAccumulator(str(first)).Reload()
+    assert [event.step for event in events.Scalars("Loss/value")] == list(range(count))
+
+    status, output, error = run_here("train.py", *task, "--resume", f"--max_iterations={count + 2}", root=ROOT)
+    assert (status, error) == (0, "")
+    (second,) = set((ROOT / "logs" / experiment).iterdir()) - {first}
+    state = torch.load(second / f"model_{count + 2}.pt", weights_only=True)
+    assert state["iter"] == count + 2 and state["infos"]["total_timesteps"] == (count + 2) * 8
+    assert int(state["infos"]["task"]["total_steps"]) == (count + 2) * 8
+    for number in (count, count + 1):
+        assert f"Learning iteration {number}/{count + 2}" in output
+        assert re.search(rf"Curriculum/mixing_pd: {1.0 - number * 8 / 400:.4f}", output)
+    for name in ("Steps per second", "ETA", "Mean reward", "Tracking/error_xy", "Tracking/error_yaw"):
+        assert output.count(f"{name}:") == 2
+    for name in ("Curriculum/weight_tracking_lin_vel", "Curriculum/mixing_torque", "Health/diverged_worlds"):
+        assert output.count(f"{name}:") == 2
+    configs = [yaml.safe_load((run / "config.yaml").read_text()) for run in (first, second)]
+    assert configs[0]["env"] == configs[1]["env"] and configs[0]["train"] == configs[1]["train"]
+    assert configs[1]["env"]["env"]["num_envs"] == 2 and configs[1]["versions"]["torch"] == torch.__version__
+
+    status, output, error = finish(start("play.py", *task, "--num_envs=2", "--steps=10"))
+    assert status == 0 and "Traceback" not in error
+    assert f"model_{count + 2}.pt, after {(count + 2) * 8:,} steps of training:" in output
+    for name in ("track_xy", "track_angular", "cost_of_transport", "falls_per_minute"):
+        assert math.isfinite(float(re.search(rf"^\s*{name}\s+(\S+)", output, re.MULTILINE).group(1)))
+    line = output.splitlines()[-1]
+    if line.startswith("video: "):
+        assert Path(line.removeprefix("video: ")).read_bytes()[4:8] == b"ftyp"  # the mark of an mp4
+    else:
+        assert re.match(r"no video: .+", line)
