@@ -43,7 +43,8 @@ class Simulator:
         ctrl: Joint torques [N m]. Shape: (num_envs, nu).
         contact_found: Number of contacts of each sensed geom with the floor, as of the start of the last physics step;
             0 after a step that did not sense. Shape: (num_envs, geoms).
-        contact_force: Net contact force on each sensed geom in the world frame [N], likewise. Shape: (num_envs, geoms, 3).
+        contact_force: Net contact force on each sensed geom in the world frame [N], likewise.
+            Shape: (num_envs, geoms, 3).
         diverged: Worlds whose state was seen to be not finite or absurdly large since the last :meth:`clear_diverged`.
             Shape: (num_envs,), bool.
     """
