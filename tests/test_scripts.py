@@ -318,7 +318,7 @@ def test_train_stop_resume_play(experiment):
     assert int(state["infos"]["task"]["total_steps"]) == (count + 2) * 8
     for number in (count, count + 1):
         assert f"Learning iteration {number}/{count + 2}" in output
-        assert re.search(rf"Curriculum/mixing_pd: {1.0 - number * 8 / 400:.4f}", output)
+        assert re.search(rf"Curriculum/mixing_pd: {max(0.0, 1.0 - number * 8 / 400):.4f}", output)
     for name in ("Steps per second", "ETA", "Mean reward", "Tracking/error_xy", "Tracking/error_yaw"):
         assert output.count(f"{name}:") == 2
     for name in ("Curriculum/weight_tracking_lin_vel", "Curriculum/mixing_torque", "Health/diverged_worlds"):

@@ -18,17 +18,20 @@ VELOCITY_COLOR = (0.1, 0.4, 1.0, 0.9)
 
 
 class Recorder:
-    """Keeps what one world does, to draw it as a video."""
+    """Keeps what one world does, to draw it as a video: the one with the fastest command at the start."""
 
-    def __init__(self, task: LeggedRobot, world: int = 0) -> None:
-        """Record ``world`` of ``task``."""
+    def __init__(self, task: LeggedRobot) -> None:
+        """Record one world of ``task``."""
         self._task = task
-        self._world = world
+        self._world: int | None = None
         self._frames: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def add_step(self) -> None:
         """Keep the state after a control step."""
-        task, world = self._task, self._world
+        task = self._task
+        if self._world is None:
+            self._world = int(task.commands[:, :2].norm(dim=1).argmax())
+        world = self._world
         parts = (task.sim.qpos, task.commands, task.base_lin_vel)
         self._frames.append(tuple(part[world].double().cpu().numpy() for part in parts))
 
@@ -59,8 +62,9 @@ class Recorder:
                 mujoco.mj_forward(model, data)
                 renderer.update_scene(data, camera=_follow(qpos))
                 rotation = data.xmat[1].reshape(3, 3)
-                for vector, color in ((command, COMMAND_COLOR), (velocity, VELOCITY_COLOR)):
-                    _add_arrow(renderer.scene, qpos[:3], rotation @ [vector[0], vector[1], 0.0], color)
+                for vector, color, height in ((command, COMMAND_COLOR, 0.24), (velocity, VELOCITY_COLOR, 0.2)):
+                    start = qpos[:3] + [0.0, 0.0, height]
+                    _add_arrow(renderer.scene, start, rotation @ [vector[0], vector[1], 0.0], color)
                 writer.append_data(renderer.render())
 
 
@@ -72,12 +76,11 @@ def _follow(qpos: np.ndarray) -> mujoco.MjvCamera:
     return camera
 
 
-def _add_arrow(scene: mujoco.MjvScene, base: np.ndarray, vector: np.ndarray, color: tuple[float, ...]) -> None:
-    """Draw a velocity [m/s] as an arrow above the robot, 0.4 m long for 1 m/s."""
+def _add_arrow(scene: mujoco.MjvScene, start: np.ndarray, vector: np.ndarray, color: tuple[float, ...]) -> None:
+    """Draw a velocity [m/s] as an arrow, 0.5 m long for 1 m/s."""
     if np.linalg.norm(vector) < 1e-3 or scene.ngeom >= scene.maxgeom:
         return
-    start = base + [0.0, 0.0, 0.2]
     geom = scene.geoms[scene.ngeom]
     mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.zeros(9), np.float32(color))
-    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.012, start, start + 0.4 * vector)
+    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.012, start, start + 0.5 * vector)
     scene.ngeom += 1

@@ -145,7 +145,7 @@ class LeggedRobot(RewardTerms, VecEnv):
 
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the scalars that curricula set, for logging: here the weights of reward terms that have one."""
-        weights = self._reward_scales / self.dt * self._reward_curriculum(self.total_steps)
+        weights = self.reward_weights() / self.dt
         curricula = section_keys(self.cfg.rewards.curriculum)
         return {f"weight_{name}": weights[i] for i, name in enumerate(self.reward_names) if name in curricula}
 
@@ -248,9 +248,8 @@ class LeggedRobot(RewardTerms, VecEnv):
         self.sim.reset(mask)
         self._reset_dofs(mask)
         self._reset_root_states(mask)
-        column = mask.unsqueeze(1)
-        for buffer in (self.actions, self.feet_air_time, self.contacts, self.feet_contact):
-            buffer.masked_fill_(column, 0.0)
+        for buffer in (self.actions, self.feet_air_time):
+            buffer.masked_fill_(mask.unsqueeze(1), 0.0)
         self._episode_length_buf.masked_fill_(mask, 0)
         self.episode_sums.masked_fill_(mask, 0.0)
         self.episode_return.masked_fill_(mask, 0.0)
