@@ -23,9 +23,14 @@ def main() -> None:
         print("\n".join(task_registry.names()))
         return
     if args.resume:
+        if args.preset:
+            raise UserError("--preset cannot be given with --resume, which keeps the settings of the run")
         run_dir, env_cfg, train_cfg = load_run(args)
-        args.load_run = str(run_dir)
+        args.load_run, args.preset = str(run_dir), args.run_config["preset"]
+        args.max_iterations = args.max_iterations or args.run_config["max_iterations"]
         find_checkpoint(run_dir, args.checkpoint)  # a mistake is told before anything is built
+    elif args.load_run or args.checkpoint is not None:
+        raise UserError("--load_run and --checkpoint need --resume")
     else:
         env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
     set_seed(train_cfg.seed)
@@ -35,7 +40,8 @@ def main() -> None:
     remaining = total - runner.current_learning_iteration
     if remaining < 1:
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
-    settings = {"task": args.task, "preset": args.preset, "device": env.device, "max_iterations": total}
+    runner.claim_log_dir()
+    settings = {"task": args.task, "preset": args.preset or "parallel", "device": env.device, "max_iterations": total}
     print(f"Training {args.task} on {device_name(env.device)}: {env.num_envs} worlds, {total} iterations.")
     print("The first run on a machine compiles kernels before its first iteration, for about a minute.")
     print(f"Curves: tensorboard --logdir {runner.log_dir}", flush=True)

@@ -620,3 +620,22 @@ def test_apply_args_needs_only_what_a_script_offers():
     add_task_args(parser)
     apply_args(env_cfg, train_cfg, parser.parse_args(["--device=cpu", "--num_envs=3"]))
     assert env_cfg.env.num_envs == 3 and to_dict(train_cfg) == before
+
+
+def test_runs_of_the_same_second_do_not_share_a_folder(tmp_path):
+    """Every run gets a folder of its own, numbered where the name is taken."""
+    folders = [runs.claim_run_dir(tmp_path / "logs" / "2026-11-21_10-00-00") for _ in range(3)]
+    assert [folder.name for folder in folders] == [f"2026-11-21_10-00-00{end}" for end in ("", "_2", "_3")]
+    assert all(folder.is_dir() for folder in folders)
+
+
+def test_tuples_are_lists():
+    """A variant may write its ranges as tuples: they come back from a file as the lists that they are then."""
+
+    class Variant(BaseConfig):
+        limits = (-0.5, 1.0)
+
+    cfg = Variant()
+    assert cfg.limits == [-0.5, 1.0]
+    update_from_dict(cfg, {"limits": [0.0, 2.0]})
+    assert cfg.limits == [0.0, 2.0]

@@ -325,6 +325,8 @@ def test_only_the_spoiled_minibatch_is_skipped(field, value):
     report = ours.update()
     assert report["skipped_updates"] == 1
     assert all(math.isfinite(number) for number in report.values())
+    entropy = NUM_ACTIONS * 0.5 * (1.0 + math.log(2.0 * math.pi))  # of deviations around 1, whose mean it reports
+    assert report["entropy"] == pytest.approx(entropy, abs=0.1)
     assert steps_taken(ours) == 3
     assert_same_state(state_of(ours), state_of(expected))
 
@@ -393,6 +395,8 @@ def test_learning_rate_ignores_an_undefined_divergence():
     [
         ({"optimizer": "adamm"}, "unknown optimizer 'adamm'; did you mean 'adam'?"),
         ({"optimizer": "sgd"}, "unknown optimizer 'sgd'; allowed: adam, adamw"),
+        ({"use_mixed_precision": True}, "does not support algorithm.use_mixed_precision"),
+        ({"symmetry_cfg": {"use_mirror_loss": True}}, "does not support algorithm.symmetry_cfg"),
         ({"num_mini_batches": SAMPLES + 1}, "num_mini_batches is 65, more than the samples of a rollout"),
     ],
 )

@@ -154,6 +154,17 @@ MISTAKES = [
     ("--set=runner.save_interval=0", "runner.save_interval"),
     ("--set=actor.activation=relo", "relo"),
     ("--set=actor.class_name=MPLModel", "MPLModel"),
+    ("--set=actor.hidden_dims=[]", "actor.hidden_dims"),
+    ("--set=actor.distribution_cfg.class_name=Gauss", "actor.distribution_cfg.class_name"),
+    ("--set=actor.distribution_cfg.std_type=lg", "unknown actor.distribution_cfg.std_type 'lg'; did you mean 'log'?"),
+    ("--set=actor.distribution_cfg.init_std=0", "actor.distribution_cfg.init_std must be greater than 0"),
+    ("--set=obs_groups.actor=[polic]", "did you mean 'policy'?"),
+    ("--set=algorithm.schedule=adaptiv", "did you mean 'adaptive'?"),
+    ("--set=env.num_actions=24", "env.num_actions must be 12 for LeggedRobot, not 24"),
+    ("--seed=99999999999999999999999", "seed must be from 0"),
+    ("--run_name=a/b", "runner.run_name must be a name, not the path 'a/b'"),
+    ("--load_run=2026", "--load_run and --checkpoint need --resume"),
+    ("--resume --preset=paper", "--preset cannot be given with --resume"),
     ("--set=asset.terminate_after_contacts_on=[trnk]", "did you mean 'trunk'?"),
 ]
 
@@ -337,3 +348,15 @@ def test_train_stop_resume_play(experiment):
         assert Path(line.removeprefix("video: ")).read_bytes()[4:8] == b"ftyp"  # the mark of an mp4
     else:
         assert re.match(r"no video: .+", line)
+
+
+def test_resume_keeps_the_number_of_iterations(root, tmp_path):
+    """Without a wish, a resumed run goes on to the number of iterations that it was started for."""
+    (run,) = (root / "logs" / "a1_position").glob("*_good")
+    words = [f"--load_run={run}", "--checkpoint=1", "--resume", "--logger=none", "--task=a1_position", "--device=cpu"]
+    status, _, error = run_here("train.py", *words, root=tmp_path)
+    assert (status, error) == (0, "")
+    (new,) = (tmp_path / "logs" / "a1_position").iterdir()
+    assert [path.name for path in new.glob("model_*")] == ["model_2.pt"]
+    config = yaml.safe_load((new / "config.yaml").read_text())
+    assert (config["max_iterations"], config["preset"]) == (2, "parallel")

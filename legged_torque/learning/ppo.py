@@ -18,7 +18,7 @@ MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2
 """Bounds of the adaptive learning rate, those of rsl_rl."""
 
 LOSS_NAMES = ("value", "surrogate", "entropy", "kl", "gradient_norm", "skipped_updates")
-"""What an update reports: means over its minibatches, except the last, which is a count."""
+"""What an update reports: means over the minibatches that were learned from, and how many were not."""
 
 
 class OnDevicePPO(PPO):
@@ -52,6 +52,11 @@ class OnDevicePPO(PPO):
         """
         if optimizer not in ("adam", "adamw"):
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
+        for name in ("rnd_cfg", "symmetry_cfg", "multi_gpu_cfg", "use_mixed_precision"):
+            if kwargs.get(name):
+                raise UserError(f"{type(self).__name__} does not support algorithm.{name}")
+        if actor.is_recurrent or critic.is_recurrent:
+            raise UserError(f"{type(self).__name__} does not support recurrent models")
         super().__init__(actor, critic, storage, learning_rate=learning_rate, optimizer=optimizer, **kwargs)
         self._batch_size = storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches
         if self._batch_size < 1:
@@ -97,8 +102,8 @@ class OnDevicePPO(PPO):
         self._update_normalization()
         self.storage.clear()
         losses = dict(zip(LOSS_NAMES, self._losses.tolist(), strict=True))
-        updates = self.num_learning_epochs * self.num_mini_batches
-        return {name: loss if name == "skipped_updates" else loss / updates for name, loss in losses.items()}
+        updates = self.num_learning_epochs * self.num_mini_batches - losses["skipped_updates"]
+        return {name: loss if name == "skipped_updates" else loss / max(updates, 1) for name, loss in losses.items()}
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Load as rsl_rl does, and keep the learning rate the tensor that it was."""

@@ -9,11 +9,13 @@ from pathlib import Path
 import torch
 from rsl_rl import runners
 
+import legged_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning.ppo import OnDevicePPO
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
+from legged_torque.utils.runs import claim_run_dir
 
 MAX_CAPTURED_STEPS = 64
 """Longer rollouts replay step by step: capturing them would take minutes and gigabytes."""
@@ -40,6 +42,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         """
         torch.set_float32_matmul_precision("high")  # TF32 on a GPU
         super().__init__(env, train_cfg, log_dir, device)
+        self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         self.log_dir = log_dir
         self._seconds_before = 0.0  # training time before this process
         self._rollout = CudaGraph(self._collect, device, enabled=self.cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS)
@@ -74,6 +77,10 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self._save_checkpoint()
         self.logger.stop_logging_writer()
 
+    def claim_log_dir(self) -> None:
+        """Create the run's folder, under another name if a run that started in the same second has it already."""
+        self.log_dir = self.logger.log_dir = str(claim_run_dir(Path(self.log_dir)))
+
     def save(self, path: str, infos: dict | None = None) -> None:
         """Save everything that training needs to continue, atomically.
 
@@ -90,8 +97,11 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             "seconds": self._seconds_before + self.logger.tot_time,
         }
         part = f"{path}.part"
-        torch.save(state, part)
-        os.replace(part, path)
+        try:
+            torch.save(state, part)
+            os.replace(part, path)
+        finally:
+            Path(part).unlink(missing_ok=True)
         self.logger.save_model(path, self.current_learning_iteration)
 
     def load(

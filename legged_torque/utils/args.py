@@ -68,7 +68,7 @@ def add_train_args(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--resume", action="store_true", help="continue a run, with its settings")
     parser.add_argument("--run_name", help="added to the name of the run's folder")
-    parser.add_argument("--preset", default="parallel", help="training settings: parallel or paper (Table II)")
+    parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
     parser.add_argument("--logger", help="where curves are written: tensorboard, wandb or none")
 
 
@@ -81,7 +81,7 @@ def apply_args(env_cfg: Any, train_cfg: Any, args: argparse.Namespace) -> None:
     Raises:
         UserError: If an argument makes no sense.
     """
-    apply_preset(env_cfg, train_cfg, getattr(args, "preset", "parallel"))
+    apply_preset(env_cfg, train_cfg, getattr(args, "preset", None) or "parallel")
     if resolve_device(args.device) == "cpu":
         env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
     run_config = getattr(args, "run_config", None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 from typing import Any
 
@@ -30,8 +31,8 @@ def instantiate_sections(section: Any) -> None:
             value = value()
             if not isinstance(value, BaseConfig):
                 instantiate_sections(value)
-        elif isinstance(value, (list, dict)):
-            value = yaml.safe_load(yaml.safe_dump(value))
+        elif isinstance(value, (list, tuple, dict)):
+            value = copy.deepcopy(list(value) if isinstance(value, tuple) else value)  # YAML knows no tuples
         setattr(section, key, value)
 
 

@@ -23,6 +23,18 @@ def new_run_dir(log_root: Path, run_name: str) -> Path:
     return log_root / (f"{name}_{run_name}" if run_name else name)
 
 
+def claim_run_dir(run_dir: Path) -> Path:
+    """Create a run's folder and return it, with a number added if another run that started just now has taken it."""
+    candidate, number = run_dir, 1
+    while True:
+        try:
+            candidate.mkdir(parents=True)
+            return candidate
+        except FileExistsError:
+            number += 1
+            candidate = run_dir.with_name(f"{run_dir.name}_{number}")
+
+
 def find_run(log_root: Path, load_run: str | None) -> Path:
     """Return the folder of a run.
 
@@ -69,10 +81,9 @@ def checkpoint_numbers(run_dir: Path) -> list[int]:
 
 def save_config(run_dir: str | Path, config: dict[str, Any]) -> None:
     """Write the settings of a run and the versions of the packages that it uses."""
-    run_dir = Path(run_dir)
-    run_dir.mkdir(parents=True, exist_ok=True)
     text = yaml.safe_dump({**config, "versions": package_versions()}, sort_keys=False)
-    (run_dir / CONFIG_FILE).write_text(text, encoding="utf-8")
+    Path(run_dir).mkdir(parents=True, exist_ok=True)
+    (Path(run_dir) / CONFIG_FILE).write_text(text, encoding="utf-8")
 
 
 def load_config(run_dir: Path) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import copy
+import importlib.util
 import io
 import math
 from pathlib import Path
@@ -109,6 +110,8 @@ class TaskRegistry:
                 raise ValueError("make_alg_runner needs a task's name or its train_cfg")
             _, train_cfg = self.get_cfgs(name, args)
         root = experiment_dir(train_cfg) if log_root == "default" else log_root and Path(log_root)
+        if root and train_cfg.runner.logger == "wandb" and importlib.util.find_spec("wandb") is None:
+            raise UserError("--logger wandb needs the extra: pip install -e .[wandb]")
         log_dir = str(new_run_dir(root, train_cfg.runner.run_name)) if root else None
         runner_class = resolve_callable(train_cfg.runner.class_name)
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints its networks at length
@@ -166,11 +169,6 @@ def _logger_cfg(runner: Any) -> dict[str, str]:
     }
     if runner.logger not in backends:
         raise unknown_name("logger", runner.logger, backends)
-    if runner.logger == "wandb":
-        try:
-            import wandb  # noqa: F401
-        except ImportError:
-            raise UserError("--logger wandb needs the extra: pip install -e .[wandb]") from None
     return backends[runner.logger]
 
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from rsl_rl.utils import resolve_callable, resolve_nn_activation
 
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.config import to_dict
+from legged_torque.utils.errors import UserError, unknown_name
+
+SCHEDULES = ("adaptive", "fixed")
+STD_TYPES = ("log", "scalar")
+OBS_GROUPS = ("policy", "critic")
 
 
 def check_train_cfg(train_cfg: Any) -> None:
@@ -27,12 +33,31 @@ def check_train_cfg(train_cfg: Any) -> None:
         value = getattr(train_cfg.algorithm, key)
         if not value > 0.0:
             raise UserError(f"algorithm.{key} must be greater than 0, not {value}")
+    for key in ("run_name", "experiment_name"):
+        value = getattr(train_cfg.runner, key)
+        if value and Path(value).name != value:
+            raise UserError(f"runner.{key} must be a name, not the path '{value}'")
+    if not 0 <= train_cfg.seed < 2**63:
+        raise UserError(f"seed must be from 0 to 2^63 - 1, not {train_cfg.seed}")
+    if train_cfg.algorithm.schedule not in SCHEDULES:
+        raise unknown_name("algorithm.schedule", train_cfg.algorithm.schedule, SCHEDULES)
+    distribution = train_cfg.actor.distribution_cfg
+    if distribution.std_type not in STD_TYPES:
+        raise unknown_name("actor.distribution_cfg.std_type", distribution.std_type, STD_TYPES)
+    if not distribution.init_std > 0.0:
+        raise UserError(f"actor.distribution_cfg.init_std must be greater than 0, not {distribution.init_std}")
+    for key, groups in to_dict(train_cfg.obs_groups).items():
+        for group in groups or [""]:
+            if group not in OBS_GROUPS:
+                raise unknown_name(f"observation group in obs_groups.{key}", group, OBS_GROUPS)
+    _check_with(resolve_callable, "actor.distribution_cfg.class_name", distribution.class_name)
     for section in ("runner", "algorithm", "actor", "critic"):
         _check_with(resolve_callable, f"{section}.class_name", getattr(train_cfg, section).class_name)
     for section in ("actor", "critic"):
         _check_with(resolve_nn_activation, f"{section}.activation", getattr(train_cfg, section).activation)
-        if any(size < 1 for size in getattr(train_cfg, section).hidden_dims):
-            raise UserError(f"{section}.hidden_dims must be at least 1 each")
+        sizes = getattr(train_cfg, section).hidden_dims
+        if not sizes or min(sizes) < 1:
+            raise UserError(f"{section}.hidden_dims must be one size or more, each at least 1, not {sizes}")
 
 
 def _check_with(resolve: Any, key: str, name: str) -> None:

@@ -16,6 +16,8 @@ class MultiHeadRobot(LeggedRobot):
         mixing: theta_pd and theta_torque of eq. 7. Shape: (2,).
     """
 
+    actions_per_dof = 2
+
     def _init_buffers(self) -> None:
         """Allocate the mixing weights as well."""
         super()._init_buffers()

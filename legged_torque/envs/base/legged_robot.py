@@ -49,6 +49,7 @@ class LeggedRobot(RewardTerms, VecEnv):
     """
 
     cfg: LeggedRobotCfg
+    actions_per_dof = 1
 
     def __init__(self, cfg: LeggedRobotCfg, device: str = "cpu") -> None:
         """Create the worlds and put each into a random initial state.
@@ -293,6 +294,9 @@ class LeggedRobot(RewardTerms, VecEnv):
         )
         self.dof_names = [model.joint(i).name for i in range(1, model.njnt)]
         self.num_dof = len(self.dof_names)
+        if self.num_actions != self.actions_per_dof * self.num_dof:
+            expected = self.actions_per_dof * self.num_dof
+            raise UserError(f"env.num_actions must be {expected} for {type(self).__name__}, not {self.num_actions}")
         self.base_pos, self.base_quat = self.sim.qpos[:, :3], self.sim.qpos[:, 3:7]
         self.dof_pos, self.dof_vel = self.sim.qpos[:, 7:], self.sim.qvel[:, 6:]
         self.base_ang_vel = self.sim.qvel[:, 3:6]
