@@ -82,11 +82,13 @@ def link_offset(leg, link):
 def quat_to_matrix(quat):
     """Rotation matrix of a (w, x, y, z) quaternion, normalized first."""
     w, x, y, z = np.asarray(quat, dtype=float) / np.linalg.norm(quat)
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def full_inertia(principal, quat):
@@ -147,11 +149,13 @@ def test_trunk_inertial(model):
     trunk = model.body("trunk")
     assert trunk.mass[0] == pytest.approx(4.713)
     np.testing.assert_allclose(trunk.ipos, (0.0, 0.0041, -0.0005), atol=1e-9)
-    expected = np.array([
-        [0.0158533, -3.66e-05, -6.11e-05],
-        [-3.66e-05, 0.0377999, -2.75e-05],
-        [-6.11e-05, -2.75e-05, 0.0456542],
-    ])
+    expected = np.array(
+        [
+            [0.0158533, -3.66e-05, -6.11e-05],
+            [-3.66e-05, 0.0377999, -2.75e-05],
+            [-6.11e-05, -2.75e-05, 0.0456542],
+        ]
+    )
     np.testing.assert_allclose(full_inertia(trunk.inertia, trunk.iquat), expected, atol=1e-9)
 
 

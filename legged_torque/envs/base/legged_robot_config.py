@@ -9,27 +9,37 @@ class LeggedRobotCfg(BaseConfig):
     """Settings of :class:`~legged_torque.envs.base.legged_robot.LeggedRobot`."""
 
     class env:
+        """Worlds and episodes."""
+
         num_envs = 4096
         num_envs_cpu = 64  # default on a CPU, where a world-step costs about a millisecond
         num_actions = 12
         episode_length_s = 20.0
 
     class asset:
+        """The robot, and which of its geoms mean what."""
+
         file = ""  # MJCF, relative to the repository's root or absolute
         foot_name = "foot"  # collision geoms whose name contains this are feet
         penalize_contacts_on: list[str] = []  # likewise: those of the collision term
         terminate_after_contacts_on: list[str] = []  # likewise: those that end an episode
 
     class sim:
+        """Physics."""
+
         dt = 0.005  # [s] physics step
         solver_iterations = 5
         ls_iterations = 8  # line search
 
     class init_state:
+        """Where episodes start, and the nominal pose."""
+
         pos = [0.0, 0.0, 0.4]  # [m] of the trunk at a reset: high enough for stretched legs
         default_joint_angles: dict[str, float] = {}  # [rad] q_nominal, by joint name
 
     class domain_rand:
+        """What is drawn at random."""
+
         # initial state, drawn uniformly at every reset
         init_roll = [-0.19635, 0.19635]  # [rad] +-pi/16
         init_pitch = [-0.19635, 0.19635]  # [rad] +-pi/16
@@ -37,14 +47,20 @@ class LeggedRobotCfg(BaseConfig):
         init_dof_pos_scale = [0.5, 1.5]  # times q_nominal, then inside the joint limits
 
     class commands:
+        """Commanded velocities, in the trunk's frame."""
+
         resampling_probability = 0.002  # per control step: about every 10 s at 50 Hz
 
         class ranges:
+            """Drawn uniformly."""
+
             lin_vel_x = [-1.0, 1.0]  # [m/s]
             lin_vel_y = [-1.0, 1.0]  # [m/s]
             ang_vel_yaw = [-1.0, 1.0]  # [rad/s]
 
     class control:
+        """From actions to torques."""
+
         decimation = 4  # physics steps per control step: 50 Hz
         refresh_torques = True  # whether torques are computed anew at every physics step
         stiffness = 20.0  # [N m/rad] Kp
@@ -53,6 +69,8 @@ class LeggedRobotCfg(BaseConfig):
         torque_scale = 4.0  # [N m] per unit of a torque action
 
     class rewards:
+        """The terms of Table III; each is a method ``_reward_<term>``."""
+
         only_positive_rewards = True  # clip the sum at 0 from below
         tracking_temperature = 4.0  # gamma of both tracking terms
         soft_dof_pos_limit = 0.9  # share of a joint's range, beyond which dof_pos_limits acts
@@ -91,10 +109,14 @@ class LeggedRobotCfg(BaseConfig):
                 t_end = 10_000_000
 
     class normalization:
+        """Scales and limits of what the networks see and say."""
+
         clip_observations = 100.0
         clip_actions = 100.0
 
         class obs_scales:
+            """Factors on observations."""
+
             lin_vel = 2.0
             ang_vel = 0.25
             dof_pos = 1.0
@@ -107,6 +129,8 @@ class LeggedRobotCfgPPO(BaseConfig):
     seed = 1
 
     class runner:
+        """Rollouts, checkpoints and logs."""
+
         class_name = "legged_torque.learning.runner:OnPolicyRunner"
         num_steps_per_env = 24
         total_steps = 110_000_000  # over all worlds; --max_iterations overrides it
@@ -117,25 +141,35 @@ class LeggedRobotCfgPPO(BaseConfig):
         wandb_project = "legged_torque"
 
     class obs_groups:
+        """Which observations which network reads."""
+
         actor = ["policy"]
         critic = ["critic"]
 
     class actor:
+        """The policy's network, an rsl_rl model."""
+
         class_name = "MLPModel"
         hidden_dims = [512, 256, 128]
         activation = "elu"
 
         class distribution_cfg:
+            """The distribution of its actions."""
+
             class_name = "legged_torque.learning.distribution:GaussianDistribution"
             init_std = 1.0
             std_type = "log"
 
     class critic:
+        """The value function's network."""
+
         class_name = "MLPModel"
         hidden_dims = [512, 256, 128]
         activation = "elu"
 
     class algorithm:
+        """PPO, with rsl_rl's names."""
+
         class_name = "legged_torque.learning.ppo:OnDevicePPO"
         num_learning_epochs = 5
         num_mini_batches = 4

@@ -1,0 +1,48 @@
+"""What the tests of settings share."""
+
+import pytest
+
+from legged_torque.envs import task_registry
+from legged_torque.utils.args import Parser, add_task_args, add_train_args
+from legged_torque.utils.errors import UserError
+
+TASKS = ["a1_position", "a1_torque", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
+
+
+def parse(*words):
+    """The namespace that train.py makes of a command line, on the CPU."""
+    parser = Parser("test")
+    add_task_args(parser)
+    add_train_args(parser)
+    return parser.parse_args(["--device=cpu", *words])
+
+
+def get_cfgs(*words, task="a1_position", run_config=None):
+    """A task's settings, changed by a command line."""
+    args = parse(*words)
+    if run_config is not None:
+        args.run_config = run_config
+    return task_registry.get_cfgs(task, args)
+
+
+def error_of(function, *args, **kwargs):
+    """The line that a mistake is told with."""
+    with pytest.raises(UserError) as error:
+        function(*args, **kwargs)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def get(section, path):
+    """A setting by its dotted path."""
+    for key in path.split("."):
+        section = section[key] if isinstance(section, dict) else getattr(section, key)
+    return section
+
+
+def flatten(values, path=""):
+    """Nested dictionaries as one of dotted paths."""
+    result = {}
+    for key, value in values.items():
+        result |= flatten(value, f"{path}{key}.") if isinstance(value, dict) and value else {f"{path}{key}": value}
+    return result

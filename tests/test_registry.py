@@ -1,0 +1,154 @@
+"""The registry of tasks, and settings that inherit."""
+
+import argparse
+import copy
+import inspect
+
+import pytest
+import torch
+from settings import TASKS, error_of, flatten, parse
+
+from legged_torque.envs import task_registry
+from legged_torque.envs.a1.a1_config import A1Cfg, A1CfgPPO
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.utils.config import BaseConfig, section_keys, to_dict, update_from_dict
+from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.task_registry import TaskRegistry
+
+
+def test_registered_tasks():
+    """The five approaches are there, each with settings of its own."""
+    assert task_registry.names() == TASKS
+    classes = {name: task_registry.get_task_class(name).__name__ for name in TASKS}
+    assert classes == {
+        "a1_position": "LeggedRobot",
+        "a1_torque": "TorqueRobot",
+        "a1_torque_curriculum": "TorqueCurriculumRobot",
+        "a1_torque_multihead": "MultiHeadRobot",
+        "a1_multihead": "MultiHeadRobot",
+    }
+    for name in TASKS:
+        env_cfg, train_cfg = task_registry.get_cfgs(name)
+        assert env_cfg.env.num_actions == (24 if name.endswith("multihead") else 12)
+        assert train_cfg.runner.experiment_name == name
+
+
+@pytest.mark.parametrize("name", ["a1_positon", "a1-position", "A1_position"])
+@pytest.mark.parametrize("function", ["get_task_class", "get_cfgs", "make_env"])
+def test_unknown_task(function, name):
+    """The nearest task is proposed and all are listed."""
+    line = error_of(getattr(task_registry, function), name)
+    assert line.startswith(f"unknown task '{name}'; did you mean 'a1_position'? allowed: ")
+    assert line.split("allowed: ")[1].split(", ") == sorted(TASKS)
+
+
+def test_name_without_a_near_match():
+    """Nothing is proposed where nothing is near."""
+    assert str(unknown_name("task", "xyz", ["b", "a"])) == "unknown task 'xyz'; allowed: a, b"
+
+
+def test_settings_are_independent_copies():
+    """Changing what the registry hands out changes neither the registry nor the classes."""
+    first_env, first_train = task_registry.get_cfgs("a1_torque")
+    before = copy.deepcopy((to_dict(first_env), to_dict(first_train)))
+    first_env.rewards.scales.torques = 1.0
+    first_env.commands.ranges.lin_vel_x[0] = -9.0
+    first_env.init_state.default_joint_angles["FR_hip_joint"] = 9.0
+    first_env.asset.penalize_contacts_on.append("hip")
+    first_train.actor.hidden_dims.append(1)
+    first_train.algorithm.gamma = 0.5
+    second = task_registry.get_cfgs("a1_torque")
+    assert (to_dict(second[0]), to_dict(second[1])) == before
+    cfg = A1Cfg()
+    cfg.commands.ranges.lin_vel_x[0] = -9.0
+    cfg.init_state.default_joint_angles["FR_hip_joint"] = 9.0
+    assert A1Cfg.init_state.default_joint_angles["FR_hip_joint"] == -0.1
+    assert A1Cfg.commands.ranges.lin_vel_x == [-1.0, 1.0]
+    assert A1CfgPPO.actor.hidden_dims == [512, 256, 128]
+
+
+class VariantCfg(A1Cfg):
+    """A variant as a user of legged_gym writes it."""
+
+    class control(A1Cfg.control):
+        stiffness = 40.0
+        new_gain = 3
+
+    class rewards(A1Cfg.rewards):
+        class scales(A1Cfg.rewards.scales):
+            torques = -1e-4
+            action_rate = 0.0
+
+
+def test_variant_changes_only_its_entries():
+    """A class that inherits differs from its parent in what it names, and in nothing else."""
+    variant, parent = flatten(to_dict(VariantCfg())), flatten(to_dict(A1Cfg()))
+    assert {key: value for key, value in variant.items() if key not in parent or parent[key] != value} == {
+        "control.stiffness": 40.0,
+        "control.new_gain": 3,
+        "rewards.scales.torques": -1e-4,
+        "rewards.scales.action_rate": 0.0,
+    }
+    assert parent.keys() <= variant.keys()
+    assert A1Cfg.control.stiffness == 20.0 and not hasattr(A1Cfg.control, "new_gain")
+
+
+def test_variant_is_built(make_task):
+    """A registered variant becomes a task with its settings; a reward scale of 0 is no term."""
+    registry = TaskRegistry()
+    registry.register("variant", LeggedRobot, VariantCfg(), A1CfgPPO())
+    env_cfg, _ = registry.get_cfgs("variant", parse("--num_envs=2"))
+    task, cfg = registry.make_env("variant", argparse.Namespace(device="cpu"), env_cfg)
+    assert task.cfg is cfg is env_cfg and task.num_envs == 2
+    assert "action_rate" not in task.reward_names
+    reference = make_task("a1_position", 2)
+    assert set(reference.reward_names) == {*task.reward_names, "action_rate"}
+    torch.testing.assert_close(
+        task._pd_torques(torch.zeros(2, 12)), 40.0 * (task.default_dof_pos - task.dof_pos) - 0.5 * task.dof_vel
+    )
+
+
+def test_reward_scale_without_a_term():
+    """A scale that names no term is refused when the task is built."""
+
+    class Cfg(VariantCfg):
+        class rewards(VariantCfg.rewards):
+            class scales(VariantCfg.rewards.scales):
+                torqes = -1.0
+
+    line = error_of(LeggedRobot, Cfg(), "cpu")
+    assert line.startswith("unknown reward term 'torqes'; did you mean 'torques'?")
+
+
+def test_sections_in_order_of_definition():
+    """Entries come in the order in which they are written, inherited ones first, methods and private names not."""
+
+    class Base(BaseConfig):
+        b = 1
+        _hidden = 2
+
+        class a:
+            z = 1
+
+        def method(self):
+            """Not an entry."""
+
+    class Child(Base):
+        c = 3
+        b = 4
+
+    assert section_keys(Child()) == ["b", "a", "c"]
+    assert to_dict(Child()) == {"b": 4, "a": {"z": 1}, "c": 3}
+    assert inspect.isclass(Child.a) and not inspect.isclass(Child().a)
+
+
+def test_tuples_are_lists():
+    """A variant may write its ranges as tuples: they come back from a file as the lists that they are then."""
+
+    class Variant(BaseConfig):
+        limits = (-0.5, 1.0)
+
+    cfg = Variant()
+    assert cfg.limits == [-0.5, 1.0]
+    update_from_dict(cfg, {"limits": [0.0, 2.0]})
+    assert cfg.limits == [0.0, 2.0]

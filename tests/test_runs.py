@@ -1,0 +1,132 @@
+"""Run folders: found, read, and refused when they are broken."""
+
+import numpy as np
+import pytest
+import torch
+from settings import TASKS, error_of, flatten, get_cfgs
+
+from legged_torque.envs import task_registry
+from legged_torque.utils import runs
+from legged_torque.utils.config import to_dict, update_from_dict
+
+
+@pytest.fixture
+def log_root(tmp_path):
+    """Three runs, of which the middle one is the newest with a checkpoint, and things that are no checkpoints."""
+    for run, files in {
+        "2026-01-01_00-00-00": ["model_2.pt", "model_10.pt", "model_9.pt"],
+        "2026-01-02_00-00-00_wide": ["model_3.pt", "model_4.pt.part", "model_best.pt", "policy.pt"],
+        "2026-01-03_00-00-00": ["config.yaml", "model_1.pt.part"],
+    }.items():
+        (tmp_path / run).mkdir()
+        for file in files:
+            (tmp_path / run / file).touch()
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("load_run", "name"),
+    [
+        (None, "2026-01-02_00-00-00_wide"),
+        ("2026-01-01_00-00-00", "2026-01-01_00-00-00"),
+        ("{root}/2026-01-03_00-00-00", "2026-01-03_00-00-00"),
+    ],
+)
+def test_find_run(log_root, load_run, name):
+    """The newest run that has a checkpoint, one by its name, or one by its path."""
+    assert runs.find_run(log_root, load_run and load_run.format(root=log_root)) == log_root / name
+
+
+def test_find_run_that_does_not_exist(log_root):
+    """The nearest run is proposed; an experiment without runs says that there is nothing to load."""
+    line = error_of(runs.find_run, log_root, "2026-01-02_00-00-00")
+    assert line.startswith("unknown run '2026-01-02_00-00-00'; did you mean '2026-01-0")
+    for folder in (log_root / "nothing", log_root / "2026-01-03_00-00-00"):
+        assert str(folder) in error_of(runs.find_run, folder, None)
+
+
+@pytest.mark.parametrize(("number", "name"), [(None, "model_10.pt"), (9, "model_9.pt"), (2, "model_2.pt")])
+def test_find_checkpoint(log_root, number, name):
+    """The last checkpoint is that of the highest number, not that of the last name."""
+    run = log_root / "2026-01-01_00-00-00"
+    assert runs.find_checkpoint(run, number) == run / name
+    assert runs.checkpoint_numbers(run) == [2, 9, 10]
+
+
+def test_find_checkpoint_that_does_not_exist(log_root):
+    """All checkpoints are listed; half-written and foreign files are none."""
+    line = error_of(runs.find_checkpoint, log_root / "2026-01-01_00-00-00", 1)
+    assert line.startswith("unknown checkpoint '1'") and line.endswith("allowed: 10, 2, 9")
+    assert runs.checkpoint_numbers(log_root / "2026-01-02_00-00-00_wide") == [3]
+    empty = log_root / "2026-01-03_00-00-00"
+    assert error_of(runs.find_checkpoint, empty, None) == f"there is no checkpoint in '{empty}'"
+
+
+def test_run_folders_sort_by_time(tmp_path):
+    """A new run's folder is named by its time, then by its name, and is not created yet."""
+    plain, named = runs.new_run_dir(tmp_path, ""), runs.new_run_dir(tmp_path, "wide")
+    assert plain.parent == named.parent == tmp_path and not any(tmp_path.iterdir())
+    assert plain.name > "2026-01-01_00-00-00" and len(plain.name) == len("2026-01-01_00-00-00")
+    assert named.name.startswith(plain.name[:10]) and named.name.endswith("_wide")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_config_file_round_trip(task, tmp_path):
+    """What a run has written gives the same settings again, of the same types; versions of all packages are there."""
+    words = ["--preset=paper", "--set=rewards.scales.torques=-1e-7", "--set=actor.hidden_dims=[8, 4]", "--run_name=7"]
+    env_cfg, train_cfg = get_cfgs(*words, task=task)
+    runs.save_config(tmp_path / "run", {"task": task, "env": to_dict(env_cfg), "train": to_dict(train_cfg)})
+    config = runs.load_config(tmp_path / "run")
+    loaded = get_cfgs(task=task, run_config=config)
+    for new, old in zip(loaded, (env_cfg, train_cfg), strict=True):
+        new, old = flatten(to_dict(new)), flatten(to_dict(old))
+        assert new == old
+        assert {key: type(value) for key, value in new.items()} == {key: type(value) for key, value in old.items()}
+    assert config["task"] == task
+    assert config["versions"]["torch"] == torch.__version__
+    assert config["versions"]["numpy"] == np.__version__
+    assert {"python", "legged_torque", "mujoco", "mujoco-warp", "warp-lang", "rsl-rl-lib"} <= config["versions"].keys()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("task: [a1", "is not valid YAML"),
+        ("task: a1\n\tenv: 3", "is not valid YAML"),
+        ("\x00\x01", "is not valid YAML"),
+        ("", "lacks the entries task, env and train"),
+        ("just words", "lacks the entries task, env and train"),
+        ("- task\n- env\n- train", "lacks the entries task, env and train"),
+        ("task: a1_position\nenv: {}", "lacks the entries task, env and train"),
+        (None, "has no config.yaml"),
+    ],
+)
+def test_broken_config_file(text, message, tmp_path):
+    """A file that is missing, not YAML or without the entries is named in one line."""
+    if text is not None:
+        (tmp_path / "config.yaml").write_text(text)
+    line = error_of(runs.load_config, tmp_path)
+    assert message in line and str(tmp_path) in line
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"env": {"num_env": 3}}, "unknown config key 'env.num_env'; did you mean 'env.num_envs'?"),
+        ({"rewards": {"scales": {"torques": "x"}}}, "config key 'rewards.scales.torques' takes a value like -0.0002"),
+        ({"rewards": {"scales": 3}}, "config key 'rewards.scales' is a section with entries"),
+        ({"rewards": None}, "config key 'rewards' is a section with entries"),
+        ({3: 4}, "unknown config key '3'"),
+    ],
+)
+def test_config_that_does_not_fit(values, message):
+    """Entries of a resumed run that do not exist or have another type are refused by name."""
+    cfg, _ = task_registry.get_cfgs("a1_position")
+    assert message in error_of(update_from_dict, cfg, values)
+
+
+def test_runs_of_the_same_second_do_not_share_a_folder(tmp_path):
+    """Every run gets a folder of its own, numbered where the name is taken."""
+    folders = [runs.claim_run_dir(tmp_path / "logs" / "2026-11-21_10-00-00") for _ in range(3)]
+    assert [folder.name for folder in folders] == [f"2026-11-21_10-00-00{end}" for end in ("", "_2", "_3")]
+    assert all(folder.is_dir() for folder in folders)

@@ -1,0 +1,104 @@
+"""The small helpers."""
+
+import ctypes.util
+import os
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from settings import get_cfgs
+
+from legged_torque.envs import task_registry
+from legged_torque.utils import rendering, runs
+from legged_torque.utils.args import Parser, add_task_args, apply_args
+from legged_torque.utils.config import to_dict
+from legged_torque.utils.math import quat_from_euler, quat_rotate_inverse
+
+
+def rotation_matrices(roll, pitch, yaw):
+    """Rotations about the world's x, then y, then z axis."""
+    result = []
+    for r, p, y in zip(roll, pitch, yaw, strict=True):
+        about_x = np.array([[1, 0, 0], [0, np.cos(r), -np.sin(r)], [0, np.sin(r), np.cos(r)]])
+        about_y = np.array([[np.cos(p), 0, np.sin(p)], [0, 1, 0], [-np.sin(p), 0, np.cos(p)]])
+        about_z = np.array([[np.cos(y), -np.sin(y), 0], [np.sin(y), np.cos(y), 0], [0, 0, 1]])
+        result.append(about_z @ about_y @ about_x)
+    return np.array(result)
+
+
+def quaternion_matrices(quat):
+    """Rotation matrices of quaternions (w, x, y, z)."""
+    w, x, y, z = quat.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def test_quaternions_from_angles():
+    """Roll, pitch and yaw are rotations about the world's axes in this order."""
+    angles = np.random.default_rng(0).uniform(-np.pi, np.pi, (3, 50))
+    quat = quat_from_euler(*torch.tensor(angles)).numpy()
+    np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(quaternion_matrices(quat), rotation_matrices(*angles), atol=1e-12)
+
+
+def test_world_vectors_in_the_body_frame():
+    """A vector is turned by the transposed rotation matrix."""
+    rng = np.random.default_rng(1)
+    quat, vec = rng.normal(size=(50, 4)), rng.normal(size=(50, 3))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    expected = np.einsum("nji,nj->ni", quaternion_matrices(quat), vec)
+    turned = quat_rotate_inverse(torch.tensor(quat), torch.tensor(vec))
+    np.testing.assert_allclose(turned, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("asked", "installed", "gpu", "chosen"),
+    [
+        (None, ["EGL", "OSMesa"], True, "egl"),
+        (None, ["EGL", "OSMesa"], False, "osmesa"),
+        (None, ["EGL"], False, "egl"),
+        (None, ["OSMesa"], True, "osmesa"),
+        ("egl", ["EGL", "OSMesa"], False, "egl"),
+        ("OSMesa", ["EGL", "OSMesa"], True, "osmesa"),
+        ("egl", ["OSMesa"], True, None),
+        ("osmesa", ["EGL"], False, None),
+        (None, [], True, None),
+        (None, [], False, None),
+    ],
+)
+def test_choice_of_the_renderer(asked, installed, gpu, chosen, monkeypatch):
+    """What the user asks for if it is installed; else EGL on a GPU, Mesa without; else none, and a line says why."""
+    monkeypatch.setenv("MUJOCO_GL", asked or "")
+    monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so" if name in installed else None)
+    monkeypatch.setattr(rendering, "Path", lambda path: SimpleNamespace(exists=lambda: gpu))
+    reason = rendering.choose_offscreen_renderer()
+    assert os.environ["MUJOCO_GL"] == (chosen or "disable")
+    if chosen:
+        assert reason is None
+    else:
+        assert "is not installed" in reason and "apt-get install libosmesa6" in reason and "\n" not in reason
+        assert asked is None or asked in reason
+
+
+def test_yaml_needs_no_tags(tmp_path):
+    """The configuration file is plain YAML that any program reads."""
+    env_cfg, train_cfg = get_cfgs("--run_name=x")
+    runs.save_config(tmp_path, {"task": "a1_position", "env": to_dict(env_cfg), "train": to_dict(train_cfg)})
+    text = (tmp_path / "config.yaml").read_text()
+    assert "!!" not in text and yaml.safe_load(text)["train"]["runner"]["run_name"] == "x"
+
+
+def test_apply_args_needs_only_what_a_script_offers():
+    """Scripts without training options, such as play.py, leave training settings alone."""
+    env_cfg, train_cfg = task_registry.get_cfgs("a1_position")
+    before = to_dict(train_cfg)
+    parser = Parser("test")
+    add_task_args(parser)
+    apply_args(env_cfg, train_cfg, parser.parse_args(["--device=cpu", "--num_envs=3"]))
+    assert env_cfg.env.num_envs == 3 and to_dict(train_cfg) == before
