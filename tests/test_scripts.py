@@ -256,7 +256,7 @@ def test_run_folder(root):
         2,
     )
     assert config["env"]["env"]["num_envs"] == 2 and config["train"]["runner"]["num_steps_per_env"] == 4
-    assert config["versions"]["torch"] == torch.__version__
+    assert torch.__version__.startswith(config["versions"]["torch"])
 
 
 def test_resume_in_a_folder_by_its_path(root, tmp_path):
@@ -336,7 +336,7 @@ def test_train_stop_resume_play(experiment):
         assert output.count(f"{name}:") == 2
     configs = [yaml.safe_load((run / "config.yaml").read_text()) for run in (first, second)]
     assert configs[0]["env"] == configs[1]["env"] and configs[0]["train"] == configs[1]["train"]
-    assert configs[1]["env"]["env"]["num_envs"] == 2 and configs[1]["versions"]["torch"] == torch.__version__
+    assert configs[1]["env"]["env"]["num_envs"] == 2 and torch.__version__.startswith(configs[1]["versions"]["torch"])
 
     status, output, error = finish(start("play.py", *task, "--num_envs=2", "--steps=10"))
     assert status == 0 and "Traceback" not in error
