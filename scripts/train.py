@@ -26,8 +26,8 @@ def main() -> None:
         if args.preset:
             raise UserError("--preset cannot be given with --resume, which keeps the settings of the run")
         run_dir, env_cfg, train_cfg = load_run(args)
-        args.load_run, args.preset = str(run_dir), args.run_config["preset"]
-        args.max_iterations = args.max_iterations or args.run_config["max_iterations"]
+        args.load_run, args.preset = str(run_dir), args.run_config.get("preset")
+        args.max_iterations = args.max_iterations or args.run_config.get("max_iterations")
         find_checkpoint(run_dir, args.checkpoint)  # a mistake is told before anything is built
     elif args.load_run or args.checkpoint is not None:
         raise UserError("--load_run and --checkpoint need --resume")

@@ -48,7 +48,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self._rollout = CudaGraph(self._collect, device, enabled=self.cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS)
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
-        """Train; Ctrl-C ends training after the current iteration, and a checkpoint is always left behind.
+        """Train, and leave a checkpoint; Ctrl-C ends training after the current iteration, a second one at once.
 
         Args:
             num_learning_iterations: How many iterations to add.
