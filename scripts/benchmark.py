@@ -31,10 +31,12 @@ COLUMNS = {
 def main() -> None:
     """Time every number of worlds and print a table."""
     parser = Parser(__doc__)
-    parser.add_argument("--task", default=DEFAULT_TASK, help="name of the task")
-    parser.add_argument("--num_envs", type=int, nargs="+", default=[4096], help="numbers of worlds")
+    parser.add_argument("--task", default=DEFAULT_TASK, help="name of the task; default: %(default)s")
+    parser.add_argument(
+        "--num_envs", type=int, nargs="+", default=[4096], help="numbers of worlds; default: %(default)s"
+    )
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda:N")
-    parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed")
+    parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
     parser.add_argument("--json", type=Path, help="file to write the numbers to")
     args = parser.parse_args()
     if args.rounds < 1:

@@ -20,7 +20,12 @@ def main() -> None:
     parser = Parser(__doc__)
     add_task_args(parser)
     parser.set_defaults(num_envs=256)
-    parser.add_argument("--steps", type=int, default=1000, help="control steps per checkpoint; 1000 are an episode")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=1000,
+        help="control steps per checkpoint; 1000 are an episode; default: %(default)s",
+    )
     parser.add_argument("--json", type=Path, help="file to write; default: curve.json in the run's folder")
     args = parser.parse_args()
     if args.steps < 1:

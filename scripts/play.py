@@ -22,7 +22,9 @@ def main() -> None:
     parser = Parser(__doc__)
     add_task_args(parser)
     parser.set_defaults(num_envs=16, seed=1)
-    parser.add_argument("--steps", type=int, default=500, help="control steps, 50 of them a second")
+    parser.add_argument(
+        "--steps", type=int, default=500, help="control steps, 50 of them a second; default: %(default)s"
+    )
     parser.add_argument("--video", type=Path, help="mp4 to write; default: in the run's folder")
     args = parser.parse_args()
     if args.steps < 1:

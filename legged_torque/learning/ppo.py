@@ -78,7 +78,7 @@ class OnDevicePPO(PPO):
         self._update_graph = CudaGraph(self._update_minibatch, self.device)
 
     def act(self, obs: TensorDict) -> Tensor:
-        """Sample actions and keep the transition; observations are buffers that the next step overwrites."""
+        """Sample actions and keep the transition, with a copy of observations that a task may overwrite in its step."""
         return super().act(obs.clone())
 
     def compute_returns(self, obs: TensorDict) -> None:

@@ -13,7 +13,7 @@ import legged_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning.ppo import OnDevicePPO
 from legged_torque.sim.graph import CudaGraph
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.runs import claim_run_dir
 
@@ -39,8 +39,15 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             train_cfg: Settings in rsl_rl's layout.
             log_dir: Folder of the run, created when training starts; None keeps nothing.
             device: "cpu" or "cuda:N", that of the task.
+
+        Raises:
+            UserError: If a network reads observations that the task does not have.
         """
         torch.set_float32_matmul_precision("high")  # TF32 on a GPU
+        for key, groups in train_cfg["obs_groups"].items():
+            for group in groups or [""]:
+                if group not in env.obs_buf.keys():
+                    raise unknown_name(f"observation group in obs_groups.{key}", group, env.obs_buf.keys())
         super().__init__(env, train_cfg, log_dir, device)
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         self.log_dir = log_dir

@@ -21,9 +21,7 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, description: str) -> None:
         """Create a parser; abbreviations of options are not accepted."""
-        super().__init__(
-            description=description, allow_abbrev=False, formatter_class=argparse.ArgumentDefaultsHelpFormatter
-        )
+        super().__init__(description=description, allow_abbrev=False)
 
     def error(self, message: str) -> NoReturn:
         """Report a mistake in the arguments."""
@@ -44,7 +42,9 @@ class Parser(argparse.ArgumentParser):
 
 def add_task_args(parser: argparse.ArgumentParser) -> None:
     """Add what all scripts that build a task take."""
-    parser.add_argument("--task", default=DEFAULT_TASK, help="name of the task; train.py --list prints all")
+    parser.add_argument(
+        "--task", default=DEFAULT_TASK, help="name of the task, see train.py --list; default: %(default)s"
+    )
     parser.add_argument("--num_envs", type=int, help="number of worlds; default: that of the task")
     parser.add_argument("--seed", type=int, help="random seed; default: that of the training settings")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda:N; auto takes the GPU if there is one")

@@ -7,12 +7,10 @@ from typing import Any
 
 from rsl_rl.utils import resolve_callable, resolve_nn_activation
 
-from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 
 SCHEDULES = ("adaptive", "fixed")
 STD_TYPES = ("log", "scalar")
-OBS_GROUPS = ("policy", "critic")
 
 
 def check_train_cfg(train_cfg: Any) -> None:
@@ -46,10 +44,6 @@ def check_train_cfg(train_cfg: Any) -> None:
         raise unknown_name("actor.distribution_cfg.std_type", distribution.std_type, STD_TYPES)
     if not distribution.init_std > 0.0:
         raise UserError(f"actor.distribution_cfg.init_std must be greater than 0, not {distribution.init_std}")
-    for key, groups in to_dict(train_cfg.obs_groups).items():
-        for group in groups or [""]:
-            if group not in OBS_GROUPS:
-                raise unknown_name(f"observation group in obs_groups.{key}", group, OBS_GROUPS)
     _check_with(resolve_callable, "actor.distribution_cfg.class_name", distribution.class_name)
     for section in ("runner", "algorithm", "actor", "critic"):
         _check_with(resolve_callable, f"{section}.class_name", getattr(train_cfg, section).class_name)

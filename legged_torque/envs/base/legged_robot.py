@@ -41,6 +41,7 @@ class LeggedRobot(RewardTerms, VecEnv):
         dof_pos: Joint positions [rad]. Shape: (num_envs, num_dof).
         dof_vel: Joint velocities [rad/s]. Shape: (num_envs, num_dof).
         torques: Torques of the last physics step [N m]. Shape: (num_envs, num_dof).
+        torque_limits: Lowest and highest torques [N m]. Shape: (2, num_dof).
         actions: Last actions. Shape: (num_envs, num_actions).
         commands: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
         contacts: 1 for each sensed geom that touches the ground, else 0. Shape: (num_envs, geoms).
@@ -50,6 +51,7 @@ class LeggedRobot(RewardTerms, VecEnv):
 
     cfg: LeggedRobotCfg
     actions_per_dof = 1
+    """Actions that :meth:`_compute_torques` takes per joint."""
 
     def __init__(self, cfg: LeggedRobotCfg, device: str = "cpu") -> None:
         """Create the worlds and put each into a random initial state.
@@ -163,7 +165,7 @@ class LeggedRobot(RewardTerms, VecEnv):
         for i in range(decimation):
             if i == 0 or self.cfg.control.refresh_torques:
                 torques = self._compute_torques(self.actions)
-                torch.clamp(torques, -self.torque_limits, self.torque_limits, out=self.torques)
+                torch.clamp(torques, self.torque_limits[0], self.torque_limits[1], out=self.torques)
             self.sim.step(sense=i == decimation - 1)
         self.sim.flag_diverged()
         self.post_physics_step()
@@ -301,7 +303,7 @@ class LeggedRobot(RewardTerms, VecEnv):
         self.dof_pos, self.dof_vel = self.sim.qpos[:, 7:], self.sim.qvel[:, 6:]
         self.base_ang_vel = self.sim.qvel[:, 3:6]
         self.torques = self.sim.ctrl
-        self.torque_limits = self._tensor(model.actuator_forcerange[:, 1])
+        self.torque_limits = self._tensor(model.actuator_forcerange.T)
         self._hard_dof_pos_limits = self._tensor(model.jnt_range[1:])
         middle = self._hard_dof_pos_limits.mean(dim=1, keepdim=True)
         self.dof_pos_limits = middle + self.cfg.rewards.soft_dof_pos_limit * (self._hard_dof_pos_limits - middle)
