@@ -40,7 +40,7 @@ def main() -> None:
     reference = reference_velocities(env.sim.mj_model, states)
     print("iterations | line search | rms error | 99.9% | max | rms change in a step   [m/s, rad/s]")
     for iterations, ls_iterations in SETTINGS:
-        sim = Simulator(env.sim.mj_model, env.num_envs, env.device, iterations, ls_iterations)
+        sim = Simulator(env.sim.mj_model, env.num_envs, env.device, engine, iterations, ls_iterations)
         errors = velocity_errors(sim, states, reference)
         print(f"{iterations:>10} | {ls_iterations:>11} |", " | ".join(f"{value:.2e}" for value in errors.values()))
 

@@ -1,10 +1,14 @@
-"""Train a policy: ``python scripts/train.py --task=a1_torque_multihead``."""
+"""Train a policy: ``python scripts/train.py --task=a1_torque_multihead``.
+
+On several GPUs of a machine: ``torchrun --standalone --nproc_per_node=2 scripts/train.py --task=a1_torque_multihead``.
+"""
 
 import os
 
 os.environ["MUJOCO_GL"] = "disable"  # training draws nothing, and MuJoCo must not look for a renderer
 
 from legged_torque.envs import task_registry
+from legged_torque.learning import distributed
 from legged_torque.utils.args import Parser, add_task_args, add_train_args, device_name, run_script
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
@@ -40,14 +44,20 @@ def main() -> None:
     remaining = total - runner.current_learning_iteration
     if remaining < 1:
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
-    runner.claim_log_dir()
-    settings = {"task": args.task, "preset": args.preset or "parallel", "device": env.device, "max_iterations": total}
-    print(f"Training {args.task} on {device_name(env.device)}: {env.num_envs} worlds, {total} iterations.")
-    print("The first run on a machine compiles kernels before its first iteration, for about a minute.")
-    print(f"Curves: tensorboard --logdir {runner.log_dir}", flush=True)
-    save_config(runner.log_dir, settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
+    if distributed.rank() == 0:
+        runner.claim_log_dir()
+        num_processes = distributed.world_size()
+        settings = {"task": args.task, "preset": args.preset or "parallel", "device": env.device}
+        settings |= {"processes": num_processes, "max_iterations": total}
+        place = f"{num_processes} x " * (num_processes > 1) + device_name(env.device)
+        print(f"Training {args.task} on {place}: {num_processes * env.num_envs} worlds, {total} iterations.")
+        print("The first run on a machine compiles kernels before its first iteration, for about a minute.")
+        print(f"Curves: tensorboard --logdir {runner.log_dir}", flush=True)
+        save_config(runner.log_dir, settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     runner.learn(remaining, init_at_random_ep_len=True)
-    print(f"The run is in {runner.log_dir}\nSee it walk: python scripts/play.py --task={args.task}")
+    if distributed.rank() == 0:
+        print(f"The run is in {runner.log_dir}\nSee it walk: python scripts/play.py --task={args.task}")
+    runner.close()
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from legged_torque.learning import distributed
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils.errors import UserError, unknown_name
 
@@ -25,7 +26,12 @@ class OnDevicePPO(PPO):
     """PPO whose minibatch update has fixed shapes and never waits for the host, so that it replays as a CUDA graph.
 
     The losses are rsl_rl's. The adaptive learning rate is a tensor. A minibatch whose gradient norm is not finite
-    leaves the networks and the optimizer untouched and is counted.
+    leaves the networks and the optimizer untouched and is counted. Processes that train together learn from minibatches
+    of their own, average gradients and KL divergence, and so take the same step, or skip it, all of them; as in rsl_rl,
+    each normalizes the advantages of its own rollout.
+
+    Attributes:
+        update_graph: The update from one minibatch.
     """
 
     def __init__(
@@ -52,7 +58,7 @@ class OnDevicePPO(PPO):
         """
         if optimizer not in ("adam", "adamw"):
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
-        for name in ("rnd_cfg", "symmetry_cfg", "multi_gpu_cfg", "use_mixed_precision"):
+        for name in ("rnd_cfg", "symmetry_cfg", "use_mixed_precision"):
             if kwargs.get(name):
                 raise UserError(f"{type(self).__name__} does not support algorithm.{name}")
         if actor.is_recurrent or critic.is_recurrent:
@@ -75,7 +81,7 @@ class OnDevicePPO(PPO):
         self.optimizer.found_inf = self._skip  # where torch's own gradient scaler tells a fused optimizer to skip
         self._losses = torch.zeros(len(LOSS_NAMES), device=self.device)
         self._indices = torch.zeros(self._batch_size, dtype=torch.long, device=self.device)
-        self._update_graph = CudaGraph(self._update_minibatch, self.device)
+        self.update_graph = CudaGraph(self._update_minibatch, self.device)
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions and keep the transition, with a copy of observations that a task may overwrite in its step."""
@@ -91,16 +97,18 @@ class OnDevicePPO(PPO):
         """Learn from the stored rollout: every epoch goes through it in random order, a minibatch at a time.
 
         Returns:
-            The numbers of :data:`LOSS_NAMES`. Reading them is the only time that the host waits.
+            The numbers of :data:`LOSS_NAMES`, over all processes. Reading them is the only time that the host waits.
         """
         self._losses.zero_()
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(self._batch_size * self.num_mini_batches, device=self.device)
             for indices in order.split(self._batch_size):
                 self._indices.copy_(indices)
-                self._update_graph()
+                self.update_graph()
         self._update_normalization()
         self.storage.clear()
+        if self.is_multi_gpu:
+            distributed.average([self._losses])
         losses = dict(zip(LOSS_NAMES, self._losses.tolist(), strict=True))
         updates = self.num_learning_epochs * self.num_mini_batches - losses["skipped_updates"]
         return {name: loss if name == "skipped_updates" else loss / max(updates, 1) for name, loss in losses.items()}
@@ -112,11 +120,14 @@ class OnDevicePPO(PPO):
         self.learning_rate = learning_rate.copy_(torch.as_tensor(self.learning_rate))
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
-        self._update_graph = CudaGraph(self._update_minibatch, self.device)  # the optimizer's tensors are new
+        self.update_graph.reset()  # the optimizer's tensors are new
         return load_iteration
 
     def _update_normalization(self) -> None:
-        """Let models that normalize observations learn from the rollout; graphs need the tensors to stay the same."""
+        """Let models that normalize observations learn from the rollout; graphs need the tensors to stay the same.
+
+        rsl_rl's normalizer learns from the rollouts of all processes.
+        """
         observations = self.storage.observations.flatten(0, 1)
         for model in (self.actor, self.critic):
             if model.obs_normalization:
@@ -131,12 +142,15 @@ class OnDevicePPO(PPO):
         log_prob = self.actor.get_output_log_prob(batch.actions)
         values = self.critic(batch.observations)
         entropy = self.actor.output_entropy.mean()
-        kl = self._adapt_learning_rate(batch)
+        kl = self._mean_kl(batch)
         surrogate_loss = self._surrogate_loss(batch, log_prob)
         value_loss = self._value_loss(batch, values)
         loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
         self.optimizer.zero_grad()
         loss.backward()
+        if self.is_multi_gpu:
+            distributed.average([*self._gradients(), kl])
+        self._adapt_learning_rate(kl)
         gradient_norm = self._clip_gradients()
         self._skip.copy_(~torch.isfinite(gradient_norm))
         self.optimizer.step()
@@ -165,15 +179,22 @@ class OnDevicePPO(PPO):
         )
 
     @torch.no_grad()
-    def _adapt_learning_rate(self, batch: RolloutStorage.Batch) -> Tensor:
-        """Return the mean KL divergence from the policy that acted, and steer the learning rate by it."""
-        kl = self.actor.get_kl_divergence(batch.old_distribution_params, self.actor.output_distribution_params).mean()
+    def _mean_kl(self, batch: RolloutStorage.Batch) -> Tensor:
+        """Return the mean KL divergence of the policy from the one that acted. Scalar."""
+        return self.actor.get_kl_divergence(batch.old_distribution_params, self.actor.output_distribution_params).mean()
+
+    def _gradients(self) -> list[Tensor]:
+        """Return the gradients of actor and critic."""
+        parameters = chain(self.actor.parameters(), self.critic.parameters())
+        return [parameter.grad for parameter in parameters if parameter.grad is not None]
+
+    def _adapt_learning_rate(self, kl: Tensor) -> None:
+        """Steer the learning rate by the mean KL divergence."""
         if self.schedule == "adaptive":
             lower = kl > 2.0 * self.desired_kl
             higher = (kl < 0.5 * self.desired_kl) & (kl > 0.0)
             factor = torch.where(lower, 1.0 / 1.5, torch.where(higher, 1.5, 1.0))
             self.learning_rate.mul_(factor).clamp_(MIN_LEARNING_RATE, MAX_LEARNING_RATE)
-        return kl
 
     def _surrogate_loss(self, batch: RolloutStorage.Batch, log_prob: Tensor) -> Tensor:
         """Return PPO's clipped policy loss."""

@@ -11,6 +11,7 @@ from rsl_rl import runners
 
 import legged_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.learning import distributed
 from legged_torque.learning.ppo import OnDevicePPO
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils.errors import UserError, unknown_name
@@ -26,6 +27,9 @@ class OnPolicyRunner(runners.OnPolicyRunner):
 
     On a GPU a whole rollout replays as one CUDA graph. Iterations are counted when they are complete:
     ``model_<n>.pt`` is the state after n iterations, from which training continues as if it had not stopped.
+
+    Processes started by torchrun train one policy, each in worlds of its own; only the first one prints, logs and
+    saves. What is logged of episodes and tracking is that of its worlds, steps and losses are those of all processes.
     """
 
     env: LeggedRobot
@@ -41,7 +45,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             device: "cpu" or "cuda:N", that of the task.
 
         Raises:
-            UserError: If a network reads observations that the task does not have.
+            UserError: If a network reads observations that the task does not have, or processes that should train
+                together cannot find each other.
         """
         torch.set_float32_matmul_precision("high")  # TF32 on a GPU
         for key, groups in train_cfg["obs_groups"].items():
@@ -52,10 +57,15 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         self.log_dir = log_dir
         self._seconds_before = 0.0  # training time before this process
-        self._rollout = CudaGraph(self._collect, device, enabled=self.cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS)
+        env.num_processes = self.gpu_world_size
+        env._step_graph.enabled = self.alg.update_graph.enabled = self.cfg["capture"]
+        enabled = self.cfg["capture"] and self.cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS
+        self._rollout = CudaGraph(self._collect, device, enabled)
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train, and leave a checkpoint; Ctrl-C ends training after the current iteration, a second one at once.
+
+        All processes that train together end after the same iteration, whichever of them is asked to stop.
 
         Args:
             num_learning_iterations: How many iterations to add.
@@ -66,11 +76,15 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             high = int(self.env.max_episode_length)
             self.env.episode_length_buf = torch.randint_like(self.env.episode_length_buf, high=high)
         self.alg.train_mode()
+        if self.is_distributed:
+            self.alg.broadcast_parameters()
         self.logger.init_logging_writer()
         start_it = self.current_learning_iteration
         total_it = start_it + num_learning_iterations
         with StopRequest() as stop:
-            while self.current_learning_iteration < total_it and not stop.requested:
+            for _ in range(num_learning_iterations):
+                if distributed.any_process(stop.requested, self.device):
+                    break
                 start = time.perf_counter()
                 self.collect_rollout()
                 self._wait()
@@ -87,6 +101,13 @@ class OnPolicyRunner(runners.OnPolicyRunner):
     def claim_log_dir(self) -> None:
         """Create the run's folder, under another name if a run that started in the same second has it already."""
         self.log_dir = self.logger.log_dir = str(claim_run_dir(Path(self.log_dir)))
+
+    def close(self) -> None:
+        """Leave the processes that train together, if there are any; training is over then."""
+        if torch.distributed.is_initialized():
+            self._wait()
+            self.alg.update_graph.reset()  # NCCL waits for the end of graphs with its work in them
+            torch.distributed.destroy_process_group()
 
     def save(self, path: str, infos: dict | None = None) -> None:
         """Save everything that training needs to continue, atomically.
@@ -157,6 +178,20 @@ class OnPolicyRunner(runners.OnPolicyRunner):
                 obs, rewards, dones, extras = self.env.step(actions)
                 self.alg.process_env_step(obs, rewards, dones, extras)
             self.alg.compute_returns(obs)
+
+    def _configure_multi_gpu(self) -> None:
+        """Join the processes that torchrun has started; rsl_rl's own method knows only GPUs."""
+        self.gpu_world_size, self.gpu_global_rank = distributed.world_size(), distributed.rank()
+        self.gpu_local_rank = distributed.local_rank()
+        self.is_distributed = self.gpu_world_size > 1
+        self.cfg["multi_gpu"] = None
+        if self.is_distributed:
+            distributed.join(self.device)
+            self.cfg["multi_gpu"] = {
+                "global_rank": self.gpu_global_rank,
+                "local_rank": self.gpu_local_rank,
+                "world_size": self.gpu_world_size,
+            }
 
     def _wait(self) -> None:
         """Wait until the device has done what was asked of it."""

@@ -60,6 +60,9 @@ class CudaGraph:
     The function must read and write tensors of fixed address and shape and never wait for the host. Its first call
     runs it as it is, which compiles kernels and allocates what is allocated once; the second captures it. On the CPU,
     and while another graph is being captured, every call runs it as it is.
+
+    Attributes:
+        enabled: Whether to capture and replay; if not, every call runs the function as it is.
     """
 
     def __init__(self, function: Callable[[], None], device: str, enabled: bool = True) -> None:
@@ -68,24 +71,28 @@ class CudaGraph:
         Args:
             function: What to replay.
             device: Name of the device.
-            enabled: Whether to capture; if not, every call runs the function.
+            enabled: See above; may be changed at any time.
         """
+        self.enabled = enabled
         self._function = function
         self._device = device
-        self._enabled = enabled and torch.device(device).type == "cuda"
+        self._is_cuda = torch.device(device).type == "cuda"
         self._calls = 0
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> None:
         """Do what the function does."""
-        if self._graph is not None and not is_capturing(self._device):
-            self._graph.replay()
-        elif not self._enabled or is_capturing(self._device) or self._calls == 0:
+        if not self.enabled or not self._is_cuda or self._calls == 0 or is_capturing(self._device):
             self._calls += 1
             self._function()
-        else:
+            return
+        if self._graph is None:
             self._capture()
-            self._graph.replay()
+        self._graph.replay()
+
+    def reset(self) -> None:
+        """Give the graph back; the next call runs the function as it is, the one after captures anew."""
+        self._calls, self._graph = 0, None
 
     def _capture(self) -> None:
         """Record the function into a graph; the recorded work does not run."""

@@ -10,8 +10,14 @@ import mujoco_warp as mjw
 import warp as wp
 from torch import Tensor
 
+from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
+from legged_torque.sim.warp_step import WarpStep
+from legged_torque.utils.errors import unknown_name
+
+ENGINES = ("fused", "mujoco_warp")
+"""What may step the worlds: one kernel per step for legged robots on a plane, or MuJoCo Warp for any robot."""
 
 MAX_POSITION = 1e4
 """Largest position [m, rad] of a world that is still believed."""
@@ -19,7 +25,6 @@ MAX_VELOCITY = 1e4
 """Largest velocity [m/s, rad/s] of a world that is still believed."""
 MAX_ACCELERATION = 1e10
 """Largest acceleration [m/s^2, rad/s^2] of a world that is still believed."""
-_NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _BUFFER_FLAGS = (
     mjw.OverflowType.NEFC,
     mjw.OverflowType.NJMAX_NNZ,
@@ -41,8 +46,8 @@ class Simulator:
             Shape: (num_envs, nv).
         qacc_warmstart: Accelerations from which the constraint solver starts. Shape: (num_envs, nv).
         ctrl: Joint torques [N m]. Shape: (num_envs, nu).
-        contact_found: Number of contacts of each sensed geom with the floor, as of the start of the last physics step;
-            0 after a step that did not sense. Shape: (num_envs, geoms).
+        contact_found: Number of contacts of each sensed geom with the floor, as of the start of the last physics step
+            that sensed. Shape: (num_envs, geoms).
         contact_force: Net contact force on each sensed geom in the world frame [N], likewise.
             Shape: (num_envs, geoms, 3).
         diverged: Worlds whose state was seen to be not finite or absurdly large since the last :meth:`clear_diverged`.
@@ -50,7 +55,13 @@ class Simulator:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, num_envs: int, device: str, solver_iterations: int, ls_iterations: int
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        device: str,
+        engine: str = "fused",
+        solver_iterations: int = 10,
+        ls_iterations: int = 20,
     ) -> None:
         """Build the worlds, all in the model's reference pose.
 
@@ -58,27 +69,34 @@ class Simulator:
             model: Model of one world, see :func:`~legged_torque.sim.model.load_model`.
             num_envs: Number of worlds.
             device: "cpu" or "cuda:N".
+            engine: One of :data:`ENGINES`.
             solver_iterations: Most iterations of the constraint solver per physics step.
             ls_iterations: Most iterations of its line search.
+
+        Raises:
+            UserError: If the engine is unknown or cannot simulate this robot.
         """
+        if engine not in ENGINES:
+            raise unknown_name("sim.engine", engine, ENGINES)
         self.mj_model = model
         self.num_envs = num_envs
         self.device = device
         prepare_device(device)
         self._wp_device = wp.get_device(device)
-        contacts = max_contacts(model)
+        contacts = max_contacts(model) if engine == "mujoco_warp" else 1  # the fused step keeps its contacts itself
         self.mj_model.opt.iterations = solver_iterations
         self.mj_model.opt.ls_iterations = ls_iterations
         with wp.ScopedDevice(self._wp_device):
             self.model = mjw.put_model(model)
             self.model.opt.warn_overflow = 0  # it prints from inside kernels; check_buffers tells instead
-            if self._wp_device.is_cuda:
-                self.model.opt.graph_conditional = False  # unrolled solver iterations are faster than a device loop
-            self._flags = self.model.opt.disableflags
             self.data = mjw.make_data(model, nworld=num_envs, nconmax=contacts, njmax=max_constraints(model, contacts))
             self._diverged = wp.zeros(num_envs, dtype=wp.bool)
             self._reset_mask = wp.zeros(num_envs, dtype=wp.bool)
             self._overflow = wp.zeros(num_envs, dtype=wp.int32)
+            self._reference_pose = wp.array(model.qpos0, dtype=wp.float32)
+        self._step = (
+            FusedStep(model, self.model, self.data) if engine == "fused" else WarpStep(self.model, self.data)
+        )
         self.qpos = wp.to_torch(self.data.qpos)
         self.qvel = wp.to_torch(self.data.qvel)
         self.qacc_warmstart = wp.to_torch(self.data.qacc_warmstart)
@@ -94,9 +112,7 @@ class Simulator:
         Args:
             sense: Whether to update the contact sensors; of several steps, only the last one needs to.
         """
-        self.model.opt.disableflags = self._flags if sense else self._flags | _NO_SENSORS
-        with wp.ScopedDevice(self._wp_device):
-            mjw.step(self.model, self.data)
+        self._step(sense)
 
     def reset(self, mask: Tensor) -> None:
         """Put worlds back to the reference pose, at rest, with every buffer cleared, warm starts included.
@@ -105,8 +121,14 @@ class Simulator:
             mask: Which worlds. Shape: (num_envs,), bool.
         """
         wp.to_torch(self._reset_mask).copy_(mask)
-        with wp.ScopedDevice(self._wp_device):
-            mjw.reset_data(self.model, self.data, reset=self._reset_mask)
+        data = self.data
+        wp.launch(
+            _reset_worlds,
+            dim=self.num_envs,
+            inputs=[self._reset_mask, self._reference_pose],
+            outputs=[data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, data.sensordata],
+            device=self._wp_device,
+        )
 
     def clear_diverged(self) -> None:
         """Forget which worlds have diverged."""
@@ -132,6 +154,30 @@ class Simulator:
         if not names:
             return None
         return f"simulation buffers overflowed ({', '.join(names)}): some contacts were ignored"
+
+
+@wp.kernel(enable_backward=False)
+def _reset_worlds(
+    mask: wp.array(dtype=wp.bool),
+    reference_pose: wp.array(dtype=wp.float32),
+    qpos: wp.array2d(dtype=wp.float32),
+    qvel: wp.array2d(dtype=wp.float32),
+    qacc_warmstart: wp.array2d(dtype=wp.float32),
+    ctrl: wp.array2d(dtype=wp.float32),
+    sensordata: wp.array2d(dtype=wp.float32),
+):
+    """Write everything that a world carries from one step to the next."""
+    world = wp.tid()
+    if mask[world]:
+        for i in range(qpos.shape[1]):
+            qpos[world, i] = reference_pose[i]
+        for i in range(qvel.shape[1]):
+            qvel[world, i] = 0.0
+            qacc_warmstart[world, i] = 0.0
+        for i in range(ctrl.shape[1]):
+            ctrl[world, i] = 0.0
+        for i in range(sensordata.shape[1]):
+            sensordata[world, i] = 0.0
 
 
 @wp.kernel(enable_backward=False)

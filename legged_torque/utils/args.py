@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 import torch
 
+from legged_torque.learning import distributed
 from legged_torque.utils.config import section_keys, set_by_path, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
 
@@ -40,17 +41,20 @@ class Parser(argparse.ArgumentParser):
         return namespace
 
 
-def add_task_args(parser: argparse.ArgumentParser) -> None:
-    """Add what all scripts that build a task take."""
+def add_build_args(parser: argparse.ArgumentParser) -> None:
+    """Add what decides how a task is built."""
     parser.add_argument(
         "--task", default=DEFAULT_TASK, help="name of the task, see train.py --list; default: %(default)s"
     )
-    parser.add_argument("--num_envs", type=int, help="number of worlds; default: that of the task")
+    parser.add_argument(
+        "--num_envs", type=int, help="number of worlds, with torchrun those of each process; default: that of the task"
+    )
     parser.add_argument("--seed", type=int, help="random seed; default: that of the training settings")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda:N; auto takes the GPU if there is one")
-    parser.add_argument("--experiment_name", help="folder of the run below logs/; default: name of the task")
-    parser.add_argument("--load_run", help="run to load: name of its folder or a path; default: the last one")
-    parser.add_argument("--checkpoint", type=int, help="checkpoint to load; default: the last one")
+    parser.add_argument(
+        "--device",
+        default="auto",
+        help="auto, cpu or cuda:N; auto takes the GPU if there is one, with torchrun one for each process",
+    )
     parser.add_argument(
         "--set",
         action="append",
@@ -58,6 +62,14 @@ def add_task_args(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="change a config entry by its dotted path, e.g. rewards.scales.torques=-1e-4; may be repeated",
     )
+
+
+def add_task_args(parser: argparse.ArgumentParser) -> None:
+    """Add what all scripts take that build a task and keep or load runs of it."""
+    add_build_args(parser)
+    parser.add_argument("--experiment_name", help="folder of the run below logs/; default: name of the task")
+    parser.add_argument("--load_run", help="run to load: name of its folder or a path; default: the last one")
+    parser.add_argument("--checkpoint", type=int, help="checkpoint to load; default: the last one")
 
 
 def add_train_args(parser: argparse.ArgumentParser) -> None:
@@ -91,7 +103,7 @@ def apply_args(env_cfg: Any, train_cfg: Any, args: argparse.Namespace) -> None:
     given = {
         "env.num_envs": args.num_envs,
         "seed": args.seed,
-        "runner.experiment_name": args.experiment_name,
+        "runner.experiment_name": getattr(args, "experiment_name", None),
         "runner.run_name": getattr(args, "run_name", None),
         "runner.logger": getattr(args, "logger", None),
     }
@@ -134,19 +146,25 @@ def set_entry_of_either(env_cfg: Any, train_cfg: Any, path: str, value: Any) -> 
 
 
 def resolve_device(device: str | None) -> str:
-    """Return the name of the device to use.
+    """Return the name of the device to use. Processes that train together take a GPU each.
 
     Args:
-        device: "auto", "cpu" or "cuda:N"; None is "auto".
+        device: "auto", "cpu", "cuda" or "cuda:N"; None is "auto".
 
     Raises:
-        UserError: If there is no such device.
+        UserError: If there is no such device, or not one for each process.
     """
-    available = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    num_gpus = torch.cuda.device_count()
+    available = ["cpu", *(f"cuda:{i}" for i in range(num_gpus))]
     if device in (None, "auto"):
-        return available[1] if len(available) > 1 else "cpu"
+        device = "cuda" if num_gpus else "cpu"
     if device == "cuda":
-        device = "cuda:0"
+        num_processes = distributed.local_world_size()
+        if 0 < num_gpus < num_processes:
+            raise UserError(f"torchrun has started {num_processes} processes on a machine with {num_gpus} GPU(s)")
+        device = f"cuda:{distributed.local_rank()}"
+    elif device in available[1:] and distributed.world_size() > 1:
+        raise UserError(f"with torchrun each process takes a GPU of its own: leave out --device {device}")
     if device not in available:
         if re.fullmatch(r"cuda:\d+", device):
             raise UserError(f"there is no device '{device}'; available: {', '.join(available)}")

@@ -17,6 +17,7 @@ from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils import resolve_callable
 
 from legged_torque import ROOT_DIR
+from legged_torque.learning import distributed
 from legged_torque.utils.args import apply_args, resolve_device
 from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
@@ -150,8 +151,9 @@ def experiment_dir(train_cfg: Any) -> Path:
 
 
 def num_iterations(env: VecEnv, train_cfg: Any) -> int:
-    """Return how many iterations a whole training takes."""
-    return math.ceil(train_cfg.runner.total_steps / (env.num_envs * train_cfg.runner.num_steps_per_env))
+    """Return how many iterations a whole training takes, with the steps of all processes counted."""
+    steps_per_iteration = distributed.world_size() * env.num_envs * train_cfg.runner.num_steps_per_env
+    return math.ceil(train_cfg.runner.total_steps / steps_per_iteration)
 
 
 def to_rsl_rl(train_cfg: Any) -> dict[str, Any]:
@@ -173,8 +175,8 @@ def _logger_cfg(runner: Any) -> dict[str, str]:
 
 
 def set_seed(seed: int) -> None:
-    """Seed every random number that a training draws."""
-    torch.manual_seed(seed)
+    """Seed every random number that a training draws; each process has random numbers of its own."""
+    torch.manual_seed(seed + distributed.rank())
 
 
 task_registry = TaskRegistry()

@@ -46,12 +46,14 @@ class LeggedRobot(RewardTerms, VecEnv):
         commands: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
         contacts: 1 for each sensed geom that touches the ground, else 0. Shape: (num_envs, geoms).
         feet_contact: The same for the feet. Shape: (num_envs, feet).
-        total_steps: Environment steps so far over all worlds: t of eq. 1. Scalar, int64.
+        total_steps: Environment steps so far over all worlds of all processes: t of eq. 1. Scalar, int64.
     """
 
     cfg: LeggedRobotCfg
     actions_per_dof = 1
     """Actions that :meth:`_compute_torques` takes per joint."""
+    num_processes = 1
+    """Processes that train together, each with as many worlds; the runner sets it."""
 
     def __init__(self, cfg: LeggedRobotCfg, device: str = "cpu") -> None:
         """Create the worlds and put each into a random initial state.
@@ -173,7 +175,7 @@ class LeggedRobot(RewardTerms, VecEnv):
     def post_physics_step(self) -> None:
         """Do what follows the physics: termination, rewards, resets, commands, observations."""
         self._episode_length_buf += 1
-        self.total_steps += self.num_envs
+        self.total_steps += self.num_envs * self.num_processes
         self._update_state()
         self.check_termination()
         self.compute_reward()
@@ -291,8 +293,9 @@ class LeggedRobot(RewardTerms, VecEnv):
         geoms = geoms_matching(spec, [asset.foot_name, *asset.penalize_contacts_on, *asset.terminate_after_contacts_on])
         model = build_model(spec, geoms)
         model.opt.timestep = self.cfg.sim.dt
+        sim = self.cfg.sim
         self.sim = Simulator(
-            model, self.num_envs, self.device, self.cfg.sim.solver_iterations, self.cfg.sim.ls_iterations
+            model, self.num_envs, self.device, sim.engine, sim.solver_iterations, sim.ls_iterations
         )
         self.dof_names = [model.joint(i).name for i in range(1, model.njnt)]
         self.num_dof = len(self.dof_names)

@@ -28,8 +28,9 @@ class LeggedRobotCfg(BaseConfig):
         """Physics."""
 
         dt = 0.005  # [s] physics step
-        solver_iterations = 5
-        ls_iterations = 8  # line search
+        engine = "fused"  # one kernel per physics step, for legged robots on a plane; or "mujoco_warp" for any robot
+        solver_iterations = 10  # at most
+        ls_iterations = 20  # line search, at most
 
     class init_state:
         """Where episodes start, and the nominal pose."""
@@ -132,8 +133,9 @@ class LeggedRobotCfgPPO(BaseConfig):
         """Rollouts, checkpoints and logs."""
 
         class_name = "legged_torque.learning.runner:OnPolicyRunner"
+        capture = True  # on a GPU, replay steps, rollouts and updates as CUDA graphs; False runs the same without
         num_steps_per_env = 24
-        total_steps = 110_000_000  # over all worlds; --max_iterations overrides it
+        total_steps = 110_000_000  # over all worlds of all processes; --max_iterations overrides it
         save_interval = 50  # iterations between checkpoints
         experiment_name = "legged_robot"
         run_name = ""

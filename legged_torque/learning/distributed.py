@@ -1,0 +1,74 @@
+"""Several processes that train one policy, each on a GPU of its own, started by torchrun."""
+
+from __future__ import annotations
+
+import os
+
+import torch
+from torch import Tensor
+
+from legged_torque.utils.errors import UserError
+
+
+def world_size() -> int:
+    """Return how many processes train together: 1 unless torchrun has started more."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def rank() -> int:
+    """Return the number of this process among all of them."""
+    return int(os.environ.get("RANK", "0")) if world_size() > 1 else 0
+
+
+def local_world_size() -> int:
+    """Return how many of the processes run on this machine."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", "1")) if world_size() > 1 else 1
+
+
+def local_rank() -> int:
+    """Return the number of this process among those on this machine, which is that of its GPU."""
+    return int(os.environ.get("LOCAL_RANK", "0")) if world_size() > 1 else 0
+
+
+def join(device: str) -> None:
+    """Meet the other processes, unless that has happened already.
+
+    Args:
+        device: "cpu" or "cuda:N", where the tensors are that processes exchange.
+
+    Raises:
+        UserError: If the processes do not know where to meet.
+    """
+    if torch.distributed.is_initialized():
+        return
+    try:
+        torch.distributed.init_process_group("nccl" if torch.device(device).type == "cuda" else "gloo")
+    except ValueError as error:  # an environment variable that torchrun sets is missing
+        raise UserError(f"WORLD_SIZE is {world_size()}, but torchrun has not started this process: {error}") from None
+
+
+def average(tensors: list[Tensor]) -> None:
+    """Replace tensors by their means over all processes, in one exchange; can be captured in a CUDA graph.
+
+    Args:
+        tensors: Of any shapes, the same in all processes. Changed in place.
+    """
+    flat = torch.cat([tensor.flatten() for tensor in tensors])
+    torch.distributed.all_reduce(flat)
+    flat /= torch.distributed.get_world_size()
+    for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
+        tensor.copy_(mean.view_as(tensor))
+
+
+def any_process(condition: bool, device: str) -> bool:
+    """Return whether a condition holds in any process, and wait for all of them; a single process asks nobody.
+
+    Args:
+        condition: Whether it holds in this one.
+        device: As for :func:`join`.
+    """
+    if not torch.distributed.is_initialized():
+        return condition
+    flag = torch.tensor(float(condition), device=device)
+    torch.distributed.all_reduce(flag)
+    return flag.item() > 0.0

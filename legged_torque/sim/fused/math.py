@@ -1,0 +1,142 @@
+"""What the kernels calculate with: quaternions, small matrices, and sums over the threads of one world."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+vec4 = wp.types.vector(length=4, dtype=wp.float32)
+vec5 = wp.types.vector(length=5, dtype=wp.float32)
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned first = (threadIdx.x & 31u) & ~(unsigned(lanes) - 1u);
+    const unsigned mask = ((1u << lanes) - 1u) << first;
+    for (int offset = lanes / 2; offset > 0; offset /= 2) value += __shfl_xor_sync(mask, value, offset);
+#endif
+    return value;
+""")
+def group_sum(value: float, lanes: int) -> float:
+    """Return the sum of a value over the ``lanes`` threads that share a world, the same to the last bit in each.
+
+    On a CPU a world has one thread, and the sum is the value.
+    """
+    ...
+
+
+@wp.func
+def group_sum3(value: wp.vec3, lanes: int) -> wp.vec3:
+    """Return the sum of a vector over the threads of a world."""
+    return wp.vec3(group_sum(value[0], lanes), group_sum(value[1], lanes), group_sum(value[2], lanes))
+
+
+@wp.func
+def group_sum33(value: wp.mat33, lanes: int) -> wp.mat33:
+    """Return the sum of a matrix over the threads of a world."""
+    result = wp.mat33()
+    for i in range(3):
+        for j in range(3):
+            result[i, j] = group_sum(value[i, j], lanes)
+    return result
+
+
+@wp.func
+def group_sum33_symmetric(value: wp.mat33, lanes: int) -> wp.mat33:
+    """Return the sum of a symmetric matrix over the threads of a world."""
+    xy = group_sum(value[0, 1], lanes)
+    xz = group_sum(value[0, 2], lanes)
+    yz = group_sum(value[1, 2], lanes)
+    xx = group_sum(value[0, 0], lanes)
+    yy = group_sum(value[1, 1], lanes)
+    zz = group_sum(value[2, 2], lanes)
+    return wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+
+
+@wp.func
+def quat_multiply(a: wp.quat, b: wp.quat) -> wp.quat:
+    """Return the product of two quaternions (w, x, y, z), the order of MuJoCo's that Warp's functions do not share."""
+    return wp.quat(
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    )
+
+
+@wp.func
+def quat_rotation(axis: wp.vec3, angle: float) -> wp.quat:
+    """Return the quaternion (w, x, y, z) of a rotation about a unit axis [rad]."""
+    s = wp.sin(0.5 * angle)
+    return wp.quat(wp.cos(0.5 * angle), s * axis[0], s * axis[1], s * axis[2])
+
+
+@wp.func
+def quat_to_matrix(q: wp.quat) -> wp.mat33:
+    """Return the rotation matrix of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return wp.mat33(
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@wp.func
+def skew(v: wp.vec3) -> wp.mat33:
+    """Return the matrix of the cross product v x."""
+    return wp.mat33(0.0, -v[2], v[1], v[2], 0.0, -v[0], -v[1], v[0], 0.0)
+
+
+@functools.cache
+def linear_algebra(n: int) -> SimpleNamespace:
+    """Return functions on symmetric positive definite matrices of a fixed size, all loops unrolled.
+
+    Args:
+        n: Number of rows.
+
+    Returns:
+        ``cholesky(a)``: the lower factor L of a = L L^T; ``cholesky_solve(L, b)``: the solution of L L^T x = b.
+    """
+    matrix = wp.types.matrix(shape=(n, n), dtype=wp.float32)
+    vector = wp.types.vector(length=n, dtype=wp.float32)
+
+    @wp.func
+    def cholesky(a: matrix) -> matrix:
+        lower = matrix()
+        for j in range(wp.static(n)):
+            pivot = a[j, j]
+            for k in range(wp.static(n)):
+                if k < j:
+                    pivot -= lower[j, k] * lower[j, k]
+            root = wp.sqrt(wp.max(pivot, 1.0e-12))
+            lower[j, j] = root
+            for i in range(wp.static(n)):
+                if i > j:
+                    rest = a[i, j]
+                    for k in range(wp.static(n)):
+                        if k < j:
+                            rest -= lower[i, k] * lower[j, k]
+                    lower[i, j] = rest / root
+        return lower
+
+    @wp.func
+    def cholesky_solve(lower: matrix, b: vector) -> vector:
+        x = vector()
+        for i in range(wp.static(n)):
+            rest = b[i]
+            for k in range(wp.static(n)):
+                if k < i:
+                    rest -= lower[i, k] * x[k]
+            x[i] = rest / lower[i, i]
+        for reverse in range(wp.static(n)):
+            i = wp.static(n - 1) - reverse
+            rest = x[i]
+            for k in range(wp.static(n)):
+                if k > i:
+                    rest -= lower[k, i] * x[k]
+            x[i] = rest / lower[i, i]
+        return x
+
+    return SimpleNamespace(matrix=matrix, vector=vector, cholesky=cholesky, cholesky_solve=cholesky_solve)

@@ -1,0 +1,191 @@
+"""The robots that the fused step can simulate, and their tables on the device."""
+
+from dataclasses import dataclass
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from legged_torque.sim.fused.math import vec5
+from legged_torque.utils.errors import UserError
+
+_CAPSULE_ENDS = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
+_BOX_CORNERS = [(float(x), float(y), float(z)) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]
+_GEOM_POINTS = {
+    mujoco.mjtGeom.mjGEOM_SPHERE: ([(0.0, 0.0, 0.0)], 1.0),
+    mujoco.mjtGeom.mjGEOM_CAPSULE: (_CAPSULE_ENDS, 1.0),
+    mujoco.mjtGeom.mjGEOM_BOX: (_BOX_CORNERS, 0.0),
+}
+"""Where a geom can touch a plane: points in units of its half sizes, and how many radii it is thick around them."""
+
+
+@wp.struct
+class Robot:
+    """A robot's tables: fields of the MuJoCo model as MuJoCo Warp keeps them, and the structure of the tree.
+
+    Fields with two axes have one row per world, or one for all; (branch, depth) counts from the trunk outwards.
+    """
+
+    gravity: wp.array(dtype=wp.vec3)
+    qpos0: wp.array2d(dtype=wp.float32)
+    qpos_spring: wp.array2d(dtype=wp.float32)
+    body_pos: wp.array2d(dtype=wp.vec3)
+    body_quat: wp.array2d(dtype=wp.quat)
+    body_ipos: wp.array2d(dtype=wp.vec3)
+    body_iquat: wp.array2d(dtype=wp.quat)
+    body_mass: wp.array2d(dtype=wp.float32)
+    body_inertia: wp.array2d(dtype=wp.vec3)
+    body_invweight0: wp.array2d(dtype=wp.vec2)
+    jnt_pos: wp.array2d(dtype=wp.vec3)
+    jnt_axis: wp.array2d(dtype=wp.vec3)
+    jnt_stiffness: wp.array2d(dtype=wp.float32)
+    jnt_range: wp.array2d(dtype=wp.vec2)
+    jnt_solref: wp.array2d(dtype=wp.vec2)
+    jnt_solimp: wp.array2d(dtype=vec5)
+    dof_damping: wp.array2d(dtype=wp.float32)
+    dof_armature: wp.array2d(dtype=wp.float32)
+    dof_frictionloss: wp.array2d(dtype=wp.float32)
+    dof_invweight0: wp.array2d(dtype=wp.float32)
+    dof_solref: wp.array2d(dtype=wp.vec2)
+    dof_solimp: wp.array2d(dtype=vec5)
+    geom_pos: wp.array2d(dtype=wp.vec3)
+    geom_quat: wp.array2d(dtype=wp.quat)
+    geom_size: wp.array2d(dtype=wp.vec3)
+    geom_friction: wp.array2d(dtype=wp.vec3)
+    geom_solmix: wp.array2d(dtype=wp.float32)
+    geom_solref: wp.array2d(dtype=wp.vec2)
+    geom_solimp: wp.array2d(dtype=vec5)
+    actuator_gear: wp.array2d(dtype=wp.spatial_vector)
+    actuator_ctrlrange: wp.array2d(dtype=wp.vec2)
+    actuator_forcerange: wp.array2d(dtype=wp.vec2)
+    geom_type: wp.array(dtype=wp.int32)
+    geom_bodyid: wp.array(dtype=wp.int32)
+    geom_priority: wp.array(dtype=wp.int32)
+    geom_sensor: wp.array(dtype=wp.int32)  # address of the geom's contact sensor, -1 without
+    branch_joint: wp.array2d(dtype=wp.int32)  # (branch, depth)
+    branch_actuator: wp.array2d(dtype=wp.int32)  # (branch, depth), -1 without
+    point_geom: wp.array2d(dtype=wp.int32)  # (branch, point)
+    point_depth: wp.array2d(dtype=wp.int32)  # (branch, point), 0 is the trunk
+    point_offset: wp.array2d(dtype=wp.vec3)  # (branch, point), in half sizes of the geom
+    point_radius: wp.array2d(dtype=wp.float32)  # (branch, point), in first sizes of the geom
+    point_count: wp.array(dtype=wp.int32)  # (branch)
+    floor: wp.int32
+    timestep: wp.float32
+    impratio: wp.float32
+    cost_scale: wp.float32
+
+
+@dataclass
+class Tree:
+    """A robot's structure: a floating trunk and branches of hinge joints, each with ``depth`` joints.
+
+    Attributes:
+        joints: Joint of each place. Shape: (branches, depth).
+        points: Per branch, the points that can touch the floor: geom, depth of its body (0 is the trunk), position in
+            half sizes of the geom, radius in first sizes of the geom.
+    """
+
+    joints: np.ndarray
+    points: list[list[tuple[int, int, tuple[float, float, float], float]]]
+
+
+def read_tree(model: mujoco.MjModel) -> Tree:
+    """Return the structure of a robot.
+
+    Raises:
+        UserError: If it has something that the fused step does not simulate.
+    """
+    _check(model)
+    children = [[c for c in range(2, model.nbody) if model.body_parentid[c] == b] for b in range(model.nbody)]
+    chains = []
+    for body in children[1]:
+        chain = [body]
+        while children[chain[-1]]:
+            _require(len(children[chain[-1]]) == 1, f"body '{model.body(chain[-1]).name}' branches")
+            chain.append(children[chain[-1]][0])
+        chains.append(chain)
+    _require(bool(chains) and len({len(chain) for chain in chains}) == 1, "its legs have unlike numbers of joints")
+    points: list[list] = [[] for _ in chains]
+    depths = {body: (i, j + 1) for i, chain in enumerate(chains) for j, body in enumerate(chain)}
+    trunk_geoms = 0
+    for geom in range(model.ngeom):
+        if model.geom_bodyid[geom] == 0 or not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+            continue
+        if model.geom_bodyid[geom] == 1:  # spread over the branches
+            branch, depth = trunk_geoms % len(chains), 0
+            trunk_geoms += 1
+        else:
+            branch, depth = depths[model.geom_bodyid[geom]]
+        offsets, radius = _GEOM_POINTS[mujoco.mjtGeom(model.geom_type[geom])]
+        points[branch] += [(geom, depth, offset, radius) for offset in offsets]
+    return Tree(np.array([[model.body_jntadr[body] for body in chain] for chain in chains]), points)
+
+
+def make_robot(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Robot:
+    """Return a robot's tables on the current device; parameters stay those of MuJoCo Warp's model, not copies."""
+    robot = Robot()
+    for name in Robot.vars:
+        if hasattr(warp_model, name):
+            setattr(robot, name, getattr(warp_model, name))
+    robot.gravity = warp_model.opt.gravity
+    robot.floor = int(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)[0])
+    robot.timestep = model.opt.timestep
+    robot.impratio = model.opt.impratio
+    robot.cost_scale = 1.0 / (model.stat.meaninertia * model.nv)
+    sensors = np.full(model.ngeom, -1, np.int32)
+    sensors[model.sensor_refid] = model.sensor_adr
+    robot.geom_sensor = wp.array(sensors, dtype=wp.int32)
+    actuator_of = {int(model.actuator_trnid[i, 0]): i for i in range(model.nu)}
+    robot.branch_joint = wp.array(tree.joints, dtype=wp.int32)
+    robot.branch_actuator = wp.array(np.vectorize(lambda j: actuator_of.get(j, -1))(tree.joints), dtype=wp.int32)
+    most = max(1, *(len(points) for points in tree.points))
+    padded = [points + [(0, 0, (0.0, 0.0, 0.0), 0.0)] * (most - len(points)) for points in tree.points]
+    for place, name, dtype in ((0, "geom", wp.int32), (1, "depth", wp.int32), (2, "offset", wp.vec3)):
+        values = np.array([[point[place] for point in points] for points in padded])
+        setattr(robot, f"point_{name}", wp.array(values, dtype=dtype))
+    robot.point_radius = wp.array([[point[3] for point in points] for points in padded], dtype=wp.float32)
+    robot.point_count = wp.array([len(points) for points in tree.points], dtype=wp.int32)
+    return robot
+
+
+def _require(holds: bool, reason: str) -> None:
+    """Raise a UserError with the reason if something does not hold."""
+    if not holds:
+        raise UserError(f"sim.engine 'fused' cannot simulate this robot: {reason}; use sim.engine = 'mujoco_warp'")
+
+
+def _check(model: mujoco.MjModel) -> None:
+    """Raise a UserError for whatever the fused step does not simulate."""
+    hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
+    planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    robot = collides & (model.geom_bodyid > 0)
+    kinds = {mujoco.mjtGeom(kind) for kind in model.geom_type[robot]}
+    inner = model.geom_contype[robot][:, None] & model.geom_conaffinity[robot]
+    _require(model.nbody > 1 and model.jnt_type[0] == free and model.jnt_bodyid[0] == 1, "its trunk is not free")
+    _require(
+        bool((model.body_jntnum[1:] == 1).all() and (model.jnt_type[1:] == hinge).all()),
+        "each body but the trunk must have one hinge joint (fixed bodies: compiler fusestatic)",
+    )
+    _require(bool(planes.sum() == 1 and (collides & ~robot).sum() == 1), "it needs one plane and no other obstacle")
+    _require(kinds <= set(_GEOM_POINTS), "only spheres, capsules and boxes may collide")
+    _require(not inner.any(), "parts of the robot collide with each other")
+    _require(bool((model.geom_condim[collides] == 3).all()), "condim must be 3")
+    _require(not (model.geom_margin[collides].any() or model.geom_gap[collides].any()), "geoms have margins or gaps")
+    _require(not model.jnt_margin.any(), "joint limits have margins")
+    _require(model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL, "the friction cone must be pyramidal")
+    _require(model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST, "the integrator must be implicitfast")
+    _require(model.opt.disableflags == 0 and model.opt.enableflags == 0, "it sets flags in its options")
+    _require(not (model.neq or model.ntendon or model.npair or model.nmocap), "equalities, tendons, pairs or mocap")
+    _require(not (model.opt.density or model.opt.viscosity or model.opt.wind.any()), "it moves through a fluid")
+    _require(not model.body_gravcomp.any(), "bodies are compensated for gravity")
+    motors = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
+        model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED
+    )
+    plain = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE) & (
+        model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE
+    )
+    _require(bool((motors & plain & (model.actuator_gainprm[:, 0] == 1)).all()), "actuators must be motors")
+    _require(bool(model.jnt_limited[1:].all()), "each joint needs a range")
+    _require(bool(model.actuator_forcelimited.all() and model.actuator_ctrllimited.all()), "motors need ranges")

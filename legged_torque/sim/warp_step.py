@@ -1,0 +1,36 @@
+"""MuJoCo Warp's own step: for any robot that MuJoCo Warp can simulate."""
+
+from __future__ import annotations
+
+import mujoco
+import mujoco_warp as mjw
+import warp as wp
+
+_NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+
+
+class WarpStep:
+    """Steps all worlds of a MuJoCo Warp ``Data``."""
+
+    def __init__(self, model: mjw.Model, data: mjw.Data) -> None:
+        """Keep model and data.
+
+        Args:
+            model: The model on the device.
+            data: The worlds.
+        """
+        self._model, self._data = model, data
+        self._device = data.qpos.device
+        self._flags = model.opt.disableflags
+        if self._device.is_cuda:
+            model.opt.graph_conditional = False  # unrolled solver iterations are faster than a device loop
+
+    def __call__(self, sense: bool) -> None:
+        """Advance every world by one physics step.
+
+        Args:
+            sense: Whether to write the contact sensors.
+        """
+        self._model.opt.disableflags = self._flags if sense else self._flags | _NO_SENSORS
+        with wp.ScopedDevice(self._device):
+            mjw.step(self._model, self._data)

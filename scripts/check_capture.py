@@ -1,0 +1,66 @@
+"""Check that training does the same with and without CUDA graphs: ``python scripts/check_capture.py``."""
+
+import os
+
+os.environ["MUJOCO_GL"] = "disable"
+
+import argparse
+import sys
+
+from legged_torque.envs import task_registry
+from legged_torque.learning.capture_check import compare_capture, warm_up
+from legged_torque.learning.runner import OnPolicyRunner
+from legged_torque.utils.args import Parser, add_build_args, device_name, resolve_device, run_script
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.task_registry import set_seed
+
+
+def main() -> None:
+    """Train the task with and without CUDA graphs, print how far all numbers are apart, and judge."""
+    parser = Parser(__doc__)
+    add_build_args(parser)
+    parser.add_argument("--iterations", type=int, default=1, help="iterations to compare; default: %(default)s")
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        default=1e-2,
+        help="how far a quantity may be off (root mean square, in parts of its own), unless two runs without graphs "
+        "are as far apart; default: %(default)s",
+    )
+    args = parser.parse_args()
+    if args.iterations < 1:
+        raise UserError(f"--iterations must be at least 1, not {args.iterations}")
+    if not args.tolerance >= 0.0:
+        raise UserError(f"--tolerance must be at least 0, not {args.tolerance}")
+    device = resolve_device(args.device)
+    print(f"{args.task} on {device_name(device)}: with CUDA graphs against without")
+    if device == "cpu":
+        print("a CPU has no graphs: this compares two runs that are the same")
+    plain, captured = (build_runner(args, capture) for capture in (False, True))
+    too_far = []
+    for iteration in range(args.iterations):
+        print(f"{f'iteration {iteration}':<24} largest |  relative |       rms | rms of two without")
+        for name, difference in compare_capture(plain, captured, seed=iteration).items():
+            numbers = (difference.largest, difference.relative, difference.rms, difference.repeated)
+            print(f"{name:<22}", " | ".join(f"{number:9.2e}" for number in numbers))
+            if not difference.within(args.tolerance):
+                too_far.append(f"{name} of iteration {iteration}")
+    captured.close()
+    if too_far:
+        sys.exit(f"beyond the tolerance of {args.tolerance:g}: {', '.join(too_far)}")
+    print(f"all within the tolerance of {args.tolerance:g}")
+
+
+def build_runner(args: argparse.Namespace, capture: bool) -> OnPolicyRunner:
+    """Build the task and its runner from the seed of the settings, and let everything that can be captured be so."""
+    env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
+    train_cfg.runner.capture = capture
+    set_seed(train_cfg.seed)
+    env, _ = task_registry.make_env(args.task, args, env_cfg)
+    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
+    warm_up(runner)
+    return runner
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,302 @@
+"""Training in two processes: one policy, one run, and what every process does of its own.
+
+Started by torchrun (:func:`train_together`), this file is the process that trains and notes what it sees.
+"""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from settings import error_of, parse
+from test_ppo import make_ppo, record_rollout, state_of
+
+from legged_torque.envs import task_registry
+from legged_torque.learning import distributed
+from legged_torque.utils.args import resolve_device
+from legged_torque.utils.task_registry import num_iterations, set_seed
+
+ROOT = Path(__file__).resolve().parents[1]
+WORLDS, STEPS = 2, 4
+ALL_STEPS = 2 * WORLDS * STEPS
+"""Environment steps of an iteration of both processes."""
+SMALL = [f"--num_envs={WORLDS}", f"--set=runner.num_steps_per_env={STEPS}", "--set=algorithm.num_mini_batches=2"]
+FORMULA = {"num_mini_batches": 1, "schedule": "adaptive", "max_grad_norm": 1e6, "learning_rate": 1e-3}
+MULTI_GPU = {"world_size": 2, "local_rank": 0}
+
+
+# --------------------------------------------------------------------------------------------------- in the processes
+
+
+def make_runner(log_root):
+    """The runner of this process, whose critic normalizes its observations."""
+    args = parse("--task=a1_multihead", *SMALL)
+    env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
+    train_cfg.runner.logger = "none"
+    train_cfg.critic.obs_normalization = True
+    set_seed(train_cfg.seed)
+    env, _ = task_registry.make_env(args.task, args, env_cfg)
+    return task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=log_root)[0]
+
+
+def everything(runner):
+    """Copies of what training has changed, counters included."""
+    return {
+        **state_of(runner.alg),
+        "total_steps": runner.env.total_steps.clone(),
+        "iterations": torch.tensor(runner.current_learning_iteration),
+    }
+
+
+def train(folder):
+    """Train, stop when the second process is asked to, save, and load in both processes."""
+    runner = make_runner(folder / "logs")
+    if distributed.rank() == 0:
+        runner.claim_log_dir()
+    start = everything(runner)
+    runner.learn(2, init_at_random_ep_len=True)
+    notes = {"start": start, "trained": everything(runner), "observations": runner.env.obs_buf["policy"].clone()}
+    update = runner.alg.update
+
+    def update_with_signal():
+        if distributed.rank() == 1 and runner.current_learning_iteration == 3:
+            signal.raise_signal(signal.SIGTERM)
+        return update()
+
+    runner.alg.update = update_with_signal
+    runner.learn(1000)
+    notes["stopped"] = everything(runner)
+    resumed = make_runner(None)
+    resumed.load(str(next((folder / "logs").glob("*/model_2.pt"))))
+    notes["loaded"] = everything(resumed)
+    resumed.learn(1)
+    notes["resumed"] = everything(resumed)
+    runner.close()
+    return notes
+
+
+def average():
+    """Learn from one minibatch per process, in the second case from bad numbers in one process."""
+    notes = {}
+    for name, spoiled in (("good", False), ("spoiled", True)):
+        alg = make_ppo(multi_gpu_cfg={**MULTI_GPU, "global_rank": distributed.rank()}, **FORMULA)
+        record_rollout(alg, seed=1 + distributed.rank())
+        if spoiled and distributed.rank() == 1:
+            alg.storage.returns[3, 1] = torch.nan
+        before = state_of(alg)
+        report = alg.update()
+        gradients = [p.grad.clone() for p in (*alg.actor.parameters(), *alg.critic.parameters())]
+        notes[name] = {"before": before, "after": state_of(alg), "report": report, "gradients": gradients}
+    return notes
+
+
+def main(folder):
+    """Do both and keep the notes."""
+    distributed.join("cpu")
+    notes = {"average": average(), **train(folder)}
+    torch.save(notes, folder / f"{distributed.rank()}.pt")
+
+
+# --------------------------------------------------------------------------------------------------- the tests
+
+
+def torchrun(*words):
+    """Start two processes that find each other."""
+    environment = os.environ | {"PYTHONUNBUFFERED": "1", "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", *map(str, words)]
+    return subprocess.Popen(
+        command, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory):
+    """The folder in which two processes have trained, and the notes of both."""
+    folder = tmp_path_factory.mktemp("together")
+    with torchrun(__file__, folder) as process:
+        output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    return folder, [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(2)], output
+
+
+def same(first, second):
+    """Whether two dictionaries of tensors are equal to the bit."""
+    return first.keys() == second.keys() and all(torch.equal(first[key], second[key]) for key in first)
+
+
+def test_one_policy_in_different_worlds(together):
+    """Both start with other numbers, see other things, and yet have the same networks, moments and learning rate."""
+    _, (first, second), _ = together
+    assert not same(first["start"], second["start"])
+    assert not torch.equal(first["observations"], second["observations"])
+    for moment in ("trained", "stopped", "resumed"):
+        assert same(first[moment], second[moment])
+    assert not same(first["trained"], first["stopped"])
+    normalizer = [key for key in first["trained"] if "obs_normalizer" in key]
+    assert "critic.obs_normalizer.count" in normalizer
+    assert int(first["trained"]["critic.obs_normalizer.count"]) == 2 * ALL_STEPS
+
+
+def test_steps_of_both_count(together):
+    """The task's counter, on which curricula depend, and the checkpoint's are those of both processes."""
+    folder, (first, second), output = together
+    for notes in (first, second):
+        assert int(notes["trained"]["total_steps"]) == 2 * ALL_STEPS
+    (run,) = (folder / "logs").iterdir()
+    state = torch.load(run / "model_2.pt", weights_only=True)
+    assert state["iter"] == 2 and state["infos"]["total_timesteps"] == 2 * ALL_STEPS
+    assert int(state["infos"]["task"]["total_steps"]) == 2 * ALL_STEPS
+    totals = [int(number) for number in re.findall(r"Total steps: (\d+)", output)]
+    assert totals == [ALL_STEPS * i for i in range(1, 5)]  # of the first process alone, the other one prints nothing
+
+
+def test_a_signal_to_one_process_stops_both(together):
+    """Both finish the iteration in which the second one was asked to stop, and the first one saves."""
+    folder, (first, second), _ = together
+    assert int(first["stopped"]["iterations"]) == int(second["stopped"]["iterations"]) == 4
+    assert {path.name for path in folder.glob("logs/*/*") if path.is_file()} == {"model_2.pt", "model_4.pt"}
+
+
+def test_both_resume(together):
+    """Both continue from the checkpoint, and stay together."""
+    _, (first, second), _ = together
+    assert same(first["loaded"], second["loaded"]) and same(first["loaded"], first["trained"])
+    assert int(first["resumed"]["iterations"]) == 3 and int(first["resumed"]["total_steps"]) == 3 * ALL_STEPS
+
+
+def union_gradients():
+    """Gradients of the loss over the samples of both processes by hand, and their mean KL divergence."""
+    algs = [make_ppo(**FORMULA) for _ in range(2)]
+    for rank, alg in enumerate(algs):
+        record_rollout(alg, seed=1 + rank)
+
+    def samples(name):
+        return torch.cat([getattr(alg.storage, name).flatten(0, 1) for alg in algs])
+
+    actor, critic = algs[0].actor, algs[0].critic
+    observations = torch.cat([alg.storage.observations.flatten(0, 1) for alg in algs])
+    actor(observations, stochastic_output=True)
+    ratio = (actor.get_output_log_prob(samples("actions")) - samples("actions_log_prob").flatten()).exp()
+    error = critic(observations) - samples("returns")
+    # nothing has moved yet, so that no clipping is active
+    loss = -(samples("advantages").flatten() * ratio).mean() + error.square().mean()
+    loss = loss - algs[0].entropy_coef * actor.output_entropy.mean()
+    return torch.autograd.grad(loss, [*actor.parameters(), *critic.parameters()])
+
+
+def test_gradients_are_those_of_all_samples(together):
+    """The averaged gradient is that of the mean loss over the samples of both processes."""
+    _, notes, _ = together
+    first, second = (each["average"]["good"] for each in notes)
+    assert same(first["before"], second["before"]) and same(first["after"], second["after"])
+    for mine, other, expected in zip(first["gradients"], second["gradients"], union_gradients(), strict=True):
+        assert torch.equal(mine, other) and mine.abs().max() > 0.0
+        torch.testing.assert_close(mine, expected, rtol=1e-4, atol=1e-6)
+    assert first["report"] == second["report"]
+
+
+def test_reported_losses_are_means(together):
+    """Losses are those over the samples of both processes."""
+    _, notes, _ = together
+    alone = []
+    for rank in range(2):
+        alg = make_ppo(**FORMULA)
+        record_rollout(alg, seed=1 + rank)
+        alone.append(alg.update())
+    report = notes[0]["average"]["good"]["report"]
+    for name in ("value", "surrogate", "entropy", "kl"):
+        assert report[name] == pytest.approx((alone[0][name] + alone[1][name]) / 2, rel=1e-4, abs=1e-6)
+    assert alone[0]["value"] != pytest.approx(alone[1]["value"], rel=1e-2)
+
+
+def test_bad_numbers_in_one_process_are_skipped_by_both(together):
+    """Neither learns from a minibatch that is bad in one of them; nothing moves by a bit."""
+    _, notes, _ = together
+    for spoiled in (each["average"]["spoiled"] for each in notes):
+        assert spoiled["report"]["skipped_updates"] == 1
+        before = {key: value for key, value in spoiled["before"].items() if not key.startswith("adam")}
+        after = {key: value for key, value in spoiled["after"].items() if not key.startswith("adam")}
+        assert same(before, after)
+
+
+def test_train_script_in_two_processes():
+    """One folder, one set of prints, and Ctrl-C saves the iteration that both have finished."""
+    name = f"test_distributed_{os.getpid()}"
+    words = ["--task=a1_position", "--device=cpu", f"--experiment_name={name}", "--logger=none", *SMALL]
+    try:
+        with torchrun(ROOT / "scripts" / "train.py", *words, "--max_iterations=100000") as process:
+            output = ""
+            for line in process.stdout:
+                output += line
+                if "Learning iteration 2/" in line:
+                    process.send_signal(signal.SIGINT)
+                    break
+            output += process.communicate(timeout=120)[0]
+        (run,) = (ROOT / "logs" / name).iterdir()
+        (checkpoint,) = run.glob("*.pt*")
+        count = int(checkpoint.stem.removeprefix("model_"))
+        state = torch.load(checkpoint, weights_only=True)
+        config = yaml.safe_load((run / "config.yaml").read_text())
+    finally:
+        shutil.rmtree(ROOT / "logs" / name, ignore_errors=True)
+    assert count >= 3 and state["infos"]["total_timesteps"] == count * ALL_STEPS
+    assert config["processes"] == 2 and config["env"]["env"]["num_envs"] == WORLDS
+    assert output.count("Training a1_position on 2 x CPU") == output.count("Learning iteration 1/") == 1
+    assert f"{2 * WORLDS} worlds" in output and output.count(f"The run is in {run}") == 1
+
+
+# --------------------------------------------------------------------------------------------------- without processes
+
+
+@pytest.fixture
+def second_of_two(monkeypatch):
+    """The environment in which torchrun starts the second of two processes."""
+    for key, value in {"WORLD_SIZE": 2, "RANK": 1, "LOCAL_RANK": 1, "LOCAL_WORLD_SIZE": 2}.items():
+        monkeypatch.setenv(key, str(value))
+    return monkeypatch
+
+
+def test_every_process_has_its_gpu(second_of_two):
+    """It is the one with the process's number; too few GPUs, or one for all, are refused."""
+    second_of_two.setattr(torch.cuda, "device_count", lambda: 2)
+    assert [resolve_device(name) for name in (None, "auto", "cuda", "cpu")] == ["cuda:1", "cuda:1", "cuda:1", "cpu"]
+    assert error_of(resolve_device, "cuda:0").startswith("with torchrun each process takes a GPU of its own: leave out")
+    second_of_two.setattr(torch.cuda, "device_count", lambda: 1)
+    line = error_of(resolve_device, "auto")
+    assert line == "torchrun has started 2 processes on a machine with 1 GPU(s)"
+    second_of_two.setattr(torch.cuda, "device_count", lambda: 0)
+    assert resolve_device("auto") == "cpu"
+
+
+def test_length_of_a_training(second_of_two):
+    """The steps of a whole training are those of all processes; each has its own random numbers."""
+    args = parse("--task=a1_position", "--num_envs=100", "--set=runner.total_steps=9601")
+    _, train_cfg = task_registry.get_cfgs("a1_position", args)
+    env = type("Task", (), {"num_envs": 100})
+    assert num_iterations(env, train_cfg) == 3  # 9601 / (2 * 100 * 24)
+    set_seed(5)
+    drawn = torch.rand(3)
+    torch.manual_seed(6)
+    assert torch.equal(torch.rand(3), drawn)
+
+
+def test_processes_that_torchrun_has_not_started(second_of_two):
+    """A stray WORLD_SIZE is told in one line."""
+    second_of_two.delenv("MASTER_ADDR", raising=False)
+    assert error_of(distributed.join, "cpu").startswith("WORLD_SIZE is 2, but torchrun has not started this process")
+
+
+def test_one_process_asks_nobody():
+    """Without other processes, a condition is what it is."""
+    assert distributed.any_process(True, "cpu") and not distributed.any_process(False, "cpu")
+    assert (distributed.world_size(), distributed.rank(), distributed.local_rank()) == (1, 0, 0)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
