@@ -143,6 +143,8 @@ def print_kernels(kernels: list[dict], device: str, trace: Path) -> None:
     kind = "torch operators (Warp's kernels show on a GPU only)" if device == "cpu" else "kernels"
     print(f"  most expensive {kind} of {TRACED} iterations, see {trace}:")
     print(f"  {'calls':>8}  {'total ms':>9}  name")
+    if not kernels:
+        print("  none was seen: torch's profiler needs CUPTI, and the permission to use it")
     for kernel in kernels:
         print(f"  {kernel['calls']:>8}  {kernel['total_ms']:>9.2f}  {kernel['name'][:110]}")
 

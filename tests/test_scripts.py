@@ -215,21 +215,6 @@ def test_mistakes_after_training(root, script, words, message):
     assert contents(root) == before
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
-        ("--num_envs 0", "num_envs must be at least 1, not 0"),
-        ("--rounds=0", "--rounds must be at least 1, not 0"),
-        ("--device=cup", "unknown device 'cup'; did you mean 'cpu'?"),
-    ],
-)
-def test_mistakes_when_benchmarking(tmp_path, words, message):
-    """So does the benchmark."""
-    small = ["--task=a1_position", "--device=cpu", "--rounds=1"]
-    assert_told_in_one_line(run_here("benchmark.py", *small, *words.split(), root=tmp_path), message)
-
-
 @pytest.mark.parametrize("script", ["train.py", "play.py", "learning_curve.py", "benchmark.py"])
 def test_help(script, tmp_path):
     """``--help`` describes the options."""

@@ -74,8 +74,8 @@ class MemoryMeter:
     On a GPU: by how much the free memory of the device has shrunk since the meter was created. That counts all of
     torch (what its allocator holds, graphs), of Warp (which has a pool of its own that torch does not see), and kernels
     that were loaded; it does not count the CUDA context, which is there before. It also counts what other processes
-    have taken or given back in the meantime: measure on a GPU of your own. Allocators keep what they have taken, so
-    that looking after an iteration shows its peak.
+    have taken or given back in the meantime: measure on a GPU of your own. Allocators keep what they have taken, graphs
+    above all, so that the most that is seen between iterations is what training needs.
 
     On the CPU: the peak resident set size of the process, which never shrinks.
     """
@@ -138,17 +138,22 @@ def measure(task_name: str, env_cfg: Any, train_cfg: Any, plan: Plan, memory: Me
 def _measure(task_name: str, env_cfg: Any, train_cfg: Any, plan: Plan, memory: MemoryMeter, device: str) -> dict:
     """Do what :func:`measure` says for a size that fits."""
     with tempfile.TemporaryDirectory() as folder:
-        start = time.perf_counter()
+        marks, used = [time.perf_counter()], []
+
+        def mark(number: int = 0) -> None:
+            marks.append(time.perf_counter())
+            used.append(memory.used())
+
         with CompileProgress() as compilation:
             set_seed(train_cfg.seed)
             task = task_registry.get_task_class(task_name)(env_cfg, device)
             runner, _ = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=folder)
             runner.claim_log_dir()
             _wait(task)
-            marks = [start, time.perf_counter()]
-            time_iterations(runner, WARM_UP, lambda number: marks.append(time.perf_counter()))
+            mark()
+            time_iterations(runner, WARM_UP, mark)
         times = time_iterations(runner, plan.rounds)
-        peak = {"peak_memory_mib": memory.used(), **memory.shares()}
+        peak = {"peak_memory_mib": max(*used, memory.used()), **memory.shares()}
         physics, step = time_physics(task, plan.rounds)
         row = summarize(times, physics, step, task.num_envs, train_cfg.runner.num_steps_per_env)
         row |= {**peak, **summarize_startup(marks), "compiled_modules": compilation.modules}

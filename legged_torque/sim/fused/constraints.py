@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from legged_torque.sim.fused.dynamics import branch_dynamics
-from legged_torque.sim.fused.math import quat_to_matrix, vec4, vec5
+from legged_torque.sim.fused.math import quat_to_matrix, row, vec4, vec5
 from legged_torque.sim.fused.robot import Robot
 
 MIN_VALUE = wp.constant(1.0e-15)
@@ -61,7 +61,7 @@ def constraint_mass(invweight: float, impedance: float) -> float:
 @wp.func
 def floor_normal(robot: Robot, world: int) -> wp.vec3:
     """Return the unit normal of the floor."""
-    rot = quat_to_matrix(robot.geom_quat[world % robot.geom_quat.shape[0], robot.floor])
+    rot = quat_to_matrix(robot.geom_quat[row(world, robot.geom_quat.shape[0]), robot.floor])
     return wp.vec3(rot[0, 2], rot[1, 2], rot[2, 2])
 
 
@@ -85,10 +85,10 @@ def set_contact_rows(
 ) -> Contact:
     """Return a contact with friction, mass and references of its rows, mixed from geom and floor as MuJoCo does."""
     floor = robot.floor
-    mix_row = world % robot.geom_solmix.shape[0]
-    ref_row = world % robot.geom_solref.shape[0]
-    imp_row = world % robot.geom_solimp.shape[0]
-    fri_row = world % robot.geom_friction.shape[0]
+    mix_row = row(world, robot.geom_solmix.shape[0])
+    ref_row = row(world, robot.geom_solref.shape[0])
+    imp_row = row(world, robot.geom_solimp.shape[0])
+    fri_row = row(world, robot.geom_friction.shape[0])
     weight_floor, weight_geom = robot.geom_solmix[mix_row, floor], robot.geom_solmix[mix_row, geom]
     mix = float(0.5)
     if weight_floor + weight_geom > 2.0 * MIN_VALUE:
@@ -107,7 +107,7 @@ def set_contact_rows(
     solimp = mix * robot.geom_solimp[imp_row, geom] + (1.0 - mix) * robot.geom_solimp[imp_row, floor]
     params = reference_dynamics(solref, solimp, dist, robot.timestep)
     friction = wp.max(friction, MIN_FRICTION)
-    invweight = robot.body_invweight0[world % robot.body_invweight0.shape[0], robot.geom_bodyid[geom]][0]
+    invweight = robot.body_invweight0[row(world, robot.body_invweight0.shape[0]), robot.geom_bodyid[geom]][0]
     invweight *= (1.0 + friction * friction) * 2.0 * friction * friction / robot.impratio
     contact.friction = friction
     contact.mass = constraint_mass(invweight, params[2])
@@ -188,22 +188,22 @@ def branch_constraints(n: int) -> SimpleNamespace:
             joint = robot.branch_joint[branch, j]
             dof = joint + 5
             vel = qvel[world, dof]
-            invweight = robot.dof_invweight0[world % robot.dof_invweight0.shape[0], dof]
-            loss = robot.dof_frictionloss[world % robot.dof_frictionloss.shape[0], dof]
+            invweight = robot.dof_invweight0[row(world, robot.dof_invweight0.shape[0]), dof]
+            loss = robot.dof_frictionloss[row(world, robot.dof_frictionloss.shape[0]), dof]
             if loss > 0.0:
-                solref = robot.dof_solref[world % robot.dof_solref.shape[0], dof]
-                solimp = robot.dof_solimp[world % robot.dof_solimp.shape[0], dof]
+                solref = robot.dof_solref[row(world, robot.dof_solref.shape[0]), dof]
+                solimp = robot.dof_solimp[row(world, robot.dof_solimp.shape[0]), dof]
                 params = reference_dynamics(solref, solimp, 0.0, robot.timestep)
                 rows.friction_loss[j] = loss
                 rows.friction_mass[j] = constraint_mass(invweight, params[2])
                 rows.friction_reference[j] = -params[1] * vel
-            limits = robot.jnt_range[world % robot.jnt_range.shape[0], joint]
+            limits = robot.jnt_range[row(world, robot.jnt_range.shape[0]), joint]
             below, above = qpos[world, joint + 6] - limits[0], limits[1] - qpos[world, joint + 6]
             dist = wp.min(below, above)
             if dist < 0.0:
                 sign = wp.where(below < above, 1.0, -1.0)
-                solref = robot.jnt_solref[world % robot.jnt_solref.shape[0], joint]
-                solimp = robot.jnt_solimp[world % robot.jnt_solimp.shape[0], joint]
+                solref = robot.jnt_solref[row(world, robot.jnt_solref.shape[0]), joint]
+                solimp = robot.jnt_solimp[row(world, robot.jnt_solimp.shape[0]), joint]
                 params = reference_dynamics(solref, solimp, dist, robot.timestep)
                 rows.limit_sign[j] = sign
                 rows.limit_mass[j] = constraint_mass(invweight, params[2])
@@ -218,17 +218,17 @@ def branch_constraints(n: int) -> SimpleNamespace:
     ) -> int:  # fmt: skip
         """Write the contacts of a branch with the floor from index ``start`` on and return how many there are."""
         count = int(0)
-        height = origin - robot.geom_pos[world % robot.geom_pos.shape[0], robot.floor]
+        height = origin - robot.geom_pos[row(world, robot.geom_pos.shape[0]), robot.floor]
         for point in range(robot.point_count[branch]):
             geom = robot.point_geom[branch, point]
             depth = robot.point_depth[branch, point]
-            size = robot.geom_size[world % robot.geom_size.shape[0], geom]
+            size = robot.geom_size[row(world, robot.geom_size.shape[0]), geom]
             is_capsule = robot.geom_type[geom] == CAPSULE
             half = size
             if is_capsule:
                 half = wp.vec3(0.0, 0.0, size[1])
-            turn = rotations[depth] * quat_to_matrix(robot.geom_quat[world % robot.geom_quat.shape[0], geom])
-            centre = positions[depth] + rotations[depth] * robot.geom_pos[world % robot.geom_pos.shape[0], geom]
+            turn = rotations[depth] * quat_to_matrix(robot.geom_quat[row(world, robot.geom_quat.shape[0]), geom])
+            centre = positions[depth] + rotations[depth] * robot.geom_pos[row(world, robot.geom_pos.shape[0]), geom]
             centre += turn * wp.cw_mul(robot.point_offset[branch, point], half)
             radius = robot.point_radius[branch, point] * size[0]
             dist = wp.dot(height + centre, normal) - radius

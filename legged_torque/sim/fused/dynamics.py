@@ -9,24 +9,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from legged_torque.sim.fused.math import quat_multiply, quat_rotation, quat_to_matrix, skew
+from legged_torque.sim.fused.math import quat_multiply, quat_rotation, quat_to_matrix, row
 from legged_torque.sim.fused.robot import Robot
-
-
-@wp.struct
-class Trunk:
-    """State and inertia of the trunk; ``inertia`` and so on are sums over all bodies once the branches are added."""
-
-    pos: wp.vec3  # in the world [m]
-    quat: wp.quat
-    rot: wp.mat33  # from the trunk's axes to the world's
-    lin_vel: wp.vec3
-    ang_vel: wp.vec3  # in world axes
-    mass: wp.float32
-    moment: wp.vec3  # mass times centre of mass [kg m]
-    inertia: wp.mat33  # about the trunk's origin
-    force: wp.vec3  # what gravity and velocities need [N], as a wrench about the trunk's origin
-    torque: wp.vec3
 
 
 @wp.struct
@@ -40,6 +24,18 @@ class Body:
     torque: wp.vec3
 
 
+@wp.struct
+class Trunk:
+    """State and inertia of the trunk."""
+
+    pos: wp.vec3  # in the world [m]
+    quat: wp.quat
+    rot: wp.mat33  # from the trunk's axes to the world's
+    lin_vel: wp.vec3
+    ang_vel: wp.vec3  # in world axes
+    body: Body
+
+
 @wp.func
 def body_dynamics(
     robot: Robot, world: int, body: int, pos: wp.vec3, rot: wp.mat33, ang: wp.vec3, lin: wp.vec3, ang_acc: wp.vec3,
@@ -47,10 +43,10 @@ def body_dynamics(
 ) -> Body:  # fmt: skip
     """Return a body's inertia and wrench (Newton-Euler) from its pose, velocity and acceleration."""
     out = Body()
-    out.mass = robot.body_mass[world % robot.body_mass.shape[0], body]
-    com = pos + rot * robot.body_ipos[world % robot.body_ipos.shape[0], body]
-    principal = rot * quat_to_matrix(robot.body_iquat[world % robot.body_iquat.shape[0], body])
-    diagonal = robot.body_inertia[world % robot.body_inertia.shape[0], body]
+    out.mass = robot.body_mass[row(world, robot.body_mass.shape[0]), body]
+    com = pos + rot * robot.body_ipos[row(world, robot.body_ipos.shape[0]), body]
+    principal = rot * quat_to_matrix(robot.body_iquat[row(world, robot.body_iquat.shape[0]), body])
+    diagonal = robot.body_inertia[row(world, robot.body_inertia.shape[0]), body]
     out.moment = out.mass * com
     out.inertia = principal * wp.diag(diagonal) * wp.transpose(principal)
     out.inertia += out.mass * (wp.dot(com, com) * wp.identity(n=3, dtype=float) - wp.outer(com, com))
@@ -71,16 +67,22 @@ def make_trunk(robot: Robot, world: int, qpos: wp.array2d(dtype=float), qvel: wp
     trunk.rot = quat_to_matrix(trunk.quat)
     trunk.lin_vel = wp.vec3(qvel[world, 0], qvel[world, 1], qvel[world, 2])
     trunk.ang_vel = trunk.rot * wp.vec3(qvel[world, 3], qvel[world, 4], qvel[world, 5])
-    acc = wp.cross(trunk.lin_vel, trunk.ang_vel) - robot.gravity[world % robot.gravity.shape[0]]
-    body = body_dynamics(
+    acc = wp.cross(trunk.lin_vel, trunk.ang_vel) - robot.gravity[row(world, robot.gravity.shape[0])]
+    trunk.body = body_dynamics(
         robot, world, 1, wp.vec3(0.0), trunk.rot, trunk.ang_vel, trunk.lin_vel, wp.vec3(0.0), acc
-    )  # fmt: skip
-    trunk.mass = body.mass
-    trunk.moment = body.moment
-    trunk.inertia = body.inertia
-    trunk.force = body.force
-    trunk.torque = body.torque
+    )
     return trunk
+
+
+@wp.func
+def add_bodies(a: Body, b: Body) -> Body:
+    """Return the sum of inertias and wrenches."""
+    a.mass += b.mass
+    a.moment = a.moment + b.moment
+    a.inertia = a.inertia + b.inertia
+    a.force = a.force + b.force
+    a.torque = a.torque + b.torque
+    return a
 
 
 @functools.cache
@@ -93,6 +95,7 @@ def branch_dynamics(n: int) -> SimpleNamespace:
     vector = wp.types.vector(length=n, dtype=wp.float32)
     matrix = wp.types.matrix(shape=(n, n), dtype=wp.float32)
     columns = wp.types.matrix(shape=(3, n), dtype=wp.float32)
+    symmetric = wp.types.matrix(shape=(6, n), dtype=wp.float32)
 
     @wp.struct
     class Branch:
@@ -119,19 +122,33 @@ def branch_dynamics(n: int) -> SimpleNamespace:
         return m
 
     @wp.func
+    def with_symmetric(m: symmetric, j: int, a: wp.mat33) -> symmetric:
+        m[0, j] = a[0, 0]
+        m[1, j] = a[0, 1]
+        m[2, j] = a[0, 2]
+        m[3, j] = a[1, 1]
+        m[4, j] = a[1, 2]
+        m[5, j] = a[2, 2]
+        return m
+
+    @wp.func
+    def symmetric_matrix(m: symmetric, j: int) -> wp.mat33:
+        return wp.mat33(m[0, j], m[1, j], m[2, j], m[1, j], m[3, j], m[4, j], m[2, j], m[4, j], m[5, j])
+
+    @wp.func
     def joint_force(
         robot: Robot, world: int, branch: int, j: int, pos: float, vel: float, ctrl: wp.array2d(dtype=float)
     ) -> float:
         """Return the torque of a joint's motor, spring and damper."""
         joint = robot.branch_joint[branch, j]
-        spring = robot.qpos_spring[world % robot.qpos_spring.shape[0], joint + 6]
-        force = robot.jnt_stiffness[world % robot.jnt_stiffness.shape[0], joint] * (spring - pos)
-        force -= robot.dof_damping[world % robot.dof_damping.shape[0], joint + 5] * vel
+        spring = robot.qpos_spring[row(world, robot.qpos_spring.shape[0]), joint + 6]
+        force = robot.jnt_stiffness[row(world, robot.jnt_stiffness.shape[0]), joint] * (spring - pos)
+        force -= robot.dof_damping[row(world, robot.dof_damping.shape[0]), joint + 5] * vel
         motor = robot.branch_actuator[branch, j]
         if motor >= 0:
-            ctrl_range = robot.actuator_ctrlrange[world % robot.actuator_ctrlrange.shape[0], motor]
-            force_range = robot.actuator_forcerange[world % robot.actuator_forcerange.shape[0], motor]
-            gear = robot.actuator_gear[world % robot.actuator_gear.shape[0], motor][0]
+            ctrl_range = robot.actuator_ctrlrange[row(world, robot.actuator_ctrlrange.shape[0]), motor]
+            force_range = robot.actuator_forcerange[row(world, robot.actuator_forcerange.shape[0]), motor]
+            gear = robot.actuator_gear[row(world, robot.actuator_gear.shape[0]), motor][0]
             torque = wp.clamp(ctrl[world, motor], ctrl_range[0], ctrl_range[1])
             force += gear * wp.clamp(torque, force_range[0], force_range[1])
         return force
@@ -144,11 +161,15 @@ def branch_dynamics(n: int) -> SimpleNamespace:
     ) -> Branch:  # fmt: skip
         """Return a branch's equations of motion; fill poses and velocities of its bodies, the trunk's at index 0."""
         out = Branch()
-        bodies = wp.zeros(shape=wp.static(n), dtype=Body)
+        masses = vector()
+        moments = columns()
+        inertias = symmetric()
+        forces = columns()
+        torques = columns()
         pos = wp.vec3(0.0)
         quat, ang, lin = 1.0 * trunk.quat, 1.0 * trunk.ang_vel, 1.0 * trunk.lin_vel  # values, not references
         ang_acc = wp.vec3(0.0)
-        lin_acc = wp.cross(lin, ang) - robot.gravity[world % robot.gravity.shape[0]]
+        lin_acc = wp.cross(lin, ang) - robot.gravity[row(world, robot.gravity.shape[0])]
         positions[0] = pos
         rotations[0] = trunk.rot
         ang_vels[0] = ang
@@ -158,12 +179,12 @@ def branch_dynamics(n: int) -> SimpleNamespace:
             body = joint + 1
             angle = qpos[world, joint + 6]
             vel = qvel[world, joint + 5]
-            pos += quat_to_matrix(quat) * robot.body_pos[world % robot.body_pos.shape[0], body]
-            quat = quat_multiply(quat, robot.body_quat[world % robot.body_quat.shape[0], body])
-            local_anchor = robot.jnt_pos[world % robot.jnt_pos.shape[0], joint]
-            local_axis = robot.jnt_axis[world % robot.jnt_axis.shape[0], joint]
+            pos += quat_to_matrix(quat) * robot.body_pos[row(world, robot.body_pos.shape[0]), body]
+            quat = quat_multiply(quat, robot.body_quat[row(world, robot.body_quat.shape[0]), body])
+            local_anchor = robot.jnt_pos[row(world, robot.jnt_pos.shape[0]), joint]
+            local_axis = robot.jnt_axis[row(world, robot.jnt_axis.shape[0]), joint]
             anchor = pos + quat_to_matrix(quat) * local_anchor
-            turned = angle - robot.qpos0[world % robot.qpos0.shape[0], joint + 6]
+            turned = angle - robot.qpos0[row(world, robot.qpos0.shape[0]), joint + 6]
             quat = quat_multiply(quat, quat_rotation(local_axis, turned))
             rot = quat_to_matrix(quat)
             pos = anchor - rot * local_anchor
@@ -173,7 +194,12 @@ def branch_dynamics(n: int) -> SimpleNamespace:
             lin_acc += (wp.cross(ang, lever) + wp.cross(lin, axis)) * vel
             ang += axis * vel
             lin += lever * vel
-            bodies[j] = body_dynamics(robot, world, body, pos, rot, ang, lin, ang_acc, lin_acc)
+            part = body_dynamics(robot, world, body, pos, rot, ang, lin, ang_acc, lin_acc)
+            masses[j] = part.mass
+            moments = with_column(moments, j, part.moment)
+            inertias = with_symmetric(inertias, j, part.inertia)
+            forces = with_column(forces, j, part.force)
+            torques = with_column(torques, j, part.torque)
             positions[j + 1] = pos
             rotations[j + 1] = rot
             ang_vels[j + 1] = ang
@@ -181,16 +207,15 @@ def branch_dynamics(n: int) -> SimpleNamespace:
             out.axis = with_column(out.axis, j, axis)
             out.lever = with_column(out.lever, j, lever)
             out.force[j] = joint_force(robot, world, branch, j, angle, vel, ctrl)
-            out.damping[j] = robot.dof_damping[world % robot.dof_damping.shape[0], joint + 5]
+            out.damping[j] = robot.dof_damping[row(world, robot.dof_damping.shape[0]), joint + 5]
         total = Body()
         for reverse in range(wp.static(n)):
             j = wp.static(n - 1) - reverse
-            part = bodies[j]
-            total.mass += part.mass
-            total.moment += part.moment
-            total.inertia += part.inertia
-            total.force += part.force
-            total.torque += part.torque
+            total.mass += masses[j]
+            total.moment += column(moments, j)
+            total.inertia += symmetric_matrix(inertias, j)
+            total.force += column(forces, j)
+            total.torque += column(torques, j)
             axis, lever = column(out.axis, j), column(out.lever, j)
             out.force[j] -= wp.dot(axis, total.torque) + wp.dot(lever, total.force)
             torque = total.inertia * axis + wp.cross(total.moment, lever)
@@ -203,7 +228,7 @@ def branch_dynamics(n: int) -> SimpleNamespace:
             out.mass_lin = with_column(out.mass_lin, j, force)
             out.mass_ang = with_column(out.mass_ang, j, wp.transpose(trunk.rot) * torque)
             dof = robot.branch_joint[branch, j] + 5
-            out.mass[j, j] += robot.dof_armature[world % robot.dof_armature.shape[0], dof]
+            out.mass[j, j] += robot.dof_armature[row(world, robot.dof_armature.shape[0]), dof]
         out.total = total
         return out
 
@@ -212,14 +237,3 @@ def branch_dynamics(n: int) -> SimpleNamespace:
         make_branch=make_branch,
     )  # fmt: skip
 
-
-@wp.func
-def trunk_mass_coupling(trunk: Trunk) -> wp.mat33:
-    """Return the inertia that couples the trunk's translation (rows) with its rotation in its own axes (columns)."""
-    return -skew(trunk.moment) * trunk.rot
-
-
-@wp.func
-def trunk_mass_rotation(trunk: Trunk) -> wp.mat33:
-    """Return the inertia of the trunk's rotation in its own axes."""
-    return wp.transpose(trunk.rot) * trunk.inertia * trunk.rot

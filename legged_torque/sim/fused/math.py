@@ -55,6 +55,12 @@ def group_sum33_symmetric(value: wp.mat33, lanes: int) -> wp.mat33:
 
 
 @wp.func
+def row(world: int, rows: int) -> int:
+    """Return a world's row in a table that has one row per world or one for all."""
+    return wp.where(rows == 1, 0, world)
+
+
+@wp.func
 def quat_multiply(a: wp.quat, b: wp.quat) -> wp.quat:
     """Return the product of two quaternions (w, x, y, z), the order of MuJoCo's that Warp's functions do not share."""
     return wp.quat(
@@ -97,46 +103,48 @@ def linear_algebra(n: int) -> SimpleNamespace:
         n: Number of rows.
 
     Returns:
-        ``cholesky(a)``: the lower factor L of a = L L^T; ``cholesky_solve(L, b)``: the solution of L L^T x = b.
+        The types ``matrix`` and ``vector``, and ``cholesky(a)`` and ``cholesky_solve(cholesky(a), b)``.
     """
     matrix = wp.types.matrix(shape=(n, n), dtype=wp.float32)
     vector = wp.types.vector(length=n, dtype=wp.float32)
 
     @wp.func
     def cholesky(a: matrix) -> matrix:
+        """Return the lower factor, with the inverse of its diagonal in the diagonal's place."""
         lower = matrix()
         for j in range(wp.static(n)):
             pivot = a[j, j]
             for k in range(wp.static(n)):
                 if k < j:
                     pivot -= lower[j, k] * lower[j, k]
-            root = wp.sqrt(wp.max(pivot, 1.0e-12))
-            lower[j, j] = root
+            inverse = 1.0 / wp.sqrt(wp.max(pivot, 1.0e-12))
+            lower[j, j] = inverse
             for i in range(wp.static(n)):
                 if i > j:
                     rest = a[i, j]
                     for k in range(wp.static(n)):
                         if k < j:
                             rest -= lower[i, k] * lower[j, k]
-                    lower[i, j] = rest / root
+                    lower[i, j] = rest * inverse
         return lower
 
     @wp.func
     def cholesky_solve(lower: matrix, b: vector) -> vector:
+        """Return the solution of a x = b from the factor of a."""
         x = vector()
         for i in range(wp.static(n)):
             rest = b[i]
             for k in range(wp.static(n)):
                 if k < i:
                     rest -= lower[i, k] * x[k]
-            x[i] = rest / lower[i, i]
+            x[i] = rest * lower[i, i]
         for reverse in range(wp.static(n)):
             i = wp.static(n - 1) - reverse
             rest = x[i]
             for k in range(wp.static(n)):
                 if k > i:
                     rest -= lower[k, i] * x[k]
-            x[i] = rest / lower[i, i]
+            x[i] = rest * lower[i, i]
         return x
 
     return SimpleNamespace(matrix=matrix, vector=vector, cholesky=cholesky, cholesky_solve=cholesky_solve)

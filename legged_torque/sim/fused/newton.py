@@ -19,46 +19,8 @@ from legged_torque.sim.fused.constraints import (
     row_values,
 )
 from legged_torque.sim.fused.dynamics import branch_dynamics
-from legged_torque.sim.fused.math import linear_algebra, skew, vec4, vec6
-
-
-@wp.struct
-class TrunkSystem:
-    """Six equations for the trunk: matrix blocks and right-hand side of its translation and rotation (own axes)."""
-
-    lin: wp.mat33
-    coupling: wp.mat33  # rows translation, columns rotation
-    ang: wp.mat33
-    rhs_lin: wp.vec3
-    rhs_ang: wp.vec3
-
-
-@wp.struct
-class TrunkMotion:
-    """Accelerations, or a direction of search, of the trunk: translation, and rotation in its own axes."""
-
-    lin: wp.vec3
-    ang: wp.vec3
-
-
-@wp.func
-def solve_trunk(system: TrunkSystem) -> TrunkMotion:
-    """Return the solution of the trunk's six equations."""
-    a = wp.matrix(shape=(6, 6), dtype=float)
-    b = vec6()
-    for i in range(3):
-        b[i] = system.rhs_lin[i]
-        b[i + 3] = system.rhs_ang[i]
-        for j in range(3):
-            a[i, j] = system.lin[i, j]
-            a[i + 3, j] = system.coupling[j, i]
-            a[i, j + 3] = system.coupling[i, j]
-            a[i + 3, j + 3] = system.ang[i, j]
-    x = wp.static(linear_algebra(6).cholesky_solve)(wp.static(linear_algebra(6).cholesky)(a), b)
-    out = TrunkMotion()
-    out.lin = wp.vec3(x[0], x[1], x[2])
-    out.ang = wp.vec3(x[3], x[4], x[5])
-    return out
+from legged_torque.sim.fused.math import linear_algebra, skew, vec4
+from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
 
 
 @wp.func
@@ -69,7 +31,11 @@ def friction_force(mass: float, loss: float, x: float) -> float:
 
 @functools.cache
 def branch_newton(n: int) -> SimpleNamespace:
-    """Return the types and functions of the solver for branches of ``n`` joints."""
+    """Return the types and functions of the solver for branches of ``n`` joints.
+
+    Returns:
+        ``Leg``, the state of a branch in the solver, and the parts of an iteration in their order.
+    """
     dynamics, constraints, algebra = branch_dynamics(n), branch_constraints(n), linear_algebra(n)
     vector, matrix, columns = dynamics.vector, dynamics.matrix, dynamics.columns
     Branch, JointRows = dynamics.Branch, constraints.JointRows
@@ -84,179 +50,238 @@ def branch_newton(n: int) -> SimpleNamespace:
         limit: vector
 
     @wp.struct
-    class BranchSystem:
-        """The Newton equations of a branch, eliminated: what is needed to find its part of the step."""
+    class Leg:
+        """A branch in the solver: its equations, where it is, and where it goes."""
 
+        branch: Branch
+        rows: JointRows
+        first_contact: int  # its contacts' indices
+        num_contacts: int
+        acc: vector
+        residuals: Residuals
+        step: vector
+        change: Residuals  # of the residuals per unit of the step
         factor: matrix  # Cholesky factor of the Hessian's block
-        coupling_lin: columns
+        coupling_lin: columns  # Hessian's blocks with the trunk
         coupling_ang: columns
         gradient: vector
         trunk_gradient_lin: wp.vec3  # this branch's part
         trunk_gradient_ang: wp.vec3
 
     @wp.func
-    def joint_rows_times(rows: JointRows, x: vector) -> Residuals:
-        """Return J x of the joint rows."""
+    def joint_rows_times(rows: JointRows, a: vector) -> Residuals:
+        """Return J a of the joint rows."""
         out = Residuals()
-        for j in range(wp.static(n)):
-            out.friction[j] = x[j]
-            out.limit[j] = rows.limit_sign[j] * x[j]
+        out.friction = 1.0 * a
+        out.limit = wp.cw_mul(rows.limit_sign, a)
         return out
 
     @wp.func
     def contact_rows_times(
-        branch: Branch, rot: wp.mat33, trunk: TrunkMotion, x: vector, normal: wp.vec3, contacts: wp.array(dtype=Contact),
-        start: int, count: int, out: wp.array(dtype=vec4),
-    ) -> int:  # fmt: skip
-        """Write J x of the contact rows of a branch, from index ``start`` on."""
-        if count > 0:
-            lin = wp.zeros(shape=wp.static(n + 1), dtype=wp.vec3)
-            ang = wp.zeros(shape=wp.static(n + 1), dtype=wp.vec3)
-            lin[0] = trunk.lin
-            ang[0] = rot * trunk.ang
-            for j in range(wp.static(n)):
-                lin[j + 1] = lin[j] + x[j] * column(branch.lever, j)
-                ang[j + 1] = ang[j] + x[j] * column(branch.axis, j)
-            for k in range(start, start + count):
-                contact = contacts[k]
-                motion = lin[contact.depth] + wp.cross(ang[contact.depth], contact.pos)
-                out[k] = row_values(contact, normal, motion)
-        return count
+        branch: Branch, rot: wp.mat33, trunk: TrunkMotion, a: vector, normal: wp.vec3, contact: Contact
+    ) -> vec4:
+        """Return J a of a contact's rows."""
+        lin = 1.0 * trunk.lin
+        ang = rot * trunk.ang
+        for j in range(wp.static(n)):
+            if j < contact.depth:
+                lin += a[j] * column(branch.lever, j)
+                ang += a[j] * column(branch.axis, j)
+        return row_values(contact, normal, lin + wp.cross(ang, contact.pos))
 
     @wp.func
-    def eliminate(
-        branch: Branch, rows: JointRows, residuals: Residuals, rot: wp.mat33, trunk_acc: TrunkMotion, acc: vector,
-        normal: wp.vec3, contacts: wp.array(dtype=Contact), x: wp.array(dtype=vec4), start: int, count: int,
+    def start_leg(
+        leg: Leg, rot: wp.mat33, trunk_acc: TrunkMotion, normal: wp.vec3, contacts: wp.array(dtype=Contact),
+        x: wp.array(dtype=vec4),
+    ) -> Leg:  # fmt: skip
+        """Return a branch with the residuals of the accelerations that it starts from."""
+        leg.residuals = joint_rows_times(leg.rows, leg.acc)
+        leg.residuals.friction = leg.residuals.friction - leg.rows.friction_reference
+        leg.residuals.limit = leg.residuals.limit - leg.rows.limit_reference
+        for k in range(leg.first_contact, leg.first_contact + leg.num_contacts):
+            x[k] = (
+                contact_rows_times(leg.branch, rot, trunk_acc, leg.acc, normal, contacts[k]) - contacts[k].reference
+            )
+        return leg
+
+    @wp.func
+    def assemble(
+        leg: Leg, rot: wp.mat33, trunk_acc: TrunkMotion, normal: wp.vec3, contacts: wp.array(dtype=Contact),
+        x: wp.array(dtype=vec4),
     ):  # fmt: skip
-        """Return a branch's eliminated Newton equations and what it adds to those of the trunk."""
-        out = BranchSystem()
+        """Return a branch with gradient and Hessian of the cost, and what its contacts add for the trunk."""
         add = TrunkSystem()
-        hessian = branch.mass
-        out.coupling_lin = branch.mass_lin
-        out.coupling_ang = branch.mass_ang
-        out.gradient = branch.mass * acc - branch.force
-        out.gradient += wp.transpose(branch.mass_lin) * trunk_acc.lin + wp.transpose(branch.mass_ang) * trunk_acc.ang
-        out.trunk_gradient_lin = branch.mass_lin * acc
-        out.trunk_gradient_ang = branch.mass_ang * acc
+        hessian = 1.0 * leg.branch.mass
+        coupling_lin = 1.0 * leg.branch.mass_lin
+        coupling_ang = 1.0 * leg.branch.mass_ang
+        gradient = leg.branch.mass * leg.acc - leg.branch.force
+        gradient += wp.transpose(coupling_lin) * trunk_acc.lin + wp.transpose(coupling_ang) * trunk_acc.ang
+        gradient_lin = coupling_lin * leg.acc
+        gradient_ang = coupling_ang * leg.acc
         for j in range(wp.static(n)):
-            fri_mass, fri_x = rows.friction_mass[j], residuals.friction[j]
-            out.gradient[j] -= friction_force(fri_mass, rows.friction_loss[j], fri_x)
-            if wp.abs(fri_mass * fri_x) < rows.friction_loss[j]:
-                hessian[j, j] += fri_mass
-            lim_mass, lim_x = rows.limit_mass[j], residuals.limit[j]
-            out.gradient[j] -= rows.limit_sign[j] * row_force(lim_mass, lim_x)
-            if lim_x < 0.0:
-                hessian[j, j] += lim_mass
-        for k in range(start, start + count):
+            friction_mass, friction_x = leg.rows.friction_mass[j], leg.residuals.friction[j]
+            gradient[j] -= friction_force(friction_mass, leg.rows.friction_loss[j], friction_x)
+            if wp.abs(friction_mass * friction_x) < leg.rows.friction_loss[j]:
+                hessian[j, j] += friction_mass
+            limit_mass, limit_x = leg.rows.limit_mass[j], leg.residuals.limit[j]
+            gradient[j] -= leg.rows.limit_sign[j] * row_force(limit_mass, limit_x)
+            if limit_x < 0.0:
+                hessian[j, j] += limit_mass
+        for k in range(leg.first_contact, leg.first_contact + leg.num_contacts):
             contact = contacts[k]
             lever = -skew(contact.pos) * rot  # motion of the point per unit of the trunk's rotation
-            jac = columns()
+            jacobian = columns()
             for j in range(wp.static(n)):
                 if j < contact.depth:
-                    axis = column(branch.axis, j)
-                    jac = with_column(jac, j, column(branch.lever, j) + wp.cross(axis, contact.pos))
+                    motion = column(leg.branch.lever, j) + wp.cross(column(leg.branch.axis, j), contact.pos)
+                    jacobian = with_column(jacobian, j, motion)
             force = contact_force(contact, normal, x[k])
-            out.gradient -= wp.transpose(jac) * force
-            out.trunk_gradient_lin -= force
-            out.trunk_gradient_ang -= wp.transpose(lever) * force
+            gradient -= wp.transpose(jacobian) * force
+            gradient_lin -= force
+            gradient_ang -= wp.transpose(lever) * force
             stiffness = contact_stiffness(contact, normal, x[k])
-            pushed = stiffness * jac
-            hessian += wp.transpose(jac) * pushed
-            out.coupling_lin += pushed
-            out.coupling_ang += wp.transpose(lever) * pushed
+            pushed = stiffness * jacobian
+            hessian += wp.transpose(jacobian) * pushed
+            coupling_lin += pushed
+            coupling_ang += wp.transpose(lever) * pushed
             add.lin += stiffness
             add.coupling += stiffness * lever
             add.ang += wp.transpose(lever) * stiffness * lever
-        out.factor = cholesky(hessian)
-        add.rhs_lin = -out.trunk_gradient_lin + out.coupling_lin * cholesky_solve(out.factor, out.gradient)
-        add.rhs_ang = -out.trunk_gradient_ang + out.coupling_ang * cholesky_solve(out.factor, out.gradient)
-        # Schur complement, column by column of H^-1 C^T
-        inv_lin = columns()
-        inv_ang = columns()
-        for r in range(3):
-            row_lin = vector()
-            row_ang = vector()
-            for j in range(wp.static(n)):
-                row_lin[j] = out.coupling_lin[r, j]
-                row_ang[j] = out.coupling_ang[r, j]
-            row_lin = cholesky_solve(out.factor, row_lin)
-            row_ang = cholesky_solve(out.factor, row_ang)
-            for j in range(wp.static(n)):
-                inv_lin[r, j] = row_lin[j]
-                inv_ang[r, j] = row_ang[j]
-        add.lin -= inv_lin * wp.transpose(out.coupling_lin)
-        add.coupling -= inv_lin * wp.transpose(out.coupling_ang)
-        add.ang -= inv_ang * wp.transpose(out.coupling_ang)
-        return out, add
+        leg.factor = cholesky(hessian)
+        leg.coupling_lin = coupling_lin
+        leg.coupling_ang = coupling_ang
+        leg.gradient = gradient
+        leg.trunk_gradient_lin = gradient_lin
+        leg.trunk_gradient_ang = gradient_ang
+        return leg, add
 
     @wp.func
-    def branch_step(system: BranchSystem, trunk_step: TrunkMotion) -> vector:
-        """Return a branch's part of the Newton step."""
-        rhs = system.gradient + wp.transpose(system.coupling_lin) * trunk_step.lin
-        rhs += wp.transpose(system.coupling_ang) * trunk_step.ang
-        return -cholesky_solve(system.factor, rhs)
+    def assemble_damping(leg: Leg, timestep: float) -> Leg:
+        """Return a branch with the equations of the change that implicit damping makes: (M + h D) da = -h D a."""
+        hessian = 1.0 * leg.branch.mass
+        for j in range(wp.static(n)):
+            hessian[j, j] += timestep * leg.branch.damping[j]
+        leg.factor = cholesky(hessian)
+        leg.coupling_lin = leg.branch.mass_lin
+        leg.coupling_ang = leg.branch.mass_ang
+        leg.gradient = timestep * wp.cw_mul(leg.branch.damping, leg.acc)
+        leg.trunk_gradient_lin = wp.vec3(0.0)
+        leg.trunk_gradient_ang = wp.vec3(0.0)
+        return leg
+
+    @wp.func
+    def solve_rows(factor: matrix, c: columns) -> columns:
+        """Return C H^-1 from the factor of H."""
+        out = columns()
+        for r in range(3):
+            line = vector()
+            for j in range(wp.static(n)):
+                line[j] = c[r, j]
+            line = cholesky_solve(factor, line)
+            for j in range(wp.static(n)):
+                out[r, j] = line[j]
+        return out
+
+    @wp.func
+    def eliminate(leg: Leg, add: TrunkSystem) -> TrunkSystem:
+        """Add what is left for the trunk when a branch is eliminated from the equations (Schur complement)."""
+        free = cholesky_solve(leg.factor, leg.gradient)  # the branch's own step, less the sign
+        add.rhs_lin = add.rhs_lin + leg.coupling_lin * free - leg.trunk_gradient_lin
+        add.rhs_ang = add.rhs_ang + leg.coupling_ang * free - leg.trunk_gradient_ang
+        solved_lin = solve_rows(leg.factor, leg.coupling_lin)
+        add.lin = add.lin - solved_lin * wp.transpose(leg.coupling_lin)
+        add.coupling = add.coupling - solved_lin * wp.transpose(leg.coupling_ang)
+        add.ang = add.ang - solve_rows(leg.factor, leg.coupling_ang) * wp.transpose(leg.coupling_ang)
+        return add
+
+    @wp.func
+    def branch_step(leg: Leg, trunk_step: TrunkMotion) -> vector:
+        """Return a branch's part of the step."""
+        rhs = leg.gradient + wp.transpose(leg.coupling_lin) * trunk_step.lin
+        rhs += wp.transpose(leg.coupling_ang) * trunk_step.ang
+        return -cholesky_solve(leg.factor, rhs)
+
+    @wp.func
+    def turn_to(
+        leg: Leg, rot: wp.mat33, trunk_step: TrunkMotion, normal: wp.vec3, contacts: wp.array(dtype=Contact),
+        dx: wp.array(dtype=vec4),
+    ) -> Leg:  # fmt: skip
+        """Return a branch with its part of the Newton step and the changes of its residuals along it."""
+        leg.step = branch_step(leg, trunk_step)
+        leg.change = joint_rows_times(leg.rows, leg.step)
+        for k in range(leg.first_contact, leg.first_contact + leg.num_contacts):
+            dx[k] = contact_rows_times(leg.branch, rot, trunk_step, leg.step, normal, contacts[k])
+        return leg
 
     @wp.func
     def row_slopes(
-        rows: JointRows, x: Residuals, dx: Residuals, contacts: wp.array(dtype=Contact), cx: wp.array(dtype=vec4),
-        dcx: wp.array(dtype=vec4), start: int, count: int, alpha: float,
-    ) -> wp.vec2:  # fmt: skip
-        """Return first and second derivative of the rows' cost along a direction, at a distance ``alpha``."""
+        leg: Leg, contacts: wp.array(dtype=Contact), x: wp.array(dtype=vec4), dx: wp.array(dtype=vec4), alpha: float
+    ) -> wp.vec2:
+        """Return first and second derivative of the rows' cost along the step, at a share ``alpha`` of it."""
         slope = float(0.0)
         curvature = float(0.0)
         for j in range(wp.static(n)):
-            mass, loss, d = rows.friction_mass[j], rows.friction_loss[j], dx.friction[j]
-            value = x.friction[j] + alpha * d
-            slope -= friction_force(mass, loss, value) * d
+            mass, loss, along = leg.rows.friction_mass[j], leg.rows.friction_loss[j], leg.change.friction[j]
+            value = leg.residuals.friction[j] + alpha * along
+            slope -= friction_force(mass, loss, value) * along
             if wp.abs(mass * value) < loss:
-                curvature += mass * d * d
-            d = dx.limit[j]
-            value = x.limit[j] + alpha * d
+                curvature += mass * along * along
+            along = leg.change.limit[j]
+            value = leg.residuals.limit[j] + alpha * along
             if value < 0.0:
-                slope += rows.limit_mass[j] * value * d
-                curvature += rows.limit_mass[j] * d * d
-        for k in range(start, start + count):
+                slope += leg.rows.limit_mass[j] * value * along
+                curvature += leg.rows.limit_mass[j] * along * along
+        for k in range(leg.first_contact, leg.first_contact + leg.num_contacts):
             mass = contacts[k].mass
-            along = dcx[k]
-            values = cx[k] + alpha * along
+            along4 = dx[k]
+            values = x[k] + alpha * along4
             for r in range(4):
                 if values[r] < 0.0:
-                    slope += mass * values[r] * along[r]
-                    curvature += mass * along[r] * along[r]
+                    slope += mass * values[r] * along4[r]
+                    curvature += mass * along4[r] * along4[r]
         return wp.vec2(slope, curvature)
 
     @wp.func
-    def move_residuals(
-        rows: JointRows, x: Residuals, dx: Residuals, cx: wp.array(dtype=vec4), dcx: wp.array(dtype=vec4), start: int,
-        count: int, alpha: float,
-    ):  # fmt: skip
-        """Move along a direction; return the joint rows' new residuals and how many rows changed their state."""
-        out = Residuals()
-        out.friction = x.friction + alpha * dx.friction
-        out.limit = x.limit + alpha * dx.limit
-        changed = float(0.0)
+    def slopes_at_start(
+        leg: Leg, trunk_step: TrunkMotion, contacts: wp.array(dtype=Contact), x: wp.array(dtype=vec4),
+        dx: wp.array(dtype=vec4),
+    ) -> wp.vec3:  # fmt: skip
+        """Return a branch's slope of the whole cost along the step, and slope and curvature of its smooth part."""
+        slope = wp.dot(leg.step, leg.gradient)
+        slope += wp.dot(trunk_step.lin, leg.trunk_gradient_lin) + wp.dot(trunk_step.ang, leg.trunk_gradient_ang)
+        curvature = wp.dot(leg.step, leg.branch.mass * leg.step)
+        curvature += 2.0 * wp.dot(leg.branch.mass_lin * leg.step, trunk_step.lin)
+        curvature += 2.0 * wp.dot(leg.branch.mass_ang * leg.step, trunk_step.ang)
+        return wp.vec3(slope, slope - row_slopes(leg, contacts, x, dx, 0.0)[0], curvature)
+
+    @wp.func
+    def move(leg: Leg, x: wp.array(dtype=vec4), dx: wp.array(dtype=vec4), alpha: float):
+        """Return a branch moved by a share of the step, and how many rows changed their state on the way."""
+        flips = float(0.0)
+        leg.acc = leg.acc + alpha * leg.step
         for j in range(wp.static(n)):
-            before, after = rows.friction_mass[j] * x.friction[j], rows.friction_mass[j] * out.friction[j]
-            changed += wp.abs(clamp_state(before, rows.friction_loss[j]) - clamp_state(after, rows.friction_loss[j]))
-            if rows.limit_mass[j] > 0.0 and (x.limit[j] < 0.0) != (out.limit[j] < 0.0):
-                changed += 1.0
-        for k in range(start, start + count):
-            old = cx[k]
-            new = old + alpha * dcx[k]
+            mass, loss = leg.rows.friction_mass[j], leg.rows.friction_loss[j]
+            old, new = leg.residuals.friction[j], leg.residuals.friction[j] + alpha * leg.change.friction[j]
+            flips += wp.abs(friction_state(mass * old, loss) - friction_state(mass * new, loss))
+            old_limit, new_limit = leg.residuals.limit[j], leg.residuals.limit[j] + alpha * leg.change.limit[j]
+            flips += wp.where((old_limit < 0.0) != (new_limit < 0.0), 1.0, 0.0)
+        leg.residuals.friction = leg.residuals.friction + alpha * leg.change.friction
+        leg.residuals.limit = leg.residuals.limit + alpha * leg.change.limit
+        for k in range(leg.first_contact, leg.first_contact + leg.num_contacts):
+            before = x[k]
+            after = before + alpha * dx[k]
             for r in range(4):
-                if (old[r] < 0.0) != (new[r] < 0.0):
-                    changed += 1.0
-            cx[k] = new
-        return out, changed
+                flips += wp.where((before[r] < 0.0) != (after[r] < 0.0), 1.0, 0.0)
+            x[k] = after
+        return leg, flips
 
     return SimpleNamespace(
-        Residuals=Residuals, BranchSystem=BranchSystem, joint_rows_times=joint_rows_times,
-        contact_rows_times=contact_rows_times, eliminate=eliminate, branch_step=branch_step, row_slopes=row_slopes,
-        move_residuals=move_residuals,
+        Leg=Leg, start_leg=start_leg, assemble=assemble, assemble_damping=assemble_damping, eliminate=eliminate,
+        branch_step=branch_step, turn_to=turn_to, slopes_at_start=slopes_at_start, row_slopes=row_slopes, move=move,
     )  # fmt: skip
 
 
 @wp.func
-def clamp_state(force: float, loss: float) -> float:
+def friction_state(force: float, loss: float) -> float:
     """Return in which of its three states a dry friction row is: -1, 0 or 1."""
     return wp.where(force <= -loss, -1.0, wp.where(force >= loss, 1.0, 0.0))

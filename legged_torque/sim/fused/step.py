@@ -11,27 +11,20 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from legged_torque.sim.fused.constraints import Contact, branch_constraints, contact_force, floor_normal
-from legged_torque.sim.fused.dynamics import (
-    branch_dynamics,
-    make_trunk,
-    trunk_mass_coupling,
-    trunk_mass_rotation,
-)
-from legged_torque.sim.fused.math import (
-    group_sum,
-    group_sum3,
-    group_sum33,
-    group_sum33_symmetric,
-    quat_multiply,
-    quat_rotation,
-    vec4,
-)
-from legged_torque.sim.fused.newton import TrunkMotion, TrunkSystem, branch_newton, clamp_state, solve_trunk
+from legged_torque.sim.fused.constraints import Contact, floor_normal
+from legged_torque.sim.fused.dynamics import Body, add_bodies, make_trunk
+from legged_torque.sim.fused.math import group_sum, group_sum3, vec4
+from legged_torque.sim.fused.newton import TrunkMotion, TrunkSystem, branch_newton
 from legged_torque.sim.fused.robot import Robot, make_robot, read_tree
+from legged_torque.sim.fused.stages import branch_stages, integrate_trunk
+from legged_torque.sim.fused.trunk import add_systems, solve_trunk, trunk_residual, trunk_slopes, whole_body
 
 BLOCK_DIM = 64
 """Threads per block; small blocks spread few worlds over the whole GPU."""
+TOLERANCE = wp.constant(1.0e-9)
+"""The solver stops when a step promises less than this decrease of the cost, in MuJoCo's units."""
+LINE_SEARCH_TOLERANCE = wp.constant(0.01)
+"""The line search stops when the slope has come down to this share of that at its start."""
 
 
 class FusedStep:
@@ -56,6 +49,8 @@ class FusedStep:
             self._robot = make_robot(mj_model, model, tree)
         self._lanes = 1 << (branches - 1).bit_length() if self._device.is_cuda else 1
         points = max(1, *(len(points) for points in tree.points))
+        room = data.nworld * branches * points
+        self._scratch = [wp.empty(room, dtype=dtype, device=self._device) for dtype in (Contact, vec4, vec4)]
         self._kernel = make_kernel(branches, depth, points, self._lanes)
         self._limits = (mj_model.opt.iterations, mj_model.opt.ls_iterations)
 
@@ -70,7 +65,9 @@ class FusedStep:
             self._kernel,
             dim=(data.nworld, self._lanes),
             inputs=[self._robot, *self._limits, sense, data.ctrl],
-            outputs=[data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, data.solver_niter],
+            outputs=[
+                data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, data.solver_niter, *self._scratch,
+            ],  # fmt: skip
             block_dim=BLOCK_DIM,
             device=self._device,
         )
@@ -80,6 +77,9 @@ class FusedStep:
 def make_kernel(branches: int, depth: int, points: int, lanes: int) -> wp.Kernel:
     """Return the kernel for a robot's structure.
 
+    On a GPU each thread keeps its one branch in registers. On a CPU the only thread of a world goes through all of
+    them in turns, and an array keeps those that wait: the statements under ``several``.
+
     Args:
         branches: Number of branches.
         depth: Joints per branch.
@@ -87,216 +87,122 @@ def make_kernel(branches: int, depth: int, points: int, lanes: int) -> wp.Kernel
         lanes: Threads per world, a power of two; 1 on a CPU.
     """
     per_lane = -(-branches // lanes)
-    dynamics, constraints, newton = branch_dynamics(depth), branch_constraints(depth), branch_newton(depth)
-    vector, Branch = dynamics.vector, dynamics.Branch
-    JointRows, Residuals, BranchSystem = constraints.JointRows, newton.Residuals, newton.BranchSystem
-    make_branch, make_joint_rows, find_contacts = (
-        dynamics.make_branch, constraints.make_joint_rows, constraints.find_contacts,
-    )  # fmt: skip
-    joint_rows_times, contact_rows_times = newton.joint_rows_times, newton.contact_rows_times
-    eliminate, branch_step, row_slopes, move_residuals = (
-        newton.eliminate, newton.branch_step, newton.row_slopes, newton.move_residuals,
-    )  # fmt: skip
+    several = per_lane > 1
+    newton, stages = branch_newton(depth), branch_stages(depth)
+    Leg, start_leg, assemble, eliminate = newton.Leg, newton.start_leg, newton.assemble, newton.eliminate
+    turn_to, assemble_damping, branch_step = newton.turn_to, newton.assemble_damping, newton.branch_step
+    slopes_at_start, row_slopes, move = newton.slopes_at_start, newton.row_slopes, newton.move
+    make_leg, integrate_leg, sense_leg = stages.make_leg, stages.integrate_leg, stages.sense_leg
 
     @wp.kernel(module="unique", enable_backward=False)
     def fused_step(
         robot: Robot, iterations: int, ls_iterations: int, sense: bool, ctrl: wp.array2d(dtype=float),
         qpos: wp.array2d(dtype=float), qvel: wp.array2d(dtype=float), warmstart: wp.array2d(dtype=float),
-        sensordata: wp.array2d(dtype=float), niter: wp.array(dtype=int),
+        sensordata: wp.array2d(dtype=float), niter: wp.array(dtype=int), contacts: wp.array(dtype=Contact),
+        x: wp.array(dtype=vec4), dx: wp.array(dtype=vec4),
     ):  # fmt: skip
         world, lane = wp.tid()
-        legs = wp.zeros(shape=wp.static(per_lane), dtype=Branch)
-        rows = wp.zeros(shape=wp.static(per_lane), dtype=JointRows)
-        acc = wp.zeros(shape=wp.static(per_lane), dtype=vector)
-        residuals = wp.zeros(shape=wp.static(per_lane), dtype=Residuals)
-        direction = wp.zeros(shape=wp.static(per_lane), dtype=Residuals)
-        systems = wp.zeros(shape=wp.static(per_lane), dtype=BranchSystem)
-        steps = wp.zeros(shape=wp.static(per_lane), dtype=vector)
-        counts = wp.zeros(shape=wp.static(per_lane), dtype=int)
-        contacts = wp.zeros(shape=wp.static(per_lane * points), dtype=Contact)
-        x = wp.zeros(shape=wp.static(per_lane * points), dtype=vec4)
-        dx = wp.zeros(shape=wp.static(per_lane * points), dtype=vec4)
-        positions = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
-        rotations = wp.zeros(shape=wp.static(depth + 1), dtype=wp.mat33)
-        ang_vels = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
-        lin_vels = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
-
+        leg = Leg()
+        if wp.static(several):
+            legs = wp.zeros(shape=wp.static(per_lane), dtype=Leg)
         trunk = make_trunk(robot, world, qpos, qvel)
         normal = floor_normal(robot, world)
-        trunk_acc = TrunkMotion()
-        trunk_acc.lin = wp.vec3(warmstart[world, 0], warmstart[world, 1], warmstart[world, 2])
-        trunk_acc.ang = wp.vec3(warmstart[world, 3], warmstart[world, 4], warmstart[world, 5])
-        mass = float(0.0)
-        moment = wp.vec3(0.0)
-        inertia = wp.mat33()
-        force = wp.vec3(0.0)
-        torque = wp.vec3(0.0)
+        acc = TrunkMotion()
+        acc.lin = wp.vec3(warmstart[world, 0], warmstart[world, 1], warmstart[world, 2])
+        acc.ang = wp.vec3(warmstart[world, 3], warmstart[world, 4], warmstart[world, 5])
+        total = Body()
         for i in range(wp.static(per_lane)):
             branch = lane + i * wp.static(lanes)
             if branch < wp.static(branches):
-                legs[i] = make_branch(
-                    robot, world, branch, trunk, qpos, qvel, ctrl, positions, rotations, ang_vels, lin_vels
-                )
-                rows[i] = make_joint_rows(robot, world, branch, qpos, qvel)
-                counts[i] = find_contacts(
-                    robot, world, branch, trunk.pos, normal, positions, rotations, ang_vels, lin_vels, contacts,
-                    i * wp.static(points),
+                leg = make_leg(
+                    robot, world, branch, trunk, normal, ctrl, qpos, qvel, warmstart, contacts,
+                    (world * wp.static(branches) + branch) * wp.static(points),
                 )  # fmt: skip
-                for j in range(wp.static(depth)):
-                    acc[i][j] = warmstart[world, robot.branch_joint[branch, j] + 5]
-                total = legs[i].total
-                mass += total.mass
-                moment += total.moment
-                inertia += total.inertia
-                force += total.force
-                torque += total.torque
-        trunk.mass += group_sum(mass, wp.static(lanes))
-        trunk.moment += group_sum3(moment, wp.static(lanes))
-        trunk.inertia += group_sum33_symmetric(inertia, wp.static(lanes))
-        trunk.force += group_sum3(force, wp.static(lanes))
-        trunk.torque += group_sum3(torque, wp.static(lanes))
-        mass_coupling = trunk_mass_coupling(trunk)
-        mass_rotation = trunk_mass_rotation(trunk)
-        bias_ang = wp.transpose(trunk.rot) * trunk.torque
-        for i in range(wp.static(per_lane)):
-            residuals[i] = joint_rows_times(rows[i], acc[i])
-            residuals[i].friction -= rows[i].friction_reference
-            residuals[i].limit -= rows[i].limit_reference
-            contact_rows_times(
-                legs[i], trunk.rot, trunk_acc, acc[i], normal, contacts, i * wp.static(points), counts[i], x
-            )
-            for k in range(i * wp.static(points), i * wp.static(points) + counts[i]):
-                x[k] = x[k] - contacts[k].reference
+                leg = start_leg(leg, trunk.rot, acc, normal, contacts, x)
+                total = add_bodies(total, leg.branch.total)
+            if wp.static(several):
+                legs[i] = leg
+        whole = whole_body(trunk, total, wp.static(lanes))
 
         used = int(0)
         for _iteration in range(iterations):
             used += 1
             system = TrunkSystem()
             for i in range(wp.static(per_lane)):
+                if wp.static(several):
+                    leg = legs[i]
                 if lane + i * wp.static(lanes) < wp.static(branches):
-                    solved, add = eliminate(
-                        legs[i], rows[i], residuals[i], trunk.rot, trunk_acc, acc[i], normal, contacts, x,
-                        i * wp.static(points), counts[i],
-                    )  # fmt: skip
-                    systems[i] = solved
-                    system.lin += add.lin
-                    system.coupling += add.coupling
-                    system.ang += add.ang
-                    system.rhs_lin += add.rhs_lin
-                    system.rhs_ang += add.rhs_ang
-            own_lin = trunk.mass * trunk_acc.lin + mass_coupling * trunk_acc.ang + trunk.force
-            own_ang = wp.transpose(mass_coupling) * trunk_acc.lin + mass_rotation * trunk_acc.ang + bias_ang
-            system.lin = group_sum33_symmetric(system.lin, wp.static(lanes))
-            system.lin += trunk.mass * wp.identity(n=3, dtype=float)
-            system.coupling = group_sum33(system.coupling, wp.static(lanes)) + mass_coupling
-            system.ang = group_sum33_symmetric(system.ang, wp.static(lanes)) + mass_rotation
-            system.rhs_lin = group_sum3(system.rhs_lin, wp.static(lanes)) - own_lin
-            system.rhs_ang = group_sum3(system.rhs_ang, wp.static(lanes)) - own_ang
-            trunk_step = solve_trunk(system)
-
-            slope = float(0.0)
-            linear = float(0.0)
-            quadratic = float(0.0)
+                    leg, add = assemble(leg, trunk.rot, acc, normal, contacts, x)
+                    system = add_systems(system, eliminate(leg, add))
+                if wp.static(several):
+                    legs[i] = leg
+            residual = trunk_residual(whole, acc)
+            step = solve_trunk(whole, residual, system, wp.static(lanes))
+            start = wp.vec3(0.0)
             for i in range(wp.static(per_lane)):
+                if wp.static(several):
+                    leg = legs[i]
                 if lane + i * wp.static(lanes) < wp.static(branches):
-                    steps[i] = branch_step(systems[i], trunk_step)
-                    direction[i] = joint_rows_times(rows[i], steps[i])
-                    contact_rows_times(
-                        legs[i], trunk.rot, trunk_step, steps[i], normal, contacts, i * wp.static(points), counts[i], dx
-                    )
-                    part = wp.dot(steps[i], systems[i].gradient)
-                    part += wp.dot(trunk_step.lin, systems[i].trunk_gradient_lin)
-                    part += wp.dot(trunk_step.ang, systems[i].trunk_gradient_ang)
-                    slope += part
-                    at_start = row_slopes(
-                        rows[i], residuals[i], direction[i], contacts, x, dx, i * wp.static(points), counts[i], 0.0
-                    )
-                    linear += part - at_start[0]
-                    quadratic += wp.dot(steps[i], legs[i].mass * steps[i])
-                    quadratic += 2.0 * wp.dot(legs[i].mass_lin * steps[i], trunk_step.lin)
-                    quadratic += 2.0 * wp.dot(legs[i].mass_ang * steps[i], trunk_step.ang)
-            own_slope = wp.dot(trunk_step.lin, own_lin) + wp.dot(trunk_step.ang, own_ang)
-            slope = group_sum(slope, wp.static(lanes)) + own_slope
-            linear = group_sum(linear, wp.static(lanes)) + own_slope
-            quadratic = group_sum(quadratic, wp.static(lanes))
-            quadratic += trunk.mass * wp.dot(trunk_step.lin, trunk_step.lin)
-            quadratic += 2.0 * wp.dot(trunk_step.lin, mass_coupling * trunk_step.ang)
-            quadratic += wp.dot(trunk_step.ang, mass_rotation * trunk_step.ang)
-            if not (-slope * robot.cost_scale > 1.0e-9):
+                    leg = turn_to(leg, trunk.rot, step, normal, contacts, dx)
+                    start += slopes_at_start(leg, step, contacts, x, dx)
+                if wp.static(several):
+                    legs[i] = leg
+            start = group_sum3(start, wp.static(lanes)) + trunk_slopes(whole, residual, step)
+            if not (-start[0] * robot.cost_scale > TOLERANCE):
                 break
-
             alpha = float(1.0)
             low = float(0.0)
             high = float(0.0)
             for _search in range(ls_iterations):
                 slopes = wp.vec2(0.0, 0.0)
                 for i in range(wp.static(per_lane)):
-                    slopes += row_slopes(
-                        rows[i], residuals[i], direction[i], contacts, x, dx, i * wp.static(points), counts[i], alpha
-                    )
-                first = linear + alpha * quadratic + group_sum(slopes[0], wp.static(lanes))
-                second = quadratic + group_sum(slopes[1], wp.static(lanes))
-                if wp.abs(first) <= -0.01 * slope:
+                    if wp.static(several):
+                        leg = legs[i]
+                    slopes += row_slopes(leg, contacts, x, dx, alpha)
+                slope = start[1] + alpha * start[2] + group_sum(slopes[0], wp.static(lanes))
+                curvature = start[2] + group_sum(slopes[1], wp.static(lanes))
+                if wp.abs(slope) <= -LINE_SEARCH_TOLERANCE * start[0]:
                     break
-                if first < 0.0:
+                if slope < 0.0:
                     low = alpha
                 else:
                     high = alpha
-                alpha -= first / second
+                alpha -= slope / curvature
                 if high > 0.0 and (alpha <= low or alpha >= high):
                     alpha = 0.5 * (low + high)
-            changed = float(0.0)
-            trunk_acc.lin += alpha * trunk_step.lin
-            trunk_acc.ang += alpha * trunk_step.ang
+            flips = float(0.0)
+            acc.lin = acc.lin + alpha * step.lin
+            acc.ang = acc.ang + alpha * step.ang
             for i in range(wp.static(per_lane)):
-                acc[i] = acc[i] + alpha * steps[i]
-                moved, flips = move_residuals(
-                    rows[i], residuals[i], direction[i], x, dx, i * wp.static(points), counts[i], alpha
-                )
-                residuals[i] = moved
-                changed += flips
-            if alpha == 1.0 and group_sum(changed, wp.static(lanes)) == 0.0:
-                break
+                if wp.static(several):
+                    leg = legs[i]
+                leg, leg_flips = move(leg, x, dx, alpha)
+                flips += leg_flips
+                if wp.static(several):
+                    legs[i] = leg
+            if alpha == 1.0 and group_sum(flips, wp.static(lanes)) == 0.0:
+                break  # the whole step stayed in one piece of the piecewise quadratic cost: this is its minimum
 
-        # integrate
-        h = robot.timestep
+        system = TrunkSystem()
+        for i in range(wp.static(per_lane)):
+            if wp.static(several):
+                leg = legs[i]
+            if lane + i * wp.static(lanes) < wp.static(branches):
+                leg = assemble_damping(leg, robot.timestep)
+                system = add_systems(system, eliminate(leg, TrunkSystem()))
+            if wp.static(several):
+                legs[i] = leg
+        step = solve_trunk(whole, TrunkMotion(), system, wp.static(lanes))
         for i in range(wp.static(per_lane)):
             branch = lane + i * wp.static(lanes)
+            if wp.static(several):
+                leg = legs[i]
             if branch < wp.static(branches):
-                for j in range(wp.static(depth)):
-                    joint = robot.branch_joint[branch, j]
-                    warmstart[world, joint + 5] = acc[i][j]
-                    vel = qvel[world, joint + 5] + h * acc[i][j]
-                    qvel[world, joint + 5] = vel
-                    qpos[world, joint + 6] = qpos[world, joint + 6] + h * vel
+                integrate_leg(robot, world, branch, leg, step, qpos, qvel, warmstart)
                 if sense:
-                    for k in range(robot.point_count[branch]):
-                        adr = robot.geom_sensor[robot.point_geom[branch, k]]
-                        if adr >= 0:
-                            for r in range(4):
-                                sensordata[world, adr + r] = 0.0
-                    for k in range(i * wp.static(points), i * wp.static(points) + counts[i]):
-                        adr = contacts[k].sensor
-                        if adr >= 0:
-                            push = contact_force(contacts[k], normal, x[k])
-                            sensordata[world, adr] = sensordata[world, adr] + 1.0
-                            for r in range(3):
-                                sensordata[world, adr + 1 + r] = sensordata[world, adr + 1 + r] + push[r]
+                    sense_leg(robot, world, branch, leg, normal, contacts, x, sensordata)
         if lane == 0:
-            lin = trunk.lin_vel + h * trunk_acc.lin
-            ang = wp.transpose(trunk.rot) * trunk.ang_vel + h * trunk_acc.ang
-            speed = wp.length(ang)
-            quat = trunk.quat
-            if speed > 0.0:
-                quat = wp.normalize(quat_multiply(quat, quat_rotation(ang / speed, h * speed)))
-            for r in range(3):
-                warmstart[world, r] = trunk_acc.lin[r]
-                warmstart[world, 3 + r] = trunk_acc.ang[r]
-                qvel[world, r] = lin[r]
-                qvel[world, 3 + r] = ang[r]
-                qpos[world, r] = qpos[world, r] + h * lin[r]
-            for r in range(4):
-                qpos[world, 3 + r] = quat[r]
+            integrate_trunk(robot, world, trunk, acc, step, qpos, qvel, warmstart)
             niter[world] = used
 
     return fused_step

@@ -1,0 +1,112 @@
+"""The trunk's six equations, which are left when all branches are eliminated."""
+
+import warp as wp
+
+from legged_torque.sim.fused.dynamics import Body, Trunk
+from legged_torque.sim.fused.math import (
+    group_sum,
+    group_sum3,
+    group_sum33,
+    group_sum33_symmetric,
+    linear_algebra,
+    skew,
+    vec6,
+)
+
+
+@wp.struct
+class WholeBody:
+    """Inertia and bias of the trunk's translation (world axes) and rotation (its own axes), with all branches."""
+
+    mass: wp.float32
+    coupling: wp.mat33  # rows translation, columns rotation
+    rotation: wp.mat33
+    bias_lin: wp.vec3
+    bias_ang: wp.vec3
+
+
+@wp.struct
+class TrunkMotion:
+    """Accelerations, or a direction of search, of the trunk: translation (world axes), rotation (its own axes)."""
+
+    lin: wp.vec3
+    ang: wp.vec3
+
+
+@wp.struct
+class TrunkSystem:
+    """Six equations for the trunk's step: matrix blocks and right-hand sides."""
+
+    lin: wp.mat33
+    coupling: wp.mat33  # rows translation, columns rotation
+    ang: wp.mat33
+    rhs_lin: wp.vec3
+    rhs_ang: wp.vec3
+
+
+@wp.func
+def whole_body(trunk: Trunk, branches: Body, lanes: int) -> WholeBody:
+    """Return the equations of the trunk with its branches, given the sum over the branches of this thread."""
+    out = WholeBody()
+    moment = trunk.body.moment + group_sum3(branches.moment, lanes)
+    inertia = trunk.body.inertia + group_sum33_symmetric(branches.inertia, lanes)
+    torque = trunk.body.torque + group_sum3(branches.torque, lanes)
+    out.mass = trunk.body.mass + group_sum(branches.mass, lanes)
+    out.coupling = -skew(moment) * trunk.rot
+    out.rotation = wp.transpose(trunk.rot) * inertia * trunk.rot
+    out.bias_lin = trunk.body.force + group_sum3(branches.force, lanes)
+    out.bias_ang = wp.transpose(trunk.rot) * torque
+    return out
+
+
+@wp.func
+def trunk_residual(whole: WholeBody, acc: TrunkMotion) -> TrunkMotion:
+    """Return M a + bias of the trunk, without what accelerations of the branches add."""
+    out = TrunkMotion()
+    out.lin = whole.mass * acc.lin + whole.coupling * acc.ang + whole.bias_lin
+    out.ang = wp.transpose(whole.coupling) * acc.lin + whole.rotation * acc.ang + whole.bias_ang
+    return out
+
+
+@wp.func
+def trunk_slopes(whole: WholeBody, residual: TrunkMotion, step: TrunkMotion) -> wp.vec3:
+    """Return the trunk's slope of the cost along a step, the same for its smooth part, and its curvature."""
+    slope = wp.dot(step.lin, residual.lin) + wp.dot(step.ang, residual.ang)
+    curvature = whole.mass * wp.dot(step.lin, step.lin) + 2.0 * wp.dot(step.lin, whole.coupling * step.ang)
+    return wp.vec3(slope, slope, curvature + wp.dot(step.ang, whole.rotation * step.ang))
+
+
+@wp.func
+def add_systems(a: TrunkSystem, b: TrunkSystem) -> TrunkSystem:
+    """Return the sum of what two branches add to the trunk's equations."""
+    a.lin = a.lin + b.lin
+    a.coupling = a.coupling + b.coupling
+    a.ang = a.ang + b.ang
+    a.rhs_lin = a.rhs_lin + b.rhs_lin
+    a.rhs_ang = a.rhs_ang + b.rhs_ang
+    return a
+
+
+@wp.func
+def solve_trunk(whole: WholeBody, residual: TrunkMotion, branches: TrunkSystem, lanes: int) -> TrunkMotion:
+    """Return the trunk's Newton step, given what the branches of this thread add."""
+    lin = group_sum33_symmetric(branches.lin, lanes) + whole.mass * wp.identity(n=3, dtype=float)
+    coupling = group_sum33(branches.coupling, lanes) + whole.coupling
+    ang = group_sum33_symmetric(branches.ang, lanes) + whole.rotation
+    rhs_lin = group_sum3(branches.rhs_lin, lanes) - residual.lin
+    rhs_ang = group_sum3(branches.rhs_ang, lanes) - residual.ang
+    a = wp.matrix(shape=(6, 6), dtype=float)
+    b = vec6()
+    for i in range(3):
+        b[i] = rhs_lin[i]
+        b[i + 3] = rhs_ang[i]
+        for j in range(3):
+            a[i, j] = lin[i, j]
+            a[i + 3, j] = coupling[j, i]
+            a[i, j + 3] = coupling[i, j]
+            a[i + 3, j + 3] = ang[i, j]
+    x = wp.static(linear_algebra(6).cholesky_solve)(wp.static(linear_algebra(6).cholesky)(a), b)
+    out = TrunkMotion()
+    out.lin = wp.vec3(x[0], x[1], x[2])
+    out.ang = wp.vec3(x[3], x[4], x[5])
+    return out
