@@ -99,7 +99,7 @@ def test_capture_is_a_setting(make_runner, tmp_path, capture):
     path = tmp_path / "model_0.pt"
     runner.save(str(path))
     runner.load(str(path))
-    assert [each.enabled for each in (runner._rollout, runner.env._step_graph, runner.alg.update_graph)] == [
+    assert [each.enabled for each in (runner._rollout, runner.env.step_graph, runner.alg.update_graph)] == [
         capture
     ] * 3
     usual = make_runner()
@@ -119,7 +119,7 @@ def test_capture_on_the_command_line():
 def test_long_rollouts_replay_step_by_step(make_runner):
     """A rollout that is too long for one graph leaves steps and updates theirs."""
     runner = make_runner(**{"runner.num_steps_per_env": 65})
-    assert not runner._rollout.enabled and runner.env._step_graph.enabled and runner.alg.update_graph.enabled
+    assert not runner._rollout.enabled and runner.env.step_graph.enabled and runner.alg.update_graph.enabled
 
 
 @pytest.fixture

@@ -58,11 +58,14 @@ class OnDevicePPO(PPO):
         """
         if optimizer not in ("adam", "adamw"):
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
-        for name in ("rnd_cfg", "symmetry_cfg", "use_mixed_precision"):
+        for name in ("rnd_cfg", "use_mixed_precision"):
             if kwargs.get(name):
                 raise UserError(f"{type(self).__name__} does not support algorithm.{name}")
         if actor.is_recurrent or critic.is_recurrent:
             raise UserError(f"{type(self).__name__} does not support recurrent models")
+        symmetry = kwargs.pop("symmetry_cfg", None)
+        if symmetry and (symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]):
+            kwargs["symmetry_cfg"] = symmetry
         super().__init__(actor, critic, storage, learning_rate=learning_rate, optimizer=optimizer, **kwargs)
         self._batch_size = storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches
         if self._batch_size < 1:
@@ -138,6 +141,8 @@ class OnDevicePPO(PPO):
     def _update_minibatch(self) -> None:
         """Take one gradient step on the samples of ``_indices``."""
         batch = self._gather()
+        if self.symmetry:
+            self.symmetry.augment_batch(batch, self._batch_size)
         self.actor(batch.observations, stochastic_output=True)
         log_prob = self.actor.get_output_log_prob(batch.actions)
         values = self.critic(batch.observations)
@@ -146,6 +151,9 @@ class OnDevicePPO(PPO):
         surrogate_loss = self._surrogate_loss(batch, log_prob)
         value_loss = self._value_loss(batch, values)
         loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
+        if self.symmetry and self.symmetry.use_mirror_loss:
+            mirror_loss = self.symmetry.compute_loss(self.actor, batch, self._batch_size)
+            loss = loss + self.symmetry.mirror_loss_coeff * mirror_loss
         self.optimizer.zero_grad()
         loss.backward()
         if self.is_multi_gpu:
@@ -180,8 +188,9 @@ class OnDevicePPO(PPO):
 
     @torch.no_grad()
     def _mean_kl(self, batch: RolloutStorage.Batch) -> Tensor:
-        """Return the mean KL divergence of the policy from the one that acted. Scalar."""
-        return self.actor.get_kl_divergence(batch.old_distribution_params, self.actor.output_distribution_params).mean()
+        """Return the mean KL divergence of the policy from the one that acted, without mirror images. Scalar."""
+        params = tuple(params[: self._batch_size] for params in self.actor.output_distribution_params)
+        return self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
 
     def _gradients(self) -> list[Tensor]:
         """Return the gradients of actor and critic."""

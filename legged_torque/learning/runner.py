@@ -58,7 +58,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self.log_dir = log_dir
         self._seconds_before = 0.0  # training time before this process
         env.num_processes = self.gpu_world_size
-        env._step_graph.enabled = self.alg.update_graph.enabled = self.cfg["capture"]
+        env.step_graph.enabled = self.alg.update_graph.enabled = self.cfg["capture"]
         enabled = self.cfg["capture"] and self.cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS
         self._rollout = CudaGraph(self._collect, device, enabled)
 

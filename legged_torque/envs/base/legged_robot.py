@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from legged_torque import ROOT_DIR
 from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.rewards import RewardTerms
+from legged_torque.envs.base.symmetry import Mirror
 from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.sim.graph import CudaGraph
@@ -75,7 +77,7 @@ class LeggedRobot(RewardTerms, VecEnv):
         self._create_sim()
         self._init_buffers()
         self._prepare_reward_functions()
-        self._step_graph = CudaGraph(self._step, device)
+        self.step_graph = CudaGraph(self._step, device)
         self.reset()
 
     # ---- what rsl_rl calls -------------------------------------------------------------------------------------------
@@ -91,7 +93,7 @@ class LeggedRobot(RewardTerms, VecEnv):
             bool. Rewards, dones and extras are buffers that the next step overwrites.
         """
         self._given_actions.copy_(actions)
-        self._step_graph()
+        self.step_graph()
         return self.get_observations(), self.rew_buf, self.reset_buf, self.extras
 
     def get_observations(self) -> TensorDict:
@@ -105,6 +107,11 @@ class LeggedRobot(RewardTerms, VecEnv):
         self.compute_observations()
         self._keep_last()
         return self.get_observations()
+
+    @functools.cached_property
+    def mirror(self) -> Mirror:
+        """Reflects observations and actions of this robot left to right."""
+        return Mirror(self)
 
     @property
     def episode_length_buf(self) -> Tensor:
@@ -297,6 +304,7 @@ class LeggedRobot(RewardTerms, VecEnv):
         self.sim = Simulator(
             model, self.num_envs, self.device, sim.engine, sim.solver_iterations, sim.ls_iterations
         )
+        self.foot_names = [name for name in geoms if asset.foot_name in name]
         self.dof_names = [model.joint(i).name for i in range(1, model.njnt)]
         self.num_dof = len(self.dof_names)
         if self.num_actions != self.actions_per_dof * self.num_dof:

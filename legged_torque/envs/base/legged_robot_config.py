@@ -186,6 +186,14 @@ class LeggedRobotCfgPPO(BaseConfig):
         desired_kl = 0.01
         use_clipped_value_loss = True
 
+        class symmetry_cfg:
+            """Learning from mirror images as well, with rsl_rl's names."""
+
+            use_data_augmentation = False
+            use_mirror_loss = False
+            mirror_loss_coeff = 0.1
+            data_augmentation_func = "legged_torque.envs.base.symmetry:with_mirror_images"
+
     def presets(self) -> dict[str, dict]:
         """Return the named changes to the settings of task and training that ``--preset`` chooses from."""
         paper = {  # Table II to the letter
