@@ -3,21 +3,24 @@
 On several GPUs of a machine: ``torchrun --standalone --nproc_per_node=2 scripts/train.py --task=a1_torque_multihead``.
 """
 
+import argparse
 import os
 
 os.environ["MUJOCO_GL"] = "disable"  # training draws nothing, and MuJoCo must not look for a renderer
 
 from legged_torque.envs import task_registry
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 from legged_torque.learning import distributed
 from legged_torque.utils.args import Parser, add_task_args, add_train_args, device_name, run_script
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.progress import CompileProgress
 from legged_torque.utils.runs import find_checkpoint, save_config
 from legged_torque.utils.task_registry import load_run, num_iterations, set_seed
 
 
 def main() -> None:
-    """Parse the command line, build the task, train."""
+    """Parse the command line and train."""
     parser = Parser(__doc__)
     add_task_args(parser)
     add_train_args(parser)
@@ -38,6 +41,12 @@ def main() -> None:
     else:
         env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
     set_seed(train_cfg.seed)
+    with CompileProgress():
+        train(args, env_cfg, train_cfg)
+
+
+def train(args: argparse.Namespace, env_cfg: LeggedRobotCfg, train_cfg: LeggedRobotCfgPPO) -> None:
+    """Build the task and train it."""
     env, _ = task_registry.make_env(args.task, args, env_cfg)
     runner, _ = task_registry.make_alg_runner(env, args.task, args, train_cfg)
     total = args.max_iterations or num_iterations(env, train_cfg)
@@ -51,7 +60,6 @@ def main() -> None:
         settings |= {"processes": num_processes, "max_iterations": total}
         place = f"{num_processes} x " * (num_processes > 1) + device_name(env.device)
         print(f"Training {args.task} on {place}: {num_processes * env.num_envs} worlds, {total} iterations.")
-        print("The first run on a machine compiles kernels before its first iteration, for about a minute.")
         print(f"Curves: tensorboard --logdir {runner.log_dir}", flush=True)
         save_config(runner.log_dir, settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     runner.learn(remaining, init_at_random_ep_len=True)

@@ -10,13 +10,13 @@ def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     """Turn world vectors into body vectors.
 
     Args:
-        quat: Unit quaternions (w, x, y, z) of the bodies in the world. Shape: (N, 4).
-        vec: Vectors in the world frame. Shape: (N, 3).
+        quat: Unit quaternions (w, x, y, z) of the bodies in the world. Shape: (..., 4).
+        vec: Vectors in the world frame. Shape: (..., 3), of as many axes; those of size 1 are broadcast.
 
     Returns:
-        The vectors in the body frames. Shape: (N, 3).
+        The vectors in the body frames. Shape: (..., 3).
     """
-    w, xyz = quat[:, :1], quat[:, 1:]
+    w, xyz = quat[..., :1], quat[..., 1:]
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec - w * t + torch.linalg.cross(xyz, t)
 
@@ -32,15 +32,7 @@ def quat_from_euler(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
     Returns:
         Unit quaternions (w, x, y, z). Shape: (N, 4).
     """
-    cr, sr = torch.cos(0.5 * roll), torch.sin(0.5 * roll)
-    cp, sp = torch.cos(0.5 * pitch), torch.sin(0.5 * pitch)
-    cy, sy = torch.cos(0.5 * yaw), torch.sin(0.5 * yaw)
-    return torch.stack(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ],
-        dim=-1,
-    )
+    half = 0.5 * torch.stack([roll, pitch, yaw])
+    (cr, cp, cy), (sr, sp, sy) = torch.cos(half), torch.sin(half)
+    cc, ss, sc, cs = cr * cp, sr * sp, sr * cp, cr * sp
+    return torch.stack([cc * cy + ss * sy, sc * cy - cs * sy, cs * cy + sc * sy, cc * sy - ss * cy], dim=-1)

@@ -36,3 +36,7 @@ class A1CfgPPO(LeggedRobotCfgPPO):
 
     class runner(LeggedRobotCfgPPO.runner):
         experiment_name = "a1_position"
+
+    class algorithm(LeggedRobotCfgPPO.algorithm):
+        class symmetry_cfg(LeggedRobotCfgPPO.algorithm.symmetry_cfg):
+            use_data_augmentation = True

@@ -194,8 +194,10 @@ class LeggedRobot(RewardTerms, VecEnv):
 
     def _update_state(self) -> None:
         """Compute what follows from the simulator's state."""
-        self.base_lin_vel.copy_(quat_rotate_inverse(self.base_quat, self.sim.qvel[:, :3]))
-        self.projected_gravity.copy_(quat_rotate_inverse(self.base_quat, self._gravity))
+        in_world = torch.stack([self.sim.qvel[:, :3], self._gravity])
+        lin_vel, gravity = quat_rotate_inverse(self.base_quat.unsqueeze(0), in_world)
+        self.base_lin_vel.copy_(lin_vel)
+        self.projected_gravity.copy_(gravity)
         self.contacts.copy_(self.sim.contact_found > 0)
         self.feet_contact.copy_(self.contacts[:, self.feet_indices])
 

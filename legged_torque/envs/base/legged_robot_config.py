@@ -207,6 +207,7 @@ class LeggedRobotCfgPPO(BaseConfig):
                 "learning_rate": 1e-4,
                 "max_grad_norm": 5.0,
                 "schedule": "fixed",
+                "symmetry_cfg": {"use_data_augmentation": False},
             },
         }
         return {"parallel": {}, "paper": paper}

@@ -8,6 +8,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.utils.errors import UserError
+
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
 
@@ -24,12 +26,15 @@ class Mirror:
 
         Args:
             task: The task; its observations are those of ``LeggedRobot.compute_observations``.
+
+        Raises:
+            UserError: If a joint or foot has no counterpart on the other side.
         """
         names = task.dof_names
-        joints = [names.index(mirrored_name(name)) for name in names]
+        joints = counterparts(names)
         rolls = [abs(task.sim.mj_model.joint(name).axis[0]) > 0.5 for name in names]
         joint_signs = [-1.0 if roll else 1.0 for roll in rolls]
-        feet = [task.foot_names.index(mirrored_name(name)) for name in task.foot_names]
+        feet = counterparts(task.foot_names)
         actions = [joints, joint_signs] if task.actions_per_dof == 1 else repeat(joints, joint_signs, 2)
         vector, axial = ([0, 1, 2], [1.0, -1.0, 1.0]), ([0, 1, 2], [-1.0, 1.0, -1.0])
         command = ([0, 1, 2], [1.0, -1.0, -1.0])
@@ -68,10 +73,20 @@ def repeat(indices: list[int], signs: list[float], times: int) -> tuple[list[int
     return [block * size + index for block in range(times) for index in indices], signs * times
 
 
-def mirrored_name(name: str) -> str:
-    """Return the name of a part on the other side: FR_hip for FL_hip."""
-    leg, _, rest = name.partition("_")
-    return f"{leg[:-1]}{leg[-1:].translate(str.maketrans('LR', 'RL'))}_{rest}"
+def counterparts(names: list[str]) -> list[int]:
+    """Return where each part's counterpart on the other side stands: that of FR_hip is FL_hip.
+
+    Raises:
+        UserError: If one is missing.
+    """
+    result = []
+    for name in names:
+        leg, _, rest = name.partition("_")
+        other = f"{leg[:-1]}{leg[-1:].translate(str.maketrans('LR', 'RL'))}_{rest}"
+        if other not in names:
+            raise UserError(f"algorithm.symmetry_cfg: '{name}' has no counterpart '{other}' on the other side")
+        result.append(names.index(other))
+    return result
 
 
 def with_mirror_images(
