@@ -13,7 +13,14 @@ from legged_torque.utils.args import Parser, add_task_args, run_script
 from legged_torque.utils.runs import find_checkpoint
 from legged_torque.utils.task_registry import load_run, set_seed
 
-SETTINGS = ((10, 20), (5, 8), (4, 8), (3, 8), (3, 6), (3, 4), (2, 6), (1, 6))
+SETTINGS = (
+    ("fused", 10, 20),
+    ("fused", 5, 8),
+    ("fused", 3, 6),
+    ("mujoco_warp", 10, 20),
+    ("mujoco_warp", 5, 8),
+    ("mujoco_warp", 3, 6),
+)
 
 
 def main() -> None:
@@ -38,11 +45,11 @@ def main() -> None:
             obs = env.step(policy(obs))[0]
             states.append(copy_state(env.sim))
     reference = reference_velocities(env.sim.mj_model, states)
-    print("iterations | line search | rms error | 99.9% | max | rms change in a step   [m/s, rad/s]")
-    for iterations, ls_iterations in SETTINGS:
+    print("engine      | iterations | line search | rms error | 99.9% | max | rms change in a step   [m/s, rad/s]")
+    for engine, iterations, ls_iterations in SETTINGS:
         sim = Simulator(env.sim.mj_model, env.num_envs, env.device, engine, iterations, ls_iterations)
         errors = velocity_errors(sim, states, reference)
-        print(f"{iterations:>10} | {ls_iterations:>11} |", " | ".join(f"{value:.2e}" for value in errors.values()))
+        print(f"{engine:<11} | {iterations:>10} | {ls_iterations:>11} |", " | ".join(f"{value:.2e}" for value in errors.values()))
 
 
 if __name__ == "__main__":
