@@ -49,7 +49,10 @@ def main() -> None:
     for engine, iterations, ls_iterations in SETTINGS:
         sim = Simulator(env.sim.mj_model, env.num_envs, env.device, engine, iterations, ls_iterations)
         errors = velocity_errors(sim, states, reference)
-        print(f"{engine:<11} | {iterations:>10} | {ls_iterations:>11} |", " | ".join(f"{value:.2e}" for value in errors.values()))
+        print(
+            f"{engine:<11} | {iterations:>10} | {ls_iterations:>11} |",
+            " | ".join(f"{value:.2e}" for value in errors.values()),
+        )
 
 
 if __name__ == "__main__":

@@ -94,9 +94,7 @@ class Simulator:
             self._reset_mask = wp.zeros(num_envs, dtype=wp.bool)
             self._overflow = wp.zeros(num_envs, dtype=wp.int32)
             self._reference_pose = wp.array(model.qpos0, dtype=wp.float32)
-        self._step = (
-            FusedStep(model, self.model, self.data) if engine == "fused" else WarpStep(self.model, self.data)
-        )
+        self._step = FusedStep(model, self.model, self.data) if engine == "fused" else WarpStep(self.model, self.data)
         self.qpos = wp.to_torch(self.data.qpos)
         self.qvel = wp.to_torch(self.data.qvel)
         self.qacc_warmstart = wp.to_torch(self.data.qacc_warmstart)

@@ -303,9 +303,7 @@ class LeggedRobot(RewardTerms, VecEnv):
         model = build_model(spec, geoms)
         model.opt.timestep = self.cfg.sim.dt
         sim = self.cfg.sim
-        self.sim = Simulator(
-            model, self.num_envs, self.device, sim.engine, sim.solver_iterations, sim.ls_iterations
-        )
+        self.sim = Simulator(model, self.num_envs, self.device, sim.engine, sim.solver_iterations, sim.ls_iterations)
         self.foot_names = [name for name in geoms if asset.foot_name in name]
         self.dof_names = [model.joint(i).name for i in range(1, model.njnt)]
         self.num_dof = len(self.dof_names)

@@ -236,4 +236,3 @@ def branch_dynamics(n: int) -> SimpleNamespace:
         vector=vector, matrix=matrix, columns=columns, Branch=Branch, column=column, with_column=with_column,
         make_branch=make_branch,
     )  # fmt: skip
-

@@ -99,9 +99,7 @@ def branch_newton(n: int) -> SimpleNamespace:
         leg.residuals.friction = leg.residuals.friction - leg.rows.friction_reference
         leg.residuals.limit = leg.residuals.limit - leg.rows.limit_reference
         for k in range(leg.first_contact, leg.first_contact + leg.num_contacts):
-            x[k] = (
-                contact_rows_times(leg.branch, rot, trunk_acc, leg.acc, normal, contacts[k]) - contacts[k].reference
-            )
+            x[k] = contact_rows_times(leg.branch, rot, trunk_acc, leg.acc, normal, contacts[k]) - contacts[k].reference
         return leg
 
     @wp.func
@@ -183,16 +181,17 @@ def branch_newton(n: int) -> SimpleNamespace:
         return out
 
     @wp.func
-    def eliminate(leg: Leg, add: TrunkSystem) -> TrunkSystem:
-        """Add what is left for the trunk when a branch is eliminated from the equations (Schur complement)."""
+    def eliminate(leg: Leg, system: TrunkSystem, add: TrunkSystem) -> TrunkSystem:
+        """Add to the trunk's equations what is left there of a branch's (Schur complement) and of its contacts."""
         free = cholesky_solve(leg.factor, leg.gradient)  # the branch's own step, less the sign
-        add.rhs_lin = add.rhs_lin + leg.coupling_lin * free - leg.trunk_gradient_lin
-        add.rhs_ang = add.rhs_ang + leg.coupling_ang * free - leg.trunk_gradient_ang
+        system.rhs_lin = system.rhs_lin + leg.coupling_lin * free - leg.trunk_gradient_lin
+        system.rhs_ang = system.rhs_ang + leg.coupling_ang * free - leg.trunk_gradient_ang
         solved_lin = solve_rows(leg.factor, leg.coupling_lin)
-        add.lin = add.lin - solved_lin * wp.transpose(leg.coupling_lin)
-        add.coupling = add.coupling - solved_lin * wp.transpose(leg.coupling_ang)
-        add.ang = add.ang - solve_rows(leg.factor, leg.coupling_ang) * wp.transpose(leg.coupling_ang)
-        return add
+        system.lin = system.lin + add.lin - solved_lin * wp.transpose(leg.coupling_lin)
+        system.coupling = system.coupling + add.coupling - solved_lin * wp.transpose(leg.coupling_ang)
+        solved_ang = solve_rows(leg.factor, leg.coupling_ang)
+        system.ang = system.ang + add.ang - solved_ang * wp.transpose(leg.coupling_ang)
+        return system
 
     @wp.func
     def branch_step(leg: Leg, trunk_step: TrunkMotion) -> vector:

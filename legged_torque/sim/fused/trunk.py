@@ -77,17 +77,6 @@ def trunk_slopes(whole: WholeBody, residual: TrunkMotion, step: TrunkMotion) -> 
 
 
 @wp.func
-def add_systems(a: TrunkSystem, b: TrunkSystem) -> TrunkSystem:
-    """Return the sum of what two branches add to the trunk's equations."""
-    a.lin = a.lin + b.lin
-    a.coupling = a.coupling + b.coupling
-    a.ang = a.ang + b.ang
-    a.rhs_lin = a.rhs_lin + b.rhs_lin
-    a.rhs_ang = a.rhs_ang + b.rhs_ang
-    return a
-
-
-@wp.func
 def solve_trunk(whole: WholeBody, residual: TrunkMotion, branches: TrunkSystem, lanes: int) -> TrunkMotion:
     """Return the trunk's Newton step, given what the branches of this thread add."""
     lin = group_sum33_symmetric(branches.lin, lanes) + whole.mass * wp.identity(n=3, dtype=float)
