@@ -99,9 +99,7 @@ def test_capture_is_a_setting(make_runner, tmp_path, capture):
     path = tmp_path / "model_0.pt"
     runner.save(str(path))
     runner.load(str(path))
-    assert [each.enabled for each in (runner._rollout, runner.env.step_graph, runner.alg.update_graph)] == [
-        capture
-    ] * 3
+    assert [each.enabled for each in (runner._rollout, runner.env.step_graph, runner.alg.update_graph)] == [capture] * 3
     usual = make_runner()
     for each in (runner, usual):
         torch.manual_seed(0)

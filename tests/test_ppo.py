@@ -396,7 +396,7 @@ def test_learning_rate_ignores_an_undefined_divergence():
         ({"optimizer": "adamm"}, "unknown optimizer 'adamm'; did you mean 'adam'?"),
         ({"optimizer": "sgd"}, "unknown optimizer 'sgd'; allowed: adam, adamw"),
         ({"use_mixed_precision": True}, "does not support algorithm.use_mixed_precision"),
-        ({"symmetry_cfg": {"use_mirror_loss": True}}, "does not support algorithm.symmetry_cfg"),
+        ({"rnd_cfg": {"weight": 1.0}}, "does not support algorithm.rnd_cfg"),
         ({"num_mini_batches": SAMPLES + 1}, "num_mini_batches is 65, more than the samples of a rollout"),
     ],
 )

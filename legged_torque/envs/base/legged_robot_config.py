@@ -200,6 +200,7 @@ class LeggedRobotCfgPPO(BaseConfig):
             "env": {"num_envs": 16, "num_envs_cpu": 16},
             "runner": {"num_steps_per_env": 2000},
             "algorithm": {
+                "num_learning_epochs": 5,
                 "num_mini_batches": 32,
                 "clip_param": 0.1,
                 "lam": 0.9,

@@ -13,8 +13,12 @@ MIN_VALUE = wp.constant(1.0e-15)
 MIN_IMPEDANCE = wp.constant(1.0e-4)
 MAX_IMPEDANCE = wp.constant(0.9999)
 MIN_FRICTION = wp.constant(1.0e-5)
+"""MuJoCo's mjMINVAL, mjMINIMP, mjMAXIMP and mjMINMU."""
 CAPSULE = wp.constant(3)
-"""MuJoCo's mjMINVAL, mjMINIMP, mjMAXIMP, mjMINMU and mjGEOM_CAPSULE."""
+BOX = wp.constant(6)
+"""MuJoCo's mjGEOM_CAPSULE and mjGEOM_BOX."""
+MAX_CORNERS = wp.constant(4)
+"""Most contacts of a box with a plane: MuJoCo takes the first four corners below its centre that touch."""
 
 
 @wp.struct
@@ -45,7 +49,9 @@ def reference_dynamics(solref: wp.vec2, solimp: vec5, pos: float, timestep: floa
         damping = 2.0 / wp.max(MIN_VALUE, high * time)
     x = wp.abs(pos) / wp.max(MIN_VALUE, solimp[2])
     share = float(1.0)
-    if x < mid:
+    if solimp[2] <= MIN_VALUE:
+        share = 0.5
+    elif x < mid:
         share = wp.pow(x, power) / wp.pow(mid, power - 1.0)
     elif x < 1.0:
         share = 1.0 - wp.pow(1.0 - x, power) / wp.pow(1.0 - mid, power - 1.0)
@@ -93,17 +99,19 @@ def set_contact_rows(
     mix = float(0.5)
     if weight_floor + weight_geom > 2.0 * MIN_VALUE:
         mix = weight_geom / (weight_floor + weight_geom)
-    friction = wp.max(robot.geom_friction[fri_row, floor][0], robot.geom_friction[fri_row, geom][0])
-    if robot.geom_priority[geom] > robot.geom_priority[floor]:
-        mix = 1.0
-        friction = robot.geom_friction[fri_row, geom][0]
-    if robot.geom_priority[geom] < robot.geom_priority[floor]:
-        mix = 0.0
-        friction = robot.geom_friction[fri_row, floor][0]
     ref_floor, ref_geom = robot.geom_solref[ref_row, floor], robot.geom_solref[ref_row, geom]
     solref = wp.min(ref_floor, ref_geom)
     if ref_floor[0] > 0.0 and ref_geom[0] > 0.0:
         solref = mix * ref_geom + (1.0 - mix) * ref_floor
+    friction = wp.max(robot.geom_friction[fri_row, floor][0], robot.geom_friction[fri_row, geom][0])
+    if robot.geom_priority[geom] > robot.geom_priority[floor]:
+        mix = 1.0
+        solref = 1.0 * ref_geom
+        friction = robot.geom_friction[fri_row, geom][0]
+    if robot.geom_priority[geom] < robot.geom_priority[floor]:
+        mix = 0.0
+        solref = 1.0 * ref_floor
+        friction = robot.geom_friction[fri_row, floor][0]
     solimp = mix * robot.geom_solimp[imp_row, geom] + (1.0 - mix) * robot.geom_solimp[imp_row, floor]
     params = reference_dynamics(solref, solimp, dist, robot.timestep)
     friction = wp.max(friction, MIN_FRICTION)
@@ -218,6 +226,8 @@ def branch_constraints(n: int) -> SimpleNamespace:
     ) -> int:  # fmt: skip
         """Write the contacts of a branch with the floor from index ``start`` on and return how many there are."""
         count = int(0)
+        last_geom = int(-1)
+        in_geom = int(0)
         height = origin - robot.geom_pos[row(world, robot.geom_pos.shape[0]), robot.floor]
         for point in range(robot.point_count[branch]):
             geom = robot.point_geom[branch, point]
@@ -229,10 +239,17 @@ def branch_constraints(n: int) -> SimpleNamespace:
                 half = wp.vec3(0.0, 0.0, size[1])
             turn = rotations[depth] * quat_to_matrix(robot.geom_quat[row(world, robot.geom_quat.shape[0]), geom])
             centre = positions[depth] + rotations[depth] * robot.geom_pos[row(world, robot.geom_pos.shape[0]), geom]
-            centre += turn * wp.cw_mul(robot.point_offset[branch, point], half)
+            arm = turn * wp.cw_mul(robot.point_offset[branch, point], half)
+            centre += arm
             radius = robot.point_radius[branch, point] * size[0]
             dist = wp.dot(height + centre, normal) - radius
+            if geom != last_geom:
+                last_geom = geom
+                in_geom = 0
+            if robot.geom_type[geom] == BOX and (wp.dot(arm, normal) > 0.0 or in_geom == MAX_CORNERS):
+                dist = 0.0
             if dist < 0.0:
+                in_geom += 1
                 contact = Contact()
                 contact.pos = centre - (radius + 0.5 * dist) * normal
                 contact.depth = depth

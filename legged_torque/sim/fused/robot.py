@@ -129,7 +129,8 @@ def make_robot(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Robo
         if hasattr(warp_model, name):
             setattr(robot, name, getattr(warp_model, name))
     robot.gravity = warp_model.opt.gravity
-    robot.floor = int(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)[0])
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    robot.floor = int(np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & collides)[0])
     robot.timestep = model.opt.timestep
     robot.impratio = model.opt.impratio
     robot.cost_scale = 1.0 / (model.stat.meaninertia * model.nv)
@@ -157,35 +158,69 @@ def _require(holds: bool, reason: str) -> None:
 
 def _check(model: mujoco.MjModel) -> None:
     """Raise a UserError for whatever the fused step does not simulate."""
+    _check_bodies(model)
+    _check_contacts(model)
+    _check_motors(model)
+    option = model.opt
+    _require(option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL, "the friction cone must be pyramidal")
+    _require(option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST, "the integrator must be implicitfast")
+    flags = option.disableflags or option.enableflags or option.noslip_iterations or option.disableactuator
+    _require(not flags, "it sets flags in its options")
+    _require(not (option.density or option.viscosity or option.wind.any()), "it moves through a fluid")
+    _require(not (model.neq or model.ntendon or model.npair or model.nmocap), "equalities, tendons, pairs or mocap")
+    _require(not model.nexclude, "some contacts are excluded")
+
+
+def _check_bodies(model: mujoco.MjModel) -> None:
+    """Check bodies and joints."""
     hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
-    planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    robot = collides & (model.geom_bodyid > 0)
-    kinds = {mujoco.mjtGeom(kind) for kind in model.geom_type[robot]}
-    inner = model.geom_contype[robot][:, None] & model.geom_conaffinity[robot]
     _require(model.nbody > 1 and model.jnt_type[0] == free and model.jnt_bodyid[0] == 1, "its trunk is not free")
     _require(
         bool((model.body_jntnum[1:] == 1).all() and (model.jnt_type[1:] == hinge).all()),
         "each body but the trunk must have one hinge joint (fixed bodies: compiler fusestatic)",
     )
-    _require(bool(planes.sum() == 1 and (collides & ~robot).sum() == 1), "it needs one plane and no other obstacle")
+    _require(not (model.body_parentid[2:] == 0).any(), "something beside the trunk hangs on the world")
+    _require(not model.body_gravcomp.any(), "bodies are compensated for gravity")
+    _require(bool(model.jnt_limited[1:].all()), "each joint needs a range")
+    _require(not model.jnt_margin.any(), "joint limits have margins")
+    _require(not (model.jnt_actfrclimited.any()), "joints limit the forces of their actuators")
+    root = [model.dof_damping[:6], model.dof_armature[:6], model.dof_frictionloss[:6], model.jnt_stiffness[:1]]
+    _require(not any(values.any() for values in root), "the trunk's free joint has passive forces or armature")
+    _require(not _any_of(model, "jnt_stiffnesspoly", "jnt_springyield", "dof_dampingpoly"), "springs or dampers are not linear")
+
+
+def _check_contacts(model: mujoco.MjModel) -> None:
+    """Check the floor and what collides with it."""
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    floor = np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & collides)
+    robot = collides & (model.geom_bodyid > 0)
+    _require(bool(len(floor) == 1 and (collides & ~robot).sum() == 1), "it needs one plane and no other obstacle")
+    types, affinities = model.geom_contype[robot], model.geom_conaffinity[robot]
+    kinds = {mujoco.mjtGeom(kind) for kind in model.geom_type[robot]}
     _require(kinds <= set(_GEOM_POINTS), "only spheres, capsules and boxes may collide")
-    _require(not inner.any(), "parts of the robot collide with each other")
+    _require(not (types[:, None] & affinities).any(), "parts of the robot collide with each other")
+    touch = (types & model.geom_conaffinity[floor]) | (affinities & model.geom_contype[floor])
+    _require(bool((touch != 0).all()), "the floor lets some of its geoms through")
     _require(bool((model.geom_condim[collides] == 3).all()), "condim must be 3")
     _require(not (model.geom_margin[collides].any() or model.geom_gap[collides].any()), "geoms have margins or gaps")
-    _require(not model.jnt_margin.any(), "joint limits have margins")
-    _require(model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL, "the friction cone must be pyramidal")
-    _require(model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST, "the integrator must be implicitfast")
-    _require(model.opt.disableflags == 0 and model.opt.enableflags == 0, "it sets flags in its options")
-    _require(not (model.neq or model.ntendon or model.npair or model.nmocap), "equalities, tendons, pairs or mocap")
-    _require(not (model.opt.density or model.opt.viscosity or model.opt.wind.any()), "it moves through a fluid")
-    _require(not model.body_gravcomp.any(), "bodies are compensated for gravity")
-    motors = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
+    _require(not _any_of(model, "geom_surfacevel", "geom_adhesion"), "surfaces move or stick")
+
+
+def _check_motors(model: mujoco.MjModel) -> None:
+    """Check the actuators: at most one plain motor per hinge."""
+    plain = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
         model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED
     )
-    plain = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE) & (
+    plain &= (model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE) & (
         model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE
     )
-    _require(bool((motors & plain & (model.actuator_gainprm[:, 0] == 1)).all()), "actuators must be motors")
-    _require(bool(model.jnt_limited[1:].all()), "each joint needs a range")
+    extras = _any_of(model, "actuator_delay", "actuator_damping", "actuator_dampingpoly", "actuator_armature")
+    _require(bool((plain & (model.actuator_gainprm[:, 0] == 1)).all()) and not extras, "actuators must be motors")
+    joints = model.actuator_trnid[:, 0]
+    _require(len(set(joints)) == len(joints) and 0 not in joints, "each motor needs a hinge of its own")
     _require(bool(model.actuator_forcelimited.all() and model.actuator_ctrllimited.all()), "motors need ranges")
+
+
+def _any_of(model: mujoco.MjModel, *names: str) -> bool:
+    """Return whether a field is not all zero; older versions of MuJoCo lack some."""
+    return any(getattr(model, name, np.zeros(0)).any() for name in names)

@@ -1,0 +1,126 @@
+"""What the fused step does not simulate, and refuses by name."""
+
+import mujoco
+import pytest
+
+from legged_torque import ROOT_DIR
+from legged_torque.sim.fused.robot import read_tree
+from legged_torque.sim.model import build_model, read_spec
+from legged_torque.sim.simulator import Simulator
+from legged_torque.utils.errors import UserError
+
+GEOM, JOINT, TRN = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtTrn
+A1 = ROOT_DIR / "resources/robots/a1/a1.xml"
+MOTOR = {"gear": [1, 0, 0, 0, 0, 0], "ctrlrange": (-9, 9), "forcerange": (-9, 9), "trntype": TRN.mjTRN_JOINT}
+HINGES = "each body but the trunk must have one hinge joint"
+SPHERE = "type=GEOM.mjGEOM_SPHERE, size=(0.1, 0, 0)"
+SITE = "spec.body('FR_calf').add_site(name='site'); spec.add_actuator(name='x', trntype=TRN.mjTRN_SITE, target='site')"
+REFUSED = [
+    ("spec.delete(spec.joint('root'))", "its trunk is not free"),
+    ("spec.joint('root').type = JOINT.mjJNT_HINGE", "its trunk is not free"),
+    ("spec.joint('RL_calf_joint').type = JOINT.mjJNT_SLIDE", HINGES),
+    ("spec.body('FL_hip').add_joint(axis=(0, 0, 1), range=(-1, 1))", HINGES),
+    (f"spec.body('FL_hip').add_body(name='b').add_geom({SPHERE})", HINGES),
+    ("spec.geom('floor').contype = 0", "it needs one plane and no other obstacle"),
+    (f"spec.worldbody.add_geom({SPHERE}, pos=(0, 0, -1), condim=3)", "it needs one plane and no other obstacle"),
+    (
+        "spec.worldbody.add_geom(type=GEOM.mjGEOM_PLANE, size=(1, 1, 1), pos=(0, 0, -9))",
+        "it needs one plane and no other obstacle",
+    ),
+    ("spec.geom('FR_hip').type = GEOM.mjGEOM_CYLINDER; spec.geom('FR_hip').size = (0.1, 0.1, 0)", "only spheres"),
+    ("spec.geom('FR_foot').contype = 1", "parts of the robot collide with each other"),
+    ("spec.geom('RR_foot').condim = 4", "condim must be 3"),
+    ("spec.geom('RR_foot').margin = 0.01", "geoms have margins or gaps"),
+    ("spec.geom('floor').gap = 0.01", "geoms have margins or gaps"),
+    ("spec.joint('FR_calf_joint').margin = 0.01", "joint limits have margins"),
+    ("spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC", "the friction cone must be pyramidal"),
+    ("spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER", "the integrator must be implicitfast"),
+    ("spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_WARMSTART", "it sets flags in its options"),
+    ("spec.option.enableflags = mujoco.mjtEnableBit.mjENBL_ENERGY", "it sets flags in its options"),
+    ("spec.add_equality(type=2, name1='FR_hip_joint', name2='FL_hip_joint')", "equalities, tendons, pairs or mocap"),
+    ("spec.add_tendon(name='t').wrap_joint('FR_hip_joint', 1.0)", "equalities, tendons, pairs or mocap"),
+    ("spec.add_pair(geomname1='floor', geomname2='FR_foot')", "equalities, tendons, pairs or mocap"),
+    ("spec.option.density = 1.2", "it moves through a fluid"),
+    ("spec.option.viscosity = 1.2", "it moves through a fluid"),
+    ("spec.option.wind = (1, 0, 0)", "it moves through a fluid"),
+    ("spec.body('FR_calf').gravcomp = 0.5", "bodies are compensated for gravity"),
+    (SITE, "actuators must be motors"),
+    ("spec.actuator('FR_hip').set_to_position(kp=10.0)", "actuators must be motors"),
+    ("a = spec.actuator('FR_hip'); a.ctrlrange = (0, 1); a.set_to_damper(kv=1.0)", "actuators must be motors"),
+    ("spec.actuator('FR_hip').dyntype = mujoco.mjtDyn.mjDYN_INTEGRATOR", "actuators must be motors"),
+    ("spec.actuator('FR_hip').gainprm[0] = 2.0", "actuators must be motors"),
+    ("spec.joint('FR_calf_joint').limited = 0", "each joint needs a range"),
+    ("spec.actuator('FR_hip').forcelimited = 0", "motors need ranges"),
+    ("spec.actuator('FR_hip').ctrllimited = 0", "motors need ranges"),
+    ("branch(spec.body('FL_thigh'))", "body 'FL_thigh' branches"),
+    ("branch(spec.body('FL_calf'))", "its legs have unlike numbers of joints"),
+    ("remove_legs(spec)", "its legs have unlike numbers of joints"),
+    ("spec.add_actuator(target='FR_calf_joint', **MOTOR)", "each motor needs a hinge of its own"),
+    ("spec.add_actuator(target='root', **MOTOR)", "each motor needs a hinge of its own"),
+    ("spec.joint('FR_calf_joint').actfrcrange = (-5, 5)", "joints limit the forces of their actuators"),
+    ("spec.actuators[0].group = 2; spec.option.disableactuator = 4", "it sets flags in its options"),
+    ("spec.option.noslip_iterations = 10", "it sets flags in its options"),
+    ("for a in spec.actuators: a.delay, a.nsample = 0.01, 5", "actuators must be motors"),
+    ("spec.actuators[0].damping = [1.0, 0.0, 0.0]", "actuators must be motors"),
+    ("spec.actuators[0].armature = 0.1", "actuators must be motors"),
+    ("spec.joint('FR_calf_joint').stiffness = [1.0, 40.0, 30.0]", "springs or dampers are not linear"),
+    ("spec.joint('FR_calf_joint').damping = [1.0, 4.0, 3.0]", "springs or dampers are not linear"),
+    ("spec.joint('root').damping = [5.0, 0.0, 0.0]", "the trunk's free joint has passive forces or armature"),
+    ("spec.joint('root').armature = 1.0", "the trunk's free joint has passive forces or armature"),
+    ("spec.joint('root').frictionloss = 5.0", "the trunk's free joint has passive forces or armature"),
+    ("spec.joint('root').stiffness = [50.0, 0.0, 0.0]", "the trunk's free joint has passive forces or armature"),
+    ("spec.add_exclude(bodyname1='world', bodyname2='FR_calf')", "some contacts are excluded"),
+    ("spec.geom('FR_foot').conaffinity = 2", "the floor lets some of its geoms through"),
+    (f"spec.geom('floor').contype = 0; spec.worldbody.add_geom({SPHERE}, condim=3)", "it needs one plane"),
+    ("spec.geom('floor').surfacevel = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]", "surfaces move or stick"),
+    ("spec.geom('FR_foot').adhesion = 10.0", "surfaces move or stick"),
+    ("branch(spec.worldbody)", "something beside the trunk hangs on the world"),
+    ("spec.actuators[0].damping = [0.0, 1.0, 0.0]", "actuators must be motors"),
+]
+
+
+if hasattr(mujoco.MjsJoint, "springyield"):  # not in MuJoCo 3
+    YIELD = "j = spec.joint('FR_calf_joint'); j.stiffness = [1.0, 0.0, 0.0]; j.springyield = 0.1"
+    REFUSED.append((YIELD, "springs or dampers are not linear"))
+
+
+def branch(body):
+    """Add a body on a hinge."""
+    body.add_body().add_joint(axis=(1, 0, 0), range=(-1, 1))
+    body.bodies[-1].mass, body.bodies[-1].inertia, body.bodies[-1].explicitinertial = 1.0, (1, 1, 1), True
+
+
+def remove_legs(spec):
+    """Leave the trunk alone."""
+    for leg in ("FR", "FL", "RR", "RL"):
+        spec.delete(spec.body(f"{leg}_hip"))
+
+
+@pytest.mark.parametrize(
+    ("edit", "reason"),
+    [pytest.param(*case, id=case[0][:60]) for case in REFUSED],
+)
+def test_refused(edit, reason):
+    """A robot with anything that the step does not simulate is refused, by its reason."""
+    spec = read_spec(A1)
+    for key in list(spec.keys):
+        spec.delete(key)
+    exec(edit, globals(), {"spec": spec})
+    model = spec.compile()
+    with pytest.raises(UserError) as error:
+        read_tree(model)
+    message = str(error.value)
+    assert message.startswith("sim.engine 'fused' cannot simulate this robot: ") and reason in message
+    assert message.endswith("; use sim.engine = 'mujoco_warp'")
+
+
+def test_engines_by_name():
+    """A robot that is refused can be simulated with the other engine, and there is no third one."""
+    spec = read_spec(A1)
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    model = build_model(spec, [])
+    with pytest.raises(UserError, match="the friction cone must be pyramidal"):
+        Simulator(model, 1, "cpu")
+    Simulator(model, 1, "cpu", engine="mujoco_warp")
+    with pytest.raises(UserError, match="fuse"):
+        Simulator(model, 1, "cpu", engine="fuse")
