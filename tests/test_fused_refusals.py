@@ -75,6 +75,10 @@ REFUSED = [
     ("spec.geom('floor').surfacevel = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]", "surfaces move or stick"),
     ("spec.geom('FR_foot').adhesion = 10.0", "surfaces move or stick"),
     ("branch(spec.worldbody)", "something beside the trunk hangs on the world"),
+    ("for _ in range(13): branch(spec.body('trunk'))", "its legs have unlike numbers of joints"),
+    ("remove_legs(spec)\nfor _ in range(17): branch(spec.body('trunk'))", "it has more than 16 legs"),
+    ("spec.geom('FR_foot').solref = (-500, 0.7)", "a solref mixes its two formats"),
+    ("spec.joint('FR_calf_joint').solref_limit = (0.02, -1)", "a solref mixes its two formats"),
     ("spec.actuators[0].damping = [0.0, 1.0, 0.0]", "actuators must be motors"),
 ]
 

@@ -10,6 +10,8 @@ import warp as wp
 from legged_torque.sim.fused.math import vec5
 from legged_torque.utils.errors import UserError
 
+MAX_BRANCHES = 16
+"""Threads of a world must fit into half a warp."""
 _CAPSULE_ENDS = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
 _BOX_CORNERS = [(float(x), float(y), float(z)) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]
 _GEOM_POINTS = {
@@ -106,6 +108,7 @@ def read_tree(model: mujoco.MjModel) -> Tree:
             chain.append(children[chain[-1]][0])
         chains.append(chain)
     _require(bool(chains) and len({len(chain) for chain in chains}) == 1, "its legs have unlike numbers of joints")
+    _require(len(chains) <= MAX_BRANCHES, f"it has more than {MAX_BRANCHES} legs")
     points: list[list] = [[] for _ in chains]
     depths = {body: (i, j + 1) for i, chain in enumerate(chains) for j, body in enumerate(chain)}
     trunk_geoms = 0
@@ -186,7 +189,10 @@ def _check_bodies(model: mujoco.MjModel) -> None:
     _require(not (model.jnt_actfrclimited.any()), "joints limit the forces of their actuators")
     root = [model.dof_damping[:6], model.dof_armature[:6], model.dof_frictionloss[:6], model.jnt_stiffness[:1]]
     _require(not any(values.any() for values in root), "the trunk's free joint has passive forces or armature")
-    _require(not _any_of(model, "jnt_stiffnesspoly", "jnt_springyield", "dof_dampingpoly"), "springs or dampers are not linear")
+    _require(
+        not _any_of(model, "jnt_stiffnesspoly", "jnt_springyield", "dof_dampingpoly"),
+        "springs or dampers are not linear",
+    )
 
 
 def _check_contacts(model: mujoco.MjModel) -> None:
@@ -204,6 +210,8 @@ def _check_contacts(model: mujoco.MjModel) -> None:
     _require(bool((model.geom_condim[collides] == 3).all()), "condim must be 3")
     _require(not (model.geom_margin[collides].any() or model.geom_gap[collides].any()), "geoms have margins or gaps")
     _require(not _any_of(model, "geom_surfacevel", "geom_adhesion"), "surfaces move or stick")
+    solrefs = np.concatenate([model.geom_solref[collides], model.jnt_solref, model.dof_solref])
+    _require(bool(((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1)).all()), "a solref mixes its two formats")
 
 
 def _check_motors(model: mujoco.MjModel) -> None:
