@@ -251,6 +251,18 @@ def test_parameters(on_floor, edit):
     assert_alike(model, states, step_fused(model, states), expected)
 
 
+@pytest.mark.parametrize("friction", [0.1, 0.01, 0.001])
+def test_slippery_floors(friction):
+    """With little friction contacts are softer than in MuJoCo, for the sake of float32, which is hardly noticed."""
+    model = compiled(make_a1())
+    model.geom_friction[:, 0] = friction
+    states = draw_states(model, 200, seed=6)
+    velocities = step_mujoco(model, states)[0]
+    error = np.abs(step_fused(model, states)[0] - velocities).max(axis=1)
+    change = np.sqrt(np.square(velocities - states["qvel"]).mean())
+    assert np.median(error) < 1e-4 * change and error.max() < 0.1 * change
+
+
 def test_parameters_per_world():
     """Worlds with arrays of their own move as MuJoCo's models with these numbers; writing them acts at once."""
     model = compiled(make_a1())

@@ -14,6 +14,9 @@ MIN_IMPEDANCE = wp.constant(1.0e-4)
 MAX_IMPEDANCE = wp.constant(0.9999)
 MIN_FRICTION = wp.constant(1.0e-5)
 """MuJoCo's mjMINVAL, mjMINIMP, mjMAXIMP and mjMINMU."""
+MAX_CONTACT_MASS = wp.constant(1.0e5)
+"""Contacts get stiffer with less friction, without limit; above this, which one of 0.2 has with impratio 100, float32
+loses the solution, while the softness that it stands for no longer matters."""
 CAPSULE = wp.constant(3)
 BOX = wp.constant(6)
 """MuJoCo's mjGEOM_CAPSULE and mjGEOM_BOX."""
@@ -118,7 +121,7 @@ def set_contact_rows(
     invweight = robot.body_invweight0[row(world, robot.body_invweight0.shape[0]), robot.geom_bodyid[geom]][0]
     invweight *= (1.0 + friction * friction) * 2.0 * friction * friction / robot.impratio
     contact.friction = friction
-    contact.mass = constraint_mass(invweight, params[2])
+    contact.mass = wp.min(constraint_mass(invweight, params[2]), MAX_CONTACT_MASS)
     along = row_values(contact, normal, velocity)
     contact.reference = vec4(-params[0] * params[2] * dist) - params[1] * along
     return contact
