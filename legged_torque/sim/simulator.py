@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import functools
 import operator
+from collections.abc import Sequence
 
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
 from torch import Tensor
 
+from legged_torque.sim.fused.constants import DerivedConstants
 from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
+from legged_torque.sim.per_world import expand
 from legged_torque.sim.warp_step import WarpStep
 from legged_torque.utils.errors import unknown_name
 
@@ -62,6 +65,7 @@ class Simulator:
         engine: str = "fused",
         solver_iterations: int = 10,
         ls_iterations: int = 20,
+        per_world: Sequence[str] = (),
     ) -> None:
         """Build the worlds, all in the model's reference pose.
 
@@ -72,6 +76,7 @@ class Simulator:
             engine: One of :data:`ENGINES`.
             solver_iterations: Most iterations of the constraint solver per physics step.
             ls_iterations: Most iterations of its line search.
+            per_world: Fields of the model, or "gravity", of which each world gets its own.
 
         Raises:
             UserError: If the engine is unknown or cannot simulate this robot.
@@ -90,11 +95,14 @@ class Simulator:
             self.model = mjw.put_model(model)
             self.model.opt.warn_overflow = 0  # it prints from inside kernels; check_buffers tells instead
             self.data = mjw.make_data(model, nworld=num_envs, nconmax=contacts, njmax=max_constraints(model, contacts))
+            for name in per_world:
+                expand(self.model, name, num_envs)
             self._diverged = wp.zeros(num_envs, dtype=wp.bool)
             self._reset_mask = wp.zeros(num_envs, dtype=wp.bool)
             self._overflow = wp.zeros(num_envs, dtype=wp.int32)
             self._reference_pose = wp.array(model.qpos0, dtype=wp.float32)
-        self._step = FusedStep(model, self.model, self.data) if engine == "fused" else WarpStep(self.model, self.data)
+        self._constants = DerivedConstants(model, self.model, num_envs) if per_world else None
+        self._step = self._make_step(engine)
         self.qpos = wp.to_torch(self.data.qpos)
         self.qvel = wp.to_torch(self.data.qvel)
         self.qacc_warmstart = wp.to_torch(self.data.qacc_warmstart)
@@ -103,6 +111,29 @@ class Simulator:
         sensors = wp.to_torch(self.data.sensordata).view(num_envs, -1, CONTACT_DATA)
         self.contact_found = sensors[:, :, 0]
         self.contact_force = sensors[:, :, 1:]
+
+    def _make_step(self, engine: str) -> FusedStep | WarpStep:
+        """Return what steps the worlds."""
+        if engine == "mujoco_warp":
+            return WarpStep(self.model, self.data)
+        return FusedStep(self.mj_model, self.model, self.data)
+
+    def field(self, name: str) -> Tensor:
+        """Return a field of the model, or "gravity", that is writable.
+
+        Args:
+            name: One of those that were asked for ``per_world``. Shape: (num_envs, ...).
+        """
+        return wp.to_torch(expand(self.model, name, self.num_envs))
+
+    def update_constants(self, mask: Tensor) -> None:
+        """Recompute what MuJoCo derives from masses and armatures, after they have been changed.
+
+        Args:
+            mask: In which worlds. Shape: (num_envs,), bool.
+        """
+        wp.to_torch(self._reset_mask).copy_(mask)
+        self._constants.update(self._reset_mask)
 
     def step(self, sense: bool = True) -> None:
         """Advance every world by one physics step under the torques in ``ctrl``.

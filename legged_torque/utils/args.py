@@ -51,6 +51,11 @@ def add_build_args(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, help="random seed; default: that of the training settings")
     parser.add_argument(
+        "--perturbation",
+        help="random parameters, pushes and noise: none, low, high, high_frequency or doubled; default: none, or what "
+        "a loaded run has",
+    )
+    parser.add_argument(
         "--device",
         default="auto",
         help="auto, cpu or cuda:N; auto takes the GPU if there is one, with torchrun one for each process",
@@ -88,7 +93,7 @@ def apply_args(env_cfg: Any, train_cfg: Any, args: argparse.Namespace) -> None:
     """Change settings as the command line asks; what is more explicit wins.
 
     In this order: the preset, the number of worlds that suits the device, the settings of a resumed run
-    (``args.run_config``, if present), single options, ``--set``.
+    (``args.run_config``, if present), the perturbation, single options, ``--set``.
 
     Raises:
         UserError: If an argument makes no sense.
@@ -100,6 +105,8 @@ def apply_args(env_cfg: Any, train_cfg: Any, args: argparse.Namespace) -> None:
     if run_config:
         update_from_dict(env_cfg, run_config["env"])
         update_from_dict(train_cfg, run_config["train"])
+    if getattr(args, "perturbation", None):
+        apply_perturbation(env_cfg, args.perturbation)
     given = {
         "env.num_envs": args.num_envs,
         "seed": args.seed,
@@ -130,6 +137,18 @@ def apply_preset(env_cfg: Any, train_cfg: Any, name: str) -> None:
         raise unknown_name("preset", name, presets)
     for section, values in presets[name].items():
         update_from_dict(env_cfg if section in section_keys(env_cfg) else train_cfg, {section: values})
+
+
+def apply_perturbation(env_cfg: Any, name: str) -> None:
+    """Apply one of the named sets of random events that the task's settings offer.
+
+    Raises:
+        UserError: If there is no such set.
+    """
+    perturbations = env_cfg.perturbations()
+    if name not in perturbations:
+        raise unknown_name("perturbation", name, perturbations)
+    update_from_dict(env_cfg, perturbations[name])
 
 
 def set_entry_of_either(env_cfg: Any, train_cfg: Any, path: str, value: Any) -> None:

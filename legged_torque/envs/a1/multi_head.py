@@ -34,7 +34,7 @@ class MultiHeadRobot(LeggedRobot):
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """tau = theta_pd tau_pd(a[:n]) + theta_torque torque_scale a[n:] (eq. 7) [N m]. Shape: (num_envs, n)."""
         theta_pd, theta_torque = self.mixing
-        torque = self.cfg.control.torque_scale * actions[:, self.num_dof :]
+        torque = self.torque_scale * actions[:, self.num_dof :]
         return theta_pd * self._pd_torques(actions[:, : self.num_dof]) + theta_torque * torque
 
     def curriculum_values(self) -> dict[str, Tensor]:

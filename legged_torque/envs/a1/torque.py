@@ -13,7 +13,7 @@ class TorqueRobot(LeggedRobot):
 
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """tau = torque_scale a [N m]. Shapes: (num_envs, num_dof)."""
-        return self.cfg.control.torque_scale * actions
+        return self.torque_scale * actions
 
 
 class A1TorqueCfg(A1Cfg):

@@ -13,20 +13,23 @@ from torch import Tensor
 
 from legged_torque import ROOT_DIR
 from legged_torque.envs.base.curriculum import LinearCurriculum
+from legged_torque.envs.base.domain_rand import MODEL_FIELDS, parameters
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.envs.base.random_events import RandomEvents
 from legged_torque.envs.base.rewards import RewardTerms
 from legged_torque.envs.base.symmetry import Mirror
 from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.sim.model import build_model, geoms_matching, read_spec
+from legged_torque.sim.randomization import Randomization
 from legged_torque.sim.simulator import Simulator
 from legged_torque.utils.config import section_keys, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.math import quat_from_euler, quat_rotate_inverse
+from legged_torque.utils.math import quat_rotate_inverse
 
 
-class LeggedRobot(RewardTerms, VecEnv):
+class LeggedRobot(RandomEvents, RewardTerms, VecEnv):
     """A batch of robots with position control, and what all approaches share.
 
     An approach overrides :meth:`_compute_torques`, adds ``_reward_<term>`` methods, or overrides the curriculum hook
@@ -77,6 +80,9 @@ class LeggedRobot(RewardTerms, VecEnv):
         self._create_sim()
         self._init_buffers()
         self._prepare_reward_functions()
+        rand = cfg.domain_rand
+        if rand.randomize_parameters:
+            self.randomization = Randomization(parameters(self), self.num_envs, device, rand.keep_probability)
         self.step_graph = CudaGraph(self._step, device)
         self.reset()
 
@@ -148,9 +154,8 @@ class LeggedRobot(RewardTerms, VecEnv):
 
     def _pd_torques(self, actions: Tensor) -> Tensor:
         """tau = Kp (q_nominal + scale a - q) - Kd qd (eq. 8). Shapes: (num_envs, num_dof)."""
-        control = self.cfg.control
-        target = self.default_dof_pos + control.action_scale * actions
-        return control.stiffness * (target - self.dof_pos) - control.damping * self.dof_vel
+        target = self.default_dof_pos + self.joint_offset + self.action_scale * actions
+        return self.p_gains * (target - self.dof_pos) - self.d_gains * self.dof_vel
 
     def update_curriculum(self) -> None:
         """Curriculum hook for what may only change between rollouts; the runner calls it before each of them."""
@@ -173,7 +178,7 @@ class LeggedRobot(RewardTerms, VecEnv):
         decimation = self.cfg.control.decimation
         for i in range(decimation):
             if i == 0 or self.cfg.control.refresh_torques:
-                torques = self._compute_torques(self.actions)
+                torques = self.motor_strength * self._compute_torques(self.actions)
                 torch.clamp(torques, self.torque_limits[0], self.torque_limits[1], out=self.torques)
             self.sim.step(sense=i == decimation - 1)
         self.sim.flag_diverged()
@@ -241,6 +246,8 @@ class LeggedRobot(RewardTerms, VecEnv):
             dim=1,
         )
         critic = torch.cat([policy, self.base_lin_vel * scales.lin_vel, self.base_pos[:, 2:], self.feet_contact], dim=1)
+        if self.cfg.noise.add_noise:
+            policy = policy + self._noise_scale_vec * self._uniform(policy, [-1.0, 1.0])
         clip = self.cfg.normalization.clip_observations
         torch.clamp(policy, -clip, clip, out=self.obs_buf["policy"])
         torch.clamp(critic, -clip, clip, out=self.obs_buf["critic"])
@@ -254,44 +261,6 @@ class LeggedRobot(RewardTerms, VecEnv):
         """Count the time of each foot since it left the ground."""
         self.feet_air_time.copy_((self.feet_air_time + self.dt) * (1.0 - self.feet_contact))
 
-    # ---- resets and commands, by mask --------------------------------------------------------------------------------
-
-    def _reset_worlds(self) -> None:
-        """Start a new episode in the worlds of ``reset_buf``, and draw new commands where they are due."""
-        mask = self.reset_buf
-        self.sim.reset(mask)
-        self._reset_dofs(mask)
-        self._reset_root_states(mask)
-        for buffer in (self.actions, self.feet_air_time):
-            buffer.masked_fill_(mask.unsqueeze(1), 0.0)
-        self._episode_length_buf.masked_fill_(mask, 0)
-        self.episode_sums.masked_fill_(mask, 0.0)
-        self.episode_return.masked_fill_(mask, 0.0)
-        due = torch.rand(self.num_envs, device=self.device) < self.cfg.commands.resampling_probability
-        self._resample_commands(mask | due)
-        self._update_state()
-
-    def _reset_dofs(self, mask: Tensor) -> None:
-        """Draw joint positions around q_nominal for the worlds in ``mask``; joints start at rest."""
-        low, high = self.cfg.domain_rand.init_dof_pos_scale
-        scale = torch.empty_like(self.dof_pos).uniform_(low, high)
-        drawn = (self.default_dof_pos * scale).clamp(self._hard_dof_pos_limits[:, 0], self._hard_dof_pos_limits[:, 1])
-        self.dof_pos.copy_(torch.where(mask.unsqueeze(1), drawn, self.dof_pos))
-
-    def _reset_root_states(self, mask: Tensor) -> None:
-        """Draw the trunk's orientation for the worlds in ``mask``, at the initial position and at rest."""
-        rand = self.cfg.domain_rand
-        ranges = (rand.init_roll, rand.init_pitch, rand.init_yaw)
-        angles = [torch.empty_like(self.rew_buf).uniform_(*limits) for limits in ranges]
-        column = mask.unsqueeze(1)
-        self.base_pos.copy_(torch.where(column, self._init_pos, self.base_pos))
-        self.base_quat.copy_(torch.where(column, quat_from_euler(*angles), self.base_quat))
-
-    def _resample_commands(self, mask: Tensor) -> None:
-        """Draw new commands for the worlds in ``mask``."""
-        drawn = self._command_low + self._command_span * torch.rand_like(self.commands)
-        self.commands.copy_(torch.where(mask.unsqueeze(1), drawn, self.commands))
-
     # ---- construction ------------------------------------------------------------------------------------------------
 
     def _create_sim(self) -> None:
@@ -303,7 +272,10 @@ class LeggedRobot(RewardTerms, VecEnv):
         model = build_model(spec, geoms)
         model.opt.timestep = self.cfg.sim.dt
         sim = self.cfg.sim
-        self.sim = Simulator(model, self.num_envs, self.device, sim.engine, sim.solver_iterations, sim.ls_iterations)
+        per_world = MODEL_FIELDS if self.cfg.domain_rand.randomize_parameters else ()
+        self.sim = Simulator(
+            model, self.num_envs, self.device, sim.engine, sim.solver_iterations, sim.ls_iterations, per_world
+        )
         self.foot_names = [name for name in geoms if asset.foot_name in name]
         self.dof_names = [model.joint(i).name for i in range(1, model.njnt)]
         self.num_dof = len(self.dof_names)
@@ -337,6 +309,13 @@ class LeggedRobot(RewardTerms, VecEnv):
         self._given_actions, self.actions, self.last_actions = (zeros(n, self.num_actions) for _ in range(3))
         self.base_lin_vel, self.projected_gravity, self.commands = (zeros(n, 3) for _ in range(3))
         self.last_dof_vel = zeros(n, self.num_dof)
+        control = cfg.control
+        self.p_gains, self.d_gains = (
+            zeros(n, self.num_dof) + control.stiffness,
+            zeros(n, self.num_dof) + control.damping,
+        )
+        self.motor_strength, self.joint_offset = zeros(n, self.num_dof) + 1.0, zeros(n, self.num_dof)
+        self.action_scale, self.torque_scale = zeros(n, 1) + control.action_scale, zeros(n, 1) + control.torque_scale
         self.contacts = zeros(*self.sim.contact_found.shape)
         self.feet_contact, self.feet_air_time = (zeros(n, len(self.feet_indices)) for _ in range(2))
         self.rew_buf, self.episode_return = zeros(n), zeros(n)
@@ -361,6 +340,7 @@ class LeggedRobot(RewardTerms, VecEnv):
         self._init_pos = self._tensor(cfg.init_state.pos)
         self._gravity = self._tensor([0.0, 0.0, -1.0]).expand(n, 3)
         ranges, scales = cfg.commands.ranges, cfg.normalization.obs_scales
+        self._noise_scale_vec = self._tensor(self._noise_scales())
         limits = self._tensor([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw])
         self._command_low, self._command_span = limits[:, 0], limits[:, 1] - limits[:, 0]
         self._command_scales = self._tensor([scales.lin_vel, scales.lin_vel, scales.ang_vel])

@@ -39,13 +39,60 @@ class LeggedRobotCfg(BaseConfig):
         default_joint_angles: dict[str, float] = {}  # [rad] q_nominal, by joint name
 
     class domain_rand:
-        """What is drawn at random."""
+        """What is drawn at random: uniform ranges [lowest, highest]. See ``perturbations``."""
 
-        # initial state, drawn uniformly at every reset
+        # initial state, at every reset
         init_roll = [-0.19635, 0.19635]  # [rad] +-pi/16
         init_pitch = [-0.19635, 0.19635]  # [rad] +-pi/16
         init_yaw = [-3.14159, 3.14159]  # [rad]
         init_dof_pos_scale = [0.5, 1.5]  # times q_nominal, then inside the joint limits
+        init_dof_vel = [0.0, 0.0]  # [rad/s]
+        init_lin_vel = [0.0, 0.0]  # [m/s] of the trunk, per axis
+        init_ang_vel = [0.0, 0.0]  # [rad/s] of the trunk, per axis
+
+        # parameters, at every reset and now and then
+        randomize_parameters = False
+        keep_fixed: list[str] = []  # names of ranges below that are not drawn after all
+        resampling_probability = 0.002  # per control step and world
+        keep_probability = 0.3  # share of draws in which the robot keeps its own values, those up to friction loss
+        trunk_mass_offset = [-0.8, 0.8]  # [kg], then
+        trunk_mass_scale = [0.75, 1.25]  # times the mass; inertia in proportion
+        trunk_com_offset = [-0.0025, 0.0025]  # [m] per axis
+        foot_radius = [0.0195, 0.0205]  # [m]
+        foot_offset = [-0.0025, 0.0025]  # [m] per axis
+        dof_damping = [0.0, 0.2]  # [N m s/rad]
+        dof_armature = [0.009, 0.02]  # [kg m^2]
+        dof_stiffness = [0.0, 0.5]  # [N m/rad] of a spring towards angle 0
+        dof_frictionloss = [0.0, 0.65]  # [N m]
+        ground_friction = [0.001, 2.0]  # tangential; torsional and rolling in proportion
+        contact_stiffness = [500.0, 1500.0]  # of MuJoCo's direct solref
+        contact_damping = [30.0, 130.0]
+        gravity = [8.81, 10.81]  # [m/s^2]
+        motor_strength = [0.75, 1.25]  # times the torque, per joint
+        joint_offset = [-0.05, 0.05]  # [rad] on the target angle, per joint
+        action_scale_offset = [-0.03, 0.03]  # [rad] per unit of a position action; torques in proportion
+        stiffness_offset = [-3.0, 3.0]  # [N m/rad] on Kp, per joint, then
+        stiffness_scale = [0.75, 1.25]  # times Kp
+        damping_offset = [-0.1, 0.1]  # [N m s/rad] on Kd, per joint, then
+        damping_scale = [0.75, 1.25]  # times Kd
+
+        # pushes: half of them set the trunk's velocity, half are added to it
+        push_robots = False
+        push_probability = 0.002  # per control step and world
+        push_velocity = [-0.3, 0.3]  # [m/s] on each axis
+
+    class noise:
+        """Errors of the policy's sensors: uniform, at most this much either way."""
+
+        add_noise = False
+
+        class noise_scales:
+            """By group of observations."""
+
+            dof_pos = 0.01  # [rad]
+            dof_vel = 1.5  # [rad/s]
+            ang_vel = 0.2  # [rad/s]
+            gravity = 0.05
 
     class commands:
         """Commanded velocities, in the trunk's frame."""
@@ -122,6 +169,23 @@ class LeggedRobotCfg(BaseConfig):
             ang_vel = 0.25
             dof_pos = 1.0
             dof_vel = 0.05
+
+    def perturbations(self) -> dict[str, dict]:
+        """Return the named changes that ``--perturbation`` chooses from (paper, IV-A)."""
+
+        def environment(on: bool, velocity: float = 0.0, probability: float = 0.0) -> dict:
+            speeds = {"init_dof_vel": 10.5, "init_lin_vel": 0.5, "init_ang_vel": 0.5}  # half of what joints can do
+            states = {name: [-on * speed, on * speed] for name, speed in speeds.items()}
+            pushes = {"push_robots": on, "push_velocity": [-velocity, velocity], "push_probability": probability}
+            return {"domain_rand": {"randomize_parameters": on, **states, **pushes}, "noise": {"add_noise": on}}
+
+        return {
+            "none": environment(False),
+            "low": environment(True, 0.3, 0.002),
+            "high": environment(True, 1.0, 0.002),
+            "high_frequency": environment(True, 1.0, 0.006),
+            "doubled": environment(True, 1.0, 0.012),
+        }
 
 
 class LeggedRobotCfgPPO(BaseConfig):

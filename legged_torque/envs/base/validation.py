@@ -4,7 +4,23 @@ from __future__ import annotations
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.utils.config import section_keys
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, unknown_name
+
+POSITIVE = (
+    "trunk_mass_scale",
+    "foot_radius",
+    "dof_damping",
+    "dof_armature",
+    "dof_stiffness",
+    "dof_frictionloss",
+    "ground_friction",
+    "contact_stiffness",
+    "contact_damping",
+    "motor_strength",
+    "stiffness_scale",
+    "damping_scale",
+)
+"""Ranges of ``domain_rand`` that make no sense below 0."""
 
 
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:
@@ -27,13 +43,31 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
             raise UserError(f"{key} must be greater than 0, not {value}")
     if len(cfg.init_state.pos) != 3:
         raise UserError(f"init_state.pos must be [x, y, z], not {cfg.init_state.pos}")
-    if not 0.0 <= cfg.commands.resampling_probability <= 1.0:
-        raise UserError(
-            f"commands.resampling_probability must be from 0 to 1, not {cfg.commands.resampling_probability}"
-        )
+    _check_probability("commands.resampling_probability", cfg.commands.resampling_probability)
+    for key in section_keys(cfg.noise.noise_scales):
+        if getattr(cfg.noise.noise_scales, key) < 0.0:
+            raise UserError(
+                f"noise.noise_scales.{key} must not be negative, it is {getattr(cfg.noise.noise_scales, key)}"
+            )
+    for key in POSITIVE:
+        if min(getattr(cfg.domain_rand, key)) < 0.0:
+            raise UserError(f"domain_rand.{key} must not be negative, it is {getattr(cfg.domain_rand, key)}")
+    for name in cfg.domain_rand.keep_fixed:
+        if name not in section_keys(cfg.domain_rand):
+            raise unknown_name("range in domain_rand.keep_fixed", name, section_keys(cfg.domain_rand))
     for name, section in {"commands.ranges": cfg.commands.ranges, "domain_rand": cfg.domain_rand}.items():
         for key in section_keys(section):
-            _check_range(f"{name}.{key}", getattr(section, key))
+            value = getattr(section, key)
+            if key.endswith("probability"):
+                _check_probability(f"{name}.{key}", value)
+            elif not isinstance(value, bool) and key != "keep_fixed":
+                _check_range(f"{name}.{key}", value)
+
+
+def _check_probability(key: str, value: float) -> None:
+    """Refuse what is not a probability."""
+    if not 0.0 <= value <= 1.0:
+        raise UserError(f"{key} must be from 0 to 1, not {value}")
 
 
 def _check_range(key: str, limits: list[float]) -> None:

@@ -16,7 +16,7 @@ from legged_torque.sim.fused.dynamics import make_trunk
 from legged_torque.sim.fused.legs import all_legs
 from legged_torque.sim.fused.math import vec4
 from legged_torque.sim.fused.newton import branch_newton
-from legged_torque.sim.fused.robot import Robot, make_robot, read_tree
+from legged_torque.sim.fused.robot import Robot, lanes_per_world, make_robot, read_tree
 from legged_torque.sim.fused.stages import integrate_trunk
 from legged_torque.sim.fused.trunk import TrunkMotion, solve_trunk, trunk_residual, whole_body
 
@@ -46,7 +46,7 @@ class FusedStep:
         self._device = data.qpos.device
         with wp.ScopedDevice(self._device):
             self._robot = make_robot(mj_model, model, tree)
-        self._lanes = 1 << (branches - 1).bit_length() if self._device.is_cuda else 1
+        self._lanes = lanes_per_world(branches, self._device.is_cuda)
         points = max(1, *(len(points) for points in tree.points))
         room = data.nworld * branches * points
         self._scratch = [wp.empty(room, dtype=dtype, device=self._device) for dtype in (Contact, vec4, vec4)]

@@ -1,0 +1,129 @@
+"""Which numbers of the robot, the ground and the controller are drawn at random (paper, App. I-B)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from legged_torque.sim.randomization import Parameter
+
+if TYPE_CHECKING:
+    from legged_torque.envs.base.legged_robot import LeggedRobot
+
+MODEL_FIELDS = (
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "geom_size",
+    "geom_pos",
+    "dof_damping",
+    "dof_armature",
+    "jnt_stiffness",
+    "dof_frictionloss",
+    "geom_friction",
+    "geom_solref",
+    "gravity",
+)
+"""Fields of the model of which each world has its own."""
+
+TRUNK = 1
+"""The trunk"s body."""
+
+
+def parameters(task: LeggedRobot) -> list[Parameter]:
+    """Return everything that ``cfg.domain_rand`` draws."""
+    return [*robot_parameters(task), *ground_parameters(task), *control_parameters(task)]
+
+
+def robot_parameters(task: LeggedRobot) -> list[Parameter]:
+    """Return what is drawn of the robot; all of it may keep its own value."""
+    cfg, model = task.cfg.domain_rand, task.sim.mj_model
+    dofs, joints = range(6, model.nv), range(1, model.njnt)
+    feet = [model.geom(name).id for name in task.foot_names]
+    trunk = offset(cfg, "trunk_mass_offset") | scale(cfg, "trunk_mass_scale")
+    inertia_per_mass = list(model.body_inertia[TRUNK] / model.body_mass[TRUNK])
+
+    def drawn(name: str, field: str, columns: Any, **settings: Any) -> Parameter:
+        return Parameter(name, view(task, field), list(columns), may_keep=True, **settings)
+
+    return [
+        drawn("trunk_mass", "body_mass", [TRUNK], **trunk),
+        drawn(
+            "trunk_inertia", "body_inertia", entries(3, [TRUNK]), shared=True, same_draw_as="trunk_mass",
+            **trunk | {"weight": inertia_per_mass},
+        ),
+        drawn("trunk_com", "body_ipos", entries(3, [TRUNK]), **offset(cfg, "trunk_com_offset")),
+        drawn("foot_radius", "geom_size", [3 * foot for foot in feet], **absolute(cfg, "foot_radius")),
+        drawn("foot_offset", "geom_pos", entries(3, feet), **offset(cfg, "foot_offset")),
+        drawn("dof_damping", "dof_damping", dofs, **absolute(cfg, "dof_damping")),
+        drawn("dof_armature", "dof_armature", dofs, **absolute(cfg, "dof_armature")),
+        drawn("dof_stiffness", "jnt_stiffness", joints, **absolute(cfg, "dof_stiffness")),
+        drawn("dof_frictionloss", "dof_frictionloss", dofs, **absolute(cfg, "dof_frictionloss")),
+    ]  # fmt: skip
+
+
+def ground_parameters(task: LeggedRobot) -> list[Parameter]:
+    """Return what is drawn of the ground; it is the same for all geoms of a world."""
+    cfg, model = task.cfg.domain_rand, task.sim.mj_model
+    geoms = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
+    kinds = list(model.geom_friction[geoms[0]] / model.geom_friction[geoms[0], 0]) * len(geoms)
+    return [
+        Parameter(
+            "ground_friction", view(task, "geom_friction"), entries(3, geoms), shared=True,
+            **absolute(cfg, "ground_friction", kinds),
+        ),
+        Parameter(
+            "contact_stiffness", view(task, "geom_solref"), [2 * geom for geom in geoms], shared=True,
+            **absolute(cfg, "contact_stiffness", -1.0),
+        ),
+        Parameter(
+            "contact_damping", view(task, "geom_solref"), [2 * geom + 1 for geom in geoms], shared=True,
+            **absolute(cfg, "contact_damping", -1.0),
+        ),
+        Parameter("gravity", view(task, "gravity"), [2], **absolute(cfg, "gravity", -1.0)),
+    ]  # fmt: skip
+
+
+def control_parameters(task: LeggedRobot) -> list[Parameter]:
+    """Return what is drawn of the controller, per joint but for the scales of actions."""
+    cfg, control = task.cfg.domain_rand, task.cfg.control
+    joints = range(task.num_dof)
+    torque_per_position = control.torque_scale / control.action_scale
+    return [
+        Parameter("motor_strength", task.motor_strength, joints, **scale(cfg, "motor_strength")),
+        Parameter("joint_offset", task.joint_offset, joints, **offset(cfg, "joint_offset")),
+        Parameter("action_scale", task.action_scale, [0], **offset(cfg, "action_scale_offset")),
+        Parameter(
+            "torque_scale", task.torque_scale, [0], same_draw_as="action_scale",
+            **offset(cfg, "action_scale_offset") | {"weight": torque_per_position},
+        ),
+        Parameter("p_gains", task.p_gains, joints, **offset(cfg, "stiffness_offset") | scale(cfg, "stiffness_scale")),
+        Parameter("d_gains", task.d_gains, joints, **offset(cfg, "damping_offset") | scale(cfg, "damping_scale")),
+    ]  # fmt: skip
+
+
+def view(task: LeggedRobot, field: str) -> Tensor:
+    """Return a field of the model as one row of numbers per world."""
+    return task.sim.field(field).flatten(1)
+
+
+def entries(width: int, rows: list[int]) -> list[int]:
+    """Return the places of all numbers of some entries that have ``width`` numbers each."""
+    return [row * width + part for row in rows for part in range(width)]
+
+
+def offset(cfg: Any, name: str) -> dict[str, Any]:
+    """Return settings for a value that is changed by an offset, unless it is kept fixed."""
+    return {} if name in cfg.keep_fixed else {"offset": tuple(getattr(cfg, name))}
+
+
+def scale(cfg: Any, name: str) -> dict[str, Any]:
+    """Return settings for a value that is multiplied, unless it is kept fixed."""
+    return {} if name in cfg.keep_fixed else {"scale": tuple(getattr(cfg, name))}
+
+
+def absolute(cfg: Any, name: str, weight: list[float] | float = 1.0) -> dict[str, Any]:
+    """Return settings for a value that is replaced, times a weight, unless it is kept fixed."""
+    limits = tuple(getattr(cfg, name))
+    return {} if name in cfg.keep_fixed else {"base": 0.0, "offset": limits, "weight": weight}

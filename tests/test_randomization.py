@@ -1,0 +1,290 @@
+"""Random parameters, pushes and sensor errors: each acts as in MuJoCo, and draws follow their definition."""
+
+import copy
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from settings import error_of, get_cfgs
+
+from legged_torque.utils.config import to_dict
+from legged_torque.utils.errors import UserError
+
+RANGES = {
+    "trunk_mass_offset": ("body_mass", (-0.8, 0.8)),
+    "trunk_mass_scale": ("body_mass", (0.75, 1.25)),
+    "trunk_com_offset": ("body_ipos", (-0.0025, 0.0025)),
+    "foot_radius": ("geom_size", (0.0195, 0.0205)),
+    "foot_offset": ("geom_pos", (-0.0025, 0.0025)),
+    "dof_damping": ("dof_damping", (0.0, 0.2)),
+    "dof_armature": ("dof_armature", (0.009, 0.02)),
+    "dof_stiffness": ("jnt_stiffness", (0.0, 0.5)),
+    "dof_frictionloss": ("dof_frictionloss", (0.0, 0.65)),
+    "ground_friction": ("geom_friction", (0.001, 2.0)),
+    "contact_stiffness": ("geom_solref", (500.0, 1500.0)),
+    "contact_damping": ("geom_solref", (30.0, 130.0)),
+    "gravity": ("gravity", (8.81, 10.81)),
+}
+"""Field and range of design.md, section 8, for each parameter of robot and ground."""
+CONTROL = ("motor_strength", "joint_offset", "action_scale_offset", "stiffness_offset", "stiffness_scale")
+CONTROL += ("damping_offset", "damping_scale")
+FIELDS = sorted({field for field, _ in RANGES.values()} | {"body_inertia"})
+ON = {"domain_rand.randomize_parameters": True}
+ALWAYS = {**ON, "domain_rand.keep_probability": 0.0}
+
+
+def only(*names):
+    """Settings that randomize these parameters and no others, in every draw."""
+    return ALWAYS | {"domain_rand.keep_fixed": [name for name in (*RANGES, *CONTROL) if name not in names]}
+
+
+def edited_model(sim, world):
+    """MuJoCo's model with the numbers of one world, and everything that follows from them."""
+    model = copy.copy(sim.mj_model)
+    for name in FIELDS:
+        target = model.opt.gravity if name == "gravity" else getattr(model, name)
+        target[:] = sim.field(name)[world].numpy().reshape(target.shape)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
+    return model
+
+
+def uniformity(values, low, high):
+    """Kolmogorov's distance of a sample from a uniform distribution, in units of what 1 in 1000 samples exceeds."""
+    sample = np.sort(np.asarray(values, dtype=np.float64).ravel())
+    expected = np.clip((sample - low) / (high - low), 0.0, 1.0)
+    steps = np.arange(len(sample) + 1) / len(sample)
+    distance = max(np.abs(expected - steps[1:]).max(), np.abs(expected - steps[:-1]).max())
+    return distance * np.sqrt(len(sample)) / 1.95
+
+
+def move_about(task):
+    """Put worlds into lively states near the floor, with torques."""
+    sim = task.sim
+    sim.qpos[:, 2] = torch.linspace(0.2, 0.33, task.num_envs)
+    sim.qvel.copy_(torch.randn_like(sim.qvel))
+    sim.qacc_warmstart.zero_()
+    sim.ctrl.copy_(8.0 * torch.randn_like(sim.ctrl))
+
+
+@pytest.mark.parametrize("name", [*RANGES, "all of them"])
+def test_worlds_move_as_their_models(make_task, name):
+    """A world with drawn parameters moves as MuJoCo's model with these numbers, and otherwise than without them."""
+    settings = ALWAYS if name == "all of them" else only(name)
+    if name == "all of them":
+        settings = settings | {"domain_rand.ground_friction": [0.3, 2.0]}  # float32 is less exact below
+    task = make_task("a1_torque", 12, **settings, **{"sim.solver_iterations": 50, "sim.ls_iterations": 50})
+    move_about(task)
+    before = task.sim.qvel.clone()
+    moved = 0
+    data = [mujoco.MjData(task.sim.mj_model) for _ in range(12)]
+    for world in range(12):
+        for field in ("qpos", "qvel", "ctrl", "qacc_warmstart"):
+            getattr(data[world], field)[:] = getattr(task.sim, field)[world].numpy()
+    task.sim.step()
+    for world in range(12):
+        plain = mujoco.MjData(task.sim.mj_model)
+        for field in ("qpos", "qvel", "ctrl", "qacc_warmstart"):
+            getattr(plain, field)[:] = getattr(data[world], field)
+        mujoco.mj_step(task.sim.mj_model, plain)
+        mujoco.mj_step(edited_model(task.sim, world), data[world])
+        np.testing.assert_allclose(task.sim.qvel[world], data[world].qvel, atol=0.02 if "friction" in name else 3e-3)
+        moved += np.abs(plain.qvel - data[world].qvel).max() > 1e-4
+    assert moved >= 5 and not torch.equal(task.sim.qvel, before)
+
+
+def test_derived_constants(make_task):
+    """Inverse weights are those of mj_setConst, in the worlds that were drawn anew and only there."""
+    task = make_task("a1_torque", 6, **ALWAYS)
+    for world in range(6):
+        model = edited_model(task.sim, world)
+        np.testing.assert_allclose(task.sim.field("body_invweight0")[world, 1:], model.body_invweight0[1:], rtol=1e-5)
+        np.testing.assert_allclose(task.sim.field("dof_invweight0")[world], model.dof_invweight0, rtol=1e-5)
+    before = {name: task.sim.field(name).clone() for name in (*FIELDS, "body_invweight0", "dof_invweight0")}
+    mask = torch.tensor([True, False, True, False, False, False])
+    task._randomize_parameters(mask)
+    for name, old in before.items():
+        new = task.sim.field(name)
+        assert torch.equal(new[~mask], old[~mask]), name
+        assert not torch.equal(new[mask], old[mask]), name
+
+
+def test_distributions(make_task):
+    """Draws are uniform in their ranges (Kolmogorov-Smirnov), and no two parameters or worlds go together."""
+    task = make_task("a1_position", 1500, **ALWAYS, **{"domain_rand.keep_fixed": ["trunk_mass_scale"]})
+    sim, model = task.sim, task.sim.mj_model
+    feet = [model.geom(name).id for name in task.foot_names]
+    samples = {
+        "trunk_mass_offset": sim.field("body_mass")[:, 1] - model.body_mass[1],
+        "trunk_com_offset": sim.field("body_ipos")[:, 1] - torch.tensor(model.body_ipos[1]),
+        "foot_radius": sim.field("geom_size")[:, feet, 0],
+        "foot_offset": sim.field("geom_pos")[:, feet] - torch.tensor(model.geom_pos[feet]),
+        "dof_damping": sim.field("dof_damping")[:, 6:],
+        "dof_armature": sim.field("dof_armature")[:, 6:],
+        "dof_stiffness": sim.field("jnt_stiffness")[:, 1:],
+        "dof_frictionloss": sim.field("dof_frictionloss")[:, 6:],
+        "ground_friction": sim.field("geom_friction")[:, 0, 0],
+        "contact_stiffness": -sim.field("geom_solref")[:, 0, 0],
+        "contact_damping": -sim.field("geom_solref")[:, 0, 1],
+        "gravity": -sim.field("gravity")[:, 2],
+    }
+    ranges = {name: RANGES[name][1] for name in samples}
+    samples |= {"motor_strength": task.motor_strength, "joint_offset": task.joint_offset}
+    ranges |= {"motor_strength": (0.75, 1.25), "joint_offset": (-0.05, 0.05)}
+    samples["action_scale_offset"], ranges["action_scale_offset"] = task.action_scale - 0.25, (-0.03, 0.03)
+    for name, values in samples.items():
+        assert uniformity(values, *ranges[name]) < 1.0, name
+    table = torch.cat([values.double().flatten(1) if values.dim() > 1 else values.double().unsqueeze(1)
+                       for values in samples.values()], dim=1)  # fmt: skip
+    for correlations in (torch.corrcoef(table.T), torch.corrcoef(((table - table.mean(0)) / table.std(0))[:100])):
+        away = correlations - torch.diag(torch.diag(correlations))
+        assert away.abs().max() < (0.15 if len(away) == table.shape[1] else 0.65)
+
+
+def test_what_goes_together(make_task):
+    """Inertia changes with the mass, all kinds of friction with the first, torque scale with the action scale."""
+    task = make_task("a1_torque", 50, **ALWAYS)
+    model = task.sim.mj_model
+    ratio = task.sim.field("body_mass")[:, 1] / model.body_mass[1]
+    inertia = task.sim.field("body_inertia")[:, 1] / torch.tensor(model.body_inertia[1], dtype=torch.float32)
+    torch.testing.assert_close(inertia, ratio.unsqueeze(1).expand(-1, 3), rtol=1e-4, atol=1e-5)
+    friction = task.sim.field("geom_friction")
+    assert (friction == friction[:, :1]).all()
+    kinds = torch.tensor(model.geom_friction[0] / model.geom_friction[0, 0], dtype=torch.float32)
+    torch.testing.assert_close(friction[:, 0], friction[:, 0, :1] * kinds)
+    torch.testing.assert_close(task.torque_scale / 4.0, task.action_scale / 0.25)
+
+
+def test_kept_values(make_task):
+    """In 30% of the draws the robot keeps its own values, all at once; ground and controller are drawn always."""
+    task = make_task("a1_torque", 1000, **ON)
+    kept = torch.isclose(task.sim.field("body_mass")[:, 1], torch.tensor(float(task.sim.mj_model.body_mass[1])))
+    assert 0.25 < kept.float().mean() < 0.35
+    own = torch.tensor(task.sim.mj_model.dof_armature, dtype=torch.float32)
+    assert torch.equal(kept, (task.sim.field("dof_armature") == own).all(dim=1))
+    assert (task.motor_strength != 1.0).float().mean() > 0.99
+
+
+def test_one_seed_one_draw(make_task):
+    """The same seed draws the same parameters, another one others."""
+    draws = []
+    for seed in (5, 5, 6):
+        draws.append(make_task("a1_torque", 4, seed, **ON).sim.field("geom_friction").clone())
+    assert torch.equal(draws[0], draws[1]) and not torch.equal(draws[0], draws[2])
+
+
+def test_drawn_now_and_then(make_task):
+    """Besides resets, each world is drawn anew with the probability of the settings in every step."""
+    task = make_task("a1_torque", 200, **ON, **{"domain_rand.resampling_probability": 0.1})
+    task.base_pos[:, 2] = 50.0  # no falls
+    changes = 0
+    for _ in range(20):
+        before = task.sim.field("gravity").clone()
+        task.step(torch.zeros(200, 12))
+        changes += int((task.sim.field("gravity") != before).any(dim=1).sum())
+    assert 300 < changes < 500
+
+
+def test_torques_by_hand(make_task):
+    """Motor strength, joint offset, scales and gains act in eq. 8 as written."""
+    task = make_task("a1_position", 5, **ALWAYS)
+    actions = torch.randn(5, 12)
+    target = task.default_dof_pos + task.joint_offset + task.action_scale * actions
+    expected = task.p_gains * (target - task.dof_pos) - task.d_gains * task.dof_vel
+    torch.testing.assert_close(task._compute_torques(actions), expected)
+    assert (task.p_gains > 17.0 * 0.75).all() and (task.p_gains < 23.0 * 1.25).all() and task.p_gains.std() > 1.0
+    assert (task.d_gains > 0.4 * 0.75).all() and (task.d_gains < 0.6 * 1.25).all()
+
+
+def test_pushes(make_task):
+    """A push sets a velocity or adds one, each half the time, uniformly, in the chosen worlds only."""
+    task = make_task("a1_torque", 3000, **{"domain_rand.push_velocity": [-2.0, 2.0]})
+    task.sim.qvel[:, :3] = 10.0
+    mask = torch.arange(3000) % 3 == 0
+    task._push_robots(mask)
+    velocity = task.sim.qvel[:, :3]
+    assert (velocity[~mask] == 10.0).all()
+    added = velocity[mask][:, 0] > 5.0
+    assert 0.44 < added.float().mean() < 0.56
+    assert uniformity(torch.where(added.unsqueeze(1), velocity[mask] - 10.0, velocity[mask]), -2.0, 2.0) < 1.0
+
+
+def test_noise(make_task):
+    """The policy's sensors err within their limits, uniformly; the critic, commands and actions know no errors."""
+    settings = {"noise.add_noise": True}
+    task = make_task("a1_position", 2000, **settings)
+    clean = task.get_observations()["critic"][:, :45]
+    error = task.get_observations()["policy"] - clean
+    limits = [0.05] * 3 + [0.2 * 0.25] * 3 + [0.0] * 3 + [0.01] * 12 + [1.5 * 0.05] * 12 + [0.0] * 12
+    for i, limit in enumerate(limits):
+        if limit == 0.0:
+            assert (error[:, i] == 0.0).all()
+        else:
+            assert uniformity(error[:, i], -limit, limit) < 1.15, i
+
+
+def test_initial_velocities(make_task):
+    """Joints and trunk start with the velocities of the settings."""
+    ranges = {"init_dof_vel": [-10.5, 10.5], "init_lin_vel": [-0.5, 0.5], "init_ang_vel": [-0.4, 0.4]}
+    task = make_task("a1_torque", 1000, **{f"domain_rand.{key}": value for key, value in ranges.items()})
+    assert uniformity(task.dof_vel, -10.5, 10.5) < 1.0
+    assert uniformity(task.sim.qvel[:, :3], -0.5, 0.5) < 1.0 and uniformity(task.base_ang_vel, -0.4, 0.4) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "velocity", "probability"),
+    [("low", 0.3, 0.002), ("high", 1.0, 0.002), ("high_frequency", 1.0, 0.006), ("doubled", 1.0, 0.012)],
+)
+def test_perturbations(name, velocity, probability):
+    """The paper's four environments, in training and over what a loaded run has; none takes all of it back."""
+    plain = to_dict(get_cfgs()[0])
+    cfg = get_cfgs(f"--perturbation={name}")[0]
+    rand = cfg.domain_rand
+    assert rand.randomize_parameters and rand.push_robots and cfg.noise.add_noise
+    assert (rand.push_velocity, rand.push_probability) == ([-velocity, velocity], probability)
+    assert (rand.init_dof_vel, rand.init_lin_vel, rand.init_ang_vel) == ([-10.5, 10.5], [-0.5, 0.5], [-0.5, 0.5])
+    run_config = {"env": to_dict(cfg), "train": {}}
+    assert get_cfgs(run_config=run_config)[0].domain_rand.push_probability == probability
+    assert get_cfgs("--perturbation=doubled", run_config=run_config)[0].domain_rand.push_probability == 0.012
+    without = get_cfgs("--perturbation=none", run_config=run_config)[0]
+    assert not (without.domain_rand.randomize_parameters or without.domain_rand.push_robots or without.noise.add_noise)
+    assert without.domain_rand.init_dof_vel == plain["domain_rand"]["init_dof_vel"] == [0.0, 0.0]
+
+
+def test_unknown_perturbation():
+    """It is told with those that there are."""
+    assert "did you mean 'high'" in error_of(get_cfgs, "--perturbation=hih")
+
+
+@pytest.mark.parametrize("task", ["a1_position", "a1_torque_multihead"])
+def test_everything_at_once(make_task, task):
+    """With all random events on, a task runs, and worlds that fall are drawn anew."""
+    cfg = get_cfgs("--perturbation=doubled", task=task)[0]
+    settings = {f"domain_rand.{key}": value for key, value in to_dict(cfg.domain_rand).items()}
+    world = make_task(task, 16, **settings, **{"noise.add_noise": True})
+    masses = world.sim.field("body_mass").clone()
+    for _ in range(60):
+        obs, rewards, dones, _ = world.step(torch.randn(16, world.num_actions))
+        assert torch.isfinite(obs["policy"]).all() and torch.isfinite(rewards).all()
+    assert not torch.equal(world.sim.field("body_mass"), masses)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("domain_rand.gravity", [10.0, 9.0]),
+        ("domain_rand.dof_damping", [-0.1, 0.2]),
+        ("domain_rand.trunk_mass_scale", [-0.5, 1.0]),
+        ("domain_rand.foot_radius", [0.02]),
+        ("domain_rand.push_probability", 1.1),
+        ("domain_rand.resampling_probability", -0.1),
+        ("domain_rand.keep_probability", 2.0),
+        ("domain_rand.keep_fixed", ["gravitation"]),
+        ("noise.noise_scales.dof_vel", -1.0),
+    ],
+)
+def test_settings_that_make_no_sense(make_task, key, value):
+    """They are refused by their names."""
+    with pytest.raises(UserError, match=key.replace(".", r"\.")):
+        make_task("a1_torque", 1, **{key: value})
