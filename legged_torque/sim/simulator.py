@@ -15,7 +15,7 @@ from legged_torque.sim.fused.constants import DerivedConstants
 from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
-from legged_torque.sim.per_world import expand
+from legged_torque.sim.per_world import expand, owner
 from legged_torque.sim.warp_step import WarpStep
 from legged_torque.utils.errors import unknown_name
 
@@ -70,7 +70,7 @@ class Simulator:
         """Build the worlds, all in the model's reference pose.
 
         Args:
-            model: Model of one world, see :func:`~legged_torque.sim.model.load_model`.
+            model: Model of one world, see :func:`~legged_torque.sim.model.build_model`.
             num_envs: Number of worlds.
             device: "cpu" or "cuda:N".
             engine: One of :data:`ENGINES`.
@@ -124,7 +124,7 @@ class Simulator:
         Args:
             name: One of those that were asked for ``per_world``. Shape: (num_envs, ...).
         """
-        return wp.to_torch(expand(self.model, name, self.num_envs))
+        return wp.to_torch(getattr(owner(self.model, name), name))
 
     def update_constants(self, mask: Tensor) -> None:
         """Recompute what MuJoCo derives from masses and armatures, after they have been changed.

@@ -28,7 +28,7 @@ MODEL_FIELDS = (
 """Fields of the model of which each world has its own."""
 
 TRUNK = 1
-"""The trunk"s body."""
+"""The trunk's body."""
 
 
 def parameters(task: LeggedRobot) -> list[Parameter]:
@@ -67,7 +67,7 @@ def ground_parameters(task: LeggedRobot) -> list[Parameter]:
     """Return what is drawn of the ground; it is the same for all geoms of a world."""
     cfg, model = task.cfg.domain_rand, task.sim.mj_model
     geoms = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
-    kinds = list(model.geom_friction[geoms[0]] / model.geom_friction[geoms[0], 0]) * len(geoms)
+    kinds = list((model.geom_friction[geoms] / model.geom_friction[geoms, :1]).ravel())
     return [
         Parameter(
             "ground_friction", view(task, "geom_friction"), entries(3, geoms), shared=True,

@@ -48,7 +48,7 @@ class RandomEvents:
         angles = self.default_dof_pos * self._uniform(self.dof_pos, rand.init_dof_pos_scale)
         angles = angles.clamp(self._hard_dof_pos_limits[:, 0], self._hard_dof_pos_limits[:, 1])
         self.dof_pos.copy_(torch.where(column, angles, self.dof_pos))
-        self.dof_vel.copy_(torch.where(column, self._uniform(self.dof_vel, rand.init_dof_vel), self.dof_vel))
+        self._reset_velocity(self.dof_vel, rand.init_dof_vel, mask)
 
     def _reset_root_states(self, mask: Tensor) -> None:
         """Draw the trunk's orientation and velocities for the worlds in ``mask``, at the initial position."""
@@ -56,8 +56,13 @@ class RandomEvents:
         angles = [self._uniform(self.rew_buf, limits) for limits in (rand.init_roll, rand.init_pitch, rand.init_yaw)]
         self.base_pos.copy_(torch.where(column, self._init_pos, self.base_pos))
         self.base_quat.copy_(torch.where(column, quat_from_euler(*angles), self.base_quat))
-        for velocity, limits in ((self.sim.qvel[:, :3], rand.init_lin_vel), (self.base_ang_vel, rand.init_ang_vel)):
-            velocity.copy_(torch.where(column, self._uniform(velocity, limits), velocity))
+        self._reset_velocity(self.sim.qvel[:, :3], rand.init_lin_vel, mask)
+        self._reset_velocity(self.base_ang_vel, rand.init_ang_vel, mask)
+
+    def _reset_velocity(self, velocity: Tensor, limits: list[float], mask: Tensor) -> None:
+        """Draw velocities for the worlds in ``mask``; the simulator has just put them at rest."""
+        if any(limits):
+            velocity.copy_(torch.where(mask.unsqueeze(1), self._uniform(velocity, limits), velocity))
 
     def _randomize_parameters(self, mask: Tensor) -> None:
         """Draw parameters of robot, ground and controller anew for the worlds in ``mask``."""

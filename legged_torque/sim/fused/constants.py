@@ -7,9 +7,10 @@ import mujoco_warp as mjw
 import warp as wp
 
 from legged_torque.sim.fused.dynamics import Body, add_bodies, branch_dynamics, make_trunk
-from legged_torque.sim.fused.math import group_sum33, group_sum33_symmetric, linear_algebra, row, skew, vec6
+from legged_torque.sim.fused.math import linear_algebra, row, vec6
+from legged_torque.sim.fused.newton import branch_newton
 from legged_torque.sim.fused.robot import Robot, lanes_per_world, make_robot, read_tree
-from legged_torque.sim.fused.trunk import whole_body
+from legged_torque.sim.fused.trunk import TrunkSystem, mat66, trunk_matrix, whole_body
 from legged_torque.sim.per_world import expand
 
 
@@ -58,7 +59,7 @@ class DerivedConstants:
 
 
 @wp.func
-def forward_solve(lower: wp.types.matrix(shape=(6, 6), dtype=wp.float32), b: vec6) -> vec6:
+def forward_solve(lower: mat66, b: vec6) -> vec6:
     """Return L^-1 b, where L has the inverse of its diagonal in the diagonal's place."""
     x = vec6()
     for i in range(6):
@@ -81,13 +82,14 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
     dynamics, algebra = branch_dynamics(depth), linear_algebra(depth)
     vector, matrix, column = dynamics.vector, dynamics.matrix, dynamics.column
     Branch, make_branch = dynamics.Branch, dynamics.make_branch
-    cholesky, cholesky_solve = algebra.cholesky, algebra.cholesky_solve
-    cholesky6 = linear_algebra(6).cholesky
-    matrix6 = linear_algebra(6).matrix
+    cholesky_solve = algebra.cholesky_solve
+    Leg, assemble_damping, eliminate = (
+        branch_newton(depth).Leg, branch_newton(depth).assemble_damping, branch_newton(depth).eliminate,
+    )  # fmt: skip
 
     @wp.func
     def inverse_weight(
-        branch: Branch, factor: matrix, trunk_factor: matrix6, jac_lin: wp.vec3, jac_ang: wp.vec3, jac: vector
+        branch: Branch, factor: matrix, trunk_factor: mat66, jac_lin: wp.vec3, jac_ang: wp.vec3, jac: vector
     ) -> float:
         """Return j M^-1 j^T of one row j = (trunk's translation, trunk's rotation, branch)."""
         solved = cholesky_solve(factor, jac)
@@ -98,10 +100,10 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
 
     @wp.func
     def body_inverse_weights(
-        branch: Branch, factor: matrix, trunk_factor: matrix6, rot: wp.mat33, com: wp.vec3, body_depth: int
+        branch: Branch, factor: matrix, trunk_factor: mat66, rot: wp.mat33, com: wp.vec3, body_depth: int
     ) -> wp.vec2:
         """Return the mean inverse weights of a body's centre of mass against translation, and of its rotation."""
-        lever = -skew(com) * rot
+        lever = -wp.skew(com) * rot
         translation = float(0.0)
         rotation = float(0.0)
         for r in range(3):
@@ -120,6 +122,46 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
             rotation += inverse_weight(branch, factor, trunk_factor, wp.vec3(0.0), row_rot, turn) / 3.0
         return wp.vec2(translation, rotation)
 
+    @wp.func
+    def trunk_constants(
+        robot: Robot, world: int, rot: wp.mat33, trunk_factor: mat66, body_invweight0: wp.array2d(dtype=wp.vec2),
+        dof_invweight0: wp.array2d(dtype=float),
+    ):  # fmt: skip
+        """Write the inverse weights of the trunk: means over its translations and over its rotations."""
+        mean_lin = float(0.0)
+        mean_ang = float(0.0)
+        for r in range(6):
+            unit = vec6()
+            unit[r] = 1.0
+            u = forward_solve(trunk_factor, unit)
+            mean_lin += wp.where(r < 3, wp.dot(u, u) / 3.0, 0.0)
+            mean_ang += wp.where(r < 3, 0.0, wp.dot(u, u) / 3.0)
+        for r in range(3):
+            dof_invweight0[world, r] = mean_lin
+            dof_invweight0[world, r + 3] = mean_ang
+        com = rot * robot.body_ipos[row(world, robot.body_ipos.shape[0]), 1]
+        body_invweight0[world, 1] = body_inverse_weights(Branch(), matrix(), trunk_factor, rot, com, 0)
+
+    @wp.func
+    def branch_constants(
+        robot: Robot, world: int, branch: int, leg: Leg, rot: wp.mat33, trunk_factor: mat66,
+        positions: wp.array(dtype=wp.vec3), rotations: wp.array(dtype=wp.mat33),
+        body_invweight0: wp.array2d(dtype=wp.vec2), dof_invweight0: wp.array2d(dtype=float),
+    ):  # fmt: skip
+        """Write the inverse weights of a branch's joints and bodies."""
+        for j in range(wp.static(depth)):
+            joint = robot.branch_joint[branch, j]
+            unit = vector()
+            unit[j] = 1.0
+            dof_invweight0[world, joint + 5] = inverse_weight(
+                leg.branch, leg.factor, trunk_factor, wp.vec3(0.0), wp.vec3(0.0), unit
+            )
+            ipos = robot.body_ipos[row(world, robot.body_ipos.shape[0]), joint + 1]
+            com = positions[j + 1] + rotations[j + 1] * ipos
+            body_invweight0[world, joint + 1] = body_inverse_weights(
+                leg.branch, leg.factor, trunk_factor, rot, com, j + 1
+            )
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def derive_constants(
         robot: Robot, mask: wp.array(dtype=wp.bool), qpos: wp.array2d(dtype=float), rest: wp.array2d(dtype=float),
@@ -129,77 +171,35 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
         if mask[world]:
             positions = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
             rotations = wp.zeros(shape=wp.static(depth + 1), dtype=wp.mat33)
-            unused = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
+            at_rest = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
             trunk = make_trunk(robot, world, qpos, rest)
             total = Body()
-            lin = wp.mat33()
-            coupling = wp.mat33()
-            ang = wp.mat33()
-            for i in range(wp.static(per_lane)):
-                if lane + i * wp.static(lanes) < wp.static(branches):
-                    leg = make_branch(
-                        robot, world, lane + i * wp.static(lanes), trunk, qpos, rest, rest, positions, rotations,
-                        unused, unused,
-                    )  # fmt: skip
-                    total = add_bodies(total, leg.total)
-                    factor = cholesky(leg.mass)
-                    for r in range(3):
-                        row_lin = vector()
-                        row_ang = vector()
-                        for j in range(wp.static(depth)):
-                            row_lin[j] = leg.mass_lin[r, j]
-                            row_ang[j] = leg.mass_ang[r, j]
-                        from_lin = leg.mass_lin * cholesky_solve(factor, row_lin)
-                        from_ang = leg.mass_ang * cholesky_solve(factor, row_lin)
-                        from_both = leg.mass_ang * cholesky_solve(factor, row_ang)
-                        for c in range(3):
-                            lin[r, c] -= from_lin[c]
-                            coupling[r, c] -= from_ang[c]
-                            ang[r, c] -= from_both[c]
-            whole = whole_body(trunk, total, wp.static(lanes))
-            lin = group_sum33_symmetric(lin, wp.static(lanes)) + whole.mass * wp.identity(n=3, dtype=float)
-            coupling = group_sum33(coupling, wp.static(lanes)) + whole.coupling
-            ang = group_sum33_symmetric(ang, wp.static(lanes)) + whole.rotation
-            system = matrix6()
-            for r in range(3):
-                for c in range(3):
-                    system[r, c] = lin[r, c]
-                    system[r + 3, c] = coupling[c, r]
-                    system[r, c + 3] = coupling[r, c]
-                    system[r + 3, c + 3] = ang[r, c]
-            trunk_factor = cholesky6(system)
-            if lane == 0:
-                mean_lin = float(0.0)
-                mean_ang = float(0.0)
-                for r in range(6):
-                    unit6 = vec6()
-                    unit6[r] = 1.0
-                    u = forward_solve(trunk_factor, unit6)
-                    mean_lin += wp.where(r < 3, wp.dot(u, u) / 3.0, 0.0)
-                    mean_ang += wp.where(r < 3, 0.0, wp.dot(u, u) / 3.0)
-                for r in range(3):
-                    dof_invweight0[world, r] = mean_lin
-                    dof_invweight0[world, r + 3] = mean_ang
-                com = trunk.rot * robot.body_ipos[row(world, robot.body_ipos.shape[0]), 1]
-                body_invweight0[world, 1] = body_inverse_weights(Branch(), matrix(), trunk_factor, trunk.rot, com, 0)
+            system = TrunkSystem()
             for i in range(wp.static(per_lane)):
                 branch = lane + i * wp.static(lanes)
                 if branch < wp.static(branches):
-                    leg = make_branch(
-                        robot, world, branch, trunk, qpos, rest, rest, positions, rotations, unused, unused
+                    leg = Leg()
+                    leg.branch = make_branch(
+                        robot, world, branch, trunk, qpos, rest, rest, positions, rotations, at_rest, at_rest
                     )
-                    factor = cholesky(leg.mass)
-                    for j in range(wp.static(depth)):
-                        joint = robot.branch_joint[branch, j]
-                        unit = vector()
-                        unit[j] = 1.0
-                        dof_invweight0[world, joint + 5] = inverse_weight(
-                            leg, factor, trunk_factor, wp.vec3(0.0), wp.vec3(0.0), unit
-                        )
-                        rot = rotations[j + 1]
-                        com = positions[j + 1] + rot * robot.body_ipos[row(world, robot.body_ipos.shape[0]), joint + 1]
-                        body_invweight0[world, joint + 1] = body_inverse_weights(
-                            leg, factor, trunk_factor, trunk.rot, com, j + 1
-                        )
+                    leg = assemble_damping(leg, 0.0)  # the inertia matrix alone
+                    system = eliminate(leg, system, TrunkSystem())
+                    total = add_bodies(total, leg.branch.total)
+            whole = whole_body(trunk, total, wp.static(lanes))
+            trunk_factor = wp.static(linear_algebra(6).cholesky)(trunk_matrix(whole, system, wp.static(lanes)))
+            if lane == 0:
+                trunk_constants(robot, world, trunk.rot, trunk_factor, body_invweight0, dof_invweight0)
+            for i in range(wp.static(per_lane)):
+                branch = lane + i * wp.static(lanes)
+                if branch < wp.static(branches):
+                    leg = Leg()  # once more: few worlds are drawn in a step, and a CPU's thread has several branches
+                    leg.branch = make_branch(
+                        robot, world, branch, trunk, qpos, rest, rest, positions, rotations, at_rest, at_rest
+                    )
+                    leg = assemble_damping(leg, 0.0)
+                    branch_constants(
+                        robot, world, branch, leg, trunk.rot, trunk_factor, positions, rotations, body_invweight0,
+                        dof_invweight0,
+                    )  # fmt: skip
 
     return derive_constants

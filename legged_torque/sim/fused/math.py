@@ -89,12 +89,6 @@ def quat_to_matrix(q: wp.quat) -> wp.mat33:
     )  # fmt: skip
 
 
-@wp.func
-def skew(v: wp.vec3) -> wp.mat33:
-    """Return the matrix of the cross product v x."""
-    return wp.mat33(0.0, -v[2], v[1], v[2], 0.0, -v[0], -v[1], v[0], 0.0)
-
-
 @functools.cache
 def linear_algebra(n: int) -> SimpleNamespace:
     """Return functions on symmetric positive definite matrices of a fixed size, all loops unrolled.

@@ -19,7 +19,7 @@ from legged_torque.sim.fused.constraints import (
     row_values,
 )
 from legged_torque.sim.fused.dynamics import branch_dynamics
-from legged_torque.sim.fused.math import linear_algebra, skew, vec4
+from legged_torque.sim.fused.math import linear_algebra, vec4
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
 
 
@@ -127,7 +127,7 @@ def branch_newton(n: int) -> SimpleNamespace:
                 hessian[j, j] += limit_mass
         for k in range(leg.first_contact, leg.first_contact + leg.num_contacts):
             contact = contacts[k]
-            lever = -skew(contact.pos) * rot  # motion of the point per unit of the trunk's rotation
+            lever = -wp.skew(contact.pos) * rot  # motion of the point per unit of the trunk's rotation
             jacobian = columns()
             for j in range(wp.static(n)):
                 if j < contact.depth:

@@ -9,9 +9,10 @@ from legged_torque.sim.fused.math import (
     group_sum33,
     group_sum33_symmetric,
     linear_algebra,
-    skew,
     vec6,
 )
+
+mat66 = linear_algebra(6).matrix
 
 
 @wp.struct
@@ -52,7 +53,7 @@ def whole_body(trunk: Trunk, branches: Body, lanes: int) -> WholeBody:
     inertia = trunk.body.inertia + group_sum33_symmetric(branches.inertia, lanes)
     torque = trunk.body.torque + group_sum3(branches.torque, lanes)
     out.mass = trunk.body.mass + group_sum(branches.mass, lanes)
-    out.coupling = -skew(moment) * trunk.rot
+    out.coupling = -wp.skew(moment) * trunk.rot
     out.rotation = wp.transpose(trunk.rot) * inertia * trunk.rot
     out.bias_lin = trunk.body.force + group_sum3(branches.force, lanes)
     out.bias_ang = wp.transpose(trunk.rot) * torque
@@ -77,24 +78,28 @@ def trunk_slopes(whole: WholeBody, residual: TrunkMotion, step: TrunkMotion) -> 
 
 
 @wp.func
-def solve_trunk(whole: WholeBody, residual: TrunkMotion, branches: TrunkSystem, lanes: int) -> TrunkMotion:
-    """Return the trunk's Newton step, given what the branches of this thread add."""
+def trunk_matrix(whole: WholeBody, branches: TrunkSystem, lanes: int) -> mat66:
+    """Return the matrix of the trunk's equations, given what the branches of this thread add."""
     lin = group_sum33_symmetric(branches.lin, lanes) + whole.mass * wp.identity(n=3, dtype=float)
     coupling = group_sum33(branches.coupling, lanes) + whole.coupling
     ang = group_sum33_symmetric(branches.ang, lanes) + whole.rotation
-    rhs_lin = group_sum3(branches.rhs_lin, lanes) - residual.lin
-    rhs_ang = group_sum3(branches.rhs_ang, lanes) - residual.ang
-    a = wp.matrix(shape=(6, 6), dtype=float)
-    b = vec6()
+    a = mat66()
     for i in range(3):
-        b[i] = rhs_lin[i]
-        b[i + 3] = rhs_ang[i]
         for j in range(3):
             a[i, j] = lin[i, j]
             a[i + 3, j] = coupling[j, i]
             a[i, j + 3] = coupling[i, j]
             a[i + 3, j + 3] = ang[i, j]
-    x = wp.static(linear_algebra(6).cholesky_solve)(wp.static(linear_algebra(6).cholesky)(a), b)
+    return a
+
+
+@wp.func
+def solve_trunk(whole: WholeBody, residual: TrunkMotion, branches: TrunkSystem, lanes: int) -> TrunkMotion:
+    """Return the trunk's Newton step, given what the branches of this thread add."""
+    lin = group_sum3(branches.rhs_lin, lanes) - residual.lin
+    ang = group_sum3(branches.rhs_ang, lanes) - residual.ang
+    factor = wp.static(linear_algebra(6).cholesky)(trunk_matrix(whole, branches, lanes))
+    x = wp.static(linear_algebra(6).cholesky_solve)(factor, vec6(lin[0], lin[1], lin[2], ang[0], ang[1], ang[2]))
     out = TrunkMotion()
     out.lin = wp.vec3(x[0], x[1], x[2])
     out.ang = wp.vec3(x[3], x[4], x[5])
