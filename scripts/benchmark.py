@@ -13,7 +13,7 @@ from typing import Any
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.evaluation.benchmark import TRACED, MemoryMeter, Plan, measure
-from legged_torque.utils.args import DEFAULT_TASK, Parser, device_name, resolve_device, run_script
+from legged_torque.utils.args import Parser, add_settings_args, device_name, resolve_device, run_script
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import package_versions
 
@@ -59,6 +59,7 @@ def main() -> None:
         "device": device_name(device),
         "versions": package_versions(),
         "preset": args.preset or "parallel",
+        "perturbation": args.perturbation or "none",
         "set": args.set,
         "rounds": args.rounds,
         "rows": [],
@@ -81,18 +82,9 @@ def parse_args() -> argparse.Namespace:
         UserError: If it makes no sense.
     """
     parser = Parser(__doc__)
-    parser.add_argument("--task", default=DEFAULT_TASK, help="name of the task; default: %(default)s")
+    add_settings_args(parser)
     parser.add_argument("--num_envs", type=int, nargs="+", help="numbers of worlds; default: that of the task")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda:N; auto takes the GPU if there is one")
-    parser.add_argument("--seed", type=int, help="random seed; default: that of the training settings")
     parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="change a config entry by its dotted path, e.g. sim.solver_iterations=3; may be repeated",
-    )
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
     parser.add_argument("--json", type=Path, help="file to write all numbers to")
     parser.add_argument(

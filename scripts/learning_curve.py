@@ -10,6 +10,7 @@ from pathlib import Path
 from legged_torque.envs import task_registry
 from legged_torque.evaluation.metrics import measure
 from legged_torque.utils.args import Parser, add_task_args, device_name, run_script
+from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import load_run, set_seed
@@ -46,9 +47,9 @@ def main() -> None:
         "task": args.task,
         "seed": train_cfg.seed,
         "trained_with": args.run_config["train"],
-        "trained_num_envs": args.run_config["env"]["env"]["num_envs"],
+        "trained_env": args.run_config["env"],
         "device": device_name(env.device),
-        "evaluation": {"num_envs": env.num_envs, "num_steps": args.steps, "actions": "mean"},
+        "evaluation": {"num_envs": env.num_envs, "num_steps": args.steps, "actions": "mean", "env": to_dict(env_cfg)},
         "versions": package_versions(),
         "points": points,
     }

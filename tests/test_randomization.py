@@ -63,6 +63,8 @@ def move_about(task):
     """Put worlds into lively states near the floor, with torques."""
     sim = task.sim
     sim.qpos[:, 2] = torch.linspace(0.2, 0.33, task.num_envs)
+    low, high = task._hard_dof_pos_limits.T
+    task.dof_pos.clamp_(low + 1e-3, high - 1e-3)  # at a limit, rounding decides whether it acts
     sim.qvel.copy_(torch.randn_like(sim.qvel))
     sim.qacc_warmstart.zero_()
     sim.ctrl.copy_(8.0 * torch.randn_like(sim.ctrl))
@@ -118,7 +120,7 @@ def test_distributions(make_task):
     samples = {
         "trunk_mass_offset": sim.field("body_mass")[:, 1] - model.body_mass[1],
         "trunk_com_offset": sim.field("body_ipos")[:, 1] - torch.tensor(model.body_ipos[1]),
-        "foot_radius": sim.field("geom_size")[:, feet, 0],
+        "foot_radius": sim.field("geom_size")[:, feet[0], 0],
         "foot_offset": sim.field("geom_pos")[:, feet] - torch.tensor(model.geom_pos[feet]),
         "dof_damping": sim.field("dof_damping")[:, 6:],
         "dof_armature": sim.field("dof_armature")[:, 6:],
@@ -130,11 +132,13 @@ def test_distributions(make_task):
         "gravity": -sim.field("gravity")[:, 2],
     }
     ranges = {name: RANGES[name][1] for name in samples}
-    samples |= {"motor_strength": task.motor_strength, "joint_offset": task.joint_offset}
+    samples |= {"motor_strength": task.motor_strength[:, 0], "joint_offset": task.joint_offset}
     ranges |= {"motor_strength": (0.75, 1.25), "joint_offset": (-0.05, 0.05)}
     samples["action_scale_offset"], ranges["action_scale_offset"] = task.action_scale - 0.25, (-0.03, 0.03)
     for name, values in samples.items():
         assert uniformity(values, *ranges[name]) < 1.0, name
+    torch.testing.assert_close(samples["contact_damping"], 30.0 + (samples["contact_stiffness"] - 500.0) / 10.0)
+    del samples["contact_damping"]  # which goes with the stiffness
     table = torch.cat([values.double().flatten(1) if values.dim() > 1 else values.double().unsqueeze(1)
                        for values in samples.values()], dim=1)  # fmt: skip
     for correlations in (torch.corrcoef(table.T), torch.corrcoef(((table - table.mean(0)) / table.std(0))[:100])):
@@ -143,7 +147,10 @@ def test_distributions(make_task):
 
 
 def test_what_goes_together(make_task):
-    """Inertia changes with the mass, all kinds of friction with the first, torque scale with the action scale."""
+    """Inertia changes with the mass, all kinds of friction with the first, torque scale with the action scale.
+
+    Motor strength, gains and the radius are the same for all joints and feet of a world.
+    """
     task = make_task("a1_torque", 50, **ALWAYS)
     model = task.sim.mj_model
     ratio = task.sim.field("body_mass")[:, 1] / model.body_mass[1]
@@ -154,15 +161,25 @@ def test_what_goes_together(make_task):
     kinds = torch.tensor(model.geom_friction[0] / model.geom_friction[0, 0], dtype=torch.float32)
     torch.testing.assert_close(friction[:, 0], friction[:, 0, :1] * kinds)
     torch.testing.assert_close(task.torque_scale / 4.0, task.action_scale / 0.25)
+    feet = [model.geom(name).id for name in task.foot_names]
+    for values in (task.motor_strength, task.p_gains, task.d_gains, task.sim.field("geom_size")[:, feet, 0]):
+        assert (values == values[:, :1]).all() and values[:, 0].unique().numel() == 50
 
 
 def test_kept_values(make_task):
-    """In 30% of the draws the robot keeps its own values, all at once; ground and controller are drawn always."""
+    """In 30% of the draws the joints keep their own values, all at once; all else is drawn always."""
     task = make_task("a1_torque", 1000, **ON)
-    kept = torch.isclose(task.sim.field("body_mass")[:, 1], torch.tensor(float(task.sim.mj_model.body_mass[1])))
-    assert 0.25 < kept.float().mean() < 0.35
-    own = torch.tensor(task.sim.mj_model.dof_armature, dtype=torch.float32)
-    assert torch.equal(kept, (task.sim.field("dof_armature") == own).all(dim=1))
+    fields = ("dof_armature", "dof_damping", "dof_frictionloss", "jnt_stiffness")
+    kept = torch.stack(
+        [
+            (task.sim.field(name) == torch.tensor(getattr(task.sim.mj_model, name), dtype=torch.float32)).all(dim=1)
+            for name in fields
+        ]
+    )
+    assert 0.25 < kept[0].float().mean() < 0.35
+    assert (kept == kept[0]).all()
+    own = task.sim.mj_model.body_mass[1]
+    assert ((task.sim.field("body_mass")[:, 1] - own).abs() > 1e-5).float().mean() > 0.99
     assert (task.motor_strength != 1.0).float().mean() > 0.99
 
 

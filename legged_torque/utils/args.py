@@ -41,13 +41,10 @@ class Parser(argparse.ArgumentParser):
         return namespace
 
 
-def add_build_args(parser: argparse.ArgumentParser) -> None:
-    """Add what decides how a task is built."""
+def add_settings_args(parser: argparse.ArgumentParser) -> None:
+    """Add what chooses a task and its settings."""
     parser.add_argument(
         "--task", default=DEFAULT_TASK, help="name of the task, see train.py --list; default: %(default)s"
-    )
-    parser.add_argument(
-        "--num_envs", type=int, help="number of worlds, with torchrun those of each process; default: that of the task"
     )
     parser.add_argument("--seed", type=int, help="random seed; default: that of the training settings")
     parser.add_argument(
@@ -66,6 +63,14 @@ def add_build_args(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="KEY=VALUE",
         help="change a config entry by its dotted path, e.g. rewards.scales.torques=-1e-4; may be repeated",
+    )
+
+
+def add_build_args(parser: argparse.ArgumentParser) -> None:
+    """Add what decides how a task is built."""
+    add_settings_args(parser)
+    parser.add_argument(
+        "--num_envs", type=int, help="number of worlds, with torchrun those of each process; default: that of the task"
     )
 
 

@@ -37,7 +37,7 @@ def parameters(task: LeggedRobot) -> list[Parameter]:
 
 
 def robot_parameters(task: LeggedRobot) -> list[Parameter]:
-    """Return what is drawn of the robot; all of it may keep its own value."""
+    """Return what is drawn of the robot; its joints may keep their own values, all at once."""
     cfg, model = task.cfg.domain_rand, task.sim.mj_model
     dofs, joints = range(6, model.nv), range(1, model.njnt)
     feet = [model.geom(name).id for name in task.foot_names]
@@ -45,7 +45,10 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
     inertia_per_mass = list(model.body_inertia[TRUNK] / model.body_mass[TRUNK])
 
     def drawn(name: str, field: str, columns: Any, **settings: Any) -> Parameter:
-        return Parameter(name, view(task, field), list(columns), may_keep=True, **settings)
+        return Parameter(name, view(task, field), list(columns), **settings)
+
+    def of_joints(name: str, field: str, columns: Any) -> Parameter:
+        return drawn(name, field, columns, may_keep=True, **absolute(cfg, name))
 
     return [
         drawn("trunk_mass", "body_mass", [TRUNK], **trunk),
@@ -54,12 +57,12 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
             **trunk | {"weight": inertia_per_mass},
         ),
         drawn("trunk_com", "body_ipos", entries(3, [TRUNK]), **offset(cfg, "trunk_com_offset")),
-        drawn("foot_radius", "geom_size", [3 * foot for foot in feet], **absolute(cfg, "foot_radius")),
+        drawn("foot_radius", "geom_size", [3 * foot for foot in feet], shared=True, **absolute(cfg, "foot_radius")),
         drawn("foot_offset", "geom_pos", entries(3, feet), **offset(cfg, "foot_offset")),
-        drawn("dof_damping", "dof_damping", dofs, **absolute(cfg, "dof_damping")),
-        drawn("dof_armature", "dof_armature", dofs, **absolute(cfg, "dof_armature")),
-        drawn("dof_stiffness", "jnt_stiffness", joints, **absolute(cfg, "dof_stiffness")),
-        drawn("dof_frictionloss", "dof_frictionloss", dofs, **absolute(cfg, "dof_frictionloss")),
+        of_joints("dof_damping", "dof_damping", dofs),
+        of_joints("dof_armature", "dof_armature", dofs),
+        of_joints("dof_stiffness", "jnt_stiffness", joints),
+        of_joints("dof_frictionloss", "dof_frictionloss", dofs),
     ]  # fmt: skip
 
 
@@ -79,27 +82,33 @@ def ground_parameters(task: LeggedRobot) -> list[Parameter]:
         ),
         Parameter(
             "contact_damping", view(task, "geom_solref"), [2 * geom + 1 for geom in geoms], shared=True,
-            **absolute(cfg, "contact_damping", -1.0),
+            same_draw_as="contact_stiffness", **absolute(cfg, "contact_damping", -1.0),
         ),
         Parameter("gravity", view(task, "gravity"), [2], **absolute(cfg, "gravity", -1.0)),
     ]  # fmt: skip
 
 
 def control_parameters(task: LeggedRobot) -> list[Parameter]:
-    """Return what is drawn of the controller, per joint but for the scales of actions."""
+    """Return what is drawn of the controller: one number for all joints, but each joint has an offset of its own."""
     cfg, control = task.cfg.domain_rand, task.cfg.control
     joints = range(task.num_dof)
     torque_per_position = control.torque_scale / control.action_scale
     return [
-        Parameter("motor_strength", task.motor_strength, joints, **scale(cfg, "motor_strength")),
+        Parameter("motor_strength", task.motor_strength, joints, shared=True, **scale(cfg, "motor_strength")),
         Parameter("joint_offset", task.joint_offset, joints, **offset(cfg, "joint_offset")),
         Parameter("action_scale", task.action_scale, [0], **offset(cfg, "action_scale_offset")),
         Parameter(
             "torque_scale", task.torque_scale, [0], same_draw_as="action_scale",
             **offset(cfg, "action_scale_offset") | {"weight": torque_per_position},
         ),
-        Parameter("p_gains", task.p_gains, joints, **offset(cfg, "stiffness_offset") | scale(cfg, "stiffness_scale")),
-        Parameter("d_gains", task.d_gains, joints, **offset(cfg, "damping_offset") | scale(cfg, "damping_scale")),
+        Parameter(
+            "p_gains", task.p_gains, joints, shared=True,
+            **offset(cfg, "stiffness_offset") | scale(cfg, "stiffness_scale"),
+        ),
+        Parameter(
+            "d_gains", task.d_gains, joints, shared=True,
+            **offset(cfg, "damping_offset") | scale(cfg, "damping_scale"),
+        ),
     ]  # fmt: skip
 
 

@@ -50,30 +50,30 @@ class LeggedRobotCfg(BaseConfig):
         init_lin_vel = [0.0, 0.0]  # [m/s] of the trunk, per axis
         init_ang_vel = [0.0, 0.0]  # [rad/s] of the trunk, per axis
 
-        # parameters, at every reset and now and then
+        # parameters, at every reset and now and then; one number per world unless said otherwise
         randomize_parameters = False
         keep_fixed: list[str] = []  # names of ranges below that are not drawn after all
         resampling_probability = 0.002  # per control step and world
-        keep_probability = 0.3  # share of draws in which the robot keeps its own values, those up to friction loss
         trunk_mass_offset = [-0.8, 0.8]  # [kg], then
         trunk_mass_scale = [0.75, 1.25]  # times the mass; inertia in proportion
         trunk_com_offset = [-0.0025, 0.0025]  # [m] per axis
         foot_radius = [0.0195, 0.0205]  # [m]
-        foot_offset = [-0.0025, 0.0025]  # [m] per axis
-        dof_damping = [0.0, 0.2]  # [N m s/rad]
-        dof_armature = [0.009, 0.02]  # [kg m^2]
-        dof_stiffness = [0.0, 0.5]  # [N m/rad] of a spring towards angle 0
-        dof_frictionloss = [0.0, 0.65]  # [N m]
+        foot_offset = [-0.0025, 0.0025]  # [m] per foot and axis
+        keep_probability = 0.3  # share of draws in which the joints keep their own values of the next four
+        dof_damping = [0.0, 0.2]  # [N m s/rad] per joint
+        dof_armature = [0.009, 0.02]  # [kg m^2] per joint
+        dof_stiffness = [0.0, 0.5]  # [N m/rad] per joint, of a spring towards angle 0
+        dof_frictionloss = [0.0, 0.65]  # [N m] per joint
         ground_friction = [0.001, 2.0]  # tangential; torsional and rolling in proportion
         contact_stiffness = [500.0, 1500.0]  # of MuJoCo's direct solref
-        contact_damping = [30.0, 130.0]
+        contact_damping = [30.0, 130.0]  # low where the stiffness is low
         gravity = [8.81, 10.81]  # [m/s^2]
-        motor_strength = [0.75, 1.25]  # times the torque, per joint
+        motor_strength = [0.75, 1.25]  # times the torques
         joint_offset = [-0.05, 0.05]  # [rad] on the target angle, per joint
         action_scale_offset = [-0.03, 0.03]  # [rad] per unit of a position action; torques in proportion
-        stiffness_offset = [-3.0, 3.0]  # [N m/rad] on Kp, per joint, then
+        stiffness_offset = [-3.0, 3.0]  # [N m/rad] on Kp, then
         stiffness_scale = [0.75, 1.25]  # times Kp
-        damping_offset = [-0.1, 0.1]  # [N m s/rad] on Kd, per joint, then
+        damping_offset = [-0.1, 0.1]  # [N m s/rad] on Kd, then
         damping_scale = [0.75, 1.25]  # times Kd
 
         # pushes: half of them set the trunk's velocity, half are added to it
