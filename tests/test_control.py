@@ -247,13 +247,13 @@ def test_observation_layout(make_task, name, num_actions):
     assert task.contacts[0].nonzero().flatten().tolist() == [0, 1, 2, FEET[0], FEET[3]] and task.contacts.max() == 1
     task.compute_observations()
     obs = task.get_observations()
-    assert obs["policy"].shape == (2, 33 + num_actions) and obs["critic"].shape == (2, 41 + num_actions)
+    assert obs["policy"].shape == (2, 33 + num_actions) and obs["critic"].shape == (2, 125 + num_actions)
     for world, commands in enumerate(([1.0, -0.5, 0.25], [-2.0, 1.5, -0.125])):
         policy = [0.0, -1.0, 0.0, 0.25, -0.5, 1.0, *commands]
         policy += [*(q[world] - NOMINAL), *(0.05 * qd[world]), *action[world]]
         critic = [0.4, 0.6, 0.2, 0.35, 1.0, 0.0, 0.0, 1.0]
         np.testing.assert_allclose(obs["policy"][world], policy, atol=2e-6)
-        np.testing.assert_allclose(obs["critic"][world], policy + critic, atol=2e-6)
+        np.testing.assert_allclose(obs["critic"][world, :-84], policy + critic, atol=2e-6)
 
 
 def test_observation_scales(make_task):
@@ -399,7 +399,7 @@ def test_reset_clears_what_belongs_to_the_episode(make_task):
     for buffer in (task.feet_air_time, task.sim.qvel, task.sim.qacc_warmstart, task.contacts, task.base_lin_vel):
         assert (buffer[0] == 0).all()
     assert (task.contacts[1] != 0).any() and (task.sim.qvel[1] != 0).any()
-    assert (obs["policy"][0, 21:] == 0).all() and (obs["critic"][0, -4:] == 0).all()
+    assert (obs["policy"][0, 21:] == 0).all() and (obs["critic"][0, -88:-84] == 0).all()
 
 
 def test_reset_of_all_worlds(make_task):

@@ -183,6 +183,29 @@ def test_kept_values(make_task):
     assert (task.motor_strength != 1.0).float().mean() > 0.99
 
 
+def test_critic_knows_what_was_drawn(make_task):
+    """Its last observations are all drawn numbers, from -1, the lowest possible, to 1; without draws, the robot's own."""
+    task = make_task("a1_position", 200, **ON)
+    sizes = task.randomization.sizes
+    values = dict(zip(sizes, task.randomization.values.split([*sizes.values()], dim=1), strict=True))
+    lowest, highest = (4.713 - 0.8) * 0.75, (4.713 + 0.8) * 1.25
+    for name, number, low, high in (
+        ("gravity", task.sim.field("gravity")[:, 2:], -10.81, -8.81),
+        ("trunk_mass", task.sim.field("body_mass")[:, 1:2], lowest, highest),
+        ("ground_friction", task.sim.field("geom_friction")[:, 0, :1], 0.001, 2.0),
+        ("dof_armature", task.sim.field("dof_armature")[:, 6:], 0.009, 0.02),
+        ("p_gains", task.p_gains[:, :1], 17.0 * 0.75, 23.0 * 1.25),
+        ("joint_offset", task.joint_offset, -0.05, 0.05),
+    ):
+        torch.testing.assert_close(values[name], 2.0 * (number - low) / (high - low) - 1.0, atol=1e-4, rtol=0)
+    assert torch.equal(task.get_observations()["critic"][:, -84:], task.randomization.values)
+    plain = make_task("a1_position", 2)
+    seen = plain.get_observations()["critic"][0, -84:].split([*sizes.values()])
+    values = dict(zip(sizes, seen, strict=True))
+    assert values["dof_damping"].tolist() == [-1.0] * 12 and values["joint_offset"].tolist() == [0.0] * 12
+    torch.testing.assert_close(values["gravity"], torch.tensor([0.0]), atol=1e-5, rtol=0)
+
+
 def test_one_seed_one_draw(make_task):
     """The same seed draws the same parameters, another one others."""
     draws = []

@@ -18,6 +18,8 @@ TASKS = ["a1_position", "a1_torque", "a1_torque_curriculum", "a1_torque_multihea
 GROUPS = ("policy", "critic", "actions")
 WORLDS, STEPS = 4, 4
 SAMPLES = WORLDS * STEPS
+DRAWN = 84
+"""Numbers of a world that may be drawn at random."""
 
 
 def mirror_joints(values):
@@ -43,9 +45,19 @@ def mirror_policy(obs):
 
 
 def mirror_critic(obs):
-    """The policy's, then linear velocity, height, contacts of the feet."""
-    more = obs[:, -8:] * torch.tensor([1.0, -1, 1, 1, 1, 1, 1, 1])
-    return torch.cat([mirror_policy(obs[:, :-8]), more[:, [0, 1, 2, 3, 5, 4, 7, 6]]], dim=1)
+    """The policy's, then linear velocity, height, contacts of the feet, and what is drawn at random."""
+    policy, more, drawn = obs.split([obs.shape[1] - 8 - DRAWN, 8, DRAWN], dim=1)
+    more = (more * torch.tensor([1.0, -1, 1, 1, 1, 1, 1, 1]))[:, [0, 1, 2, 3, 5, 4, 7, 6]]
+    return torch.cat([mirror_policy(policy), more, mirror_drawn(drawn)], dim=1)
+
+
+def mirror_drawn(drawn):
+    """Mass, centre of mass, radius, places of feet; four per joint; four of the ground, ...; an offset per joint; ..."""
+    trunk, feet, joints, ground, offsets, rest = drawn.split([5, 12, 48, 4, 12, 3], dim=1)
+    feet = feet.reshape(-1, 4, 3)[:, [1, 0, 3, 2]] * torch.tensor([1.0, -1, 1])
+    joints = joints.reshape(-1, 4, 4, 3)[:, :, [1, 0, 3, 2]]
+    trunk = trunk * torch.tensor([1.0, 1, -1, 1, 1])
+    return torch.cat([trunk, feet.flatten(1), joints.flatten(1), ground, mirror_joints(offsets), rest], dim=1)
 
 
 BY_HAND = {"policy": mirror_policy, "critic": mirror_critic, "actions": mirror_joints}
@@ -125,7 +137,7 @@ def test_mirror_agrees_with_physics(make_symmetric, name):
         torch.testing.assert_close(mirror_qpos(task.sim.qpos[:num]), task.sim.qpos[num:], rtol=0, atol=1e-4)
         torch.testing.assert_close(rewards[num:], rewards[:num], rtol=0, atol=1e-3)
         assert rewards.abs().mean() > 0.01
-        touching += int(obs["critic"][:, -4:].sum())
+        touching += int(task.feet_contact.sum())
     assert touching > num
 
 

@@ -46,6 +46,10 @@ class Randomization:
     """Draws all parameters of the worlds in a mask in one kernel, from uniform numbers that torch generates.
 
     Nothing waits for the host and nothing changes its address, so that it may run inside a CUDA graph.
+
+    Attributes:
+        sizes: How many numbers of their own the parameters have, by name; those that take others' draws are left out.
+        values: These numbers as they are now, from -1, the lowest one possible, to 1. Shape: (num_envs, their sum).
     """
 
     def __init__(self, parameters: Sequence[Parameter], num_envs: int, device: str, keep_probability: float) -> None:
@@ -58,33 +62,34 @@ class Randomization:
             keep_probability: Share of draws in which the parameters that may keep their values at the start do so.
         """
         self._fields = [parameter.field for parameter in parameters]  # their memory must not be freed
-        rows, addresses, strides, draws = [], [], [], []
+        self.sizes: dict[str, int] = {}
+        rows, addresses, strides, draws, places, at_start = [], [], [], [], [], []
         first_draw: dict[str, int] = {}
         num_draws = 1  # the first decides what is kept
         for parameter in parameters:
             count = 1 if parameter.shared else len(parameter.columns)
-            start = first_draw.get(parameter.same_draw_as or "", num_draws)
-            first_draw[parameter.name] = start
-            if start == num_draws:
+            start = first_draw.setdefault(parameter.same_draw_as or parameter.name, num_draws)
+            is_new = start == num_draws
+            if is_new:
+                self.sizes[parameter.name] = count
                 num_draws += 2 * count
-            defaults = parameter.field[0, list(parameter.columns)].tolist()
-            bases = defaults if parameter.base is None else per_column(parameter.base, len(defaults))
-            weights = per_column(parameter.weight, len(defaults))
-            low, high = parameter.offset
-            least, most = parameter.scale
-            for i, column in enumerate(parameter.columns):
-                keep = keep_probability if parameter.may_keep else 0.0
-                rows.append((bases[i], weights[i], low, high - low, least, most - least, defaults[i], keep))
+            for i, (column, row) in enumerate(zip(parameter.columns, table(parameter, keep_probability), strict=True)):
+                rows.append(row)
                 addresses.append(parameter.field.data_ptr() + column * parameter.field.element_size())
                 strides.append(parameter.field.stride(0) * parameter.field.element_size())
                 draws.append(start + (0 if parameter.shared else 2 * i))
+                places.append(len(at_start) if is_new and i < count else -1)
+                if places[-1] >= 0:
+                    at_start.append((row.own_value - row.middle) * row.per_half_range)
         self._num_envs, self._device = num_envs, device
+        self.values = torch.tensor(at_start, device=device).repeat(num_envs, 1)
         self._uniform = torch.zeros(num_envs, num_draws, device=device)
         self._mask = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._rows = wp.array(rows, dtype=_Row, device=device)
         self._addresses = wp.array(addresses, dtype=wp.uint64, device=device)
         self._strides = wp.array(strides, dtype=wp.uint64, device=device)
         self._draws = wp.array(draws, dtype=wp.int32, device=device)
+        self._places = wp.array(places, dtype=wp.int32, device=device)
 
     def draw(self, mask: Tensor) -> None:
         """Draw all parameters anew.
@@ -104,13 +109,27 @@ class Randomization:
                 self._addresses,
                 self._strides,
                 self._draws,
+                self._places,
+                wp.from_torch(self.values),
             ],
             device=self._device,
         )
 
 
-_Row = wp.types.vector(length=8, dtype=wp.float32)
-"""Of a column: base, weight, low and span of the offset, low and span of the scale, default, probability to keep it."""
+@wp.struct
+class _Row:
+    """How one column is drawn, and how its value is brought to [-1, 1]."""
+
+    base: wp.float32
+    weight: wp.float32
+    offset_low: wp.float32
+    offset_span: wp.float32
+    scale_low: wp.float32
+    scale_span: wp.float32
+    own_value: wp.float32
+    keep_probability: wp.float32
+    middle: wp.float32
+    per_half_range: wp.float32
 
 
 @wp.kernel(enable_backward=False)
@@ -121,19 +140,42 @@ def _draw(
     addresses: wp.array(dtype=wp.uint64),
     strides: wp.array(dtype=wp.uint64),
     draws: wp.array(dtype=wp.int32),
+    places: wp.array(dtype=wp.int32),
+    values: wp.array2d(dtype=wp.float32),
 ):
     """Write one number of one world."""
     world, column = wp.tid()
     if mask[world]:
         row = rows[column]
         first = draws[column]
-        offset = row[2] + row[3] * uniform[world, first]
-        scale = row[4] + row[5] * uniform[world, first + 1]
-        value = (row[0] + row[1] * offset) * scale
-        if uniform[world, 0] < row[7]:
-            value = row[6]
+        offset = row.offset_low + row.offset_span * uniform[world, first]
+        scale = row.scale_low + row.scale_span * uniform[world, first + 1]
+        value = (row.base + row.weight * offset) * scale
+        if uniform[world, 0] < row.keep_probability:
+            value = row.own_value
         target = wp.array(ptr=addresses[column] + wp.uint64(world) * strides[column], shape=(1,), dtype=wp.float32)
         target[0] = value
+        if places[column] >= 0:
+            values[world, places[column]] = (value - row.middle) * row.per_half_range
+
+
+def table(parameter: Parameter, keep_probability: float) -> list[_Row]:
+    """Return how each column of a parameter is drawn."""
+    defaults = parameter.field[0, list(parameter.columns)].tolist()
+    bases = defaults if parameter.base is None else per_column(parameter.base, len(defaults))
+    rows = []
+    for default, base, weight in zip(defaults, bases, per_column(parameter.weight, len(defaults)), strict=True):
+        row = _Row()
+        row.base, row.weight, row.own_value = base, weight, default
+        row.offset_low, row.offset_span = parameter.offset[0], parameter.offset[1] - parameter.offset[0]
+        row.scale_low, row.scale_span = parameter.scale[0], parameter.scale[1] - parameter.scale[0]
+        row.keep_probability = keep_probability if parameter.may_keep else 0.0
+        corners = [(base + weight * offset) * scale for offset in parameter.offset for scale in parameter.scale]
+        half_range = (max(corners) - min(corners)) / 2
+        row.middle = (max(corners) + min(corners)) / 2
+        row.per_half_range = 1.0 / half_range if half_range > 0.0 else 0.0
+        rows.append(row)
+    return rows
 
 
 def per_column(value: Sequence[float] | float, count: int) -> list[float]:

@@ -15,6 +15,7 @@ from legged_torque import ROOT_DIR
 from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.envs.base.domain_rand import MODEL_FIELDS, parameters
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.envs.base.observations import Observations
 from legged_torque.envs.base.random_events import RandomEvents
 from legged_torque.envs.base.rewards import RewardTerms
 from legged_torque.envs.base.symmetry import Mirror
@@ -29,7 +30,7 @@ from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.math import quat_rotate_inverse
 
 
-class LeggedRobot(RandomEvents, RewardTerms, VecEnv):
+class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
     """A batch of robots with position control, and what all approaches share.
 
     An approach overrides :meth:`_compute_torques`, adds ``_reward_<term>`` methods, or overrides the curriculum hook
@@ -80,9 +81,8 @@ class LeggedRobot(RandomEvents, RewardTerms, VecEnv):
         self._create_sim()
         self._init_buffers()
         self._prepare_reward_functions()
-        rand = cfg.domain_rand
-        if rand.randomize_parameters:
-            self.randomization = Randomization(parameters(self), self.num_envs, device, rand.keep_probability)
+        self.randomization = Randomization(parameters(self), self.num_envs, device, cfg.domain_rand.keep_probability)
+        self._init_observations()
         self.step_graph = CudaGraph(self._step, device)
         self.reset()
 
@@ -231,27 +231,6 @@ class LeggedRobot(RandomEvents, RewardTerms, VecEnv):
         """Return the weights of the terms at this moment of training, Delta t included. Shape: (terms,)."""
         return self._reward_scales * self._reward_curriculum(self.total_steps)
 
-    def compute_observations(self) -> None:
-        """Compute what a real robot can measure for the policy, and what only a simulator knows for the critic."""
-        scales = self.cfg.normalization.obs_scales
-        policy = torch.cat(
-            [
-                self.projected_gravity,
-                self.base_ang_vel * scales.ang_vel,
-                self.commands * self._command_scales,
-                (self.dof_pos - self.default_dof_pos) * scales.dof_pos,
-                self.dof_vel * scales.dof_vel,
-                self.actions,
-            ],
-            dim=1,
-        )
-        critic = torch.cat([policy, self.base_lin_vel * scales.lin_vel, self.base_pos[:, 2:], self.feet_contact], dim=1)
-        if self.cfg.noise.add_noise:
-            policy = policy + self._noise_scale_vec * self._uniform(policy, [-1.0, 1.0])
-        clip = self.cfg.normalization.clip_observations
-        torch.clamp(policy, -clip, clip, out=self.obs_buf["policy"])
-        torch.clamp(critic, -clip, clip, out=self.obs_buf["critic"])
-
     def _keep_last(self) -> None:
         """Keep what the next step's rewards compare with."""
         self.last_actions.copy_(self.actions)
@@ -323,12 +302,6 @@ class LeggedRobot(RandomEvents, RewardTerms, VecEnv):
         self._episode_length_buf = zeros(n, dtype=torch.long)
         self.total_steps, self.num_diverged = zeros((), dtype=torch.long), zeros((), dtype=torch.long)
         self.extras = {"time_outs": self.time_out_buf}
-        num_obs = 9 + 2 * self.num_dof + self.num_actions
-        self.obs_buf = TensorDict(
-            {"policy": zeros(n, num_obs), "critic": zeros(n, num_obs + 4 + len(self.feet_indices))},
-            batch_size=[n],
-            device=self.device,
-        )
         angles = cfg.init_state.default_joint_angles
         for name in angles:
             if name not in self.dof_names:
@@ -339,11 +312,9 @@ class LeggedRobot(RandomEvents, RewardTerms, VecEnv):
         self.default_dof_pos = self._tensor([angles[name] for name in self.dof_names])
         self._init_pos = self._tensor(cfg.init_state.pos)
         self._gravity = self._tensor([0.0, 0.0, -1.0]).expand(n, 3)
-        ranges, scales = cfg.commands.ranges, cfg.normalization.obs_scales
-        self._noise_scale_vec = self._tensor(self._noise_scales())
+        ranges = cfg.commands.ranges
         limits = self._tensor([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw])
         self._command_low, self._command_span = limits[:, 0], limits[:, 1] - limits[:, 0]
-        self._command_scales = self._tensor([scales.lin_vel, scales.lin_vel, scales.ang_vel])
 
     def _prepare_reward_functions(self) -> None:
         """Collect the functions of all terms with a scale that is not zero, and their weights."""

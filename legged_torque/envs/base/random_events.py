@@ -80,11 +80,3 @@ class RandomEvents:
         """Draw new commands for the worlds in ``mask``."""
         drawn = self._command_low + self._command_span * torch.rand_like(self.commands)
         self.commands.copy_(torch.where(mask.unsqueeze(1), drawn, self.commands))
-
-    def _noise_scales(self) -> list[float]:
-        """Return the largest errors of the policy's observations, in their order and scaled as they are."""
-        noise, scales = self.cfg.noise.noise_scales, self.cfg.normalization.obs_scales
-        gravity, ang_vel, commands = [noise.gravity] * 3, [noise.ang_vel * scales.ang_vel] * 3, [0.0] * 3
-        dof_pos = [noise.dof_pos * scales.dof_pos] * self.num_dof
-        dof_vel = [noise.dof_vel * scales.dof_vel] * self.num_dof
-        return gravity + ang_vel + commands + dof_pos + dof_vel + [0.0] * self.num_actions

@@ -25,7 +25,7 @@ class Mirror:
         """Prepare the permutations.
 
         Args:
-            task: The task; its observations are those of ``LeggedRobot.compute_observations``.
+            task: The task; its observations are those of ``Observations.compute_observations``.
 
         Raises:
             UserError: If a joint or foot has no counterpart on the other side.
@@ -39,7 +39,14 @@ class Mirror:
         vector, axial = ([0, 1, 2], [1.0, -1.0, 1.0]), ([0, 1, 2], [-1.0, 1.0, -1.0])
         command = ([0, 1, 2], [1.0, -1.0, -1.0])
         policy = [vector, axial, command, (joints, joint_signs), (joints, joint_signs), tuple(actions)]
-        critic = [*policy, vector, ([0], [1.0]), (feet, [1.0] * len(feet))]
+        signed = {
+            "trunk_com": vector,
+            "foot_offset": ([3 * foot + axis for foot in feet for axis in range(3)], vector[1] * len(feet)),
+            "joint_offset": (joints, joint_signs),
+        }
+        unsigned = {1: ([0], [1.0]), len(joints): (joints, [1.0] * len(joints))}
+        drawn = [signed.get(name) or unsigned[size] for name, size in task.randomization.sizes.items()]
+        critic = [*policy, vector, ([0], [1.0]), (feet, [1.0] * len(feet)), *drawn]
         self._maps = {
             name: self._concatenate(parts, task.device)
             for name, parts in {"policy": policy, "critic": critic, "actions": [tuple(actions)]}.items()
