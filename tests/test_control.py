@@ -256,6 +256,22 @@ def test_observation_layout(make_task, name, num_actions):
         np.testing.assert_allclose(obs["critic"][world, :-84], policy + critic, atol=2e-6)
 
 
+def test_history(make_task):
+    """The policy sees the steps before as it saw them then, the newest first; an episode starts with copies."""
+    task = make_task("a1_torque", 3, **{"env.history_length": 3, "noise.add_noise": True, "env.episode_length_s": 0.08})
+    task.base_pos[:, 2] = 5.0
+    task.episode_length_buf = torch.tensor([0, 0, 1])
+    first = task.get_observations()
+    assert first["policy"].shape == (3, 135) and first["critic"].shape == (3, 137)
+    torch.testing.assert_close(first["policy"], first["policy"][:, :45].repeat(1, 3))
+    seen = [first["policy"][:, :45]]
+    for _ in range(3):
+        policy = task.step(torch.randn(3, 12))[0]["policy"]
+        seen.append(policy[:, :45])
+    assert torch.equal(policy[:2], torch.cat(seen[:0:-1], dim=1)[:2])
+    assert torch.equal(policy[2], seen[-1][2].repeat(3)) and task.reset_buf.tolist() == [False, False, True]
+
+
 def test_observation_scales(make_task):
     """Every scale is a setting that acts on its own entries alone."""
     scales = {"lin_vel": 3.0, "ang_vel": 5.0, "dof_pos": 7.0, "dof_vel": 11.0}

@@ -14,6 +14,7 @@ class LeggedRobotCfg(BaseConfig):
         num_envs = 4096
         num_envs_cpu = 64  # default on a CPU, where a world-step costs about a millisecond
         num_actions = 12
+        history_length = 1  # control steps whose observations the policy sees, the newest first
         episode_length_s = 20.0
 
     class asset:

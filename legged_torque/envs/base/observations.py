@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict
+from torch import Tensor
 
 
 class Observations:
@@ -36,14 +37,24 @@ class Observations:
         if self.cfg.noise.add_noise:
             policy = policy + self._noise_scale_vec * self._uniform(policy, [-1.0, 1.0])
         clip = self.cfg.normalization.clip_observations
-        torch.clamp(policy, -clip, clip, out=self.obs_buf["policy"])
+        self.obs_buf["policy"].copy_(self._with_history(policy.clamp(-clip, clip)))
         torch.clamp(critic, -clip, clip, out=self.obs_buf["critic"])
+
+    def _with_history(self, policy: Tensor) -> Tensor:
+        """Return the policy's observations followed by those of the steps before; an episode starts with copies."""
+        length = self.cfg.env.history_length
+        if length == 1:
+            return policy
+        before = self.obs_buf["policy"][:, : -policy.shape[1]]
+        copies = policy.repeat(1, length - 1)
+        return torch.cat([policy, torch.where(self.reset_buf.unsqueeze(1), copies, before)], dim=1)
 
     def _init_observations(self) -> None:
         """Allocate the observations and their scales."""
         n, scales = self.num_envs, self.cfg.normalization.obs_scales
-        policy = 9 + 2 * self.num_dof + self.num_actions
-        critic = policy + 4 + len(self.feet_indices) + self.randomization.values.shape[1]
+        now = 9 + 2 * self.num_dof + self.num_actions
+        policy = now * self.cfg.env.history_length
+        critic = now + 4 + len(self.feet_indices) + self.randomization.values.shape[1]
         self.obs_buf = TensorDict(
             {name: torch.zeros(n, size, device=self.device) for name, size in (("policy", policy), ("critic", critic))},
             batch_size=[n],

@@ -49,7 +49,11 @@ class Mirror:
         critic = [*policy, vector, ([0], [1.0]), (feet, [1.0] * len(feet)), *drawn]
         self._maps = {
             name: self._concatenate(parts, task.device)
-            for name, parts in {"policy": policy, "critic": critic, "actions": [tuple(actions)]}.items()
+            for name, parts in {
+                "policy": policy * task.cfg.env.history_length,
+                "critic": critic,
+                "actions": [tuple(actions)],
+            }.items()
         }
 
     def __call__(self, name: str, values: Tensor) -> Tensor:

@@ -32,6 +32,7 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     for key, value in {
         "env.num_envs": cfg.env.num_envs,
         "env.num_actions": cfg.env.num_actions,
+        "env.history_length": cfg.env.history_length,
         "control.decimation": cfg.control.decimation,
         "sim.solver_iterations": cfg.sim.solver_iterations,
         "sim.ls_iterations": cfg.sim.ls_iterations,
