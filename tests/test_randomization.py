@@ -63,7 +63,7 @@ def move_about(task):
     """Put worlds into lively states near the floor, with torques."""
     sim = task.sim
     sim.qpos[:, 2] = torch.linspace(0.2, 0.33, task.num_envs)
-    low, high = task._hard_dof_pos_limits.T
+    low, high = torch.tensor(sim.mj_model.jnt_range[1:], dtype=torch.float32).T
     task.dof_pos.clamp_(low + 1e-3, high - 1e-3)  # at a limit, rounding decides whether it acts
     sim.qvel.copy_(torch.randn_like(sim.qvel))
     sim.qacc_warmstart.zero_()
@@ -184,7 +184,7 @@ def test_kept_values(make_task):
 
 
 def test_critic_knows_what_was_drawn(make_task):
-    """Its last observations are all drawn numbers, from -1, the lowest possible, to 1; without draws, the robot's own."""
+    """Its last observations are all drawn numbers, from -1, the lowest one, to 1; without draws, the robot's own."""
     task = make_task("a1_position", 200, **ON)
     sizes = task.randomization.sizes
     values = dict(zip(sizes, task.randomization.values.split([*sizes.values()], dim=1), strict=True))
@@ -238,13 +238,15 @@ def test_torques_by_hand(make_task):
 
 
 def test_pushes(make_task):
-    """A push sets a velocity or adds one, each half the time, uniformly, in the chosen worlds only."""
-    task = make_task("a1_torque", 3000, **{"domain_rand.push_velocity": [-2.0, 2.0]})
+    """A push sets a velocity or adds one, each half the time, uniformly, as often as set."""
+    settings = {"push_robots": True, "push_probability": 0.3, "push_velocity": [-2.0, 2.0]}
+    task = make_task("a1_torque", 4000, **{f"domain_rand.{key}": value for key, value in settings.items()})
     task.sim.qvel[:, :3] = 10.0
-    mask = torch.arange(3000) % 3 == 0
-    task._push_robots(mask)
+    task.reset_buf.fill_(False)
+    task._reset_worlds()
     velocity = task.sim.qvel[:, :3]
-    assert (velocity[~mask] == 10.0).all()
+    mask = (velocity != 10.0).all(dim=1)
+    assert (velocity[~mask] == 10.0).all() and 0.27 < mask.float().mean() < 0.33
     added = velocity[mask][:, 0] > 5.0
     assert 0.44 < added.float().mean() < 0.56
     assert uniformity(torch.where(added.unsqueeze(1), velocity[mask] - 10.0, velocity[mask]), -2.0, 2.0) < 1.0

@@ -1,5 +1,7 @@
 """The batched simulator against plain MuJoCo in double precision, and what it promises about sensors and resets."""
 
+import math
+
 import mujoco
 import numpy as np
 import pytest
@@ -332,3 +334,32 @@ def test_ordinary_speed_is_no_divergence(make_task):
     sim.qpos[0, :2], sim.qvel[0, 6:], sim.qacc_warmstart[0, 6:] = 1000.0, 100.0, 1e6
     sim.flag_diverged()
     assert not sim.diverged.any()
+
+
+def rotation_matrices(roll, pitch, yaw):
+    """Rotations about the world's x, then y, then z axis."""
+    result = []
+    for r, p, y in zip(roll, pitch, yaw, strict=True):
+        about_x = np.array([[1, 0, 0], [0, np.cos(r), -np.sin(r)], [0, np.sin(r), np.cos(r)]])
+        about_y = np.array([[np.cos(p), 0, np.sin(p)], [0, 1, 0], [-np.sin(p), 0, np.cos(p)]])
+        about_z = np.array([[np.cos(y), -np.sin(y), 0], [np.sin(y), np.cos(y), 0], [0, 0, 1]])
+        result.append(about_z @ about_y @ about_x)
+    return np.array(result)
+
+
+def test_orientation(make_task):
+    """Roll, pitch and yaw are rotations about the world's axes in this order, in the worlds of the mask."""
+    sim = make_task("a1_torque", 50).sim
+    angles = torch.empty(50, 3).uniform_(-math.pi, math.pi)
+    mask = torch.arange(50) % 2 == 0
+    before = sim.qpos.clone()
+    sim.set_orientation(mask, angles)
+    assert torch.equal(sim.qpos[~mask], before[~mask]) and torch.equal(
+        sim.qpos[:, [0, 1, 2, *range(7, 19)]], before[:, [0, 1, 2, *range(7, 19)]]
+    )
+    for quat, expected in zip(
+        sim.qpos[mask, 3:7].double(), rotation_matrices(*angles[mask].double().numpy().T), strict=True
+    ):
+        matrix = np.zeros(9)
+        mujoco.mju_quat2Mat(matrix, quat.numpy())
+        np.testing.assert_allclose(matrix.reshape(3, 3), expected, atol=1e-6)

@@ -52,7 +52,7 @@ def mirror_critic(obs):
 
 
 def mirror_drawn(drawn):
-    """Mass, centre of mass, radius, places of feet; four per joint; four of the ground, ...; an offset per joint; ..."""
+    """Mass, centre of mass, radius, feet; four per joint; four of the ground; an offset per joint; three more."""
     trunk, feet, joints, ground, offsets, rest = drawn.split([5, 12, 48, 4, 12, 3], dim=1)
     feet = feet.reshape(-1, 4, 3)[:, [1, 0, 3, 2]] * torch.tensor([1.0, -1, 1])
     joints = joints.reshape(-1, 4, 4, 3)[:, :, [1, 0, 3, 2]]

@@ -14,18 +14,7 @@ from legged_torque.envs import task_registry
 from legged_torque.utils import rendering, runs
 from legged_torque.utils.args import Parser, add_task_args, apply_args
 from legged_torque.utils.config import to_dict
-from legged_torque.utils.math import quat_from_euler, quat_rotate_inverse
-
-
-def rotation_matrices(roll, pitch, yaw):
-    """Rotations about the world's x, then y, then z axis."""
-    result = []
-    for r, p, y in zip(roll, pitch, yaw, strict=True):
-        about_x = np.array([[1, 0, 0], [0, np.cos(r), -np.sin(r)], [0, np.sin(r), np.cos(r)]])
-        about_y = np.array([[np.cos(p), 0, np.sin(p)], [0, 1, 0], [-np.sin(p), 0, np.cos(p)]])
-        about_z = np.array([[np.cos(y), -np.sin(y), 0], [np.sin(y), np.cos(y), 0], [0, 0, 1]])
-        result.append(about_z @ about_y @ about_x)
-    return np.array(result)
+from legged_torque.utils.math import quat_rotate_inverse
 
 
 def quaternion_matrices(quat):
@@ -37,14 +26,6 @@ def quaternion_matrices(quat):
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.array(rows).transpose(2, 0, 1)
-
-
-def test_quaternions_from_angles():
-    """Roll, pitch and yaw are rotations about the world's axes in this order."""
-    angles = np.random.default_rng(0).uniform(-np.pi, np.pi, (3, 50))
-    quat = quat_from_euler(*torch.tensor(angles)).numpy()
-    np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0, rtol=1e-12)
-    np.testing.assert_allclose(quaternion_matrices(quat), rotation_matrices(*angles), atol=1e-12)
 
 
 def test_world_vectors_in_the_body_frame():

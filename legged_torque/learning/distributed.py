@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -72,3 +73,12 @@ def any_process(condition: bool, device: str) -> bool:
     flag = torch.tensor(float(condition), device=device)
     torch.distributed.all_reduce(flag)
     return flag.item() > 0.0
+
+
+def gather(value: Any) -> list[Any]:
+    """Return the values of all processes, in their order; a single process asks nobody."""
+    if not torch.distributed.is_initialized():
+        return [value]
+    values: list[Any] = [None] * torch.distributed.get_world_size()
+    torch.distributed.all_gather_object(values, value)
+    return values

@@ -13,6 +13,7 @@ import legged_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning import distributed
 from legged_torque.learning.ppo import OnDevicePPO
+from legged_torque.learning.random_state import random_state, restore_random_state
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.interrupt import StopRequest
@@ -110,7 +111,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             torch.distributed.destroy_process_group()
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Save everything that training needs to continue, atomically.
+        """Save everything that training needs to continue, atomically; all processes that train together call it.
 
         Args:
             path: The file; it is either complete or absent.
@@ -123,7 +124,10 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             "task": self.env.state_dict(),
             "total_timesteps": self.logger.tot_timesteps,
             "seconds": self._seconds_before + self.logger.tot_time,
+            "random_states": distributed.gather(random_state(self.device)),
         }
+        if self.gpu_global_rank > 0:
+            return
         part = f"{path}.part"
         try:
             torch.save(state, part)
@@ -163,6 +167,16 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         except (RuntimeError, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
             raise UserError(f"checkpoint '{path}' does not fit this task: {last_line(error)}") from None
         return state["infos"]
+
+    def continue_random_numbers(self, infos: dict) -> None:
+        """Go on with the random numbers of the run that a checkpoint is from, instead of repeating them.
+
+        Args:
+            infos: From :meth:`load`. Processes beyond those of that run keep their own numbers.
+        """
+        states = infos["random_states"]
+        if self.gpu_global_rank < len(states):
+            restore_random_state(self.device, states[self.gpu_global_rank])
 
     def collect_rollout(self) -> None:
         """Let curricula that hold for a rollout move on, and fill the storage with one rollout and its returns."""
@@ -224,8 +238,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
 
     def _save_checkpoint(self) -> None:
         """Save into the run's folder, and warn if the simulator had too little room."""
-        if self.logger.writer is not None:
-            self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
+        if self.log_dir is not None:
+            self.save(str(Path(self.log_dir) / f"model_{self.current_learning_iteration}.pt"))
         warning = self.env.sim.check_buffers()
         if warning:
             print(f"Warning: {warning}.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -28,6 +29,7 @@ class Parameter:
         shared: Whether all columns take the same offset and scale, or each its own.
         same_draw_as: Name of an earlier parameter whose draws it takes.
         may_keep: Whether it keeps its value at the start in a share of the draws.
+        limits: Lowest and highest values, per column, into which draws are clipped.
     """
 
     name: str
@@ -40,6 +42,7 @@ class Parameter:
     shared: bool = False
     same_draw_as: str | None = None
     may_keep: bool = False
+    limits: tuple[Sequence[float], Sequence[float]] | None = None
 
 
 class Randomization:
@@ -52,7 +55,9 @@ class Randomization:
         values: These numbers as they are now, from -1, the lowest one possible, to 1. Shape: (num_envs, their sum).
     """
 
-    def __init__(self, parameters: Sequence[Parameter], num_envs: int, device: str, keep_probability: float) -> None:
+    def __init__(
+        self, parameters: Sequence[Parameter], num_envs: int, device: str, keep_probability: float = 0.0
+    ) -> None:
         """Prepare the tables; nothing is drawn yet.
 
         Args:
@@ -84,7 +89,6 @@ class Randomization:
         self._num_envs, self._device = num_envs, device
         self.values = torch.tensor(at_start, device=device).repeat(num_envs, 1)
         self._uniform = torch.zeros(num_envs, num_draws, device=device)
-        self._mask = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._rows = wp.array(rows, dtype=_Row, device=device)
         self._addresses = wp.array(addresses, dtype=wp.uint64, device=device)
         self._strides = wp.array(strides, dtype=wp.uint64, device=device)
@@ -97,13 +101,12 @@ class Randomization:
         Args:
             mask: In which worlds. Shape: (num_envs,), bool.
         """
-        self._mask.copy_(mask)
         self._uniform.uniform_()
         wp.launch(
             _draw,
             dim=(self._num_envs, len(self._rows)),
             inputs=[
-                wp.from_torch(self._mask),
+                wp.from_torch(mask),
                 wp.from_torch(self._uniform),
                 self._rows,
                 self._addresses,
@@ -130,6 +133,8 @@ class _Row:
     keep_probability: wp.float32
     middle: wp.float32
     per_half_range: wp.float32
+    lowest: wp.float32
+    highest: wp.float32
 
 
 @wp.kernel(enable_backward=False)
@@ -150,7 +155,7 @@ def _draw(
         first = draws[column]
         offset = row.offset_low + row.offset_span * uniform[world, first]
         scale = row.scale_low + row.scale_span * uniform[world, first + 1]
-        value = (row.base + row.weight * offset) * scale
+        value = wp.clamp((row.base + row.weight * offset) * scale, row.lowest, row.highest)
         if uniform[world, 0] < row.keep_probability:
             value = row.own_value
         target = wp.array(ptr=addresses[column] + wp.uint64(world) * strides[column], shape=(1,), dtype=wp.float32)
@@ -163,9 +168,12 @@ def table(parameter: Parameter, keep_probability: float) -> list[_Row]:
     """Return how each column of a parameter is drawn."""
     defaults = parameter.field[0, list(parameter.columns)].tolist()
     bases = defaults if parameter.base is None else per_column(parameter.base, len(defaults))
+    weights = per_column(parameter.weight, len(defaults))
+    lowest, highest = parameter.limits or ([-math.inf] * len(defaults), [math.inf] * len(defaults))
     rows = []
-    for default, base, weight in zip(defaults, bases, per_column(parameter.weight, len(defaults)), strict=True):
+    for default, base, weight, low, high in zip(defaults, bases, weights, lowest, highest, strict=True):
         row = _Row()
+        row.lowest, row.highest = low, high
         row.base, row.weight, row.own_value = base, weight, default
         row.offset_low, row.offset_span = parameter.offset[0], parameter.offset[1] - parameter.offset[0]
         row.scale_low, row.scale_span = parameter.scale[0], parameter.scale[1] - parameter.scale[0]

@@ -98,7 +98,6 @@ class Simulator:
             for name in per_world:
                 expand(self.model, name, num_envs)
             self._diverged = wp.zeros(num_envs, dtype=wp.bool)
-            self._reset_mask = wp.zeros(num_envs, dtype=wp.bool)
             self._overflow = wp.zeros(num_envs, dtype=wp.int32)
             self._reference_pose = wp.array(model.qpos0, dtype=wp.float32)
         self._constants = DerivedConstants(model, self.model, num_envs) if per_world else None
@@ -132,8 +131,7 @@ class Simulator:
         Args:
             mask: In which worlds. Shape: (num_envs,), bool.
         """
-        wp.to_torch(self._reset_mask).copy_(mask)
-        self._constants.update(self._reset_mask)
+        self._constants.update(wp.from_torch(mask))
 
     def step(self, sense: bool = True) -> None:
         """Advance every world by one physics step under the torques in ``ctrl``.
@@ -149,13 +147,27 @@ class Simulator:
         Args:
             mask: Which worlds. Shape: (num_envs,), bool.
         """
-        wp.to_torch(self._reset_mask).copy_(mask)
         data = self.data
         wp.launch(
             _reset_worlds,
             dim=self.num_envs,
-            inputs=[self._reset_mask, self._reference_pose],
+            inputs=[wp.from_torch(mask), self._reference_pose],
             outputs=[data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, data.sensordata],
+            device=self._wp_device,
+        )
+
+    def set_orientation(self, mask: Tensor, angles: Tensor) -> None:
+        """Turn trunks: about x (roll), then y (pitch), then z (yaw), all axes of the world.
+
+        Args:
+            mask: In which worlds. Shape: (num_envs,), bool.
+            angles: Roll, pitch and yaw [rad]. Shape: (num_envs, 3).
+        """
+        wp.launch(
+            _set_orientation,
+            dim=self.num_envs,
+            inputs=[wp.from_torch(mask), wp.from_torch(angles)],
+            outputs=[self.data.qpos],
             device=self._wp_device,
         )
 
@@ -207,6 +219,22 @@ def _reset_worlds(
             ctrl[world, i] = 0.0
         for i in range(sensordata.shape[1]):
             sensordata[world, i] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def _set_orientation(
+    mask: wp.array(dtype=wp.bool), angles: wp.array2d(dtype=wp.float32), qpos: wp.array2d(dtype=wp.float32)
+):
+    """Write the quaternion (w, x, y, z) of one world; Warp's own are (x, y, z, w)."""
+    world = wp.tid()
+    if mask[world]:
+        roll = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), angles[world, 0])
+        pitch = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), angles[world, 1])
+        yaw = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angles[world, 2])
+        quat = yaw * pitch * roll
+        qpos[world, 3] = quat[3]
+        for i in range(3):
+            qpos[world, 4 + i] = quat[i]
 
 
 @wp.kernel(enable_backward=False)

@@ -19,20 +19,3 @@ def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     w, xyz = quat[..., :1], quat[..., 1:]
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec - w * t + torch.linalg.cross(xyz, t)
-
-
-def quat_from_euler(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
-    """Return the quaternions of extrinsic rotations about x (roll), then y (pitch), then z (yaw).
-
-    Args:
-        roll: Angles in rad. Shape: (N,).
-        pitch: Angles in rad. Shape: (N,).
-        yaw: Angles in rad. Shape: (N,).
-
-    Returns:
-        Unit quaternions (w, x, y, z). Shape: (N, 4).
-    """
-    half = 0.5 * torch.stack([roll, pitch, yaw])
-    (cr, cp, cy), (sr, sp, sy) = torch.cos(half), torch.sin(half)
-    cc, ss, sc, cs = cr * cp, sr * sp, sr * cp, cr * sp
-    return torch.stack([cc * cy + ss * sy, sc * cy - cs * sy, cs * cy + sc * sy, cc * sy - ss * cy], dim=-1)

@@ -119,7 +119,8 @@ class TaskRegistry:
             runner = runner_class(env, to_rsl_rl(train_cfg), log_dir, env.device)
         if args is not None and getattr(args, "resume", False):
             run_dir = find_run(root or experiment_dir(train_cfg), args.load_run)
-            runner.load(str(find_checkpoint(run_dir, args.checkpoint)))
+            infos = runner.load(str(find_checkpoint(run_dir, args.checkpoint)))
+            runner.continue_random_numbers(infos)
         return runner, train_cfg
 
     def _get(self, name: str) -> tuple[type[VecEnv], BaseConfig, BaseConfig]:

@@ -31,6 +31,34 @@ TRUNK = 1
 """The trunk's body."""
 
 
+def initial_state(task: LeggedRobot) -> list[Parameter]:
+    """Return what is drawn at the start of an episode: its state, the trunk's orientation as angles, and the delay."""
+    rand, pose = task.cfg.domain_rand, task.default_dof_pos.tolist()
+    qpos, qvel, dofs = task.sim.qpos, task.sim.qvel, range(task.num_dof)
+    limits = task.sim.mj_model.jnt_range[1:].T.tolist()
+    shortest, longest = rand.action_delay
+
+    def velocity(name: str, columns: Any) -> Parameter:
+        return Parameter(name, qvel, list(columns), base=0.0, offset=tuple(getattr(rand, name)))
+
+    return [
+        Parameter("base_pos", qpos, range(3), base=task.cfg.init_state.pos, shared=True),
+        Parameter("roll", task.init_angles, [0], base=0.0, offset=tuple(rand.init_roll)),
+        Parameter("pitch", task.init_angles, [1], base=0.0, offset=tuple(rand.init_pitch)),
+        Parameter("yaw", task.init_angles, [2], base=0.0, offset=tuple(rand.init_yaw)),
+        Parameter(
+            "dof_pos", qpos, [7 + dof for dof in dofs], base=pose, scale=tuple(rand.init_dof_pos_scale), limits=limits
+        ),
+        velocity("init_lin_vel", range(3)),
+        velocity("init_ang_vel", range(3, 6)),
+        velocity("init_dof_vel", [6 + dof for dof in dofs]),
+        Parameter(
+            "action_delay", task.action_delay.drawn, [0], base=0.0, offset=(shortest, longest + 1),
+            limits=([shortest], [longest + 0.5]),
+        ),
+    ]  # fmt: skip
+
+
 def parameters(task: LeggedRobot) -> list[Parameter]:
     """Return everything that ``cfg.domain_rand`` draws."""
     return [*robot_parameters(task), *ground_parameters(task), *control_parameters(task)]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from legged_torque import ROOT_DIR
 from legged_torque.envs.base.curriculum import LinearCurriculum
-from legged_torque.envs.base.domain_rand import MODEL_FIELDS, parameters
+from legged_torque.envs.base.domain_rand import MODEL_FIELDS
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations
 from legged_torque.envs.base.random_events import RandomEvents
@@ -23,7 +23,6 @@ from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.sim.model import build_model, geoms_matching, read_spec
-from legged_torque.sim.randomization import Randomization
 from legged_torque.sim.simulator import Simulator
 from legged_torque.utils.config import section_keys, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
@@ -81,7 +80,7 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         self._create_sim()
         self._init_buffers()
         self._prepare_reward_functions()
-        self.randomization = Randomization(parameters(self), self.num_envs, device, cfg.domain_rand.keep_probability)
+        self._init_random_events()
         self._init_observations()
         self.step_graph = CudaGraph(self._step, device)
         self.reset()
@@ -174,11 +173,12 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         self.sim.flag_diverged()
         self.sim.diverged.logical_or_(~torch.isfinite(self._given_actions).all(dim=1))
         clip = self.cfg.normalization.clip_actions
+        self.action_delay.keep()
         self.actions.copy_(self._given_actions.nan_to_num().clamp(-clip, clip))
         decimation = self.cfg.control.decimation
         for i in range(decimation):
             if i == 0 or self.cfg.control.refresh_torques:
-                torques = self.motor_strength * self._compute_torques(self.actions)
+                torques = self.motor_strength * self._compute_torques(self.action_delay.actions(i))
                 torch.clamp(torques, self.torque_limits[0], self.torque_limits[1], out=self.torques)
             self.sim.step(sense=i == decimation - 1)
         self.sim.flag_diverged()
@@ -266,9 +266,9 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         self.base_ang_vel = self.sim.qvel[:, 3:6]
         self.torques = self.sim.ctrl
         self.torque_limits = self._tensor(model.actuator_forcerange.T)
-        self._hard_dof_pos_limits = self._tensor(model.jnt_range[1:])
-        middle = self._hard_dof_pos_limits.mean(dim=1, keepdim=True)
-        self.dof_pos_limits = middle + self.cfg.rewards.soft_dof_pos_limit * (self._hard_dof_pos_limits - middle)
+        limits = self._tensor(model.jnt_range[1:])
+        middle = limits.mean(dim=1, keepdim=True)
+        self.dof_pos_limits = middle + self.cfg.rewards.soft_dof_pos_limit * (limits - middle)
 
         def indices(parts: list[str]) -> Tensor:
             chosen = [i for i, name in enumerate(geoms) if any(part in name for part in parts)]
@@ -310,7 +310,6 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
             if name not in angles:
                 raise UserError(f"init_state.default_joint_angles lacks the joint '{name}'")
         self.default_dof_pos = self._tensor([angles[name] for name in self.dof_names])
-        self._init_pos = self._tensor(cfg.init_state.pos)
         self._gravity = self._tensor([0.0, 0.0, -1.0]).expand(n, 3)
         ranges = cfg.commands.ranges
         limits = self._tensor([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw])

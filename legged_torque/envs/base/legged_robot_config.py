@@ -51,6 +51,10 @@ class LeggedRobotCfg(BaseConfig):
         init_lin_vel = [0.0, 0.0]  # [m/s] of the trunk, per axis
         init_ang_vel = [0.0, 0.0]  # [rad/s] of the trunk, per axis
 
+        # time from the policy to the motors, at every reset
+        action_delay = [0, 0]  # whole numbers of
+        action_delay_unit = "physics_steps"  # or "control_steps"
+
         # parameters, at every reset and now and then; one number per world unless said otherwise
         randomize_parameters = False
         keep_fixed: list[str] = []  # names of ranges below that are not drawn after all

@@ -35,7 +35,7 @@ class Observations:
             dim=1,
         )
         if self.cfg.noise.add_noise:
-            policy = policy + self._noise_scale_vec * self._uniform(policy, [-1.0, 1.0])
+            policy = torch.addcmul(policy, self._noise_scale_vec, self._uniform(policy, [-1.0, 1.0]))
         clip = self.cfg.normalization.clip_observations
         self.obs_buf["policy"].copy_(self._with_history(policy.clamp(-clip, clip)))
         torch.clamp(critic, -clip, clip, out=self.obs_buf["critic"])

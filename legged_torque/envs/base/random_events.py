@@ -5,7 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from legged_torque.utils.math import quat_from_euler
+from legged_torque.envs.base.action_delay import ActionDelay
+from legged_torque.envs.base.domain_rand import initial_state, parameters
+from legged_torque.sim.randomization import Randomization
+
+PUSH_ADDED = 0.5
+"""Share of pushes that add a velocity; the others set one."""
 
 
 class RandomEvents:
@@ -18,65 +23,55 @@ class RandomEvents:
     def _reset_worlds(self) -> None:
         """Start a new episode in the worlds of ``reset_buf``; elsewhere draw anew what is due."""
         mask = self.reset_buf
-        self.sim.reset(mask)
-        self._reset_dofs(mask)
-        self._reset_root_states(mask)
+        self._reset_state(mask)
         for buffer in (self.actions, self.feet_air_time):
             buffer.masked_fill_(mask.unsqueeze(1), 0.0)
+        self.action_delay.reset(mask)
         self._episode_length_buf.masked_fill_(mask, 0)
         self.episode_sums.masked_fill_(mask, 0.0)
         self.episode_return.masked_fill_(mask, 0.0)
         rand = self.cfg.domain_rand
-        self._resample_commands(mask | self._due(self.cfg.commands.resampling_probability))
+        new_commands, new_parameters, push, add = torch.rand(4, self.num_envs, device=self.device) < self._probabilities
+        self._resample_commands(mask | new_commands)
         if rand.randomize_parameters:
-            self._randomize_parameters(mask | self._due(rand.resampling_probability))
+            self._randomize_parameters(mask | new_parameters)
         if rand.push_robots:
-            self._push_robots(self._due(rand.push_probability))
+            self._push_robots(push, add)
         self._update_state()
 
-    def _due(self, probability: float) -> Tensor:
-        """Choose worlds at random. Shape: (num_envs,), bool."""
-        return torch.rand(self.num_envs, device=self.device) < probability
+    def _init_random_events(self) -> None:
+        """Allocate what the events need."""
+        rand = self.cfg.domain_rand
+        probabilities = [self.cfg.commands.resampling_probability, rand.resampling_probability, rand.push_probability]
+        self._probabilities = self._tensor([*probabilities, PUSH_ADDED]).unsqueeze(1)
+        self.action_delay = ActionDelay(self)
+        self.init_angles = torch.zeros(self.num_envs, 3, device=self.device)
+        self.initial_state = Randomization(initial_state(self), self.num_envs, self.device)
+        self.randomization = Randomization(parameters(self), self.num_envs, self.device, rand.keep_probability)
 
     def _uniform(self, like: Tensor, limits: list[float]) -> Tensor:
         """Return uniform random numbers in the shape of a tensor."""
         return torch.empty_like(like).uniform_(*limits)
 
-    def _reset_dofs(self, mask: Tensor) -> None:
-        """Draw joint positions around q_nominal and joint velocities for the worlds in ``mask``."""
-        rand, column = self.cfg.domain_rand, mask.unsqueeze(1)
-        angles = self.default_dof_pos * self._uniform(self.dof_pos, rand.init_dof_pos_scale)
-        angles = angles.clamp(self._hard_dof_pos_limits[:, 0], self._hard_dof_pos_limits[:, 1])
-        self.dof_pos.copy_(torch.where(column, angles, self.dof_pos))
-        self._reset_velocity(self.dof_vel, rand.init_dof_vel, mask)
-
-    def _reset_root_states(self, mask: Tensor) -> None:
-        """Draw the trunk's orientation and velocities for the worlds in ``mask``, at the initial position."""
-        rand, column = self.cfg.domain_rand, mask.unsqueeze(1)
-        angles = [self._uniform(self.rew_buf, limits) for limits in (rand.init_roll, rand.init_pitch, rand.init_yaw)]
-        self.base_pos.copy_(torch.where(column, self._init_pos, self.base_pos))
-        self.base_quat.copy_(torch.where(column, quat_from_euler(*angles), self.base_quat))
-        self._reset_velocity(self.sim.qvel[:, :3], rand.init_lin_vel, mask)
-        self._reset_velocity(self.base_ang_vel, rand.init_ang_vel, mask)
-
-    def _reset_velocity(self, velocity: Tensor, limits: list[float], mask: Tensor) -> None:
-        """Draw velocities for the worlds in ``mask``; the simulator has just put them at rest."""
-        if any(limits):
-            velocity.copy_(torch.where(mask.unsqueeze(1), self._uniform(velocity, limits), velocity))
+    def _reset_state(self, mask: Tensor) -> None:
+        """Draw positions and velocities for the worlds in ``mask``, and clear what they had."""
+        self.sim.reset(mask)
+        self.initial_state.draw(mask)
+        self.sim.set_orientation(mask, self.init_angles)
 
     def _randomize_parameters(self, mask: Tensor) -> None:
         """Draw parameters of robot, ground and controller anew for the worlds in ``mask``."""
         self.randomization.draw(mask)
         self.sim.update_constants(mask)
 
-    def _push_robots(self, mask: Tensor) -> None:
-        """Push the worlds in ``mask``: half the time a drawn velocity is set, half the time it is added."""
+    def _push_robots(self, mask: Tensor, add: Tensor) -> None:
+        """Push the worlds in ``mask``: in those of ``add`` a drawn velocity is added, elsewhere set."""
         velocity = self.sim.qvel[:, :3]
         drawn = self._uniform(velocity, self.cfg.domain_rand.push_velocity)
-        added = self._due(0.5).unsqueeze(1)
-        velocity.copy_(torch.where(mask.unsqueeze(1), drawn + added * velocity, velocity))
+        pushed = torch.where(add.unsqueeze(1), drawn + velocity, drawn)
+        torch.where(mask.unsqueeze(1), pushed, velocity, out=velocity)
 
     def _resample_commands(self, mask: Tensor) -> None:
         """Draw new commands for the worlds in ``mask``."""
-        drawn = self._command_low + self._command_span * torch.rand_like(self.commands)
-        self.commands.copy_(torch.where(mask.unsqueeze(1), drawn, self.commands))
+        drawn = torch.addcmul(self._command_low, self._command_span, torch.rand_like(self.commands))
+        torch.where(mask.unsqueeze(1), drawn, self.commands, out=self.commands)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from legged_torque.envs.base.action_delay import UNITS
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.utils.config import section_keys
 from legged_torque.utils.errors import UserError, unknown_name
@@ -61,8 +62,23 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
             value = getattr(section, key)
             if key.endswith("probability"):
                 _check_probability(f"{name}.{key}", value)
-            elif not isinstance(value, bool) and key != "keep_fixed":
+            elif isinstance(value, list) and key != "keep_fixed":
                 _check_range(f"{name}.{key}", value)
+    _check_action_delay(cfg)
+
+
+def _check_action_delay(cfg: LeggedRobotCfg) -> None:
+    """Refuse delays that are not whole steps, or that torques cannot follow."""
+    rand = cfg.domain_rand
+    if rand.action_delay_unit not in UNITS:
+        raise unknown_name("domain_rand.action_delay_unit", rand.action_delay_unit, UNITS)
+    if not all(isinstance(steps, int) and steps >= 0 for steps in rand.action_delay):
+        raise UserError(f"domain_rand.action_delay must be two whole numbers from 0 on, not {rand.action_delay}")
+    if rand.action_delay[1] and rand.action_delay_unit == "physics_steps" and not cfg.control.refresh_torques:
+        raise UserError(
+            "domain_rand.action_delay_unit must be control_steps, since control.refresh_torques is off: torques are "
+            "computed once per control step"
+        )
 
 
 def _check_probability(key: str, value: float) -> None:

@@ -6,7 +6,7 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from legged_torque.sim.fused.dynamics import Body, add_bodies, branch_dynamics, make_trunk
+from legged_torque.sim.fused.dynamics import Body, Trunk, add_bodies, branch_dynamics, make_trunk
 from legged_torque.sim.fused.math import linear_algebra, row, vec6
 from legged_torque.sim.fused.newton import branch_newton
 from legged_torque.sim.fused.robot import Robot, lanes_per_world, make_robot, read_tree
@@ -86,6 +86,19 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
     Leg, assemble_damping, eliminate = (
         branch_newton(depth).Leg, branch_newton(depth).assemble_damping, branch_newton(depth).eliminate,
     )  # fmt: skip
+
+    @wp.func
+    def leg_at_rest(
+        robot: Robot, world: int, branch: int, trunk: Trunk, qpos: wp.array2d(dtype=float),
+        rest: wp.array2d(dtype=float), positions: wp.array(dtype=wp.vec3), rotations: wp.array(dtype=wp.mat33),
+    ) -> Leg:  # fmt: skip
+        """Return a branch with its inertia matrix factorized; fill the poses of its bodies."""
+        velocities = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
+        leg = Leg()
+        leg.branch = make_branch(
+            robot, world, branch, trunk, qpos, rest, rest, positions, rotations, velocities, velocities
+        )
+        return assemble_damping(leg, 0.0)
 
     @wp.func
     def inverse_weight(
@@ -171,18 +184,14 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
         if mask[world]:
             positions = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
             rotations = wp.zeros(shape=wp.static(depth + 1), dtype=wp.mat33)
-            at_rest = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
             trunk = make_trunk(robot, world, qpos, rest)
             total = Body()
             system = TrunkSystem()
+            leg = Leg()
             for i in range(wp.static(per_lane)):
                 branch = lane + i * wp.static(lanes)
                 if branch < wp.static(branches):
-                    leg = Leg()
-                    leg.branch = make_branch(
-                        robot, world, branch, trunk, qpos, rest, rest, positions, rotations, at_rest, at_rest
-                    )
-                    leg = assemble_damping(leg, 0.0)  # the inertia matrix alone
+                    leg = leg_at_rest(robot, world, branch, trunk, qpos, rest, positions, rotations)
                     system = eliminate(leg, system, TrunkSystem())
                     total = add_bodies(total, leg.branch.total)
             whole = whole_body(trunk, total, wp.static(lanes))
@@ -192,11 +201,8 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
             for i in range(wp.static(per_lane)):
                 branch = lane + i * wp.static(lanes)
                 if branch < wp.static(branches):
-                    leg = Leg()  # once more: few worlds are drawn in a step, and a CPU's thread has several branches
-                    leg.branch = make_branch(
-                        robot, world, branch, trunk, qpos, rest, rest, positions, rotations, at_rest, at_rest
-                    )
-                    leg = assemble_damping(leg, 0.0)
+                    if wp.static(per_lane > 1):  # a CPU's thread has several branches, of which it kept the last one
+                        leg = leg_at_rest(robot, world, branch, trunk, qpos, rest, positions, rotations)
                     branch_constants(
                         robot, world, branch, leg, trunk.rot, trunk_factor, positions, rotations, body_invweight0,
                         dof_invweight0,
