@@ -85,15 +85,9 @@ class A1TorqueMultiHeadCfgPPO(A1CfgPPO):
         hidden_dims = [512, 256]  # shared by both heads
         head_hidden_dims = [128]
 
-    class algorithm(A1CfgPPO.algorithm):
-        num_learning_epochs = 3  # as good as 5, and sooner done
-
 
 class A1MultiHeadCfgPPO(A1TorqueMultiHeadCfgPPO):
     """Training of ``a1_multihead``."""
 
     class runner(A1TorqueMultiHeadCfgPPO.runner):
         experiment_name = "a1_multihead"
-
-    class algorithm(A1CfgPPO.algorithm):
-        num_learning_epochs = 5  # 3 were not measured for this task
