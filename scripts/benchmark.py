@@ -109,7 +109,8 @@ def size_settings(args: argparse.Namespace, num_envs: int | None) -> tuple[Any, 
     Raises:
         UserError: If an argument makes no sense.
     """
-    env_cfg, train_cfg = task_registry.get_cfgs(args.task, argparse.Namespace(**{**vars(args), "num_envs": num_envs}))
+    changes = {"num_envs": num_envs, "set": ["evaluation.interval=0", *args.set]}  # so that iterations are alike
+    env_cfg, train_cfg = task_registry.get_cfgs(args.task, argparse.Namespace(**{**vars(args), **changes}))
     check_env_cfg(env_cfg)  # a mistake in the last size is told before the first one is measured
     return env_cfg, train_cfg
 

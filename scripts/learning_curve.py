@@ -38,7 +38,7 @@ def main() -> None:
     for number in checkpoint_numbers(run_dir):
         infos = runner.load(str(find_checkpoint(run_dir, number)))
         set_seed(train_cfg.seed + 1000)  # the same worlds for every checkpoint, others than in training
-        numbers = measure(env, runner.get_inference_policy(env.device), args.steps)
+        numbers = measure(env, runner.get_inference_policy(env.device), args.steps).means()
         points.append({"steps": infos["total_timesteps"], "seconds": infos["seconds"], **numbers})
         print(
             f"{points[-1]['steps']:>12,} steps", *(f"{name} {value:.4f}" for name, value in numbers.items()), sep="  "

@@ -7,14 +7,12 @@ NO_RENDERER = choose_offscreen_renderer()  # before anything imports mujoco
 from pathlib import Path
 
 from legged_torque.envs import task_registry
-from legged_torque.evaluation.metrics import measure
+from legged_torque.evaluation.metrics import UNITS, measure
 from legged_torque.evaluation.video import Recorder
 from legged_torque.utils.args import Parser, add_task_args, run_script
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import find_checkpoint
 from legged_torque.utils.task_registry import load_run, set_seed
-
-UNITS = {"track_xy": "m^2/s^2", "track_angular": "rad^2/s^2", "speed": "m/s"}
 
 
 def main() -> None:
@@ -36,10 +34,11 @@ def main() -> None:
     runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
     runner.load(str(checkpoint))
     recorder = Recorder(env)
-    numbers = measure(env, runner.get_inference_policy(env.device), args.steps, recorder.add_step)
+    policy = runner.get_inference_policy(env.device)
+    metrics = measure(env, policy, args.steps, lambda commands: recorder.add_step())
     print(f"{checkpoint}, after {int(runner.logger.tot_timesteps):,} steps of training:")
-    for name, value in numbers.items():
-        print(f"  {name:<18} {value:8.4f} {UNITS.get(name, '')}")
+    for name, value in metrics.means().items():
+        print(f"  {name:<18} {value:8.4f} {UNITS[name]}")
     video = args.video or run_dir / "videos" / f"{checkpoint.stem}.mp4"
     try:
         if NO_RENDERER:

@@ -64,7 +64,9 @@ def train(args: argparse.Namespace, env_cfg: LeggedRobotCfg, train_cfg: LeggedRo
         save_config(runner.log_dir, settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     runner.learn(remaining, init_at_random_ep_len=True)
     if distributed.rank() == 0:
-        print(f"The run is in {runner.log_dir}\nSee it walk: python scripts/play.py --task={args.task}")
+        print(
+            f"The run is in {runner.log_dir}\nSee it walk: python scripts/play.py --task={args.task} --load_run={runner.log_dir}"
+        )
     runner.close()
 
 

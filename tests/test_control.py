@@ -12,8 +12,8 @@ NOMINAL = np.array([-0.1, 0.8, -1.5, 0.1, 0.8, -1.5, -0.1, 1.0, -1.5, 0.1, 1.0, 
 RANGE = {"hip": (-0.802851, 0.802851), "thigh": (-1.0472, 4.18879), "calf": (-2.69653, -0.916298)}
 LOW, HIGH = np.array([RANGE[name[3:]] for name in JOINTS]).T
 TORQUE_LIMIT = 33.5
-FEET = [3, 6, 9, 12]
-"""Columns of the feet in the contact buffers: after the trunk, each leg has thigh, calf, foot."""
+FEET = [4, 8, 12, 16]
+"""Columns of the feet in the contact buffers: after the trunk, each leg has hip, thigh, calf, foot."""
 POSITION_TASKS, TORQUE_TASKS = ["a1_position"], ["a1_torque", "a1_torque_curriculum"]
 MULTI_HEAD_TASKS = ["a1_torque_multihead", "a1_multihead"]
 IN_THE_AIR = {"init_state.pos": [0.0, 0.0, 2.0]}

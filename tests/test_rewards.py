@@ -8,7 +8,7 @@ import pytest
 import torch
 
 LEGS = ("FR", "FL", "RR", "RL")
-SENSED = ["trunk", *(f"{leg}_{part}" for leg in LEGS for part in ("thigh", "calf", "foot"))]
+SENSED = ["trunk", *(f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh", "calf", "foot"))]
 JOINTS = [f"{leg}_{link}" for leg in LEGS for link in ("hip", "thigh", "calf")]
 
 TABLE_III = {  # weight without Delta t, at the start of training

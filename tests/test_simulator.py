@@ -11,8 +11,8 @@ from legged_torque.sim import simulator
 from legged_torque.sim.simulator import ENGINES, Simulator
 
 LEGS = ("FR", "FL", "RR", "RL")
-SENSED = ["trunk", *(f"{leg}_{part}" for leg in LEGS for part in ("thigh", "calf", "foot"))]
-"""Columns of the contact buffers: the geoms of feet, calves, thighs and trunk in the order of the XML."""
+SENSED = ["trunk", *(f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh", "calf", "foot"))]
+"""Columns of the contact buffers: all collision geoms of the robot in the order of the XML."""
 FEET = [i for i, name in enumerate(SENSED) if name.endswith("foot")]
 WEIGHT = 12.453 * 9.81
 LEG_UP = (0.0, 2.6, -0.95)
@@ -239,7 +239,7 @@ def test_buffers_suffice_for_the_worst_case(make_task):
     for world in range(3):
         found = dict(zip(SENSED, sim.contact_found[world].tolist(), strict=True))
         assert found.pop("trunk") >= 4
-        assert found == {name: 1 if name.endswith("foot") else 2 for name in found}
+        assert found == {name: 1 if name.endswith(("foot", "hip")) else 2 for name in found}  # spheres and capsules
 
 
 def test_buffers_suffice_in_normal_use(make_task):

@@ -18,7 +18,7 @@ from legged_torque.utils.errors import UserError, unknown_name
 MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2
 """Bounds of the adaptive learning rate, those of rsl_rl."""
 
-LOSS_NAMES = ("value", "surrogate", "entropy", "kl", "gradient_norm", "skipped_updates")
+LOSS_NAMES = ("value", "surrogate", "entropy", "kl", "gradient_norm", "critic_gradient_norm", "skipped_updates")
 """What an update reports: means over the minibatches that were learned from, and how many were not."""
 
 
@@ -159,10 +159,11 @@ class OnDevicePPO(PPO):
         if self.is_multi_gpu:
             distributed.average([*self._gradients(), kl])
         self._adapt_learning_rate(kl)
-        gradient_norm = self._clip_gradients()
+        norms = self._clip_gradients()
+        gradient_norm = torch.linalg.vector_norm(norms)
         self._skip.copy_(~torch.isfinite(gradient_norm))
         self.optimizer.step()
-        numbers = torch.stack([value_loss, surrogate_loss, entropy, kl, gradient_norm]).detach()
+        numbers = torch.stack([value_loss, surrogate_loss, entropy, kl, gradient_norm, norms[1]]).detach()
         kept = torch.where(self._skip.bool(), 0.0, numbers)
         self._losses += torch.cat([kept, self._skip.unsqueeze(0)])
 
@@ -221,6 +222,6 @@ class OnDevicePPO(PPO):
         return error.mean()
 
     def _clip_gradients(self) -> Tensor:
-        """Clip the gradients of actor and critic, each to ``max_grad_norm``; return the norm over both before that."""
+        """Clip the gradients of actor and critic, each to ``max_grad_norm``; return their norms before. Shape: (2,)."""
         norms = [nn.utils.clip_grad_norm_(m.parameters(), self.max_grad_norm) for m in (self.actor, self.critic)]
-        return torch.linalg.vector_norm(torch.stack(norms))
+        return torch.stack(norms)

@@ -11,16 +11,17 @@ from rsl_rl import runners
 
 import legged_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.evaluation.evaluator import EVALUATIONS_FILE, TrainingEvaluator, append_row
 from legged_torque.learning import distributed
 from legged_torque.learning.ppo import OnDevicePPO
-from legged_torque.learning.random_state import random_state, restore_random_state
-from legged_torque.sim.graph import CudaGraph
+from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.interrupt import StopRequest
+from legged_torque.utils.random_state import random_state, restore_random_state
 from legged_torque.utils.runs import claim_run_dir
 
-MAX_CAPTURED_STEPS = 64
-"""Longer rollouts replay step by step: capturing them would take minutes and gigabytes."""
+EVALUATION_SEED = 10_000
+"""Added to the seed of a training for that of its evaluations."""
 
 
 class OnPolicyRunner(runners.OnPolicyRunner):
@@ -54,6 +55,9 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             for group in groups or [""]:
                 if group not in env.obs_buf.keys():
                     raise unknown_name(f"observation group in obs_groups.{key}", group, env.obs_buf.keys())
+        perturbation = train_cfg["evaluation"]["perturbation"]
+        if perturbation and perturbation not in env.cfg.perturbations():
+            raise unknown_name("evaluation.perturbation", perturbation, env.cfg.perturbations())
         super().__init__(env, train_cfg, log_dir, device)
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         self.log_dir = log_dir
@@ -62,6 +66,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         env.step_graph.enabled = self.alg.update_graph.enabled = self.cfg["capture"]
         enabled = self.cfg["capture"] and self.cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS
         self._rollout = CudaGraph(self._collect, device, enabled)
+        self._evaluator: TrainingEvaluator | None = None
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train, and leave a checkpoint; Ctrl-C ends training after the current iteration, a second one at once.
@@ -91,8 +96,9 @@ class OnPolicyRunner(runners.OnPolicyRunner):
                 self._wait()
                 collected = time.perf_counter()
                 losses = self.alg.update()
+                measured = self._evaluate(losses)
                 learned = time.perf_counter()
-                self._log(start_it, total_it, collected - start, learned - collected, losses)
+                self._log(start_it, total_it, collected - start, learned - collected, losses, measured)
                 self.current_learning_iteration += 1
                 if self.current_learning_iteration % self.cfg["save_interval"] == 0:
                     self._save_checkpoint()
@@ -212,9 +218,35 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         if torch.device(self.device).type == "cuda":
             torch.cuda.synchronize(self.device)
 
-    def _log(self, start_it: int, total_it: int, collect_time: float, learn_time: float, losses: dict) -> None:
+    def _evaluate(self, losses: dict) -> dict[str, float]:
+        """Measure the policy if it is time, note it in the run's folder, and return what is to be logged."""
+        settings = self.cfg["evaluation"]
+        steps = int(self.env.total_steps)
+        before = steps - self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
+        interval = settings["interval"]
+        if self.logger.writer is None or interval == 0 or steps // interval == before // interval:
+            return {}
+        start = time.perf_counter()
+        if self._evaluator is None:
+            seed = self.cfg["seed"] + EVALUATION_SEED
+            self._evaluator = TrainingEvaluator(self.env, self.alg.actor, settings, seed)
+        metrics = self._evaluator.evaluate()
+        row = {
+            "steps": steps,
+            "iteration": self.current_learning_iteration + 1,
+            "seconds": self._seconds_before + self.logger.tot_time,
+            **metrics,
+            "critic_gradient_norm": losses["critic_gradient_norm"],
+        }
+        append_row(Path(self.log_dir) / EVALUATIONS_FILE, row)
+        logged = {f"Evaluation/{name}": value for name, value in metrics.items()}
+        return {**logged, "Perf/evaluation_time": time.perf_counter() - start}
+
+    def _log(
+        self, start_it: int, total_it: int, collect_time: float, learn_time: float, losses: dict, measured: dict
+    ) -> None:
         """Hand the numbers of one iteration to rsl_rl's logger, which prints and writes them."""
-        numbers = self.env.log.read(self.env.max_episode_length * self.env.dt)
+        numbers = self.env.log.read(self.env.max_episode_length * self.env.dt) | measured
         if self.logger.writer is None:
             return
         if "return" in numbers:

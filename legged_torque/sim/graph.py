@@ -9,6 +9,9 @@ from collections.abc import Callable, Iterator
 import torch
 import warp as wp
 
+MAX_CAPTURED_STEPS = 64
+"""Longer sequences of control steps replay step by step: capturing them would take minutes and gigabytes."""
+
 _STREAMS: dict[str, tuple[torch.cuda.Stream, wp.Stream]] = {}
 
 

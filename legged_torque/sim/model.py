@@ -27,17 +27,22 @@ def read_spec(file: Path) -> mujoco.MjSpec:
         raise UserError(f"cannot load the robot '{file}': {' '.join(str(error).split())}") from None
 
 
-def geoms_matching(spec: mujoco.MjSpec, parts: list[str]) -> list[str]:
-    """Return the colliding geoms whose names contain one of ``parts``, in the file's order.
+def collision_geoms(spec: mujoco.MjSpec, floor: str = "floor") -> list[str]:
+    """Return the names of the geoms that can touch the ground, in the file's order."""
+    geoms = [geom.name for geom in spec.geoms if geom.name and (geom.contype or geom.conaffinity)]
+    return [name for name in geoms if name != floor]
+
+
+def indices_matching(names: list[str], parts: list[str]) -> list[int]:
+    """Return which names contain one of ``parts``.
 
     Raises:
-        UserError: If a part matches no geom.
+        UserError: If a part matches no name.
     """
-    names = [geom.name for geom in spec.geoms if geom.name and (geom.contype or geom.conaffinity)]
     for part in parts:
         if not any(part in name for name in names):
             raise unknown_name("collision geom (part of its name)", part, names)
-    return [name for name in names if any(part in name for part in parts)]
+    return [i for i, name in enumerate(names) if any(part in name for part in parts)]
 
 
 def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = "floor") -> mujoco.MjModel:

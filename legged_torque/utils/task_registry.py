@@ -110,7 +110,7 @@ class TaskRegistry:
             if name is None:
                 raise ValueError("make_alg_runner needs a task's name or its train_cfg")
             _, train_cfg = self.get_cfgs(name, args)
-        root = experiment_dir(train_cfg) if log_root == "default" else log_root and Path(log_root)
+        root = experiment_dir(train_cfg, args) if log_root == "default" else log_root and Path(log_root)
         if root and train_cfg.runner.logger == "wandb" and importlib.util.find_spec("wandb") is None:
             raise UserError("--logger wandb needs the extra: pip install -e .[wandb]")
         log_dir = str(new_run_dir(root, train_cfg.runner.run_name)) if root else None
@@ -118,7 +118,7 @@ class TaskRegistry:
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints its networks at length
             runner = runner_class(env, to_rsl_rl(train_cfg), log_dir, env.device)
         if args is not None and getattr(args, "resume", False):
-            run_dir = find_run(root or experiment_dir(train_cfg), args.load_run)
+            run_dir = find_run(root or experiment_dir(train_cfg, args), args.load_run)
             infos = runner.load(str(find_checkpoint(run_dir, args.checkpoint)))
             runner.continue_random_numbers(infos)
         return runner, train_cfg
@@ -138,7 +138,7 @@ def load_run(args: argparse.Namespace) -> tuple[Path, Any, Any]:
     """
     _, train_cfg = task_registry.get_cfgs(args.task)
     train_cfg.runner.experiment_name = args.experiment_name or train_cfg.runner.experiment_name
-    run_dir = find_run(experiment_dir(train_cfg), args.load_run)
+    run_dir = find_run(experiment_dir(train_cfg, args), args.load_run)
     config = load_config(run_dir)
     if config["task"] != args.task:
         raise UserError(f"the run '{run_dir}' is of task '{config['task']}', not '{args.task}'")
@@ -146,9 +146,10 @@ def load_run(args: argparse.Namespace) -> tuple[Path, Any, Any]:
     return run_dir, *task_registry.get_cfgs(args.task, args)
 
 
-def experiment_dir(train_cfg: Any) -> Path:
-    """Return the folder that holds the runs of an experiment."""
-    return ROOT_DIR / "logs" / train_cfg.runner.experiment_name
+def experiment_dir(train_cfg: Any, args: argparse.Namespace | None = None) -> Path:
+    """Return the folder that holds the runs of an experiment: below ``--log_root``, or ``logs/`` in the repository."""
+    root = getattr(args, "log_root", None)
+    return (Path(root) if root else ROOT_DIR / "logs") / train_cfg.runner.experiment_name
 
 
 def num_iterations(env: VecEnv, train_cfg: Any) -> int:

@@ -22,11 +22,14 @@ def check_train_cfg(train_cfg: Any) -> None:
     for section, keys in {
         "runner": ("num_steps_per_env", "total_steps", "save_interval"),
         "algorithm": ("num_learning_epochs", "num_mini_batches"),
+        "evaluation": ("num_samples", "num_envs"),
     }.items():
         for key in keys:
             value = getattr(getattr(train_cfg, section), key)
             if value < 1:
                 raise UserError(f"{section}.{key} must be at least 1, not {value}")
+    if train_cfg.evaluation.interval < 0:
+        raise UserError(f"evaluation.interval must be at least 0, not {train_cfg.evaluation.interval}")
     for key in ("learning_rate", "max_grad_norm", "clip_param"):
         value = getattr(train_cfg.algorithm, key)
         if not value > 0.0:

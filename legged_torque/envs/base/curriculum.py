@@ -32,7 +32,7 @@ class LinearCurriculum:
             device: Name of the device.
         """
         rows = [(c.start, c.end, c.t_start, c.t_end) if c else (1.0, 1.0, 0, 1) for c in settings]
-        start, end, t_start, t_end = torch.tensor(rows, dtype=torch.float64, device=device).unbind(dim=1)
+        start, end, t_start, t_end = torch.tensor(rows, dtype=torch.float64, device=device).view(-1, 4).unbind(dim=1)
         self._start, self._change = start, end - start
         self._t_start, self._duration = t_start, (t_end - t_start).clamp(min=1.0)
 

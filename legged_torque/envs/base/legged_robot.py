@@ -22,7 +22,7 @@ from legged_torque.envs.base.symmetry import Mirror
 from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.sim.graph import CudaGraph
-from legged_torque.sim.model import build_model, geoms_matching, read_spec
+from legged_torque.sim.model import build_model, collision_geoms, indices_matching, read_spec
 from legged_torque.sim.simulator import Simulator
 from legged_torque.utils.config import section_keys, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
@@ -49,7 +49,7 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         torque_limits: Lowest and highest torques [N m]. Shape: (2, num_dof).
         actions: Last actions. Shape: (num_envs, num_actions).
         commands: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
-        contacts: 1 for each sensed geom that touches the ground, else 0. Shape: (num_envs, geoms).
+        contacts: 1 for each collision geom that touches the ground, else 0. Shape: (num_envs, geoms).
         feet_contact: The same for the feet. Shape: (num_envs, feet).
         total_steps: Environment steps so far over all worlds of all processes: t of eq. 1. Scalar, int64.
     """
@@ -216,7 +216,9 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         self.num_diverged += self.sim.diverged.sum()
 
     def compute_reward(self) -> None:
-        """Compute the sum of all terms (Table III); 0 for worlds that diverged."""
+        """Compute the sum of all terms (Table III); 0 for worlds that diverged, or without terms."""
+        if not self.reward_names:
+            return
         terms = torch.stack([function() for function in self._reward_functions])
         terms = torch.where(self.sim.diverged, 0.0, terms)
         terms *= self.reward_weights().unsqueeze(1)
@@ -247,7 +249,10 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         asset = self.cfg.asset
         file = Path(asset.file) if Path(asset.file).is_absolute() else ROOT_DIR / asset.file
         spec = read_spec(file)
-        geoms = geoms_matching(spec, [asset.foot_name, *asset.penalize_contacts_on, *asset.terminate_after_contacts_on])
+        geoms = collision_geoms(spec)
+        feet = indices_matching(geoms, [asset.foot_name])
+        penalized = indices_matching(geoms, asset.penalize_contacts_on)
+        terminating = indices_matching(geoms, asset.terminate_after_contacts_on)
         model = build_model(spec, geoms)
         model.opt.timestep = self.cfg.sim.dt
         sim = self.cfg.sim
@@ -255,7 +260,7 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         self.sim = Simulator(
             model, self.num_envs, self.device, sim.engine, sim.solver_iterations, sim.ls_iterations, per_world
         )
-        self.foot_names = [name for name in geoms if asset.foot_name in name]
+        self.foot_names = [geoms[i] for i in feet]
         self.dof_names = [model.joint(i).name for i in range(1, model.njnt)]
         self.num_dof = len(self.dof_names)
         if self.num_actions != self.actions_per_dof * self.num_dof:
@@ -269,14 +274,9 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         limits = self._tensor(model.jnt_range[1:])
         middle = limits.mean(dim=1, keepdim=True)
         self.dof_pos_limits = middle + self.cfg.rewards.soft_dof_pos_limit * (limits - middle)
-
-        def indices(parts: list[str]) -> Tensor:
-            chosen = [i for i, name in enumerate(geoms) if any(part in name for part in parts)]
-            return torch.tensor(chosen, dtype=torch.long, device=self.device)
-
-        self.feet_indices = indices([asset.foot_name])
-        self.penalized_contact_indices = indices(asset.penalize_contacts_on)
-        self.termination_contact_indices = indices(asset.terminate_after_contacts_on)
+        self.feet_indices, self.penalized_contact_indices, self.termination_contact_indices = (
+            torch.tensor(chosen, dtype=torch.long, device=self.device) for chosen in (feet, penalized, terminating)
+        )
 
     def _init_buffers(self) -> None:
         """Allocate everything that is written in place, and constants."""

@@ -211,6 +211,14 @@ class LeggedRobotCfgPPO(BaseConfig):
         logger = "tensorboard"
         wandb_project = "legged_torque"
 
+    class evaluation:
+        """Measuring the policy while it learns: mean actions, in worlds of their own, between rollouts."""
+
+        interval = 128_000  # environment steps from one evaluation to the next; 0: none
+        num_samples = 32_000  # world steps of one evaluation: the paper's 16 worlds x 2000 steps
+        num_envs = 4000  # worlds, at most as many as train
+        perturbation = ""  # environment, one of ``perturbations``; empty: that of the training
+
     class obs_groups:
         """Which observations which network reads."""
 

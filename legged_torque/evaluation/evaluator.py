@@ -1,0 +1,100 @@
+"""Measuring a policy while it learns, in worlds of its own."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.evaluation.metrics import WalkingMetrics
+from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
+from legged_torque.utils.args import apply_perturbation
+from legged_torque.utils.config import section_keys
+from legged_torque.utils.random_state import own_random_numbers, seeded_state
+
+EVALUATIONS_FILE = "evaluations.csv"
+"""In a run's folder: a row per evaluation."""
+
+
+class TrainingEvaluator:
+    """Evaluates the policy of a training now and then.
+
+    Its worlds have their own random numbers, no rewards, and go on where the last evaluation left them: an evaluation
+    has as many steps of robots as the paper's 16 worlds x 2000 steps, in as many worlds as a GPU steps in little more
+    time than 16. Training is the same with and without it.
+    """
+
+    def __init__(self, task: LeggedRobot, policy: Callable[[TensorDict], Tensor], settings: dict, seed: int) -> None:
+        """Build the worlds.
+
+        Args:
+            task: The task of the training, from whose counters curricula follow here too.
+            policy: Mean actions for observations.
+            settings: ``evaluation`` of the training's settings.
+            seed: Random seed, of the evaluation alone.
+        """
+        self._task, self._policy = task, policy
+        cfg = evaluation_cfg(task.cfg, min(settings["num_envs"], task.num_envs), settings["perturbation"])
+        self._random_state = seeded_state(task.device, seed)
+        with own_random_numbers(task.device, self._random_state):
+            self._env = type(task)(cfg, task.device)
+            length = self._env.episode_length_buf
+            self._env.episode_length_buf = torch.randint_like(length, int(self._env.max_episode_length))
+        self._metrics = WalkingMetrics(self._env)
+        self._num_steps = math.ceil(settings["num_samples"] / self._env.num_envs)
+        enabled = task.step_graph.enabled
+        self._env.step_graph.enabled = enabled
+        self._graph = CudaGraph(self._run, task.device, enabled and self._num_steps <= MAX_CAPTURED_STEPS)
+
+    def evaluate(self) -> dict[str, float]:
+        """Return the metrics of :class:`WalkingMetrics` at this moment of training."""
+        self._env.total_steps.copy_(self._task.total_steps)
+        self._env.update_curriculum()
+        self._metrics.clear()
+        with own_random_numbers(self._task.device, self._random_state):
+            self._graph()
+        return self._metrics.means()
+
+    def _run(self) -> None:
+        """Let the policy act; runs as a CUDA graph."""
+        with torch.no_grad():
+            obs = self._env.get_observations()
+            for _ in range(self._num_steps):
+                commands = self._env.commands.clone()
+                obs = self._env.step(self._policy(obs))[0]
+                self._metrics.add_step(commands)
+
+
+def evaluation_cfg(cfg: Any, num_envs: int, perturbation: str = "") -> Any:
+    """Return a copy of a task's settings for evaluation.
+
+    Args:
+        cfg: The task's settings.
+        num_envs: Number of worlds.
+        perturbation: Name of the environment; empty leaves it as it is.
+    """
+    cfg = copy.deepcopy(cfg)
+    cfg.env.num_envs = num_envs
+    for term in section_keys(cfg.rewards.scales):
+        setattr(cfg.rewards.scales, term, 0.0)
+    if perturbation:
+        apply_perturbation(cfg, perturbation)
+    return cfg
+
+
+def append_row(file: Path, row: dict[str, float]) -> None:
+    """Append a row to a CSV file, after a header if the file is new."""
+    is_new = not file.exists()
+    with file.open("a", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, row, lineterminator="\n")
+        if is_new:
+            writer.writeheader()
+        writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
