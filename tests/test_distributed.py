@@ -16,6 +16,7 @@ import torch
 import yaml
 from settings import error_of, parse
 from test_ppo import make_ppo, record_rollout, state_of
+from test_random_stream import upcoming
 
 from legged_torque.envs import task_registry
 from legged_torque.learning import distributed
@@ -62,6 +63,7 @@ def train(folder):
     start = everything(runner)
     runner.learn(2, init_at_random_ep_len=True)
     notes = {"start": start, "trained": everything(runner), "observations": runner.env.obs_buf["policy"].clone()}
+    notes["saved_stream"] = upcoming()
     update = runner.alg.update
 
     def update_with_signal():
@@ -73,8 +75,11 @@ def train(folder):
     runner.learn(1000)
     notes["stopped"] = everything(runner)
     resumed = make_runner(None)
-    resumed.load(str(next((folder / "logs").glob("*/model_2.pt"))))
-    notes["loaded"] = everything(resumed)
+    notes["own_stream"] = upcoming()
+    infos = resumed.load(str(next((folder / "logs").glob("*/model_2.pt"))))
+    notes["loaded"], notes["loaded_stream"] = everything(resumed), upcoming()
+    resumed.continue_random_numbers(infos)
+    notes["continued_stream"] = upcoming()
     resumed.learn(1)
     notes["resumed"] = everything(resumed)
     runner.close()
@@ -168,6 +173,18 @@ def test_both_resume(together):
     _, (first, second), _ = together
     assert same(first["loaded"], second["loaded"]) and same(first["loaded"], first["trained"])
     assert int(first["resumed"]["iterations"]) == 3 and int(first["resumed"]["total_steps"]) == 3 * ALL_STEPS
+
+
+def test_each_continues_its_random_numbers(together):
+    """Each gets back the stream that it had when the checkpoint was saved; they differ, and loading moves neither."""
+    folder, both, _ = together
+    for notes in both:
+        assert torch.equal(notes["continued_stream"], notes["saved_stream"])
+        assert torch.equal(notes["loaded_stream"], notes["own_stream"])
+        assert not torch.isclose(notes["continued_stream"], notes["own_stream"]).any()
+    assert not torch.isclose(both[0]["saved_stream"], both[1]["saved_stream"]).any()
+    state = torch.load(next(folder.glob("logs/*/model_2.pt")), weights_only=True)
+    assert [list(streams) for streams in state["infos"]["random_states"]] == [["cpu"], ["cpu"]]
 
 
 def union_gradients():

@@ -179,10 +179,16 @@ class OnPolicyRunner(runners.OnPolicyRunner):
 
         Args:
             infos: From :meth:`load`. Processes beyond those of that run keep their own numbers.
+
+        Raises:
+            UserError: If the checkpoint does not say where its random numbers stood.
         """
-        states = infos["random_states"]
-        if self.gpu_global_rank < len(states):
-            restore_random_state(self.device, states[self.gpu_global_rank])
+        try:
+            states = infos["random_states"]
+            if self.gpu_global_rank < len(states):
+                restore_random_state(self.device, states[self.gpu_global_rank])
+        except (KeyError, TypeError, RuntimeError, AttributeError) as error:
+            raise UserError(f"the checkpoint has no usable 'random_states': {last_line(error)}") from None
 
     def collect_rollout(self) -> None:
         """Let curricula that hold for a rollout move on, and fill the storage with one rollout and its returns."""

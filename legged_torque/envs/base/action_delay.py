@@ -58,6 +58,6 @@ class ActionDelay:
         if not len(self._before):
             return self._newest
         missing = self.drawn.floor() * self._physics_steps - physics_step
-        age = (missing / self._decimation).ceil().clamp(min=0.0).long()
+        age = (missing / self._decimation).ceil().long()
         history = torch.cat([self._newest.unsqueeze(0), self._before])
         return history.gather(0, age.unsqueeze(0).expand(1, *self._newest.shape)).squeeze(0)

@@ -1,0 +1,242 @@
+"""Action delay: what drives the motors at a physics step is what the policy has sent that many steps before."""
+
+import numpy as np
+import pytest
+import torch
+from settings import error_of, get_cfgs
+from test_control import pd_by_hand
+
+from legged_torque.envs.base.validation import check_env_cfg
+from legged_torque.utils.config import set_by_path
+
+HIGH_UP = {"init_state.pos": [0.0, 0.0, 50.0]}
+"""No world falls and starts anew by itself."""
+EXCEEDED = {1: 10.83, 3: 16.27, 5: 20.52, 15: 37.70, 35: 66.62}
+"""What 1 in 1000 chi-square numbers exceeds, by degrees of freedom."""
+
+
+def delayed(low, high, unit="physics_steps", decimation=4, **more):
+    """Settings of a task with a delay."""
+    settings = {"domain_rand.action_delay": [low, high], "domain_rand.action_delay_unit": unit}
+    return HIGH_UP | settings | {"control.decimation": decimation} | more
+
+
+def watch(task, still=False):
+    """A list that gets torques and joint states at the start of each physics step; ``still`` leaves out the physics."""
+    notes, step = [], task.sim.step
+
+    def noted_step(sense=True):
+        notes.append([getattr(task, name).numpy().copy() for name in ("torques", "dof_pos", "dof_vel")])
+        if not still:
+            step(sense)
+
+    task.sim.step = noted_step
+    return notes
+
+
+def torques_of(notes):
+    """Torques of all physics steps. Shape: (steps, worlds, joints)."""
+    return np.stack([torques for torques, _, _ in notes])
+
+
+def send(task, steps, seed=0):
+    """Act at random for some control steps, and return what was sent. Shape: (steps, worlds, actions)."""
+    sent = np.random.default_rng(seed).uniform(-1, 1, (steps, task.num_envs, task.num_actions)).astype(np.float32)
+    for actions in sent:
+        task.step(torch.tensor(actions))
+    return sent
+
+
+def arrived(sent, decimation, delay):
+    """The action behind each physics step of an episode: at t the one that was sent at t - delay, at first 0."""
+    at_physics_step = [actions for actions in sent for _ in range(decimation)]
+    nothing = np.zeros_like(sent[0])
+    return np.stack([nothing if t < delay else at_physics_step[t - delay] for t in range(len(at_physics_step))])
+
+
+def time_out(task, worlds):
+    """Let the episodes of some worlds end with the next control step."""
+    lengths = task.episode_length_buf.clone()
+    lengths[worlds] = task.max_episode_length
+    task.episode_length_buf = lengths
+
+
+def test_off_by_default(make_task):
+    """Without a setting, every physics step has the newest action, bit by bit as with a delay of 0."""
+    cases = ({}, {"domain_rand.action_delay": [0, 0]}, {"domain_rand.action_delay_unit": "control_steps"})
+    seen = []
+    for settings in cases:
+        task = make_task("a1_torque", 3, **HIGH_UP, **settings)
+        notes = watch(task)
+        sent = send(task, 5)
+        assert task.cfg.domain_rand.action_delay == [0, 0]
+        assert np.array_equal(torques_of(notes), 4.0 * np.repeat(sent, 4, axis=0))
+        seen.append(np.concatenate([*map(np.ravel, notes[-1]), task.get_observations()["critic"].numpy().ravel()]))
+    assert np.array_equal(seen[0], seen[1]) and np.array_equal(seen[0], seen[2])
+
+
+@pytest.mark.parametrize(
+    ("decimation", "delay"),
+    [*((4, delay) for delay in range(10)), (2, 1), (2, 2), (2, 3), (2, 9), (3, 1), (3, 4), (3, 9), (1, 3)],
+)
+def test_physics_steps(make_task, decimation, delay):
+    """The torque at physics step t is 4 N m times the action of physics step t - delay."""
+    task = make_task("a1_torque", 3, **delayed(delay, delay, decimation=decimation))
+    notes = watch(task)
+    sent = send(task, 10)
+    assert np.array_equal(torques_of(notes), 4.0 * arrived(sent, decimation, delay))
+
+
+@pytest.mark.parametrize("refresh", [True, False])
+@pytest.mark.parametrize(("decimation", "delay"), [(4, 0), (4, 1), (4, 3), (3, 2), (1, 2)])
+def test_control_steps(make_task, decimation, delay, refresh):
+    """A delay of control steps is one of as many whole actions, with torques once per control step as well."""
+    settings = delayed(delay, delay, "control_steps", decimation, **{"control.refresh_torques": refresh})
+    task = make_task("a1_torque", 3, **settings)
+    notes = watch(task)
+    sent = send(task, 6)
+    assert np.array_equal(torques_of(notes), 4.0 * arrived(sent, decimation, decimation * delay))
+
+
+@pytest.mark.parametrize(
+    ("delay", "unit", "refresh"),
+    [(5, "physics_steps", True), (1, "physics_steps", True), (2, "control_steps", True), (1, "control_steps", False)],
+)
+def test_position_control(make_task, delay, unit, refresh):
+    """The target is delayed, but joint angles and speeds are those of the physics step that computes the torques."""
+    task = make_task("a1_position", 3, **delayed(delay, delay, unit, **{"control.refresh_torques": refresh}))
+    notes = watch(task)
+    actions = arrived(send(task, 6), 4, delay if unit == "physics_steps" else 4 * delay)
+    for t, (torques, _, _) in enumerate(notes):
+        _, q, qd = notes[t if refresh else t // 4 * 4]
+        expected = np.clip(pd_by_hand(actions[t], q, qd), -33.5, 33.5)
+        np.testing.assert_allclose(torques, expected, rtol=1e-4, atol=1e-4)
+    assert np.abs(notes[0][1] - notes[3][1]).max() > 0.01  # the joints do move within a control step
+
+
+@pytest.mark.parametrize("delay", [2, 6])
+def test_both_heads(make_task, delay):
+    """Position and torque actions arrive together; both parts weigh 1 when training starts."""
+    task = make_task("a1_torque_multihead", 3, **delayed(delay, delay))
+    notes = watch(task)
+    actions = arrived(send(task, 6), 4, delay)
+    assert actions.shape == (24, 3, 24)
+    for action, (torques, q, qd) in zip(actions, notes, strict=True):
+        expected = np.clip(pd_by_hand(action[:, :12], q, qd) + 4.0 * action[:, 12:], -33.5, 33.5)
+        np.testing.assert_allclose(torques, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_policy_knows_what_it_has_sent(make_task):
+    """The last action of the observations and the action rate are those of the newest action."""
+    task = make_task("a1_torque", 3, **delayed(6, 6, **{"rewards.scales.action_rate": -1.0}))
+    rate, before = task.reward_names.index("action_rate"), np.zeros((3, 12))
+    for i in range(5):
+        sums = task.episode_sums[rate].numpy().copy()
+        (action,) = send(task, 1, seed=i)
+        seen = task.get_observations()
+        assert np.array_equal(seen["policy"][:, 33:45], action) and np.array_equal(seen["critic"][:, 33:45], action)
+        gained = task.episode_sums[rate].numpy() - sums
+        np.testing.assert_allclose(gained, -0.02 * np.square(action - before).sum(axis=1), rtol=1e-4)
+        before = action
+
+
+@pytest.mark.parametrize("delay", [3, 5, 9])
+@pytest.mark.parametrize("how", ["time is over", "not finite", "all at once"])
+def test_reset_forgets(make_task, how, delay):
+    """A world that starts anew gets no action from before; another one goes on with all that it was sent."""
+    task = make_task("a1_torque", 2, **delayed(delay, delay))
+    notes = watch(task)
+    first = send(task, 4)
+    if how == "time is over":
+        time_out(task, [0])
+    last = np.full((1, 2, 12), 0.5, dtype=np.float32)
+    last[:, 0] = np.nan if how == "not finite" else 0.25
+    task.step(torch.tensor(last[0]))
+    assert task.reset_buf.tolist() == [how != "all at once", False]
+    if how == "all at once":
+        task.reset()
+    then = send(task, 5, seed=1)
+    last = np.nan_to_num(last)  # what is not finite is taken for 0
+    anew = np.concatenate([arrived(np.concatenate([first, last]), 4, delay), arrived(then, 4, delay)])
+    on = arrived(np.concatenate([first, last, then]), 4, delay)
+    assert np.array_equal(torques_of(notes)[:, 0], 4.0 * anew[:, 0])
+    assert np.array_equal(torques_of(notes)[:, 1], 4.0 * (anew if how == "all at once" else on)[:, 1])
+
+
+def delays_of(torques, sent):
+    """The delay in physics steps of each world: the only one that explains all its torques."""
+    fits = np.stack([(torques == 4.0 * arrived(sent, 4, k)).all(axis=(0, 2)) for k in range(len(torques))])
+    assert (fits.sum(axis=0) == 1).all()
+    return fits.argmax(axis=0)
+
+
+def chi_square(counts):
+    """How far counts are from equal ones, in units of what 1 in 1000 samples exceeds."""
+    expected = counts.sum() / counts.size
+    return (np.square(counts - expected) / expected).sum() / EXCEEDED[counts.size - 1]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "unit"), [(0, 3, "physics_steps"), (3, 8, "physics_steps"), (1, 2, "control_steps")]
+)
+def test_draws(make_task, low, high, unit):
+    """Each world has one delay per episode, any whole number of the range as likely, whatever it had before."""
+    task = make_task("a1_torque", 2000, **delayed(low, high, unit))
+    notes = watch(task, still=True)
+    length = 4 if unit == "control_steps" else 1
+    old = send(task, 5)
+    time_out(task, slice(0, 1500))
+    old = np.concatenate([old, send(task, 1, seed=1)])
+    new = send(task, 4, seed=2)
+    torques = torques_of(notes)
+    first = delays_of(torques[:24], old)
+    others = delays_of(torques[:, 1500:], np.concatenate([old, new])[:, 1500:])
+    assert np.array_equal(others, first[1500:])  # it holds for the whole episode
+    second = delays_of(torques[24:, :1500], new[:, :1500])
+    possible = [length * steps for steps in range(low, high + 1)]
+    assert sorted(set(first)) == sorted(set(second)) == possible
+    pairs = np.zeros((len(possible), len(possible)))
+    np.add.at(pairs, ((first[:1500] // length) - low, (second // length) - low), 1)
+    assert chi_square(np.bincount(first // length)[low:]) < 1.0 and chi_square(pairs) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("key", "changes"),
+    [
+        ("action_delay", {"action_delay": [-1, 2]}),
+        ("action_delay", {"action_delay": [2, 1]}),
+        ("action_delay", {"action_delay": [0.5, 1]}),
+        ("action_delay", {"action_delay": [0, 1.5]}),
+        ("action_delay", {"action_delay": [1]}),
+        ("action_delay", {"action_delay": []}),
+        ("action_delay", {"action_delay": [0, 1, 2]}),
+        ("action_delay_unit", {"action_delay_unit": "steps"}),
+        ("action_delay_unit", {"action_delay_unit": "", "action_delay": [0, 0]}),
+    ],
+)
+def test_settings_that_make_no_sense(make_task, key, changes):
+    """They are refused by their names, whether set by path or in a configuration class."""
+    changes = {f"domain_rand.{name}": value for name, value in changes.items()}
+    assert f"domain_rand.{key}" in error_of(make_task, "a1_torque", 1, **changes)
+    cfg, _ = get_cfgs("--num_envs=1", task="a1_torque")
+    for name, value in changes.items():
+        setattr(cfg.domain_rand, name.removeprefix("domain_rand."), value)
+    assert f"domain_rand.{key}" in error_of(check_env_cfg, cfg)
+
+
+def test_torques_that_cannot_follow(make_task):
+    """Physics steps cannot be counted where torques are computed once per control step, unless there is no delay."""
+    once = {"control.refresh_torques": False}
+    line = error_of(make_task, "a1_torque", 1, **delayed(0, 3, **once))
+    assert "domain_rand.action_delay_unit" in line and "control.refresh_torques" in line
+    make_task("a1_torque", 1, **delayed(0, 0, **once))
+
+
+def test_command_line():
+    """A range is given as a list of physics steps; whole numbers may have a point."""
+    for text in ("[1, 3]", "[1.0, 3.0]"):
+        cfg, _ = get_cfgs(f"--set=domain_rand.action_delay={text}")
+        assert cfg.domain_rand.action_delay_unit == "physics_steps"
+        assert cfg.domain_rand.action_delay == [1, 3] and type(cfg.domain_rand.action_delay[0]) is int
+    line = error_of(set_by_path, get_cfgs()[0], "domain_rand.action_delay", "[a, b]")
+    assert "domain_rand.action_delay" in line

@@ -1,0 +1,191 @@
+"""Random numbers of a resumed run: they go on where the checkpoint was saved, and never repeat the run's start."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from settings import error_of, parse
+
+from legged_torque.envs import task_registry
+from legged_torque.learning import runner as runner_module
+from legged_torque.utils.random_state import random_state, restore_random_state
+from legged_torque.utils.task_registry import set_seed
+
+WORDS = ["--task=a1_torque", "--num_envs=2", "--seed=3", "--set=runner.num_steps_per_env=3", "--logger=none"]
+WORDS += ["--set=algorithm.num_mini_batches=1", "--set=actor.hidden_dims=[8]", "--set=critic.hidden_dims=[8]"]
+WORDS += ["--set=runner.save_interval=1"]
+
+
+def upcoming():
+    """The next numbers of the stream, which stays where it is."""
+    state = torch.get_rng_state()
+    numbers = torch.rand(5)
+    torch.set_rng_state(state)
+    return numbers
+
+
+def start(log_root, *words):
+    """Seed and build as train.py does; what ``words`` add may be to resume."""
+    args = parse(*WORDS, *words)
+    env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
+    set_seed(train_cfg.seed)
+    env, _ = task_registry.make_env(args.task, args, env_cfg)
+    return task_registry.make_alg_runner(env, args.task, args, train_cfg, log_root)[0]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of two iterations, and which numbers were next at its start and after each checkpoint."""
+    root = tmp_path_factory.mktemp("logs")
+    runner = start(root)
+    run = SimpleNamespace(root=root, runner=runner, numbers={0: upcoming()}, saving_draws=[])
+    save = runner.save
+
+    def noted_save(path, infos=None):
+        before = torch.get_rng_state()
+        save(path, infos)
+        run.saving_draws.append(not torch.equal(torch.get_rng_state(), before))
+        run.numbers[runner.current_learning_iteration] = upcoming()
+
+    runner.save = noted_save
+    runner.learn(2, init_at_random_ep_len=True)
+    run.next = torch.rand(5)
+    (run.folder,) = root.iterdir()
+    return run
+
+
+def states_of(run, iteration):
+    """What a checkpoint says of the random numbers."""
+    return torch.load(run.folder / f"model_{iteration}.pt", weights_only=True)["infos"]["random_states"]
+
+
+def test_streams_go_on():
+    """A restored stream gives the same numbers of every kind, as often as it is restored."""
+    torch.manual_seed(4)
+    torch.randn(3)  # an odd number, so that one is left over of a pair
+    before = torch.get_rng_state()
+    state = random_state("cpu")
+    assert list(state) == ["cpu"] and torch.equal(torch.get_rng_state(), before)
+    expected = [torch.randn(3), torch.rand(700), torch.randint(100, (5,)), torch.randperm(9)]
+    torch.manual_seed(5)
+    for _ in range(2):
+        restore_random_state("cpu", state)
+        again = [torch.randn(3), torch.rand(700), torch.randint(100, (5,)), torch.randperm(9)]
+        assert all(torch.equal(*pair) for pair in zip(again, expected, strict=True))
+
+
+def test_a_gpu_has_a_stream_of_its_own(monkeypatch):
+    """That of the named GPU is kept and restored; a CPU ignores it, and a GPU can do without."""
+    given, kept = [], torch.arange(16, dtype=torch.uint8)
+    monkeypatch.setattr(torch.cuda, "get_rng_state", lambda device: kept + int(torch.device(device).index))
+    monkeypatch.setattr(torch.cuda, "set_rng_state", lambda state, device: given.append((device, state.tolist())))
+    state = random_state("cuda:1")
+    assert torch.equal(state["cuda"], kept + 1) and torch.equal(state["cpu"], torch.get_rng_state())
+    restore_random_state("cpu", state)
+    restore_random_state("cuda:2", {"cpu": state["cpu"]})
+    assert given == []
+    restore_random_state("cuda:2", state)
+    assert given == [("cuda:2", (kept + 1).tolist())]
+
+
+@pytest.mark.parametrize("iteration", [1, 2])
+def test_a_resumed_run_goes_on(trained, iteration):
+    """Resumed as by train.py, the next numbers are those that came after the checkpoint was saved."""
+    runner = start(trained.root, "--resume", f"--load_run={trained.folder.name}", f"--checkpoint={iteration}")
+    assert runner.current_learning_iteration == iteration
+    assert torch.equal(torch.rand(5), trained.numbers[iteration])
+
+
+def test_the_last_checkpoint_is_the_default(trained):
+    """What the process drew after training is what a resumed run draws first."""
+    start(trained.root, "--resume")
+    assert torch.equal(torch.rand(5), trained.next)
+
+
+def test_saving_draws_nothing(trained):
+    """A run goes on alike whether it saves or not."""
+    assert trained.saving_draws == [False] * 3  # two iterations, and the end
+
+
+def random_actions(runner):
+    """The actions of a rollout in which the policy says 0, so that they are the random numbers alone."""
+    for parameter in runner.alg.actor.parameters():
+        parameter.data.zero_()
+    runner.collect_rollout()
+    return runner.alg.storage.actions
+
+
+def test_a_resumed_run_does_not_repeat_the_start(trained):
+    """The seed alone leads back to the start of the run; resumed, numbers and actions are others."""
+    again = start(trained.root)
+    assert torch.equal(upcoming(), trained.numbers[0])
+    first = random_actions(again)
+    resumed = start(trained.root, "--resume")
+    assert not torch.isclose(upcoming(), trained.numbers[0]).any()
+    assert not torch.isclose(random_actions(resumed), first).any()
+    assert torch.equal(random_actions(start(trained.root)), first)
+
+
+def test_loading_alone_leaves_the_stream(trained):
+    """play.py and the like draw as their own seed says; a state of the checkpoint is only for who asks for it."""
+    runner = start(trained.root)
+    torch.manual_seed(9)
+    infos = runner.load(str(trained.folder / "model_2.pt"))
+    drawn = torch.rand(5)
+    torch.manual_seed(9)
+    assert torch.equal(drawn, torch.rand(5))
+    runner.continue_random_numbers(infos)
+    assert torch.equal(torch.rand(5), trained.next)
+
+
+@pytest.mark.parametrize("iteration", [1, 2])
+def test_checkpoints_hold_one_state_per_process(trained, iteration):
+    """It is a tensor that is read without pickled code, that of the CPU where there is no GPU."""
+    (state,) = states_of(trained, iteration)
+    assert list(state) == ["cpu"] and state["cpu"].dtype == torch.uint8
+    torch.set_rng_state(state["cpu"])
+    assert torch.equal(torch.rand(5), trained.numbers[iteration])
+
+
+def test_every_process_takes_its_own(trained):
+    """A process takes the state of its number; one that the run did not have keeps its own numbers."""
+    runner = trained.runner
+    states = []
+    for seed in (20, 21):
+        torch.manual_seed(seed)
+        states.append(random_state("cpu"))
+    torch.manual_seed(22)
+    expected = {2: upcoming()}
+    for rank in range(2):
+        torch.manual_seed(20 + rank)
+        expected[rank] = torch.rand(5)
+    for rank in (0, 1, 2):
+        torch.manual_seed(22)
+        runner.gpu_global_rank = rank
+        runner.continue_random_numbers({"random_states": states})
+        assert torch.equal(torch.rand(5), expected[rank])
+    runner.gpu_global_rank = 0
+
+
+def test_states_of_all_processes_are_kept(trained, tmp_path, monkeypatch):
+    """What is saved is the list that all processes have gathered, in their order."""
+    others = [{"cpu": torch.full((3,), rank, dtype=torch.uint8)} for rank in range(3)]
+    monkeypatch.setattr(runner_module.distributed, "gather", lambda mine: [mine, *others])
+    trained.runner.save(str(tmp_path / "model_0.pt"))
+    states = torch.load(tmp_path / "model_0.pt", weights_only=True)["infos"]["random_states"]
+    assert len(states) == 4 and torch.equal(states[0]["cpu"], torch.get_rng_state())
+    assert [state["cpu"].tolist() for state in states[1:]] == [[rank] * 3 for rank in range(3)]
+
+
+@pytest.mark.parametrize("states", [None, [{}], [{"cpu": torch.zeros(3, dtype=torch.uint8)}], 5])
+def test_a_checkpoint_without_usable_states(trained, tmp_path, states):
+    """Resuming from it is refused in one line."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    state = torch.load(trained.folder / "model_1.pt", weights_only=True)
+    if states is None:
+        del state["infos"]["random_states"]
+    else:
+        state["infos"]["random_states"] = states
+    torch.save(state, folder / "model_1.pt")
+    assert "random_states" in error_of(start, tmp_path, "--resume")
