@@ -115,7 +115,7 @@ def test_refused(edit, reason):
         read_tree(model)
     message = str(error.value)
     assert message.startswith("sim.engine 'fused' cannot simulate this robot: ") and reason in message
-    assert message.endswith("; use sim.engine = 'mujoco_warp'")
+    assert message.endswith("; use sim.engine = 'mujoco_warp', without randomize_parameters")
 
 
 def test_engines_by_name():

@@ -8,6 +8,9 @@ import pytest
 import torch
 from settings import error_of, get_cfgs
 
+from legged_torque.envs.base.domain_rand import view
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.sim.randomization import Parameter
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
 
@@ -299,6 +302,32 @@ def test_unknown_perturbation():
     assert "did you mean 'high'" in error_of(get_cfgs, "--perturbation=hih")
 
 
+class ThighMassRobot(LeggedRobot):
+    """A variant that draws one number more, or one per thigh."""
+
+    shared = True
+
+    def random_parameters(self):
+        """The masses of the thighs as well."""
+        thighs = [body for body in range(2, 14) if "thigh" in self.sim.mj_model.body(body).name]
+        more = Parameter("thigh_mass", view(self, "body_mass"), thighs, shared=self.shared, scale=(0.5, 0.9))
+        return [*super().random_parameters(), more]
+
+
+def test_a_variant_draws_more():
+    """What a task adds is drawn, seen by the critic and mirrored; unless nobody knows its mirror image."""
+    cfg = get_cfgs("--set=env.num_envs=20", "--set=domain_rand.randomize_parameters=true")[0]
+    task = ThighMassRobot(cfg)
+    thighs = task.sim.field("body_mass")[:, [3, 6, 9, 12]]
+    ratio = thighs / torch.tensor(task.sim.mj_model.body_mass[[3, 6, 9, 12]], dtype=torch.float32)
+    assert (ratio == ratio[:, :1]).all() and ratio.min() > 0.5 and ratio.max() < 0.9 and ratio.std() > 0.05
+    scaled = (ratio[:, 0] - 0.7) / 0.2
+    torch.testing.assert_close(task.get_observations()["critic"][:, -1], scaled, atol=1e-4, rtol=0)
+    assert task.mirror("critic", task.get_observations()["critic"]).shape == (20, 138)
+    ThighMassRobot.shared = False
+    assert "'thigh_mass'" in error_of(lambda: ThighMassRobot(cfg).mirror)
+
+
 @pytest.mark.parametrize("task", ["a1_position", "a1_torque_multihead"])
 def test_everything_at_once(make_task, task):
     """With all random events on, a task runs, and worlds that fall are drawn anew."""
@@ -323,6 +352,8 @@ def test_everything_at_once(make_task, task):
         ("domain_rand.resampling_probability", -0.1),
         ("domain_rand.keep_probability", 2.0),
         ("domain_rand.keep_fixed", ["gravitation"]),
+        ("domain_rand.keep_fixed", ["init_roll"]),
+        ("domain_rand.keep_fixed", ["push_velocity"]),
         ("noise.noise_scales.dof_vel", -1.0),
     ],
 )

@@ -81,10 +81,16 @@ def max_contacts(model: mujoco.MjModel) -> int:
     return total
 
 
-def max_constraints(model: mujoco.MjModel, contacts: int) -> int:
-    """Return the most constraint rows that one world can have with that many contacts (pyramidal friction cones)."""
+def max_constraints(model: mujoco.MjModel, contacts: int, any_friction: bool = False) -> int:
+    """Return the most constraint rows that one world can have (pyramidal friction cones).
+
+    Args:
+        model: The model.
+        contacts: Number of contacts.
+        any_friction: Whether worlds may have dry friction in joints where the model has none.
+    """
     rows_per_contact = 2 * (int(model.geom_condim.max()) - 1)
-    friction = int((model.dof_frictionloss > 0).sum())
+    friction = model.nv if any_friction else int((model.dof_frictionloss > 0).sum())
     return contacts * rows_per_contact + friction + int(model.jnt_limited.sum())
 
 

@@ -94,7 +94,8 @@ class Simulator:
         with wp.ScopedDevice(self._wp_device):
             self.model = mjw.put_model(model)
             self.model.opt.warn_overflow = 0  # it prints from inside kernels; check_buffers tells instead
-            self.data = mjw.make_data(model, nworld=num_envs, nconmax=contacts, njmax=max_constraints(model, contacts))
+            rows = max_constraints(model, contacts, any_friction="dof_frictionloss" in per_world)
+            self.data = mjw.make_data(model, nworld=num_envs, nconmax=contacts, njmax=rows)
             for name in per_world:
                 expand(self.model, name, num_envs)
             self._diverged = wp.zeros(num_envs, dtype=wp.bool)

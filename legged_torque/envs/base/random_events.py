@@ -7,7 +7,7 @@ from torch import Tensor
 
 from legged_torque.envs.base.action_delay import ActionDelay
 from legged_torque.envs.base.domain_rand import initial_state, parameters
-from legged_torque.sim.randomization import Randomization
+from legged_torque.sim.randomization import Parameter, Randomization
 
 PUSH_ADDED = 0.5
 """Share of pushes that add a velocity; the others set one."""
@@ -47,7 +47,11 @@ class RandomEvents:
         self.action_delay = ActionDelay(self)
         self.init_angles = torch.zeros(self.num_envs, 3, device=self.device)
         self.initial_state = Randomization(initial_state(self), self.num_envs, self.device)
-        self.randomization = Randomization(parameters(self), self.num_envs, self.device, rand.keep_probability)
+        self.randomization = Randomization(self.random_parameters(), self.num_envs, self.device, rand.keep_probability)
+
+    def random_parameters(self) -> list[Parameter]:
+        """Return what ``domain_rand`` draws in each world; a variant may add to it."""
+        return parameters(self)
 
     def _uniform(self, like: Tensor, limits: list[float]) -> Tensor:
         """Return uniform random numbers in the shape of a tensor."""

@@ -28,7 +28,8 @@ class Mirror:
             task: The task; its observations are those of ``Observations.compute_observations``.
 
         Raises:
-            UserError: If a joint or foot has no counterpart on the other side.
+            UserError: If a joint or foot has no counterpart on the other side, or a drawn parameter has another number
+                of values than one or one per joint.
         """
         names = task.dof_names
         joints = counterparts(names)
@@ -45,7 +46,11 @@ class Mirror:
             "joint_offset": (joints, joint_signs),
         }
         unsigned = {1: ([0], [1.0]), len(joints): (joints, [1.0] * len(joints))}
-        drawn = [signed.get(name) or unsigned[size] for name, size in task.randomization.sizes.items()]
+        drawn = []
+        for name, size in task.randomization.sizes.items():
+            if name not in signed and size not in unsigned:
+                raise UserError(f"algorithm.symmetry_cfg: the mirror image of the {size} numbers '{name}' is not known")
+            drawn.append(signed.get(name) or unsigned[size])
         critic = [*policy, vector, ([0], [1.0]), (feet, [1.0] * len(feet)), *drawn]
         self._maps = {
             name: self._concatenate(parts, task.device)

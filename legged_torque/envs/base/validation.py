@@ -23,6 +23,9 @@ POSITIVE = (
 )
 """Ranges of ``domain_rand`` that make no sense below 0."""
 
+NOT_PARAMETERS = ("keep_fixed", "push_velocity", "action_delay")
+"""Lists in ``domain_rand`` that ``keep_fixed`` cannot name; nor can it name initial states."""
+
 
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     """Check the settings of a task.
@@ -54,9 +57,11 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     for key in POSITIVE:
         if min(getattr(cfg.domain_rand, key)) < 0.0:
             raise UserError(f"domain_rand.{key} must not be negative, it is {getattr(cfg.domain_rand, key)}")
+    ranges = [key for key in section_keys(cfg.domain_rand) if isinstance(getattr(cfg.domain_rand, key), list)]
+    ranges = [key for key in ranges if key not in NOT_PARAMETERS and not key.startswith("init_")]
     for name in cfg.domain_rand.keep_fixed:
-        if name not in section_keys(cfg.domain_rand):
-            raise unknown_name("range in domain_rand.keep_fixed", name, section_keys(cfg.domain_rand))
+        if name not in ranges:
+            raise unknown_name("range in domain_rand.keep_fixed", name, ranges)
     for name, section in {"commands.ranges": cfg.commands.ranges, "domain_rand": cfg.domain_rand}.items():
         for key in section_keys(section):
             value = getattr(section, key)

@@ -161,7 +161,9 @@ def lanes_per_world(branches: int, on_gpu: bool) -> int:
 def _require(holds: bool, reason: str) -> None:
     """Raise a UserError with the reason if something does not hold."""
     if not holds:
-        raise UserError(f"sim.engine 'fused' cannot simulate this robot: {reason}; use sim.engine = 'mujoco_warp'")
+        raise UserError(
+            f"sim.engine 'fused' cannot simulate this robot: {reason}; use sim.engine = 'mujoco_warp', without randomize_parameters"
+        )
 
 
 def _check(model: mujoco.MjModel) -> None:

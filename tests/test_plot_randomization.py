@@ -1,0 +1,68 @@
+"""The picture of what is drawn at random, and the mistakes that its script tells."""
+
+import sys
+
+import pytest
+from test_scripts import assert_told_in_one_line, run_here
+
+SCRIPT = "plot_randomization.py"
+
+
+def plot(tmp_path, *words):
+    """Run the script on the CPU with few worlds; return the result and the picture's path."""
+    file = tmp_path / "new" / "picture.png"
+    return run_here(SCRIPT, "--device=cpu", "--num_envs=12", f"--out={file}", *words, root=tmp_path), file
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        (),
+        ("--perturbation=none",),
+        ("--task=a1_torque_multihead", "--perturbation=doubled", "--set=env.history_length=3"),
+        ("--set=domain_rand.action_delay=[1, 4]", "--set=domain_rand.keep_fixed=[gravity, trunk_mass_offset]"),
+    ],
+)
+def test_picture(tmp_path, words):
+    """It is an image that can be read, whatever is drawn or not."""
+    matplotlib_image = pytest.importorskip("matplotlib.image", reason="needs the extra: pip install -e .[plots]")
+    result, file = plot(tmp_path, *words)
+    assert result == (0, "", "")
+    height, width, _ = matplotlib_image.imread(file).shape
+    assert 1000 < width < 2500 and 1000 < height < 2500
+    assert 20_000 < file.stat().st_size < 400_000
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
+        ("--perturbation=hih", "unknown perturbation 'hih'; did you mean 'high'?"),
+        ("--set=domain_rand.keep_fixed=[gravitation]", "'gravitation'; did you mean 'gravity'?"),
+    ],
+)
+def test_mistakes(tmp_path, words, message):
+    """They are told in one line, with exit status 2, and nothing is written."""
+    result, _ = plot(tmp_path, words)
+    assert_told_in_one_line(result, message)
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_matplotlib(tmp_path, monkeypatch):
+    """The extra that is missing is named."""
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    result, _ = plot(tmp_path)
+    assert_told_in_one_line(result, "pip install -e .[plots]")
+
+
+def test_unknown_format(tmp_path):
+    """A picture of an unknown format is a mistake as well."""
+    pytest.importorskip("matplotlib", reason="needs the extra: pip install -e .[plots]")
+    result, _ = plot(tmp_path, f"--out={tmp_path / 'picture.xyz'}")
+    assert_told_in_one_line(result, "picture.xyz")
+
+
+def test_out_is_needed(tmp_path):
+    """So is one without a name."""
+    result = run_here(SCRIPT, "--device=cpu", root=tmp_path)
+    assert_told_in_one_line(result, "--out")
