@@ -31,6 +31,6 @@ setup(
         "video": ["imageio", "imageio-ffmpeg"],
         "plots": ["matplotlib"],
         "wandb": ["wandb"],
-        "test": ["pytest", "imageio", "imageio-ffmpeg"],
+        "test": ["pytest", "matplotlib", "imageio", "imageio-ffmpeg"],
     },
 )

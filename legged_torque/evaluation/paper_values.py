@@ -1,0 +1,103 @@
+"""Table I of *Learning torque control for quadrupeds* (Schmidt, Gaumann, Bohlinger), as printed.
+
+The values are means over four runs with different seeds of all evaluations after training step 90 million (the table's
+caption). The table prints no standard errors or deviations, so that there are none here, and it has no row for default
+torque control (``a1_torque``) or gravity pre-training. Values that the authors mark in bold as significantly superior
+cannot be told from others in the text that we have; the test behind the marks is not named.
+
+Units are ours (:mod:`legged_torque.evaluation.metrics`): "Track %" is printed as a share (0.76, not 76), "Track xy"
+and "Track angular" are squared deviations (section IV-F), cost of transport has no unit. The paper names no units;
+collision forces fit N, as a standing A1 presses on the ground with 122 N.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How to tell a metric.
+
+    Attributes:
+        title: The paper's name.
+        unit: Its unit; empty if it has none.
+        digits: Decimals that the paper prints.
+        higher_is_better: Whether a larger value is the better one.
+    """
+
+    title: str
+    unit: str
+    digits: int
+    higher_is_better: bool = False
+
+    def label(self) -> str:
+        """Return the name with the unit."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+
+METRICS = {
+    "track_percentage": Metric("Track %", "share", 4, higher_is_better=True),
+    "track_xy": Metric("Track xy", "m²/s²", 4),
+    "track_angular": Metric("Track angular", "rad²/s²", 4),
+    "collision_force": Metric("Collision forces", "N", 1),
+    "cost_of_transport": Metric("Cost of transport", "", 4),
+}
+"""The metrics of Table I, in its order."""
+ENVIRONMENTS = {
+    "low": "Low perturbation",
+    "high": "High perturbation",
+    "high_frequency": "High perturbation & frequency",
+    "doubled": "Doubled high perturbation & frequency",
+}
+"""The columns of Table I, in its order, by the names of our perturbations."""
+MODELS = {
+    "a1_position": "PD",
+    "a1_torque": "Default torque",
+    "a1_torque_gravity": "Gravity pre-training",
+    "a1_torque_curriculum": "Torque curriculum",
+    "a1_torque_multihead": "Torque multi-head",
+    "a1_multihead": "Multi-head",
+}
+"""The paper's names of our tasks; default torque is only in its Figures 3 and 5."""
+TABLE_I = {
+    "track_percentage": {
+        "a1_position": (0.7642, 0.7518, 0.7163, 0.6765),
+        "a1_torque_multihead": (0.7624, 0.7534, 0.7159, 0.6699),
+        "a1_multihead": (0.7669, 0.7511, 0.7181, 0.6739),
+        "a1_torque_curriculum": (0.7866, 0.7700, 0.7197, 0.6764),
+    },
+    "track_xy": {
+        "a1_position": (0.0324, 0.0511, 0.0933, 0.1602),
+        "a1_torque_multihead": (0.0350, 0.0556, 0.0997, 0.1685),
+        "a1_multihead": (0.0344, 0.0544, 0.0970, 0.1698),
+        "a1_torque_curriculum": (0.0316, 0.0534, 0.0972, 0.1697),
+    },
+    "track_angular": {
+        "a1_position": (0.0124, 0.0122, 0.0152, 0.0171),
+        "a1_torque_multihead": (0.0110, 0.0113, 0.0138, 0.0158),
+        "a1_multihead": (0.0102, 0.0113, 0.0133, 0.0156),
+        "a1_torque_curriculum": (0.0097, 0.0111, 0.0143, 0.0177),
+    },
+    "collision_force": {
+        "a1_position": (135.1, 131.7, 138.5, 148.7),
+        "a1_torque_multihead": (140.9, 145.5, 157.3, 166.8),
+        "a1_multihead": (139.0, 142.0, 153.5, 160.1),
+        "a1_torque_curriculum": (136.0, 134.7, 150.5, 151.9),
+    },
+    "cost_of_transport": {
+        "a1_position": (0.8316, 0.8518, 0.9728, 1.0340),
+        "a1_torque_multihead": (0.7187, 0.7307, 0.8380, 0.8808),
+        "a1_multihead": (0.6977, 0.7209, 0.8029, 0.8611),
+        "a1_torque_curriculum": (0.8590, 0.9112, 0.9572, 1.0373),
+    },
+}
+"""Means by metric and task, one for each of :data:`ENVIRONMENTS`."""
+
+
+def paper_value(task: str, environment: str, metric: str) -> float | None:
+    """Return a mean of Table I; None if the paper has none."""
+    values = TABLE_I.get(metric, {}).get(task)
+    if values is None or environment not in ENVIRONMENTS:
+        return None
+    return values[list(ENVIRONMENTS).index(environment)]

@@ -1,0 +1,45 @@
+"""Sum up an experiment: ``python scripts/report.py logs/experiments/paper --out docs/results/paper``."""
+
+import os
+
+os.environ["MUJOCO_GL"] = "disable"
+
+from pathlib import Path
+
+from legged_torque.evaluation.figures import draw_all
+from legged_torque.evaluation.report import read_experiment, summarize, write_tables
+from legged_torque.evaluation.report_text import missing_lines, report
+from legged_torque.utils.args import Parser, run_script
+from legged_torque.utils.errors import UserError
+
+
+def main() -> None:
+    """Read, draw, write the tables and the report, say where they are."""
+    parser = Parser(__doc__)
+    parser.add_argument("experiment", type=Path, help="folder that experiment.py has filled")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the report, its tables and figures")
+    parser.add_argument(
+        "--from_step", type=float, default=90e6, help="evaluations that count begin here; default: %(default).0f"
+    )
+    args = parser.parse_args()
+    if not args.from_step >= 0:
+        raise UserError(f"--from_step must be at least 0, not {args.from_step}")
+    experiment = read_experiment(args.experiment)
+    table = summarize(experiment, args.from_step)
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot make the folder '{args.out}': {error.strerror}") from None
+    write_tables(experiment, table, args.out)
+    try:
+        figures, no_figures = draw_all(experiment, table, args.out), ""
+    except UserError as error:
+        figures, no_figures = [], str(error)
+    text = report(experiment, table, args.from_step, figures, no_figures, args.out)
+    (args.out / "report.md").write_text(text, encoding="utf-8")
+    missing = len(missing_lines(experiment, args.from_step))
+    print(f"{args.out / 'report.md'}, {len(figures)} figures; missing or not finished: {missing} lines")
+
+
+if __name__ == "__main__":
+    run_script(main)

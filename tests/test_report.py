@@ -1,0 +1,449 @@
+"""The report on an experiment: what it reads, its statistics against values worked out by hand, and what it writes."""
+
+import csv
+import json
+import math
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from legged_torque.evaluation import figures
+from legged_torque.evaluation.paper_values import ENVIRONMENTS, METRICS, TABLE_I, paper_value
+from legged_torque.evaluation.report import (
+    ALL_METRICS,
+    Run,
+    compare,
+    holm,
+    incomplete_beta,
+    read_experiment,
+    read_rows,
+    summarize,
+    welch,
+)
+from legged_torque.evaluation.report_text import run_problems
+from legged_torque.utils.errors import UserError
+
+SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "report.py"
+HEADER = (
+    "steps,iteration,seconds,track_percentage,track_xy,track_angular,collision_force,cost_of_transport,height,speed,"
+    "falls_per_minute,critic_gradient_norm"
+)
+TASKS = ["a1_position", "a1_torque", "a1_multihead"]
+SETTINGS = {
+    "env": {"env": {"num_envs": 1000}},
+    "train": {"runner": {"num_steps_per_env": 1000}},  # a million steps per iteration
+    "max_iterations": 110,
+    "device": "cuda:0",
+    "versions": {"python": "3.11.0", "torch": "2.11.0"},
+}
+
+
+def line(million, tracking, **others):
+    """A line of evaluations.csv: all metrics are 10 times the tracking, if they are not given."""
+    values = {name: 10.0 * tracking for name in ALL_METRICS} | {"track_percentage": tracking} | others
+    return f"{million * 1_000_000},{million},{million}.5," + ",".join(str(values[name]) for name in ALL_METRICS)
+
+
+def write_part(folder, lines, end="\n", **settings):
+    """Write the folder of a run, or of a part of one."""
+    folder.mkdir(parents=True)
+    task, environment = folder.parent.name.split("-")[:2]
+    config = {"task": task, **SETTINGS, **settings}
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    (folder / "evaluations.csv").write_text("\n".join([HEADER, *lines]) + end)
+
+
+def write_result(cell, environment, tracking, steps=110_000_000):
+    """Write what evaluate.py has measured in an environment."""
+    metrics = {name: {"mean": tracking, "standard_error": 0.01} for name in METRICS}
+    result = {"task": "any", "steps": steps, "device": "NVIDIA H200", "metrics": metrics}
+    (cell / f"result_{environment}.json").write_text(json.dumps(result))
+
+
+def write_experiment(folder, environments=None, seeds=(1, 2), tasks=TASKS):
+    """Write the plan of an experiment."""
+    folder.mkdir(parents=True, exist_ok=True)
+    environments = environments or {"low": ["low", "high"], "high_frequency": ["high_frequency", "doubled"]}
+    plan = {"tasks": list(tasks), "environments": environments, "seeds": list(seeds)}
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(plan, sort_keys=False))
+
+
+def whole_run(tracking):
+    """Lines of a finished training: bad before step 90 million, then around the given value."""
+    return [line(10, 0.1), line(80, 0.2), line(90, tracking - 0.05), line(100, tracking), line(110, tracking + 0.05)]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """An experiment: position complete in low, torque with one seed, unfinished, and multihead not begun."""
+    folder = tmp_path / "paper"
+    write_experiment(folder)
+    for seed, tracking in ((1, 0.7), (2, 0.8)):
+        cell = folder / f"a1_position-low-s{seed}"
+        write_part(cell / "2026-01-01_00-00-00", whole_run(tracking))
+        write_result(cell, "high", tracking - 0.1)
+        cell = folder / f"a1_position-high_frequency-s{seed}"
+        write_part(cell / "2026-01-01_00-00-00", whole_run(tracking - 0.2))
+        write_result(cell, "doubled", tracking - 0.3)
+    write_part(folder / "a1_torque-low-s1" / "2026-01-01_00-00-00", [line(i, i / 100) for i in range(10, 60, 10)])
+    return folder
+
+
+def run_script(*words):
+    """Run the script in this process; return its exit status."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["report.py", *map(str, words)])
+        try:
+            runpy.run_path(str(SCRIPT), run_name="__main__")
+        except SystemExit as stop:
+            return stop.code
+    return 0
+
+
+def rows_of(file):
+    """Return the rows of a CSV file as dictionaries."""
+    with file.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.fixture
+def report(folder, tmp_path, monkeypatch):
+    """The report on the experiment without its figures: text, table and evaluations."""
+    monkeypatch.setattr(figures, "draw_all", lambda *_: [])
+    assert run_script(folder, "--out", tmp_path / "out") == 0
+    out = tmp_path / "out"
+    return (out / "report.md").read_text(), rows_of(out / "table.csv"), rows_of(out / "evaluations.csv")
+
+
+# what the paper says
+
+
+def test_values_of_the_paper():
+    """Table I is whole: five metrics of four models in four environments, at the places where they are printed."""
+    assert TABLE_I.keys() == METRICS.keys()
+    assert all(len(values) == len(ENVIRONMENTS) == 4 for models in TABLE_I.values() for values in models.values())
+    assert all(len(models) == 4 for models in TABLE_I.values())
+    assert paper_value("a1_torque_curriculum", "low", "track_percentage") == 0.7866
+    assert paper_value("a1_multihead", "doubled", "cost_of_transport") == 0.8611
+    assert paper_value("a1_torque_multihead", "high_frequency", "collision_force") == 157.3
+    assert paper_value("a1_position", "high", "track_angular") == 0.0122
+    for missing in (("a1_torque", "low", "track_xy"), ("a1_position", "none", "track_xy"), ("a1_position", "low", "x")):
+        assert paper_value(*missing) is None
+
+
+# reading
+
+
+def test_rows_of_a_part(tmp_path):
+    """Empty and nan cells are nan, a cut-off last line is left out whatever it holds, a broken one is told."""
+    file, notes = tmp_path / "evaluations.csv", []
+    lines = [
+        HEADER,
+        line(1, 0.1, height="", speed="nan"),
+        "2000000,2,0.5,0.3",
+        line(3, 0.3),
+        line(4, 0.4, track_xy="x"),
+        line(5, 0.123),
+    ]
+    file.write_text("\n".join(lines)[:-1])  # the last cell is 1.2 instead of 1.23: only the missing end tells
+    rows = read_rows(file, notes)
+    assert [row["steps"] for row in rows] == [1_000_000, 3_000_000]
+    assert math.isnan(rows[0]["height"]) and math.isnan(rows[0]["speed"]) and rows[0]["track_percentage"] == 0.1
+    assert [note.split(" of ")[0] for note in notes] == ["line 3", "line 5"]
+    assert read_rows(tmp_path / "none.csv", notes) == [] and len(notes) == 2
+
+
+def test_parts_are_merged(tmp_path):
+    """A later part replaces an earlier one from its first evaluation on; one without evaluations replaces nothing."""
+    write_experiment(tmp_path, {"low": ["low"]}, seeds=[3], tasks=["a1_torque"])
+    cell = tmp_path / "a1_torque-low-s3"
+    write_part(cell / "2026-01-02_00-00-00", [line(3, 0.33), line(4, 0.44)])
+    write_part(cell / "2026-01-01_00-00-00", [line(i, i / 10) for i in (1, 2, 3, 4, 5)])
+    write_part(cell / "2026-01-03_00-00-00", [], max_iterations=4)
+    run = read_experiment(tmp_path).runs["a1_torque", "low", 3]
+    assert [(row["steps"] / 1e6, row["track_percentage"]) for row in run.rows] == [
+        (1, 0.1),
+        (2, 0.2),
+        (3, 0.33),
+        (4, 0.44),
+    ]
+    assert run.total_steps == 4_000_000 and run.is_finished(run.steps)  # what the last part was started for
+
+
+def test_what_counts_of_a_run():
+    """Evaluations from step 90 million on; of a shorter run the last 18 percent; elsewhere the result."""
+    run = Run("a1_torque", "low", 1, rows=[{"steps": 1e6 * million} for million in range(1, 111)])
+    run.results["high"] = {"steps": 5e6}
+    assert [row["steps"] / 1e6 for row in run.counted_rows("low", 90e6)] == list(range(90, 111))
+    assert [row["steps"] / 1e6 for row in run.counted_rows("low", 109e6)] == [109, 110]
+    del run.rows[50:]
+    assert [row["steps"] / 1e6 for row in run.counted_rows("low", 90e6)] == list(range(41, 51))
+    assert run.counted_rows("high", 90e6) == [{"steps": 5e6}] and run.counted_rows("doubled", 90e6) == []
+
+
+def test_finished_runs():
+    """A run is finished if less than an interval between evaluations is left; without settings it has 110 million."""
+    run = Run("a1_torque", "low", 1, rows=[{"steps": 99e6}, {"steps": 104e6}], configs=[])
+    assert run.total_steps == 110_000_000 and not run.is_finished(104e6)
+    run.configs.append(SETTINGS | {"max_iterations": 108})
+    assert run.total_steps == 108_000_000 and run.is_finished(104e6) and not run.is_finished(103e6)
+    run.configs.append(SETTINGS | {"max_iterations": 108, "processes": 2})
+    assert run.total_steps == 216_000_000
+    assert not Run("a1_torque", "low", 1).is_finished(0)
+
+
+def test_broken_files_are_told(folder, tmp_path):
+    """What cannot be read is a note, and everything else is still there; runs beside the plan are left out."""
+    (folder / "a1_position-low-s1" / "result_high.json").write_text('{"task": ')
+    (folder / "a1_position-low-s2" / "2026-01-01_00-00-00" / "config.yaml").write_text("walk")
+    (folder / "a1_gravity-low-s1").mkdir()
+    experiment = read_experiment(folder)
+    assert experiment.unplanned == ["a1_gravity-low-s1"]
+    first, second = experiment.runs_of("a1_position", "low")
+    assert first.notes == [f"'{folder}/a1_position-low-s1/result_high.json' cannot be read"] and first.results == {}
+    assert len(second.notes) == 1 and "lacks the entries" in second.notes[0] and len(second.rows) == 5
+
+
+# statistics
+
+
+def test_means_and_standard_errors(folder):
+    """A seed's number is the mean of its evaluations; mean and standard error are those over the seeds."""
+    table = summarize(read_experiment(folder), 90e6)
+    assert list(table) == ["low", "high_frequency", "doubled", "low -> high"]
+    summary = table["low"]["a1_position"]["track_percentage"]
+    assert summary.values == pytest.approx([0.7, 0.8]) and summary.is_final
+    assert summary.standard_error == pytest.approx(0.05)  # sqrt(0.005) / sqrt(2)
+    assert table["low"]["a1_position"]["collision_force"].values == pytest.approx([7.0, 8.0])
+    assert table["doubled"]["a1_position"]["track_xy"].values == pytest.approx([0.4, 0.5])
+    assert table["low -> high"]["a1_position"]["track_xy"].values == pytest.approx([0.6, 0.7])
+    single = table["low"]["a1_torque"]["track_percentage"]
+    assert single.values == pytest.approx([0.5]) and single.standard_error is None and not single.is_final
+    assert table["low"]["a1_multihead"] == {}
+
+
+def test_evaluations_without_a_value(folder):
+    """Values that are not finite do not count; a metric without any has no number, and the report says so."""
+    file = next(folder.glob("a1_position-low-s2/*/evaluations.csv"))
+    none = {"height": ""}
+    counted = [line(90, 0.5, height="nan"), line(100, 0.7, height="inf"), line(110, 0, track_percentage="", **none)]
+    lines = [*whole_run(0.8)[:2], *counted]
+    file.write_text("\n".join([HEADER, *lines]) + "\n")
+    cell = summarize(read_experiment(folder), 90e6)["low"]["a1_position"]
+    assert cell["track_percentage"].values == pytest.approx([0.7, 0.6])
+    assert len(cell["height"].values) == 1 and not cell["height"].is_final
+    assert cell["track_xy"].values == pytest.approx([7.0, 4.0]) and cell["track_xy"].is_final
+    problems = run_problems(read_experiment(folder).runs["a1_position", "low", 2], [], 90e6)
+    assert problems == ["1 of the 3 evaluations that count have no track_percentage"]
+
+
+@pytest.mark.parametrize(
+    ("t", "freedom", "p"),
+    # tables of Student's t, and exact: 1 degree of freedom is Cauchy, 2 have 1 - t / sqrt(2 + t^2)
+    [
+        (12.7062047364, 1, 0.05),
+        (1.0, 1, 0.5),
+        (2.0, 2, 1 - 2 / math.sqrt(6)),
+        (1e-3, 2, 1 - 1e-3 / math.sqrt(2 + 1e-6)),
+        (2.4469118511, 6, 0.05),
+        (3.7074280213, 6, 0.01),
+        (2.0422724563, 30, 0.05),
+        (1.9839715185, 100, 0.05),
+    ],
+)
+def test_tail_of_student_t(t, freedom, p):
+    """The incomplete beta function gives the tabulated tails."""
+    assert incomplete_beta(freedom / 2, 0.5, freedom / (freedom + t * t)) == pytest.approx(p, rel=1e-8)
+
+
+def test_welch_by_hand():
+    """t and degrees of freedom that are not whole, and what cannot be told."""
+    # variances 1 and 4, three values each: t = -3 / sqrt(5/3), freedom = (5/3)^2 / ((1/9 + 16/9) / 2) = 50/17
+    freedom, t_squared = 50 / 17, 9 / (5 / 3)
+    points = 200_000  # the density, integrated: t = sqrt(freedom) tan(angle)
+    angles = [math.pi / 2 * (i + 0.5) / points for i in range(points)]
+    density = [math.cos(angle) ** (freedom - 1) for angle in angles]
+    start = math.atan(math.sqrt(t_squared / freedom))
+    tail = sum(d for angle, d in zip(angles, density, strict=True) if angle > start) / sum(density)
+    assert welch([1, 2, 3], [3, 5, 7]) == pytest.approx(tail, abs=1e-5)
+    assert welch([1, 2, 3], [3, 5, 7]) == welch([3, 5, 7], [1, 2, 3])
+    assert welch([1, 2], [1, 2]) == 1.0
+    assert welch([1], [1, 2]) is None and welch([], [1, 2]) is None and welch([1, 1], [2, 2]) is None
+
+
+def test_welch_against_scipy():
+    """Where scipy is installed, it gives the same p values."""
+    stats = pytest.importorskip("scipy.stats")
+    samples = ([0.1, 0.2, 0.4], [0.3, 0.31, 0.33, 0.5], [5.0, 5.1], [0.15, 0.21, 0.42, 0.1, 0.9, 0.3])
+    for first in samples:
+        for second in samples:
+            expected = stats.ttest_ind(first, second, equal_var=False).pvalue
+            assert welch(first, second) == pytest.approx(expected, rel=1e-9)
+
+
+def test_holm_by_hand():
+    """Each p value times the number of tests that are left, never less than the one before, and at most 1."""
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.01, None, 0.6, 0.7]) == [pytest.approx(0.03), None, 1.0, 1.0]
+    assert holm([]) == [] and holm([None]) == [None]
+
+
+def test_compare(tmp_path):
+    """The tests of a metric in a column are one family; those with one seed are not counted in it."""
+    write_experiment(tmp_path, {"low": []}, seeds=[1, 2, 3])
+    trackings = {"a1_position": (0.7, 0.71, 0.72), "a1_torque": (0.5, 0.52, 0.54), "a1_multihead": (0.8,)}
+    for task, values in trackings.items():
+        for seed, tracking in enumerate(values, start=1):
+            write_part(tmp_path / f"{task}-low-s{seed}" / "2026-01-01_00-00-00", whole_run(tracking))
+    cells = summarize(read_experiment(tmp_path), 90e6)["low"]
+    pairs = [("a1_position", "a1_torque"), ("a1_position", "a1_multihead"), ("a1_torque", "a1_multihead")]
+    p = welch([0.7, 0.71, 0.72], [0.5, 0.52, 0.54])
+    assert compare(cells, "track_percentage", pairs) == [pytest.approx(p), None, None]
+    assert compare(cells, "track_percentage", pairs[:1] * 2) == pytest.approx([2 * p, 2 * p])
+
+
+# what is written
+
+
+def test_table(report):
+    """One row per task, column and metric, with the paper's value beside ours and nothing where there is nothing."""
+    _, table, _ = report
+    assert list(table[0]) == "task environment metric mean standard_error seeds paper_mean paper_error".split()
+    rows = {(row["task"], row["environment"], row["metric"]): row for row in table}
+    assert len(rows) == len(table) == 3 * 4 * len(ALL_METRICS)
+    row = rows["a1_position", "low", "track_percentage"]
+    assert float(row["mean"]) == pytest.approx(0.75) and float(row["standard_error"]) == pytest.approx(0.05)
+    assert (row["seeds"], row["paper_mean"], row["paper_error"]) == ("2", "0.7642", "")
+    assert float(rows["a1_position", "doubled", "track_xy"]["mean"]) == pytest.approx(0.45)
+    assert rows["a1_position", "doubled", "track_xy"]["paper_mean"] == "0.1602"
+    assert rows["a1_position", "low -> high", "track_xy"]["paper_mean"] == ""
+    row = rows["a1_torque", "low", "track_percentage"]
+    assert (row["standard_error"], row["seeds"], row["paper_mean"]) == ("", "1", "")
+    row = rows["a1_multihead", "low", "track_percentage"]
+    assert (row["mean"], row["standard_error"], row["seeds"], row["paper_mean"]) == ("", "", "0", "0.7669")
+
+
+def test_evaluations(report):
+    """All evaluations during training, in one table."""
+    _, _, evaluations = report
+    assert list(evaluations[0]) == ["task", "environment", "seed", "steps", *ALL_METRICS]
+    assert len(evaluations) == 4 * 5 + 5
+    row = next(row for row in evaluations if row["environment"] == "high_frequency" and row["seed"] == "2")
+    assert (row["task"], row["steps"], row["track_percentage"], row["height"]) == (
+        "a1_position",
+        "10000000",
+        "0.1",
+        "1.0",
+    )
+
+
+def test_what_is_missing(report):
+    """Cells without data, unfinished runs and missing evaluations are told at the top."""
+    text, _, _ = report
+    top = text.partition("## Table I")[0]
+    assert "- `a1_multihead` in low: no data, no training has begun." in top
+    assert "- `a1_torque` in high_frequency: no data, no training has begun." in top
+    assert "- `a1_torque` in low: no training has begun with seed 2." in top
+    told = next(line for line in top.splitlines() if "`a1_torque` in low, seed 1" in line)
+    assert "not finished, 50 of 110 million steps (45%)" in told and "its number is the mean of its last 18%" in told
+    assert "not evaluated in high" in told and "`a1_position`" not in top
+
+
+def test_text(report):
+    """Numbers stand beside the paper's, marked where they are not final, and the test and the commands are named."""
+    text, _, _ = report
+    assert (
+        "| Track % [share] | `a1_position` (PD) | 0.7500 ± 0.0500 (2) | 0.7642 | 0.5500 ± 0.0500 (2) | 0.7163 |" in text
+    )
+    assert "| Track % [share] | `a1_torque` (Default torque) | 0.5000 (1) † | – | – | – |" in text
+    assert "| `a1_position` (PD) | 0.6500 ± 0.0500 (2) |" in text.partition("## In other environments")[2]
+    assert "Welch's t-test" in text and "Holm's correction" in text
+    assert "All pairs: cannot be told, which takes two seeds at least of two tasks." in text
+    assert "NVIDIA H200" in text and "python 3.11.0, torch 2.11.0" in text
+    assert "python scripts/experiment.py" in text and "python scripts/report.py" in text
+
+
+def test_significant_differences(tmp_path, monkeypatch):
+    """A difference far beyond the seeds' is bold, and so is the task that beats all others; tracking has to be high."""
+    monkeypatch.setattr(figures, "draw_all", lambda *_: [])
+    write_experiment(tmp_path / "e", {"low": ["low"]}, seeds=[1, 2, 3])
+    for task, tracking in {"a1_position": 0.7, "a1_torque": 0.5, "a1_multihead": 0.6}.items():
+        for seed in (1, 2, 3):
+            part = tmp_path / "e" / f"{task}-low-s{seed}" / "2026-01-01_00-00-00"
+            write_part(part, whole_run(tracking + 0.001 * seed))
+    assert run_script(tmp_path / "e", "--out", tmp_path / "out") == 0
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "Nothing: all trainings and evaluations are complete." in text
+    assert "| `a1_position` (PD) | **0.7020 ± 0.0006 (3)** | 0.7642 |" in text
+    assert "| Track xy [m²/s²] | `a1_torque` (Default torque) | **5.0200 ± 0.0058 (3)** | – |" in text
+    p = holm([welch([0.701, 0.702, 0.703], [0.501, 0.502, 0.503]), 0.0, 0.0])[0]
+    assert p < 0.05 and "| `a1_position` - `a1_torque` | **+0.2000, p = " in text
+    assert "Against `a1_position`:" in text and "| `a1_multihead` - `a1_position` | **-0.1000, p = " in text
+
+
+def test_figures(folder, tmp_path):
+    """All figures are there as PNG and SVG; unfinished tasks say so, and nothing is drawn of nothing."""
+    pytest.importorskip("matplotlib", reason="figures need matplotlib: pip install -e .[plots]")
+    assert run_script(folder, "--out", tmp_path / "out") == 0
+    for name in ("figure3", "figure5a", "figure5b", "figure6", "figure7"):
+        assert (tmp_path / "out" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert "<svg" in (tmp_path / "out" / f"{name}.svg").read_text()
+        assert f"({name}.png)" in (tmp_path / "out" / "report.md").read_text()
+    assert "Default torque (1 of 2 seeds, up to 50e6 steps)" in (tmp_path / "out" / "figure3.svg").read_text()
+    write_experiment(tmp_path / "empty")
+    assert run_script(tmp_path / "empty", "--out", tmp_path / "out2") == 0
+    assert not list((tmp_path / "out2").glob("figure*"))
+    assert (
+        "No Figure 3, Figure 5a, Figure 5b, Figure 6, Figure 7: there are no data"
+        in (tmp_path / "out2" / "report.md").read_text()
+    )
+
+
+def test_notes_of_curves():
+    """Labels tell seeds that are missing and how far unfinished ones are."""
+    curve = lambda million, finished: figures.Curve([0.0, million * 1e6], [0.0, 1.0], finished)  # noqa: E731
+    assert figures.progress_note([curve(110, True)] * 4, 4) == ""
+    assert figures.progress_note([curve(110, True)] * 2, 4) == " (2 of 4 seeds)"
+    assert figures.progress_note([curve(60, False)] * 2, 4) == " (2 of 4 seeds, up to 60e6 steps)"
+    assert figures.progress_note([curve(110, True), curve(57, False)], 2) == " (2 of 2 seeds, up to 57–110e6 steps)"
+
+
+def test_without_matplotlib(folder, tmp_path, monkeypatch):
+    """Tables and report are written all the same, and the report says what the figures need."""
+
+    def refuse(*_):
+        raise UserError("plots need the extra: pip install -e .[plots]")
+
+    monkeypatch.setattr(figures, "draw_all", refuse)
+    assert run_script(folder, "--out", tmp_path / "out") == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.md", "table.csv", "evaluations.csv"}
+    assert "plots need the extra: pip install -e .[plots]" in (tmp_path / "out" / "report.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("plan", "words", "message"),
+    [
+        (None, [], "there is no folder"),
+        ("", [], "it has no experiment.yaml"),
+        ("tasks: [", [], "experiment.yaml' is not valid YAML"),
+        ("tasks: [a1_torque]", [], "lacks the lists tasks and seeds, or environments"),
+        ("tasks: [a]\nseeds: [1]\nenvironments: [low]", [], "lacks the lists tasks and seeds, or environments"),
+        ("good", ["--from_step=-1"], "--from_step must be at least 0, not -1.0"),
+        ("good", ["--from_steps=1"], "unknown option '--from_steps=1'; did you mean '--from_step'?"),
+    ],
+)
+def test_mistakes(tmp_path, capsys, plan, words, message):
+    """A mistake is one line, with exit status 2, and nothing is written."""
+    if plan is not None:
+        (tmp_path / "e").mkdir()
+    if plan == "good":
+        write_experiment(tmp_path / "e")
+    elif plan:
+        (tmp_path / "e" / "experiment.yaml").write_text(plan)
+    assert run_script(tmp_path / "e", "--out", tmp_path / "out", *words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1 and message in error
+    assert not (tmp_path / "out").exists()
