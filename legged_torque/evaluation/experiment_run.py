@@ -1,0 +1,279 @@
+"""Running a matrix of trainings: one process per GPU, skipping what is done, however often it was interrupted."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import subprocess
+import sys
+import time
+from datetime import datetime
+from pathlib import Path
+from types import FrameType
+from typing import BinaryIO
+
+from legged_torque.evaluation.experiment import (
+    SETTINGS_FILE,
+    Cell,
+    Matrix,
+    cell_state,
+    check_same,
+    is_json,
+    part_file,
+    result_file,
+    step_command,
+)
+from legged_torque.evaluation.experiment_job import Job, Worker, start_job, try_lock
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.interrupt import StopRequest
+
+POLL = 0.2
+"""Seconds between two looks at the processes."""
+SHOW_EVERY = 1.0
+"""Seconds between two changes of the live line."""
+
+
+class CountedStop(StopRequest):
+    """While this context is open, Ctrl-C and SIGTERM are only counted, so that they can be passed on.
+
+    Attributes:
+        count: How often it was asked to stop.
+    """
+
+    count = 0
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        """Count a signal."""
+        self.requested = True
+        self.count += 1
+
+
+class ExperimentRun:
+    """Brings all cells of a matrix to their end."""
+
+    def __init__(self, matrix: Matrix, out: Path, workers: list[Worker]) -> None:
+        """Look how far the cells are; nothing is written or started yet.
+
+        Args:
+            matrix: What is trained and evaluated.
+            out: Folder of all results, as an absolute path.
+            workers: Where processes run.
+        """
+        self.matrix, self.out, self.workers = matrix, out, workers
+        self.queue = [cell for cell in matrix.cells() if not self._is_done(cell)]
+        self._num_cells = len(matrix.cells())
+        self._num_done = self._num_cells - len(self.queue)
+        self._failures: list[str] = []  # a text for each cell that has failed
+        self._told: set[Cell] = set()  # cells that another process works on
+        self._durations: list[float] = []  # of the cells finished here [s]
+        self._start = time.monotonic()
+        self._shown = 0.0  # when the live line was changed last [s]
+
+    def run(self) -> int:
+        """Work until all cells are done or have failed, or the user asks to stop.
+
+        Returns:
+            Exit status: 0 if all is done, 1 if a cell has failed.
+
+        Raises:
+            KeyboardInterrupt: If the user has asked to stop. No process is left running.
+        """
+        print(f"{self._num_done} of {self._num_cells} cells are done in {self.out}", flush=True)
+        passed_on = 0
+        try:
+            with CountedStop() as stop:
+                while True:
+                    if stop.count > passed_on:
+                        passed_on = stop.count
+                        self._ask_to_stop()
+                    for worker in self.workers:
+                        self._attend(worker, stop.requested)
+                    if not self._jobs() and (stop.requested or not self.queue):
+                        break
+                    self._show_live_line()
+                    time.sleep(POLL)
+        finally:
+            self._ask_to_stop()  # nothing runs here any more, unless something unforeseen has happened
+            for job in self._jobs():
+                job.process.wait()
+        print(f"{self._num_done} of {self._num_cells} cells are done.", flush=True)
+        for failure in self._failures:
+            print(failure, file=sys.stderr)
+        if stop.requested:
+            raise KeyboardInterrupt
+        return 1 if self._failures else 0
+
+    def _jobs(self) -> list[Job]:
+        """Return what is going on."""
+        return [worker.job for worker in self.workers if worker.job is not None]
+
+    def _is_done(self, cell: Cell) -> bool:
+        """Return whether all results of a cell are there."""
+        return all(is_json(result_file(self.out, cell, name)) for name in cell.evaluated_in)
+
+    def _attend(self, worker: Worker, stopping: bool) -> None:
+        """See to a worker: end its step if the process has ended, and give it the next one if it is free."""
+        job = worker.job
+        if job is not None and job.process.poll() is not None:
+            worker.job = None
+            self._end_step(worker, job, stopping)
+        if worker.job is None and not stopping:
+            self._take_cell(worker)
+
+    def _take_cell(self, worker: Worker) -> None:
+        """Begin with the first cell that no other process works on, if there is one."""
+        for cell in list(self.queue):
+            lock = try_lock(self.out / cell.name / "lock")
+            if lock is None:
+                if cell not in self._told:
+                    self._told.add(cell)
+                    self._print(f"{cell.name}: another process works on it; left for later")
+                continue
+            self.queue.remove(cell)
+            if not self._is_done(cell):
+                self._start_step(worker, cell, lock, time.monotonic())
+                return
+            self._num_done += 1  # by that other process
+            lock.close()
+
+    def _start_step(self, worker: Worker, cell: Cell, lock: BinaryIO, cell_start: float) -> None:
+        """Start a process for the next step of a cell."""
+        try:
+            state = cell_state(self.out, cell)
+            if state.step != "evaluate":  # results of another training are no results of this one
+                for name in cell.evaluated_in:
+                    result_file(self.out, cell, name).unlink(missing_ok=True)
+            command = step_command(self.matrix, self.out, cell, state, worker.device)
+            worker.job = start_job(self.out, cell, state, command, worker.variables, lock, cell_start)
+        except (OSError, subprocess.SubprocessError, UserError) as error:
+            self._fail(cell, lock, str(error))
+
+    def _end_step(self, worker: Worker, job: Job, stopping: bool) -> None:
+        """Note what has become of a step whose process has ended, and go on with its cell."""
+        try:
+            problem = self._problem(job)
+        except (OSError, UserError) as error:
+            problem = str(error)
+        if problem and not stopping:
+            self._fail(job.cell, job.lock, problem, job)
+            return
+        is_done = self._is_done(job.cell)
+        if is_done:
+            self._num_done += 1
+            self._durations.append(time.monotonic() - job.cell_start)
+        if not problem:
+            took = duration_text(time.monotonic() - job.start)
+            self._print(f"{job.cell.name}: {job.step_text()} on {worker.name} took {took} | {self._progress()}")
+        if is_done or stopping:
+            job.lock.close()
+            self.queue += [] if is_done else [job.cell]
+        else:
+            self._start_step(worker, job.cell, job.lock, job.cell_start)
+
+    def _problem(self, job: Job) -> str:
+        """Return what is wrong with an ended step, nothing if all is well; a complete result is put in its place."""
+        status = job.process.returncode
+        if status:
+            how = f"was ended by signal {-status}" if status < 0 else f"has failed with exit status {status}"
+            return f"{job.step_text()} {how}"
+        if job.state.step != "evaluate":
+            state = cell_state(self.out, job.cell)
+            how_far = f"after {state.iterations} of {state.total} iterations" if state.total else "without a checkpoint"
+            return f"training has ended {how_far}" if state.step in ("train", "resume") else ""
+        part = part_file(self.out, job.cell, job.state.missing[0])
+        if not is_json(part):
+            return f"{job.step_text()} has left no readable '{part}'"
+        os.replace(part, result_file(self.out, job.cell, job.state.missing[0]))
+        return ""
+
+    def _fail(self, cell: Cell, lock: BinaryIO, reason: str, job: Job | None = None) -> None:
+        """Give a cell up; the last lines of the job's log are kept for the end."""
+        lock.close()
+        lines = [f"the last lines of {job.log}:", *job.last_lines()] if job else []
+        self._failures.append("\n    ".join([f"{cell.name}: {reason}", *lines]))
+        self._print(f"{cell.name}: {reason} | {self._progress()}")
+
+    def _ask_to_stop(self) -> None:
+        """Ask all processes to end. A training finishes its iteration and saves; asked once more it ends at once."""
+        for job in self._jobs():
+            job.process.terminate()
+        if self._jobs():
+            self._print("Stopping: trainings finish their iteration and save; once more to stop at once.")
+
+    def _progress(self) -> str:
+        """Say how far all is and how long it will take."""
+        left = time_left(self._durations, self._num_left(), len(self.workers))
+        text = "time left unknown yet" if left is None else f"{duration_text(left)} left"
+        elapsed = duration_text(time.monotonic() - self._start)
+        return f"{self._num_done} of {self._num_cells} cells done, {elapsed}, {text}"
+
+    def _num_left(self) -> float:
+        """Return how many cells are left, with the parts of those that are trained at the moment."""
+        left = self._num_cells - self._num_done - len(self._failures)
+        return left - sum(job.fraction() for job in self._jobs())
+
+    def _print(self, text: str) -> None:
+        """Print a line with the time, over the live line if there is one."""
+        line = f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}"
+        print(line.ljust(columns() if sys.stdout.isatty() else 0), flush=True)
+
+    def _show_live_line(self) -> None:
+        """Show what is going on, if that is due and somebody looks."""
+        if not sys.stdout.isatty() or time.monotonic() - self._shown < SHOW_EVERY:
+            return
+        self._shown = time.monotonic()
+        line = " | ".join([self._progress(), *map(str, self._jobs())])
+        print(line[: columns()].ljust(columns()), end="\r", flush=True)
+
+
+def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
+    """Create the folder of the results, or check that it fits, and keep a copy of the description in it.
+
+    Args:
+        matrix: What the file describes.
+        file: The description.
+        out: The folder.
+
+    Raises:
+        UserError: If it was made with other settings.
+    """
+    check_same(matrix, out)  # a mistake leaves nothing behind
+    out.mkdir(parents=True, exist_ok=True)
+    with open(out / "lock", "a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # another one may do the same at this moment
+        check_same(matrix, out)
+        copy, text = out / SETTINGS_FILE, file.read_bytes()
+        if not copy.is_file() or copy.read_bytes() != text:
+            part = copy.with_suffix(".yaml.part")
+            part.write_bytes(text)
+            os.replace(part, copy)
+
+
+def time_left(durations: list[float], cells: float, num_workers: int) -> float | None:
+    """Return how long the rest will take [s]; None if that is unknown.
+
+    Args:
+        durations: How long finished cells took [s].
+        cells: How many are left; a cell that is trained at the moment counts in part.
+        num_workers: How many are worked on at a time.
+    """
+    if cells <= 0:
+        return 0.0
+    if not durations:
+        return None
+    return sum(durations) / len(durations) * max(cells / num_workers, min(cells, 1.0))
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration as a person says it."""
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {seconds:02d} s" if minutes else f"{seconds} s"
+
+
+def columns() -> int:
+    """Return how many characters of a line the terminal shows."""
+    return shutil.get_terminal_size().columns - 1

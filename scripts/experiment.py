@@ -1,0 +1,46 @@
+"""Train and evaluate approaches x environments x seeds: ``python scripts/experiment.py experiments/low.yaml``.
+
+What is done already is skipped and what was interrupted goes on, so the same command is the way to continue.
+"""
+
+import os
+
+os.environ["MUJOCO_GL"] = "disable"
+
+import sys
+from pathlib import Path
+
+from legged_torque import ROOT_DIR
+from legged_torque.evaluation.experiment import cell_state, check_same, read_matrix
+from legged_torque.evaluation.experiment_job import find_workers
+from legged_torque.evaluation.experiment_run import ExperimentRun, claim_folder
+from legged_torque.utils.args import Parser, run_script
+
+
+def main() -> None:
+    """Bring a matrix to its end, or list what is to be done."""
+    parser = Parser(__doc__)
+    parser.add_argument("file", type=Path, help="description of the matrix, see experiments/")
+    parser.add_argument("--out", type=Path, help="folder of all results; default: logs/experiments/<name of the file>")
+    parser.add_argument(
+        "--device", default="auto", help="auto, cpu or cuda:N; auto takes all GPUs, one run on each, or the CPU"
+    )
+    parser.add_argument("--jobs", type=int, help="runs at a time on the CPU; default: 1")
+    parser.add_argument("--dry-run", action="store_true", help="only list what is to be done")
+    args = parser.parse_args()
+    matrix = read_matrix(args.file)
+    out = (args.out or ROOT_DIR / "logs" / "experiments" / args.file.stem).resolve()
+    workers = find_workers(args.device, args.jobs)
+    if args.dry_run:
+        check_same(matrix, out)
+        for cell in matrix.cells():
+            print(f"{cell.name}: {cell_state(out, cell)}")
+        return
+    claim_folder(matrix, args.file, out)
+    status = ExperimentRun(matrix, out, workers).run()
+    if status:
+        sys.exit(status)
+
+
+if __name__ == "__main__":
+    run_script(main)
