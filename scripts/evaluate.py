@@ -37,6 +37,10 @@ def main() -> None:
     args = parser.parse_args()
     if args.steps < 1:
         raise UserError(f"--steps must be at least 1, not {args.steps}")
+    if args.command and not all(map(math.isfinite, args.command)):
+        raise UserError(f"--command must be finite, not {args.command}")
+    if args.json and args.json.is_dir():
+        raise UserError(f"--json must be a file, '{args.json}' is a folder")
     run_dir, env_cfg, train_cfg = load_run(args)
     checkpoint = find_checkpoint(run_dir, args.checkpoint)
     env_cfg = evaluation_cfg(env_cfg, env_cfg.env.num_envs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -50,7 +51,8 @@ class WalkingMetrics:
     - track_percentage: mean of max(0, mean over the commands that are not 0 of 1 - |v - v*| / |v*|); 1 is perfect.
     - track_xy: mean of |v*_xy - v_xy|^2 [m^2/s^2]. track_angular: mean of (w*_z - w_z)^2 [rad^2/s^2].
     - collision_force: mean of the sum over geoms of the norm of the ground's force, in the last physics step of a
-      control step [N]; a robot that stands still has its weight, 122 N for the A1.
+      control step [N]. A robot that stands still has its weight, 122 N for the A1, and a little more where its feet
+      push sideways: 127 N in the nominal pose.
     - cost_of_transport: mean of sum |tau_i qd_i| over m g times mean horizontal speed, with the nominal m g.
     - height: mean height of the trunk's origin [m]. speed: mean horizontal speed [m/s].
     - falls_per_minute: resets that are not time-outs, per minute of one robot.
@@ -128,37 +130,37 @@ class CommandBreakdown:
         self._task = task
         ranges = task.cfg.commands.ranges
         self._ranges = torch.tensor([getattr(ranges, name) for name in COMMANDS], device=task.device)
-        self._sums = torch.zeros(3, len(COMMANDS), NUM_BINS, device=task.device)
+        self._sums = torch.zeros(4, len(COMMANDS), NUM_BINS, device=task.device)
 
     def add_step(self, commands: Tensor) -> None:
         """Add the step that the task has just made; arguments as for :meth:`WalkingMetrics.add_step`."""
         task = self._task
         velocity = torch.cat([task.base_lin_vel[:, :2], task.base_ang_vel[:, 2:]], dim=1)
         error = (commands - velocity).abs()
-        percentage, _ = tracking_percentage(error, commands)
+        tracking = torch.stack(tracking_percentage(error, commands)).unsqueeze(2).expand(-1, *error.shape)
         low, high = self._ranges.T
         place = ((commands - low) / (high - low).clamp(min=1e-6) * NUM_BINS).long().clamp(0, NUM_BINS - 1)
         member = torch.nn.functional.one_hot(place, NUM_BINS) * ~task.reset_buf.view(-1, 1, 1)
-        rows = torch.stack([torch.ones_like(error), percentage.unsqueeze(1).expand_as(error), error])
+        rows = torch.stack([torch.ones_like(error), error, *tracking])
         self._sums += (rows.unsqueeze(3) * member).sum(dim=1)
 
     def table(self) -> dict[str, list[dict[str, float]]]:
         """Return for each command its parts that occurred.
 
         Returns:
-            Per part: "from" and "to" of the command, "share" of the steps, "track_percentage" (of all three commands),
-            and "error": mean |v - v*| of this command [m/s or rad/s].
+            Per part: "from" and "to" of the command, "share" of the steps, "track_percentage" (of all three commands,
+            NaN if all were 0), and "error": mean |v - v*| of this command [m/s or rad/s].
         """
         result: dict[str, list[dict[str, float]]] = {}
         for i, name in enumerate(COMMANDS):
             low, high = self._ranges[i].tolist()
-            count, percentage, error = self._sums[:, i].tolist()
+            count, error, percentage, commanded = self._sums[:, i].tolist()
             result[name] = [
                 {
                     "from": low + (high - low) * part / NUM_BINS,
                     "to": low + (high - low) * (part + 1) / NUM_BINS,
                     "share": count[part] / sum(count),
-                    "track_percentage": percentage[part] / count[part],
+                    "track_percentage": percentage[part] / commanded[part] if commanded[part] else math.nan,
                     "error": error[part] / count[part],
                 }
                 for part in range(NUM_BINS)

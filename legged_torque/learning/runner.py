@@ -96,7 +96,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
                 self._wait()
                 collected = time.perf_counter()
                 losses = self.alg.update()
-                measured = self._evaluate(losses)
+                measured = self._evaluate(losses, start)
                 learned = time.perf_counter()
                 self._log(start_it, total_it, collected - start, learned - collected, losses, measured)
                 self.current_learning_iteration += 1
@@ -224,7 +224,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         if torch.device(self.device).type == "cuda":
             torch.cuda.synchronize(self.device)
 
-    def _evaluate(self, losses: dict) -> dict[str, float]:
+    def _evaluate(self, losses: dict, iteration_start: float) -> dict[str, float]:
         """Measure the policy if it is time, note it in the run's folder, and return what is to be logged."""
         settings = self.cfg["evaluation"]
         steps = int(self.env.total_steps)
@@ -233,6 +233,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         if self.logger.writer is None or interval == 0 or steps // interval == before // interval:
             return {}
         start = time.perf_counter()
+        seconds = self._seconds_before + self.logger.tot_time + start - iteration_start
         if self._evaluator is None:
             seed = self.cfg["seed"] + EVALUATION_SEED
             self._evaluator = TrainingEvaluator(self.env, self.alg.actor, settings, seed)
@@ -240,7 +241,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         row = {
             "steps": steps,
             "iteration": self.current_learning_iteration + 1,
-            "seconds": self._seconds_before + self.logger.tot_time,
+            "seconds": seconds,
             **metrics,
             "critic_gradient_norm": losses["critic_gradient_norm"],
         }

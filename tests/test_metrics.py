@@ -1,0 +1,298 @@
+"""The metrics of walking against loops over written-down steps, and forces against MuJoCo's own contacts."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from test_simulator import CONVERGED, WEIGHT, contacts_by_hand
+
+from legged_torque.evaluation.metrics import UNITS, CommandBreakdown, WalkingMetrics, estimate, measure
+
+RANGES = {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-2.0, 0.0], "ang_vel_yaw": [0.5, 2.5]}
+STILL = {f"domain_rand.init_{angle}": [0.0, 0.0] for angle in ("roll", "pitch", "yaw")}
+STILL |= {"domain_rand.init_dof_pos_scale": [1.0, 1.0]}
+
+
+@pytest.fixture(scope="module")
+def task(make_task):
+    """Worlds in which nothing happens but what a test writes."""
+    return make_task("a1_position", 5, **{f"commands.ranges.{name}": limits for name, limits in RANGES.items()})
+
+
+def random_steps(count, worlds, geoms, seed=0):
+    """Steps of numbers without meaning, with commands of 0, falls and time-outs, as arrays (count, worlds, ...)."""
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape, scale=1.0):
+        return (scale * rng.normal(size=(count, worlds, *shape))).astype(np.float32)
+
+    commands = normal(3)
+    commands[rng.random(commands.shape) < 0.3] = 0.0
+    commands[::7, 1] = 0.0
+    reset, time_out = rng.random((count, worlds)) < 0.2, rng.random((count, worlds)) < 0.5
+    height = 0.3 + normal(scale=0.05)
+    force = normal(geoms, 3, scale=20.0) * (rng.random((count, worlds, geoms, 1)) < 0.3)
+    steps = {"commands": commands, "lin_vel": normal(3), "ang_vel": normal(3), "torques": normal(12, scale=5.0)}
+    steps |= {"joint_vel": normal(12), "height": height, "force": force, "reset": reset, "time_out": reset & time_out}
+    return steps
+
+
+def add(task, metrics, **step):
+    """Write a step into the task's tensors, where they are left out as 0, and let the metrics add it."""
+    places = {"lin_vel": task.base_lin_vel, "ang_vel": task.base_ang_vel, "torques": task.torques}
+    places |= {"joint_vel": task.dof_vel, "height": task.base_pos[:, 2], "force": task.sim.contact_force}
+    places |= {"reset": task.reset_buf, "time_out": task.time_out_buf}
+    for name, place in places.items():
+        place.copy_(torch.as_tensor(step.get(name, 0)))
+    metrics.add_step(torch.as_tensor(step["commands"], dtype=torch.float32))
+
+
+def follow(command, lin_vel, ang_vel):
+    """Share of a command that is followed, None if there is none."""
+    actual = (lin_vel[0], lin_vel[1], ang_vel[2])
+    parts = [1.0 - abs(v - wanted) / abs(wanted) for v, wanted in zip(actual, command, strict=True) if wanted != 0.0]
+    return max(0.0, sum(parts) / len(parts)) if parts else None
+
+
+def sums_by_hand(steps, dt):
+    """Numerator and denominator of every metric, one number per world, by a loop over worlds and steps."""
+    count, worlds = steps["reset"].shape
+    result = {name: np.zeros((2, worlds)) for name in UNITS}
+    for t in range(count):
+        for w in range(worlds):
+            now = {name: values[t, w].astype(float) for name, values in steps.items()}
+            if now["reset"]:
+                result["falls_per_minute"][0, w] += not now["time_out"]
+                continue
+            followed = follow(now["commands"], now["lin_vel"], now["ang_vel"])
+            if followed is not None:
+                result["track_percentage"][:, w] += followed, 1.0
+            vx, vy, yaw_rate = now["lin_vel"][0], now["lin_vel"][1], now["ang_vel"][2]
+            x, y, yaw = now["commands"]
+            speed = math.hypot(vx, vy)
+            power = sum(abs(tau * v) for tau, v in zip(now["torques"], now["joint_vel"], strict=True))
+            result["track_xy"][:, w] += (vx - x) ** 2 + (vy - y) ** 2, 1.0
+            result["track_angular"][:, w] += (yaw_rate - yaw) ** 2, 1.0
+            result["collision_force"][:, w] += sum(math.sqrt(f @ f) for f in now["force"]), 1.0
+            result["cost_of_transport"][:, w] += power, WEIGHT * speed
+            result["height"][:, w] += now["height"], 1.0
+            result["speed"][:, w] += speed, 1.0
+            result["falls_per_minute"][1, w] += dt / 60.0
+    return result
+
+
+def error_by_hand(numerator, denominator):
+    """Standard error of a ratio of sums by the delta method."""
+    ratio, n = sum(numerator) / sum(denominator), len(numerator)
+    residuals = [(x - ratio * y) ** 2 for x, y in zip(numerator, denominator, strict=True)]
+    return math.sqrt(sum(residuals) / (n - 1)) / (sum(denominator) / n) / math.sqrt(n)
+
+
+def test_every_metric_of_a_written_trajectory(task):
+    """Means and standard errors are those of loops over the same numbers; clearing forgets what was before."""
+    metrics = WalkingMetrics(task)
+    steps = random_steps(40, task.num_envs, task.sim.contact_force.shape[1])
+    assert steps["time_out"].any() and (steps["reset"] & ~steps["time_out"]).any()
+    for seed in (1, 0):
+        metrics.clear()
+        steps = random_steps(40, task.num_envs, task.sim.contact_force.shape[1], seed)
+        for t in range(40):
+            add(task, metrics, **{name: values[t] for name, values in steps.items()})
+    means, estimates = metrics.means(), metrics.estimates()
+    expected = sums_by_hand(steps, task.dt)
+    assert list(means) == list(estimates) == list(UNITS) and task.dt == pytest.approx(0.02)
+    for name, (numerator, denominator) in expected.items():
+        mean = numerator.sum() / denominator.sum()
+        assert means[name] == pytest.approx(mean, rel=2e-5), name
+        assert estimates[name].mean == pytest.approx(mean, rel=2e-5), name
+        assert estimates[name].standard_error == pytest.approx(error_by_hand(numerator, denominator), rel=2e-4), name
+        assert mean > 0.0
+
+
+FOLLOWED = [
+    ((1.0, 0.0, 0.0), (0.5, 9.0, 9.0), 0.5),  # what is not commanded does not count
+    ((1.0, -1.0, 0.0), (1.5, -0.25, 3.0), 0.375),  # too fast is as bad as too slow
+    ((0.5, 1.0, -2.0), (-0.5, 1.0, -2.0), 1 / 3),  # -1, 1, 1: cut off after the mean
+    ((1.0, 1.0, 1.0), (-3.0, 0.0, 0.0), 0.0),
+    ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), None),
+]
+
+
+def test_tracking_percentage_by_hand(task):
+    """Zero commands do not count, a step without any not at all, and a mean below 0 is 0."""
+    metrics = WalkingMetrics(task)
+    commands, speeds = (np.array([row[i] for row in FOLLOWED]) for i in (0, 1))
+    step = {
+        "commands": commands,
+        "lin_vel": np.c_[speeds[:, :2], [7.0] * 5],
+        "ang_vel": np.c_[[[8.0] * 2] * 5, speeds[:, 2]],
+    }
+    add(task, metrics, **step)
+    numerator, counted = metrics.ratios()["track_percentage"]
+    assert counted.tolist() == [1.0, 1.0, 1.0, 1.0, 0.0]
+    assert numerator.tolist() == pytest.approx([row[2] or 0.0 for row in FOLLOWED], abs=1e-6)
+    assert metrics.means()["track_percentage"] == pytest.approx((0.5 + 0.375 + 1 / 3) / 4, rel=1e-6)
+    metrics.clear()
+    add(task, metrics, **step | {"commands": np.zeros((5, 3))})
+    assert math.isnan(metrics.means()["track_percentage"]) and metrics.means()["track_xy"] > 1.0
+
+
+def test_falls_by_hand(task):
+    """Two falls in 47 steps of 0.02 s that were no resets; a time-out is no fall, and resets spoil nothing else."""
+    metrics = WalkingMetrics(task)
+    for t in range(10):
+        reset, time_out = torch.zeros(5, dtype=torch.bool), torch.zeros(5, dtype=torch.bool)
+        reset[0] = t in (2, 7)
+        reset[1] = time_out[1] = t == 5
+        height = torch.where(reset, math.nan, 0.25)
+        commands = torch.where(reset.unsqueeze(1), math.inf, torch.ones(5, 3))
+        add(task, metrics, commands=commands, reset=reset, time_out=time_out, height=height)
+    means = metrics.means()
+    assert means["falls_per_minute"] == pytest.approx(2 / (47 * 0.02 / 60.0), rel=1e-6)
+    assert metrics.ratios()["falls_per_minute"][0].tolist() == [2.0, 0.0, 0.0, 0.0, 0.0]
+    assert (means["height"], means["track_xy"], means["track_angular"]) == (0.25, 2.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("numerator", "denominator", "mean", "error"),
+    [
+        ([1.0, 3.0], [1.0, 1.0], 2.0, 1.0),
+        ([2.0, 0.0, 4.0], [1.0, 2.0, 3.0], 1.0, 0.5),  # residuals 1, -2, 1
+        ([2.0, 4.0, 6.0], [1.0, 2.0, 3.0], 2.0, 0.0),
+        ([3.0], [2.0], 1.5, math.nan),
+    ],
+)
+def test_standard_error_by_hand(numerator, denominator, mean, error):
+    """A ratio of sums with its standard error; with one world nobody knows it."""
+    result = estimate(torch.tensor(numerator), torch.tensor(denominator))
+    assert (result.mean, result.standard_error) == pytest.approx((mean, error), rel=1e-12, nan_ok=True)
+
+
+def test_standard_error_is_the_spread_of_repetitions():
+    """The estimates of 2000 repetitions spread as they say; 6% are four standard errors of that spread."""
+    generator = torch.Generator().manual_seed(3)
+    denominator = 5.0 + 4.0 * torch.rand(2000, 60, generator=generator)
+    numerator = denominator * (1.0 + 0.4 * torch.randn(2000, 60, generator=generator)) + 0.3 * denominator**2
+    results = [estimate(*sums) for sums in zip(numerator, denominator, strict=True)]
+    spread = np.std([result.mean for result in results])
+    claimed = math.sqrt(np.mean([result.standard_error**2 for result in results]))
+    assert claimed == pytest.approx(spread, rel=0.06)
+
+
+def test_standing_robots(make_task):
+    """Robots that stand have their weight as collision force, and hardly move; the feet of bent hips pull inwards too.
+
+    In the second world hips are turned so that legs press straight down. In the nominal pose of the first one friction
+    holds the feet against each other, which MuJoCo says as well.
+    """
+    task = make_task("a1_position", 2, **STILL)
+    task.base_pos[:, 2] = 0.31
+    actions = torch.zeros(2, 12)
+    actions[1, [0, 6]], actions[1, [3, 9]] = 0.8, -0.8
+    metrics = WalkingMetrics(task)
+    for t in range(200):
+        task.step(actions)
+        if t >= 100:
+            metrics.add_step(torch.zeros(2, 3))
+    means, ratios = metrics.means(), metrics.ratios()
+    force, steps = ratios["collision_force"]
+    nominal, straight = (force / steps).tolist()
+    assert straight == pytest.approx(WEIGHT, rel=0.02)
+    data = mujoco.MjData(task.sim.mj_model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = task.sim.qpos[0], task.sim.qvel[0], task.sim.ctrl[0]
+    mujoco.mj_step(task.sim.mj_model, data)
+    _, by_foot = contacts_by_hand(task.sim.mj_model, data)
+    assert by_foot[:, 2].sum() == pytest.approx(WEIGHT, rel=0.002)
+    assert nominal == pytest.approx(np.linalg.norm(by_foot, axis=1).sum(), rel=0.005)
+    assert (
+        means["height"] == pytest.approx(float(task.base_pos[:, 2].mean()), abs=1e-3) and 0.25 < means["height"] < 0.3
+    )
+    assert means["speed"] < 0.01 and means["falls_per_minute"] == 0.0
+    power, weight_speed = ratios["cost_of_transport"]
+    torch.testing.assert_close(weight_speed, WEIGHT * ratios["speed"][0], rtol=1e-5, atol=0.0)
+    assert (power < 0.5 * 100).all() and (weight_speed > 0.0).all()
+
+
+def test_lying_robots_against_mujoco(make_task):
+    """Limp robots that drop on belly, side and back touch with many geoms; forces are those of mj_contactForce."""
+    settings = {"control.decimation": 1, "control.stiffness": 0.0, "asset.terminate_after_contacts_on": []}
+    task = make_task("a1_position", 3, **STILL, **CONVERGED, **settings)
+    sim, model = task.sim, task.sim.mj_model
+    task.base_pos[:, 2] = torch.tensor([0.12, 0.12, 0.10])
+    task.base_quat.copy_(torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.5**0.5, 0.5**0.5, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]))
+    data, metrics = mujoco.MjData(model), WalkingMetrics(task)
+    expected, touching = np.zeros((150, 3)), np.zeros((3, sim.contact_found.shape[1]), bool)
+    for t in range(150):
+        before = [getattr(sim, name).numpy().copy() for name in ("qpos", "qvel", "qacc_warmstart")]
+        task.step(torch.zeros(3, 12))
+        metrics.add_step(task.commands)
+        for w in range(3):
+            data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = (values[w] for values in before)
+            data.ctrl[:] = sim.ctrl[w]
+            mujoco.mj_step(model, data)
+            found, force = contacts_by_hand(model, data)
+            expected[t, w] = np.linalg.norm(force, axis=1).sum()
+            touching[w] |= found > 0
+    force, steps = metrics.ratios()["collision_force"]
+    assert steps.tolist() == [150.0] * 3
+    np.testing.assert_allclose(force / steps, expected.mean(axis=0), rtol=2e-3)
+    assert (touching.sum(axis=1) >= 4).all() and touching[:, 0].any()
+
+
+def test_breakdown_by_hand(task):
+    """Shares, tracking and errors of each part of each command's range; resets and empty parts are left out."""
+    breakdown = CommandBreakdown(task)
+    zeros = np.zeros(5)
+    commands = np.array([[-1.0, -1.9, 0.6], [-0.6, -0.1, 2.5], [0.1, -0.1, 0.6], [1.0, 0.0, 2.4], [0.3, -1.2, 1.2]])
+    speeds = np.array([[-0.5, -1.9, 0.6], [-0.6, -0.2, 1.5], [0.1, -0.1, 0.3], [0.0, 1.0, 2.4], [9.0, 9.0, 9.0]])
+    step = {"commands": commands, "lin_vel": np.c_[speeds[:, :2], zeros], "ang_vel": np.c_[zeros, zeros, speeds[:, 2]]}
+    add(task, breakdown, **step, reset=np.arange(5) == 4)
+    add(task, breakdown, **step, reset=np.arange(5) >= 2)
+    # followed: (0.5 + 1 + 1) / 3, (1 + 0 + 0.6) / 3, (1 + 1 + 0.5) / 3 once, (0 + 1) / 2 once
+    a, b, c, d = 2.5 / 3, 1.6 / 3, 2.5 / 3, 0.5
+    x = [(-1.0, -0.5, 4 / 6, (a + b) / 2, 0.25), (0.0, 0.5, 1 / 6, c, 0.0), (0.5, 1.0, 1 / 6, d, 1.0)]
+    y = [(-2.0, -1.5, 2 / 6, a, 0.0), (-0.5, 0.0, 4 / 6, (2 * b + c + d) / 4, 1.2 / 4)]
+    yaw = [(0.5, 1.0, 3 / 6, (2 * a + c) / 3, 0.3 / 3), (2.0, 2.5, 3 / 6, (2 * b + d) / 3, 2.0 / 3)]
+    expected = {"lin_vel_x": x, "lin_vel_y": y, "ang_vel_yaw": yaw}
+    table = breakdown.table()
+    assert list(table) == list(expected)
+    for name, parts in table.items():
+        assert [list(part) for part in parts] == [["from", "to", "share", "track_percentage", "error"]] * len(parts)
+        assert np.array([list(part.values()) for part in parts]) == pytest.approx(np.array(expected[name]), abs=1e-6)
+        assert sum(part["share"] for part in parts) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_breakdown_of_a_fixed_command(make_task):
+    """Each command is one part that begins and ends at it, even in a range without width."""
+    fixed = {"lin_vel_x": 0.5, "lin_vel_y": 0.0, "ang_vel_yaw": -0.2}
+    task = make_task("a1_position", 2, **{f"commands.ranges.{name}": [value] * 2 for name, value in fixed.items()})
+    breakdown = CommandBreakdown(task)
+    assert breakdown.table() == {name: [] for name in fixed}
+    for _ in range(3):
+        add(task, breakdown, commands=task.commands.clone(), lin_vel=[0.25, 0.5, 0.0], ang_vel=[0.0, 0.0, -0.1])
+    for (name, value), error in zip(fixed.items(), (0.25, 0.5, 0.1), strict=True):
+        (part,) = breakdown.table()[name]
+        expected = {"from": value, "to": value, "share": 1.0, "track_percentage": 0.5, "error": error}
+        assert part == pytest.approx(expected, abs=1e-6)
+
+
+def test_measure_uses_the_commands_of_the_step(make_task):
+    """A step is judged by the command that held in it, though a new one is drawn at its end; episodes begin anew."""
+    task = make_task("a1_position", 3, **{"commands.resampling_probability": 1.0})
+    task.episode_length_buf = torch.full((3,), 500)
+    held, told, velocity, step = [], [], [], task.step
+
+    def noted_step(actions):
+        held.append(task.commands.clone())
+        result = step(actions)
+        velocity.append(task.base_lin_vel[:, :2].clone())
+        return result
+
+    task.step = noted_step
+    means = measure(task, lambda obs: torch.zeros(3, 12), 6, told.append).means()
+    assert len(told) == 6 and all(torch.equal(*pair) for pair in zip(held, told, strict=True))
+    assert not torch.equal(held[0], held[1]) and task.episode_length_buf.tolist() == [6] * 3
+    errors = [((a[:, :2] - b) ** 2).sum(dim=1).mean() for a, b in zip(held, velocity, strict=True)]
+    assert means["track_xy"] == pytest.approx(float(torch.stack(errors).mean()), rel=1e-5)
