@@ -7,6 +7,7 @@ from setuptools import find_packages, setup
 
 ROOT = Path(__file__).parent
 VERSION = re.search(r'__version__ = "(.+?)"', (ROOT / "legged_torque" / "__init__.py").read_text("utf-8")).group(1)
+EXPORT = ["onnx>=1.16,<2", "onnxruntime>=1.18,<2", "jsonschema>=4.18,<5"]
 
 setup(
     name="legged_torque",
@@ -16,6 +17,7 @@ setup(
     long_description_content_type="text/markdown",
     license="BSD-3-Clause",
     packages=find_packages(include=["legged_torque", "legged_torque.*"]),
+    package_data={"legged_torque.deploy": ["policy.schema.json"]},
     python_requires=">=3.10",
     install_requires=[
         "torch>=2.6,<2.14",
@@ -30,7 +32,9 @@ setup(
     extras_require={
         "video": ["imageio", "imageio-ffmpeg"],
         "plots": ["matplotlib"],
+        "viewer": ["viser>=1.1,<2", "trimesh>=4.8,<6", "pillow"],
         "wandb": ["wandb"],
-        "test": ["pytest", "matplotlib", "imageio", "imageio-ffmpeg"],
+        "export": EXPORT,
+        "test": ["pytest", "matplotlib", "imageio", "imageio-ffmpeg", *EXPORT],
     },
 )

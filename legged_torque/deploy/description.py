@@ -1,0 +1,187 @@
+"""Reading, checking and writing ``policy.yaml``: what a robot must know to run a policy."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from legged_torque.utils.errors import UserError, unknown_name
+
+DESCRIPTION_FILE = "policy.yaml"
+NETWORK_FILE = "policy.onnx"
+SCHEMA_FILE = Path(__file__).with_name("policy.schema.json")
+FORMAT_VERSION = 1
+
+COMMENTS = {
+    "format_version": "How to run policy.onnx on a robot; docs/deploy.md of legged_torque explains it.",
+    "training": "total_steps: environment steps over all worlds",
+    "network": "one row of observations per robot in, one row of actions out; mean actions, normalization is inside",
+    "joint_order": "order of joints in observations, actions and torques",
+    "nominal_pose": "[rad]",
+    "nominal_trunk_height": "[m] above the ground",
+    "observations": "terms in order, each clip(scale * value); with history_length > 1 the newest step comes first,\n"
+    "and an episode starts with copies of its first step",
+    "actions": "terms in order; actions are clipped first. Torque: the sum over terms of mixing_weight times\n"
+    "position_residual: stiffness * (nominal_pose + scale * action - q) - damping * qd\n"
+    "torque: scale * action\n"
+    "then clipped to torque_limits",
+    "gains": "stiffness Kp [N m/rad], damping Kd [N m s/rad]",
+    "torque_limits": "[N m]",
+    "timing": "[Hz]; actions hold for decimation physics steps; refresh_torques: torques are computed anew from q and\n"
+    "qd at every physics step, otherwise once per control step",
+    "commands": "[m/s, m/s, rad/s] in the trunk's frame, as trained; resampling_probability per control step",
+    "initial_state": "of an episode in training, drawn uniformly: [m], [rad], [m/s], [rad/s];\n"
+    "joint positions are nominal_pose times joint_position_scale, then inside the joint limits",
+    "episode": "length [s]; parts of names of geoms whose contact with the ground ends an episode",
+}
+"""What stands above each section of the file."""
+
+
+def read(path: str | Path) -> tuple[dict[str, Any], Path]:
+    """Read and check the description of a policy.
+
+    Args:
+        path: ``policy.yaml``, a network beside it, or the folder of both.
+
+    Returns:
+        The description, and the file of the network.
+
+    Raises:
+        UserError: If a file is missing or the description is not a valid one.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise UserError(f"there is no file or folder '{path}'")
+    folder = path if path.is_dir() else path.parent
+    is_network = path.suffix == ".onnx"
+    file = folder / DESCRIPTION_FILE if path.is_dir() or is_network else path
+    if not file.is_file():
+        raise UserError(f"there is no {DESCRIPTION_FILE} in '{folder}'")
+    try:
+        description = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, ValueError, OSError) as error:
+        raise UserError(f"'{file}' is not valid YAML: {' '.join(str(error).split())}") from None
+    check(description, f"'{file}'")
+    network = path if is_network else folder / description["network"]["file"]
+    if not network.is_file():
+        raise UserError(f"there is no network '{network}'")
+    return description, network
+
+
+def to_yaml(description: dict[str, Any]) -> str:
+    """Return the text of a description, section by section with a comment above each."""
+    parts = []
+    for key, value in description.items():
+        comment = "".join(f"# {line}\n" for line in COMMENTS.get(key, "").splitlines())
+        flow = None if isinstance(value, (dict, list)) else False  # one line for what holds only plain values
+        parts.append(comment + yaml.safe_dump({key: value}, sort_keys=False, width=100, default_flow_style=flow))
+    return "\n".join(parts)
+
+
+def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
+    """Check a description by the schema, and that its parts fit each other.
+
+    Args:
+        description: As read from YAML.
+        where: Name of its file, for messages.
+
+    Raises:
+        UserError: Naming the first entry that is wrong.
+    """
+    _check_schema(description, where)
+    for path, value in _numbers(description):
+        if not math.isfinite(value):
+            raise UserError(f"{where}: {path} is not a finite number")
+    _check_joints(description, where)
+    _check_terms(description, where)
+    _check_ranges(description, where)
+    timing = description["timing"]
+    if not math.isclose(timing["physics_frequency"], timing["control_frequency"] * timing["decimation"], rel_tol=1e-6):
+        raise UserError(f"{where}: timing.physics_frequency is not control_frequency times decimation")
+
+
+def _check_schema(description: Any, where: str) -> None:
+    """Check structure, types and single values."""
+    try:
+        import jsonschema
+    except ImportError:
+        raise missing_extra("jsonschema") from None
+    validator = jsonschema.Draft202012Validator(json.loads(SCHEMA_FILE.read_text(encoding="utf-8")))
+    error = jsonschema.exceptions.best_match(validator.iter_errors(description))
+    if error is not None:
+        path = ".".join(str(key) for key in error.absolute_path) or "the file"
+        message = " ".join(error.message.split())
+        raise UserError(f"{where}: {path}: {message if len(message) < 160 else '... ' + message[-150:]}")
+
+
+def _check_joints(description: dict[str, Any], where: str) -> None:
+    """Check that what is given by joint has all joints and no others."""
+    joints = description["joint_order"]
+    by_joint = {
+        "nominal_pose": description["nominal_pose"],
+        "gains.stiffness": description["gains"]["stiffness"],
+        "gains.damping": description["gains"]["damping"],
+        "torque_limits": description["torque_limits"],
+    }
+    for path, values in by_joint.items():
+        for name in values:
+            if name not in joints:
+                raise unknown_name(f"joint in {path} of {where}", name, joints)
+        for name in joints:
+            if name not in values:
+                raise UserError(f"{where}: {path} lacks the joint '{name}'")
+
+
+def _check_terms(description: dict[str, Any], where: str) -> None:
+    """Check the sizes of the terms of observations and actions."""
+    num_joints = len(description["joint_order"])
+    observations, actions, network = (description[key] for key in ("observations", "actions", "network"))
+    num_actions = sum(term["size"] for term in actions["terms"])
+    sizes = {"joint_position": num_joints, "joint_velocity": num_joints, "last_action": num_actions}
+    for section, default in ((observations, 3), (actions, num_joints)):
+        names = [term["name"] for term in section["terms"]]
+        for term in section["terms"]:
+            name, size = term["name"], sizes.get(term["name"], default)
+            if names.count(name) > 1:
+                raise UserError(f"{where}: the term '{name}' occurs more than once")
+            if term["size"] != size:
+                raise UserError(f"{where}: the term '{name}' must have size {size}, not {term['size']}")
+            if isinstance(term["scale"], list) and len(term["scale"]) != size:
+                raise UserError(f"{where}: the term '{name}' must have one scale or {size}, not {len(term['scale'])}")
+    now = sum(term["size"] for term in observations["terms"])
+    expected = {"num_observations": now * observations["history_length"], "num_actions": num_actions}
+    for key, value in expected.items():
+        if network[key] != value:
+            raise UserError(f"{where}: network.{key} is {network[key]}, but the terms have {value} numbers")
+
+
+def _check_ranges(description: dict[str, Any], where: str) -> None:
+    """Check that no range has its ends exchanged."""
+    ranges = {f"torque_limits.{joint}": limits for joint, limits in description["torque_limits"].items()}
+    ranges |= {f"commands.{key}": limits for key, limits in description["commands"].items()}
+    ranges |= {f"initial_state.{key}": limits for key, limits in description["initial_state"].items()}
+    ranges |= {f"clip of {term['name']}": term["clip"] for term in description["observations"]["terms"]}
+    ranges["actions.clip"] = description["actions"]["clip"]
+    for path, limits in ranges.items():
+        if isinstance(limits, list) and len(limits) == 2 and limits[0] > limits[1]:
+            raise UserError(f"{where}: {path} must be [lowest, highest], not {limits}")
+
+
+def _numbers(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
+    """Return every number of nested lists and dictionaries, with its dotted path."""
+    if isinstance(value, (dict, list)):
+        entries = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, entry in entries:
+            yield from _numbers(entry, f"{path}.{key}" if path else str(key))
+    elif isinstance(value, float):
+        yield path, value
+
+
+def missing_extra(package: str) -> UserError:
+    """Return the error for a package that is not installed."""
+    return UserError(f"{package} is not installed; exported policies need the extra: pip install -e .[export]")

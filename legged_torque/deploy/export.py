@@ -1,0 +1,289 @@
+"""From a checkpoint to the files that a robot needs: ``policy.onnx``, ``policy.pt`` and ``policy.yaml``."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import shutil
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rsl_rl.models import MLPModel
+from torch import Tensor
+
+from legged_torque import ROOT_DIR, __version__
+from legged_torque.deploy.description import (
+    DESCRIPTION_FILE,
+    FORMAT_VERSION,
+    NETWORK_FILE,
+    check,
+    missing_extra,
+    to_yaml,
+)
+from legged_torque.deploy.policy import Policy, State
+from legged_torque.envs.a1.multi_head import MultiHeadRobot
+from legged_torque.envs.a1.torque import TorqueRobot
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.runs import package_versions
+
+TORCHSCRIPT_FILE = "policy.pt"
+NUM_SAMPLES = 256
+"""Random observations on which the exported networks are compared."""
+TOLERANCE = 1e-5
+"""Largest difference between an exported number and the task's, relative to the number where it is larger than 1."""
+
+
+def nominal_cfg(cfg: Any) -> Any:
+    """Change a task's settings, in place, to those of a robot that is not randomized, for :func:`export_policy`."""
+    cfg.env.num_envs = 4
+    cfg.domain_rand.randomize_parameters = cfg.domain_rand.push_robots = cfg.noise.add_noise = False
+    cfg.domain_rand.action_delay = [0, 0]
+    return cfg
+
+
+def export_policy(task: LeggedRobot, model: MLPModel, folder: Path, name: str, training: dict[str, Any]) -> float:
+    """Write a policy with everything that is needed to run it, and check what was written.
+
+    Args:
+        task: The task, with settings of :func:`nominal_cfg` and the counters of the checkpoint. Its state is changed.
+        model: The policy's network.
+        folder: Where to write; files of an earlier export there are replaced, ``policy.yaml`` last.
+        name: Name of the task.
+        training: "run", "checkpoint", "iterations" and "total_steps" of where the policy is from.
+
+    Returns:
+        Largest difference between the exported networks and the model.
+
+    Raises:
+        UserError: If the policy is not one that ``policy.yaml`` can describe, or a package is missing.
+    """
+    for package in ("onnx", "onnxruntime", "jsonschema"):
+        if importlib.util.find_spec(package) is None:
+            raise missing_extra(package)
+    if model.is_recurrent or list(model.obs_groups) != ["policy"]:
+        raise UserError("only policies without memory that read the observation group 'policy' can be exported")
+    description = describe(task, name, training)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"'{folder}' is not a folder")
+    part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        write_networks(model, part)
+        description["network"]["sha256"] = hashlib.sha256((part / NETWORK_FILE).read_bytes()).hexdigest()
+        check(description)
+        (part / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
+        policy = Policy(part)
+        difference = check_networks(model, policy, part)
+        check_task(task, policy)
+        _move(part, folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return difference
+
+
+def write_networks(model: MLPModel, folder: Path) -> None:
+    """Write the mean policy as ONNX and TorchScript, normalization of observations included."""
+    network = model.as_onnx(verbose=False).cpu().eval()
+    batch = {0: "batch"}
+    with warnings.catch_warnings():
+        # The older exporter needs 0.3 s instead of 6, writes the same nodes, and keeps everything in one file.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.onnx.export(
+            network,
+            (torch.zeros(2, model.obs_dim),),
+            str(folder / NETWORK_FILE),
+            input_names=["obs"],
+            output_names=["actions"],
+            dynamic_axes={"obs": batch, "actions": batch},
+            opset_version=17,
+            dynamo=False,
+        )
+        torch.jit.script(model.as_jit().cpu().eval()).save(str(folder / TORCHSCRIPT_FILE))
+
+
+def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str, Any]:
+    """Return the contents of ``policy.yaml`` but for the network's checksum; arguments as of :func:`export_policy`."""
+    cfg, model = task.cfg, task.sim.mj_model
+    file = Path(cfg.asset.file)
+    if file.is_absolute() and file.is_relative_to(ROOT_DIR):
+        file = file.relative_to(ROOT_DIR)
+    rand, ranges = cfg.domain_rand, cfg.commands.ranges
+    return {
+        "format_version": FORMAT_VERSION,
+        "task": name,
+        "robot": {"name": file.stem, "file": file.as_posix(), "trunk": model.body(1).name},
+        "versions": package_versions() | {"legged_torque": __version__},
+        "training": training,
+        "network": {
+            "file": NETWORK_FILE,
+            "torchscript": TORCHSCRIPT_FILE,
+            "input": "obs",
+            "output": "actions",
+            "num_observations": task.obs_buf["policy"].shape[1],
+            "num_actions": task.num_actions,
+        },
+        "joint_order": list(task.dof_names),
+        "nominal_pose": _by_joint(task, task.default_dof_pos),
+        "nominal_trunk_height": cfg.rewards.base_height_target,
+        "observations": {"history_length": cfg.env.history_length, "terms": _observation_terms(task)},
+        "actions": {"clip": _both_ways(cfg.normalization.clip_actions), "terms": _action_terms(task)},
+        "gains": {"stiffness": _by_joint(task, task.p_gains[0]), "damping": _by_joint(task, task.d_gains[0])},
+        "torque_limits": _by_joint(task, task.torque_limits.T),
+        "timing": {
+            "control_frequency": 1.0 / task.dt,
+            "physics_frequency": 1.0 / cfg.sim.dt,
+            "decimation": cfg.control.decimation,
+            "refresh_torques": cfg.control.refresh_torques,
+        },
+        "commands": {
+            "lin_vel_x": list(ranges.lin_vel_x),
+            "lin_vel_y": list(ranges.lin_vel_y),
+            "ang_vel_yaw": list(ranges.ang_vel_yaw),
+            "resampling_probability": cfg.commands.resampling_probability,
+        },
+        "initial_state": {
+            "trunk_position": list(cfg.init_state.pos),
+            "roll": list(rand.init_roll),
+            "pitch": list(rand.init_pitch),
+            "yaw": list(rand.init_yaw),
+            "joint_position_scale": list(rand.init_dof_pos_scale),
+            "trunk_linear_velocity": list(rand.init_lin_vel),
+            "trunk_angular_velocity": list(rand.init_ang_vel),
+            "joint_velocity": list(rand.init_dof_vel),
+        },
+        "episode": {
+            "length": cfg.env.episode_length_s,
+            "ends_on_contact_of": list(cfg.asset.terminate_after_contacts_on),
+        },
+    }
+
+
+def _observation_terms(task: LeggedRobot) -> list[dict[str, Any]]:
+    """Return the terms of the policy's observations in their order."""
+    scales, joints = task.cfg.normalization.obs_scales, task.num_dof
+    clip = _both_ways(task.cfg.normalization.clip_observations)
+    command_scale = [scales.lin_vel, scales.lin_vel, scales.ang_vel]
+    rows = [
+        ("projected_gravity", 3, 1.0, "trunk", "", "unit vector of gravity, (0, 0, -1) when upright"),
+        ("angular_velocity", 3, scales.ang_vel, "trunk", "rad/s", "of the trunk"),
+        ("command", 3, command_scale, "trunk", "m/s, m/s, rad/s", "commanded v_x, v_y and yaw rate"),
+        ("joint_position", joints, scales.dof_pos, "joint", "rad", "q - nominal_pose"),
+        ("joint_velocity", joints, scales.dof_vel, "joint", "rad/s", "qd"),
+        ("last_action", task.num_actions, 1.0, "none", "", "clipped actions of the step before, 0 at the start"),
+    ]
+    keys = ("name", "size", "scale", "frame", "unit", "meaning")
+    return [dict(zip(keys, row, strict=True)) | {"clip": list(clip)} for row in rows]
+
+
+def _action_terms(task: LeggedRobot) -> list[dict[str, Any]]:
+    """Return what actions mean, in their order, mixed as at the task's counters; :func:`check_task` checks it."""
+    scales = {"position_residual": task.action_scale, "torque": task.torque_scale}
+    texts = {"position_residual": ("rad", "joint position relative to nominal_pose, for PD control")}
+    texts["torque"] = ("N m", "joint torque")
+    if isinstance(task, MultiHeadRobot):
+        weights = dict(zip(scales, _plain(task.mixing), strict=True))
+    else:
+        weights = {"torque" if isinstance(task, TorqueRobot) else "position_residual": 1.0}
+    return [
+        {
+            "name": name,
+            "size": task.num_dof,
+            "scale": _plain(scales[name][0, 0]),
+            "unit": texts[name][0],
+            "mixing_weight": weight,
+            "meaning": texts[name][1],
+        }
+        for name, weight in weights.items()
+    ]
+
+
+def check_networks(model: MLPModel, policy: Policy, folder: Path) -> float:
+    """Return the largest difference between the exported networks and the model on random observations.
+
+    Raises:
+        UserError: If it is too large.
+    """
+    obs = torch.randn(NUM_SAMPLES, model.obs_dim, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        expected = model.as_jit().cpu().eval()(obs).numpy()
+        scripted = torch.jit.load(str(folder / TORCHSCRIPT_FILE))(obs).numpy()
+    run = policy.session.run(["actions"], {"obs": obs.numpy()})[0]
+    difference = max(_difference(run, expected), _difference(scripted, expected))
+    if not difference <= TOLERANCE:
+        raise UserError(f"the exported network differs from the checkpoint's by {difference:.3g}; nothing was written")
+    return difference
+
+
+def check_task(task: LeggedRobot, policy: Policy) -> None:
+    """Compare observations and torques of the task with those of the exported policy in random states.
+
+    Raises:
+        UserError: If the task computes them in another way than ``policy.yaml`` says.
+    """
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(like: Tensor, scale: float) -> None:
+        like.copy_(scale * torch.randn(like.shape, generator=generator))
+
+    draw(task.sim.qpos, 1.0)
+    task.base_quat.div_(task.base_quat.norm(dim=1, keepdim=True))
+    for tensor in (task.sim.qvel, task.commands, task.actions):
+        draw(tensor, 3.0)
+    task.reset_buf.fill_(True)  # the history starts with copies
+    task._update_state()
+    task.compute_observations()
+    torques = task.motor_strength * task._compute_torques(task.actions)
+    expected = torques.clamp(task.torque_limits[0], task.torque_limits[1])
+    for world in range(task.num_envs):
+        parts = (task.base_ang_vel, task.dof_pos, task.dof_vel, task.projected_gravity)
+        state = State(*(part[world].cpu().numpy() for part in parts))
+        policy.reset()
+        policy.last_action = actions = task.actions[world].cpu().numpy()
+        obs = policy.observation(state, task.commands[world].cpu().numpy())
+        got = policy.torques(actions, state.joint_positions, state.joint_velocities)
+        pairs = {"observations": (obs, task.obs_buf["policy"][world]), "torques": (got, expected[world])}
+        for what, (ours, theirs) in pairs.items():
+            difference = _difference(ours, theirs.cpu().numpy()) if ours.shape == theirs.shape else float("inf")
+            if not difference <= TOLERANCE:
+                raise UserError(
+                    f"the {what} of {type(task).__name__} are not what {DESCRIPTION_FILE} can describe: they differ by "
+                    f"{difference:.3g}"
+                )
+
+
+def _difference(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Return the largest difference, relative where numbers are larger than 1."""
+    return float((np.abs(ours - theirs) / np.maximum(np.abs(theirs), 1.0)).max())
+
+
+def _move(part: Path, folder: Path) -> None:
+    """Put a finished folder in its place; in one that exists, replace file by file, the description last."""
+    part.chmod(0o755)
+    if not folder.exists():
+        os.replace(part, folder)
+        return
+    for name in (NETWORK_FILE, TORCHSCRIPT_FILE, DESCRIPTION_FILE):
+        os.replace(part / name, folder / name)
+
+
+def _by_joint(task: LeggedRobot, values: Tensor) -> dict[str, Any]:
+    """Return values by name of the joint."""
+    return dict(zip(task.dof_names, _plain(values), strict=True))
+
+
+def _both_ways(limit: float) -> list[float]:
+    """Return the range of a symmetric limit."""
+    return [-float(limit), float(limit)]
+
+
+def _plain(values: Tensor) -> Any:
+    """Return a float32 tensor as nested lists of the shortest decimals that stand for its numbers."""
+    if values.dim():
+        return [_plain(value) for value in values]
+    return float(str(values.detach().cpu().numpy()))

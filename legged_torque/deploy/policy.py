@@ -1,0 +1,200 @@
+"""An exported policy in numpy: observations, actions and torques of one robot, without torch or a simulator."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from legged_torque.deploy.description import missing_extra, read
+from legged_torque.utils.errors import UserError
+
+
+@dataclass
+class State:
+    """What a robot measures; joints in the policy's order.
+
+    Attributes:
+        angular_velocity: Of the trunk, in its own frame [rad/s]. Shape: (3,).
+        joint_positions: Shape: (joints,) [rad].
+        joint_velocities: Shape: (joints,) [rad/s].
+        projected_gravity: Unit gravity vector in the trunk's frame; upright it is (0, 0, -1). Shape: (3,).
+        quaternion: Orientation of the trunk (w, x, y, z), needed if there is no gravity vector. Shape: (4,).
+    """
+
+    angular_velocity: np.ndarray
+    joint_positions: np.ndarray
+    joint_velocities: np.ndarray
+    projected_gravity: np.ndarray | None = None
+    quaternion: np.ndarray | None = None
+
+    def gravity(self) -> np.ndarray:
+        """Return the unit gravity vector in the trunk's frame. Shape: (3,)."""
+        if self.projected_gravity is not None:
+            return np.asarray(self.projected_gravity)
+        if self.quaternion is None:
+            raise ValueError("a state needs projected_gravity or quaternion")
+        w, x, y, z = np.asarray(self.quaternion) / np.linalg.norm(self.quaternion)
+        return -np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+
+
+class Policy:
+    """Runs an exported policy for one robot: once per control step :meth:`observation`, then :meth:`act`, and for
+    every physics step (or, without ``refresh_torques``, once) :meth:`torques`.
+
+    Attributes:
+        description: Contents of ``policy.yaml``.
+        joint_order: Names of the joints, in the order of all vectors of joints.
+        nominal_pose: Shape: (joints,) [rad].
+        torque_limits: Lowest and highest torques. Shape: (2, joints) [N m].
+        last_action: Clipped actions of the last step; 0 after a reset. Shape: (actions,).
+        session: The network in onnxruntime.
+    """
+
+    def __init__(self, path: str | Path, dtype: type = np.float32) -> None:
+        """Load a policy.
+
+        Args:
+            path: ``policy.yaml``, ``policy.onnx`` beside it, or the folder of both.
+            dtype: Type of observations, actions and torques: ``np.float32`` as in training, or ``np.float64``.
+
+        Raises:
+            UserError: If a file is missing, damaged or does not fit the other one.
+        """
+        self.description, network = read(path)
+        self.dtype = dtype
+        self.joint_order: list[str] = self.description["joint_order"]
+        self.nominal_pose = self._by_joint(self.description["nominal_pose"])
+        self.torque_limits = self._by_joint(self.description["torque_limits"]).T
+        gains = self.description["gains"]
+        self._stiffness, self._damping = self._by_joint(gains["stiffness"]), self._by_joint(gains["damping"])
+        self._action_terms = self.description["actions"]["terms"]
+        self._action_clip = self.description["actions"]["clip"]
+        terms = self.description["observations"]["terms"]
+        self._terms = [term["name"] for term in terms]
+        sizes = [term["size"] for term in terms]
+        self._scale = np.concatenate([np.full(n, term["scale"], dtype) for n, term in zip(sizes, terms, strict=True)])
+        clips = [np.tile(np.array(term["clip"], dtype), (n, 1)) for n, term in zip(sizes, terms, strict=True)]
+        self._low, self._high = np.concatenate(clips).T
+        self.session = load_network(network, self.description["network"])
+        self.reset()
+
+    def reset(self) -> None:
+        """Start a new episode: forget the last action and the history."""
+        self.last_action = np.zeros(self.description["network"]["num_actions"], self.dtype)
+        self._history: np.ndarray | None = None
+
+    def observation(self, state: State, command: np.ndarray) -> np.ndarray:
+        """Return what the network sees; to be called once per control step, since it keeps the history.
+
+        Args:
+            state: What the robot measures.
+            command: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (3,).
+
+        Returns:
+            Shape: (observations,), the newest step first.
+        """
+        values = {
+            "projected_gravity": state.gravity(),
+            "angular_velocity": state.angular_velocity,
+            "command": command,
+            "joint_position": self._joints(state.joint_positions) - self.nominal_pose,
+            "joint_velocity": self._joints(state.joint_velocities),
+            "last_action": self.last_action,
+        }
+        now = np.concatenate([np.asarray(values[name], self.dtype) for name in self._terms])
+        if now.shape != self._scale.shape:
+            raise ValueError(f"a state and a command make {now.size} observations, not {self._scale.size}")
+        now = np.clip(now * self._scale, self._low, self._high)
+        if self._history is None:
+            self._history = np.tile(now, self.description["observations"]["history_length"])
+        else:
+            self._history = np.concatenate([now, self._history[: -now.size]])
+        return self._history.copy()
+
+    def act(self, obs: np.ndarray) -> np.ndarray:
+        """Return the mean actions for observations, clipped, and keep them as the last ones.
+
+        Args:
+            obs: Shape: (observations,).
+
+        Returns:
+            Shape: (actions,).
+
+        Raises:
+            UserError: If an action is not finite, which must not reach a robot.
+        """
+        (actions,) = self.session.run(["actions"], {"obs": np.asarray(obs, np.float32)[np.newaxis]})
+        if not np.isfinite(actions).all():
+            raise UserError("the network's actions are not finite: check the observations")
+        self.last_action = np.clip(actions[0], *self._action_clip).astype(self.dtype)
+        return self.last_action.copy()
+
+    def torques(self, actions: np.ndarray, joint_positions: np.ndarray, joint_velocities: np.ndarray) -> np.ndarray:
+        """Return joint torques for actions, clipped to the limits.
+
+        Args:
+            actions: From :meth:`act`. Shape: (actions,).
+            joint_positions: Now. Shape: (joints,) [rad].
+            joint_velocities: Now. Shape: (joints,) [rad/s].
+
+        Returns:
+            Shape: (joints,) [N m].
+        """
+        actions = np.asarray(actions, self.dtype).reshape(len(self._action_terms), len(self.joint_order))
+        total = np.zeros(len(self.joint_order), self.dtype)
+        for term, action in zip(self._action_terms, actions, strict=True):
+            torque = self.dtype(term["scale"]) * action
+            if term["name"] == "position_residual":
+                error = self.nominal_pose + torque - self._joints(joint_positions)
+                torque = self._stiffness * error - self._damping * self._joints(joint_velocities)
+            total += self.dtype(term["mixing_weight"]) * torque
+        return np.clip(total, *self.torque_limits)
+
+    def _by_joint(self, values: dict[str, Any]) -> np.ndarray:
+        """Return values by joint in the policy's order. Shape: (joints, ...)."""
+        return np.array([values[name] for name in self.joint_order], self.dtype)
+
+    def _joints(self, values: np.ndarray) -> np.ndarray:
+        """Return one number per joint in the policy's precision. Shape: (joints,)."""
+        values = np.asarray(values, self.dtype)
+        if values.shape != self.nominal_pose.shape:
+            raise ValueError(f"there are {self.nominal_pose.size} joints, the array has shape {values.shape}")
+        return values
+
+
+def load_network(file: Path, expected: dict[str, Any]) -> Any:
+    """Return an onnxruntime session on one thread.
+
+    Args:
+        file: The network.
+        expected: ``network`` of the description.
+
+    Raises:
+        UserError: If the file cannot be read or is not the network that was described.
+    """
+    try:
+        import onnxruntime
+    except ImportError:
+        raise missing_extra("onnxruntime") from None
+    content = file.read_bytes()
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    try:
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime has an exception class per kind of damage
+        raise UserError(f"'{file}' is not a readable network: {' '.join(str(error).split())[:160]}") from None
+    ends = ("input", session.get_inputs()), ("output", session.get_outputs())
+    sizes = expected["num_observations"], expected["num_actions"]
+    for (kind, nodes), size in zip(ends, sizes, strict=True):
+        if len(nodes) != 1 or nodes[0].name != expected[kind]:
+            raise UserError(f"'{file}' must have one {kind} '{expected[kind]}', not {[node.name for node in nodes]}")
+        if len(nodes[0].shape) != 2 or nodes[0].shape[1] != size:
+            raise UserError(f"'{file}': {kind} '{nodes[0].name}' has shape {nodes[0].shape}, not [batch, {size}]")
+    if hashlib.sha256(content).hexdigest() != expected.get("sha256", hashlib.sha256(content).hexdigest()):
+        raise UserError(f"'{file}' is not the network that was exported with its policy.yaml (sha256 differs)")
+    return session

@@ -1,0 +1,246 @@
+"""The robot of a MJCF file: its joints and motors found by name, its ground, and where it differs from policy.yaml."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from legged_torque.deploy.policy import State
+from legged_torque.utils.errors import UserError, unknown_name
+
+_WARNINGS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+_JOINTS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+class Robot:
+    """One robot in MuJoCo; vectors of joints are in the policy's order, whatever the file's is.
+
+    Attributes:
+        model: The compiled MJCF, with the policy's time step.
+        data: Its state.
+        notes: What in the MJCF differs from ``policy.yaml``, a line each.
+    """
+
+    def __init__(self, xml: str | Path, description: dict[str, Any]) -> None:
+        """Load a robot.
+
+        Args:
+            xml: MJCF file, with or without a floor.
+            description: Contents of ``policy.yaml``.
+
+        Raises:
+            UserError: If the file cannot be read, or lacks a joint or a motor that the policy needs.
+        """
+        self.notes: list[str] = []
+        self.model = self._load(Path(xml))
+        self.data = mujoco.MjData(self.model)
+        self._set_time_step(1.0 / description["timing"]["physics_frequency"])
+        self._find_root()
+        self._find_joints(description["joint_order"])
+        self._find_motors(description)
+        self._find_geoms(description["episode"]["ends_on_contact_of"])
+        self.weight = float(self.model.body_mass.sum() * np.linalg.norm(self.model.opt.gravity))
+
+    # ---- what a controller reads and writes --------------------------------------------------------------------------
+
+    def state(self) -> State:
+        """Return what the robot's sensors would measure, without errors."""
+        return State(self.trunk_angular_velocity(), self.joint_positions(), self.joint_velocities(), None, self.quat())
+
+    def joint_positions(self) -> np.ndarray:
+        """Return joint positions. Shape: (joints,) [rad]."""
+        return self.data.qpos[self._qpos]
+
+    def joint_velocities(self) -> np.ndarray:
+        """Return joint velocities. Shape: (joints,) [rad/s]."""
+        return self.data.qvel[self._dofs]
+
+    def applied_torques(self) -> np.ndarray:
+        """Return the motors' torques in the last physics step. Shape: (joints,) [N m]."""
+        return self.data.qfrc_actuator[self._dofs]
+
+    def step(self, torques: np.ndarray) -> None:
+        """Advance by one physics step.
+
+        Args:
+            torques: Shape: (joints,) [N m].
+        """
+        self.data.ctrl[self._motors] = torques / self._torque_per_ctrl
+        mujoco.mj_step(self.model, self.data)
+
+    # ---- the trunk ---------------------------------------------------------------------------------------------------
+
+    def position(self) -> np.ndarray:
+        """Return the trunk's position in the world. Shape: (3,) [m]."""
+        return self.data.qpos[self._root_qpos : self._root_qpos + 3]
+
+    def quat(self) -> np.ndarray:
+        """Return the trunk's orientation (w, x, y, z). Shape: (4,)."""
+        return self.data.qpos[self._root_qpos + 3 : self._root_qpos + 7]
+
+    def velocity(self) -> np.ndarray:
+        """Return the trunk's linear velocity in the world, writable. Shape: (3,) [m/s]."""
+        return self.data.qvel[self._root_dof : self._root_dof + 3]
+
+    def trunk_velocity(self) -> np.ndarray:
+        """Return the trunk's linear velocity in its own frame. Shape: (3,) [m/s]."""
+        matrix = np.zeros(9)
+        mujoco.mju_quat2Mat(matrix, self.quat())
+        return matrix.reshape(3, 3).T @ self.velocity()
+
+    def trunk_angular_velocity(self) -> np.ndarray:
+        """Return the trunk's angular velocity in its own frame. Shape: (3,) [rad/s]."""
+        return self.data.qvel[self._root_dof + 3 : self._root_dof + 6]
+
+    def reset(
+        self, position: np.ndarray, quat: np.ndarray, joint_positions: np.ndarray, velocities: tuple[np.ndarray, ...]
+    ) -> None:
+        """Put the robot into a state, everything else as in the MJCF.
+
+        Args:
+            position: Of the trunk. Shape: (3,) [m].
+            quat: Of the trunk (w, x, y, z). Shape: (4,).
+            joint_positions: They are brought inside the joint limits. Shape: (joints,) [rad].
+            velocities: Linear (world) [m/s] and angular (trunk) [rad/s], shapes (3,), and joint velocities (joints,).
+        """
+        mujoco.mj_resetData(self.model, self.data)
+        self.position()[:], self.quat()[:] = position, quat
+        self.data.qpos[self._qpos] = np.clip(joint_positions, *self._joint_limits)
+        self.velocity()[:], self.trunk_angular_velocity()[:] = velocities[:2]
+        self.data.qvel[self._dofs] = velocities[2]
+
+    # ---- contacts ----------------------------------------------------------------------------------------------------
+
+    def has_fallen(self) -> bool:
+        """Return whether a geom that ends an episode touched the ground in the last physics step, or MuJoCo gave up."""
+        if any(self.data.warning[kind].number for kind in _WARNINGS):
+            return True
+        return any(self._is_ending[geom] for _, geom, _ in self._ground_contacts())
+
+    def contact_force(self) -> float:
+        """Return the sum over the robot's geoms of the norm of the ground's net force in the last physics step [N]."""
+        forces = np.zeros((self.model.ngeom, 3))
+        force = np.zeros(6)
+        for number, geom, sign in self._ground_contacts():
+            mujoco.mj_contactForce(self.model, self.data, number, force)
+            forces[geom] += sign * self.data.contact[number].frame.reshape(3, 3).T @ force[:3]
+        return float(np.linalg.norm(forces, axis=1).sum())
+
+    def _ground_contacts(self) -> list[tuple[int, int, float]]:
+        """Return number, geom of the robot, and the force's sign on it, of each contact with the ground."""
+        result = []
+        for number in range(self.data.ncon):
+            contact = self.data.contact[number]
+            first, second = contact.geom
+            if contact.exclude == 0 and self._is_ground[first] != self._is_ground[second]:
+                result.append((number, second, 1.0) if self._is_ground[first] else (number, first, -1.0))
+        return result
+
+    # ---- reading the MJCF --------------------------------------------------------------------------------------------
+
+    def _load(self, file: Path) -> mujoco.MjModel:
+        """Compile the file, with a floor if it has nothing to stand on."""
+        if not file.is_file():
+            raise UserError(f"there is no MJCF file '{file}'")
+        try:
+            spec = mujoco.MjSpec.from_file(str(file))
+            grounds = [geom for geom in spec.worldbody.geoms if geom.contype or geom.conaffinity]
+            if not grounds:
+                spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05])
+                self.notes.append("the MJCF has no floor: a plane at height 0 is added")
+            return spec.compile()
+        except ValueError as error:
+            raise UserError(f"cannot load the robot '{file}': {' '.join(str(error).split())}") from None
+
+    def _set_time_step(self, step: float) -> None:
+        """Take the policy's physics step."""
+        if not np.isclose(self.model.opt.timestep, step, rtol=1e-6):
+            self.notes.append(
+                f"time step: the MJCF has {self.model.opt.timestep:g} s, policy.yaml's {step:g} s is used"
+            )
+        self.model.opt.timestep = step
+
+    def _find_root(self) -> None:
+        """Find the joint that lets the trunk move freely."""
+        (free,) = np.nonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        if len(free) != 1:
+            raise UserError(f"the MJCF must have one free joint, that of the trunk; it has {len(free)}")
+        self.trunk = int(self.model.jnt_bodyid[free[0]])
+        self._root_qpos = int(self.model.jnt_qposadr[free[0]])
+        self._root_dof = int(self.model.jnt_dofadr[free[0]])
+
+    def _find_joints(self, joint_order: list[str]) -> None:
+        """Find the policy's joints by name."""
+        model = self.model
+        names = {model.joint(i).name: i for i in range(model.njnt) if model.jnt_type[i] in _JOINTS}
+        for name in joint_order:
+            if name not in names:
+                raise unknown_name("joint of the policy in the MJCF", name, names)
+        self._joint_ids = np.array([names[name] for name in joint_order])
+        self._qpos, self._dofs = model.jnt_qposadr[self._joint_ids], model.jnt_dofadr[self._joint_ids]
+        limited = model.jnt_limited[self._joint_ids, np.newaxis] > 0
+        self._joint_limits = np.where(limited, model.jnt_range[self._joint_ids], [-np.inf, np.inf]).T
+
+    def _find_motors(self, description: dict[str, Any]) -> None:
+        """Find the motor of each joint, and compare its limits with the policy's."""
+        model, motors, scales, different = self.model, [], [], {}
+        for name, joint in zip(description["joint_order"], self._joint_ids, strict=True):
+            on_joint = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
+            (found,) = np.nonzero(on_joint)
+            if len(found) != 1:
+                raise UserError(f"the MJCF must have one motor for the joint '{name}', it has {len(found)}")
+            motor = int(found[0])
+            if not _is_torque_motor(model, motor):
+                raise UserError(f"the MJCF's actuator of the joint '{name}' must be a motor, ctrl being its torque")
+            motors.append(motor)
+            scales.append(model.actuator_gainprm[motor, 0] * model.actuator_gear[motor, 0])
+            limits = _torque_range(model, motor, int(joint), scales[-1])
+            if not np.allclose(limits, description["torque_limits"][name], rtol=1e-4):
+                different.setdefault((limits, tuple(description["torque_limits"][name])), []).append(name)
+        self._motors, self._torque_per_ctrl = np.array(motors), np.array(scales)
+        for (limits, expected), names in different.items():
+            self.notes.append(
+                f"motor limits: the MJCF has {limits[0]:g} to {limits[1]:g} N m, policy.yaml {expected[0]:g} to "
+                f"{expected[1]:g} N m; the tighter ones act ({', '.join(names)})"
+            )
+        if model.nu > len(motors):
+            self.notes.append(f"{model.nu - len(motors)} motors of the MJCF are not the policy's and get 0")
+
+    def _find_geoms(self, ends_on_contact_of: list[str]) -> None:
+        """Find the ground, and the geoms whose contact with it ends an episode: by name, or else those of the trunk."""
+        model = self.model
+        self._is_ground = model.body_weldid[model.geom_bodyid] == 0
+        names = [model.geom(i).name or model.body(model.geom_bodyid[i]).name for i in range(model.ngeom)]
+        is_ending = np.array([any(part in name for part in ends_on_contact_of) for name in names]) & ~self._is_ground
+        if ends_on_contact_of and not is_ending.any():
+            trunk = model.body(self.trunk).name
+            self.notes.append(f"no geom is called like {', '.join(ends_on_contact_of)}: those of '{trunk}' count as it")
+            is_ending = model.geom_bodyid == self.trunk
+        self._is_ending = is_ending
+
+
+def _is_torque_motor(model: mujoco.MjModel, motor: int) -> bool:
+    """Return whether an actuator's torque is proportional to its control."""
+    return (
+        model.actuator_gaintype[motor] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[motor] == mujoco.mjtBias.mjBIAS_NONE
+        and model.actuator_dyntype[motor] == mujoco.mjtDyn.mjDYN_NONE
+        and model.actuator_gainprm[motor, 0] * model.actuator_gear[motor, 0] != 0.0
+    )
+
+
+def _torque_range(model: mujoco.MjModel, motor: int, joint: int, scale: float) -> tuple[float, float]:
+    """Return the lowest and highest torque that a motor can apply to its joint [N m]."""
+    low, high = -np.inf, np.inf
+    gear = model.actuator_gear[motor, 0]
+    for limited, limits in (
+        (model.actuator_ctrllimited[motor], model.actuator_ctrlrange[motor] * scale),
+        (model.actuator_forcelimited[motor], model.actuator_forcerange[motor] * gear),
+        (model.jnt_actfrclimited[joint], model.jnt_actfrcrange[joint]),
+    ):
+        if limited:
+            low, high = max(low, float(limits.min())), min(high, float(limits.max()))
+    return low, high

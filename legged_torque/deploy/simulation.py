@@ -1,0 +1,139 @@
+"""An exported policy in plain MuJoCo, one robot after another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from legged_torque.deploy.metrics import step_sums
+from legged_torque.deploy.policy import Policy
+from legged_torque.deploy.robot import Robot
+
+PUSH_ADDED = 0.5
+"""Share of pushes that add a velocity; the others set one."""
+
+
+@dataclass
+class Events:
+    """What happens to the robots.
+
+    Attributes:
+        command: Fixed v_x, v_y [m/s] and yaw rate [rad/s]; None draws them as in training. Shape: (3,).
+        push_velocity: Pushes draw each axis of the trunk's velocity from -this to this [m/s].
+        push_probability: Of a push, per control step.
+    """
+
+    command: tuple[float, float, float] | None = None
+    push_velocity: float = 0.0
+    push_probability: float = 0.0
+
+
+class Simulation:
+    """Lets a policy walk as in evaluation: random initial states and commands, pushes, new episodes.
+
+    Attributes:
+        command: The one that the robot follows now. Shape: (3,).
+    """
+
+    def __init__(self, policy: Policy, robot: Robot, events: Events) -> None:
+        """Prepare; :meth:`run` starts an episode.
+
+        Args:
+            policy: What acts.
+            robot: What it moves.
+            events: What happens to it.
+        """
+        self.policy, self.robot, self.events = policy, robot, events
+        description = policy.description
+        self._timing, self._start = description["timing"], description["initial_state"]
+        self._max_steps = math.ceil(description["episode"]["length"] * self._timing["control_frequency"] - 1e-6)
+        commands = description["commands"]
+        ranges = [commands[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")]
+        if events.command is not None:
+            ranges = [[value, value] for value in events.command]
+        self._command_range = np.array(ranges, float).T
+        self._resampling_probability = commands["resampling_probability"]
+
+    def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:
+        """Let one robot walk.
+
+        Args:
+            num_steps: Control steps.
+            seed: Of its random numbers, for ``np.random.default_rng``.
+            on_step: Called after every control step, e.g. to record it.
+
+        Returns:
+            Sums of the metrics, see :func:`~legged_torque.deploy.metrics.step_sums`. Shape: (10,).
+        """
+        self._rng = np.random.default_rng(seed)
+        self._new_episode()
+        sums = np.zeros(10)
+        for _ in range(num_steps):
+            command = self.command.copy()
+            self._control_step()
+            sums += self._finish_step(command)
+            on_step()
+        return sums
+
+    def _control_step(self) -> None:
+        """Observe, act, and apply torques for as many physics steps as actions hold."""
+        policy, robot = self.policy, self.robot
+        actions = policy.act(policy.observation(robot.state(), self.command))
+        for i in range(self._timing["decimation"]):
+            if i == 0 or self._timing["refresh_torques"]:
+                torques = policy.torques(actions, robot.joint_positions(), robot.joint_velocities())
+            robot.step(torques)
+        self._steps += 1
+
+    def _finish_step(self, command: np.ndarray) -> np.ndarray:
+        """Do what follows the physics, in the order of training, and return the step's share of the metrics."""
+        robot = self.robot
+        fell = robot.has_fallen()
+        ended = fell or self._steps >= self._max_steps
+        force = robot.contact_force()
+        power = np.abs(robot.applied_torques() * robot.joint_velocities()).sum()
+        if ended:
+            self._new_episode()
+        elif self._rng.random() < self._resampling_probability:
+            self.command = self._rng.uniform(*self._command_range)
+        if self._rng.random() < self.events.push_probability:
+            self._push()
+        velocity = np.append(robot.trunk_velocity()[:2], robot.trunk_angular_velocity()[2])
+        return step_sums(command, velocity, force, power, robot.position()[2], fell, ended)
+
+    def _push(self) -> None:
+        """Push the trunk: half of the pushes set its velocity, half are added to it."""
+        velocity = self.robot.velocity()
+        drawn = self._rng.uniform(-self.events.push_velocity, self.events.push_velocity, 3)
+        velocity[:] = drawn + velocity if self._rng.random() < PUSH_ADDED else drawn
+
+    def _new_episode(self) -> None:
+        """Draw an initial state and a command, and let the policy forget."""
+        rng, start, num_joints = self._rng, self._start, len(self.policy.joint_order)
+        angles = [rng.uniform(*start[name]) for name in ("roll", "pitch", "yaw")]
+        pose = self.policy.nominal_pose * rng.uniform(*start["joint_position_scale"], num_joints)
+        velocities = (
+            rng.uniform(*start["trunk_linear_velocity"], 3),
+            rng.uniform(*start["trunk_angular_velocity"], 3),
+            rng.uniform(*start["joint_velocity"], num_joints),
+        )
+        self.robot.reset(start["trunk_position"], quaternion(*angles), pose, velocities)
+        self.policy.reset()
+        self.command = rng.uniform(*self._command_range)
+        self._steps = 0
+
+
+def quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """Return the quaternion (w, x, y, z) of turns about x, then y, then z of the world [rad]. Shape: (4,)."""
+    result = np.array([1.0, 0.0, 0.0, 0.0])
+    for axis, angle in enumerate((roll, pitch, yaw)):
+        turn, product = np.zeros(4), np.zeros(4)
+        mujoco.mju_axisAngle2Quat(turn, np.eye(3)[axis], angle)
+        mujoco.mju_mulQuat(product, turn, result)
+        result = product
+    return result

@@ -1,0 +1,175 @@
+"""Let an exported policy walk in plain MuJoCo: ``python scripts/sim2sim.py logs/<experiment>/<run>/exported_<n>``.
+
+Needs neither torch nor Warp.
+"""
+
+import sys
+
+from legged_torque.utils.rendering import choose_offscreen_renderer
+
+NO_RENDERER = None if "--viewer" in sys.argv else choose_offscreen_renderer()  # before anything imports mujoco
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from legged_torque import ROOT_DIR
+from legged_torque.deploy.metrics import UNITS, estimates
+from legged_torque.deploy.policy import Policy
+from legged_torque.deploy.robot import Robot
+from legged_torque.deploy.simulation import Events, Simulation
+from legged_torque.deploy.video import Recorder
+from legged_torque.utils.errors import UserError
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line; that of ``legged_torque.utils.args`` needs torch."""
+
+    def error(self, message: str) -> None:
+        """Report a mistake in the arguments."""
+        raise UserError(message)
+
+
+def parse_args() -> argparse.Namespace:
+    """Parse and check the command line."""
+    parser = Parser(description=__doc__, allow_abbrev=False)
+    parser.add_argument("policy", type=Path, help="policy.yaml, policy.onnx, or the folder of both")
+    parser.add_argument("--xml", type=Path, help="MJCF of the robot; default: that of the training")
+    parser.add_argument("--steps", type=int, default=2000, help="control steps of each robot; default: %(default)s")
+    parser.add_argument("--robots", type=int, default=16, help="robots, one after another; default: %(default)s")
+    parser.add_argument(
+        "--command",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "YAW"),
+        help="fixed command [m/s, m/s, rad/s]; default: drawn as in training",
+    )
+    parser.add_argument(
+        "--push_velocity", type=float, default=0.0, help="largest velocity of a push per axis [m/s]; default: none"
+    )
+    parser.add_argument("--push_probability", type=float, help="of a push, per control step; default: 0.002")
+    parser.add_argument("--seed", type=int, default=1, help="random seed; default: %(default)s")
+    parser.add_argument("--video", type=Path, help="mp4 of the first robot to write")
+    parser.add_argument("--viewer", action="store_true", help="watch it in real time in MuJoCo's viewer")
+    parser.add_argument("--json", type=Path, help="file to write")
+    args = parser.parse_args()
+    for name in ("steps", "robots"):
+        if getattr(args, name) < 1:
+            raise UserError(f"--{name} must be at least 1, not {getattr(args, name)}")
+    if args.seed < 0:
+        raise UserError(f"--seed must not be negative, it is {args.seed}")
+    if args.push_probability is not None and not args.push_velocity:
+        raise UserError("--push_probability needs --push_velocity")
+    if args.push_probability is None:
+        args.push_probability = 0.002 if args.push_velocity else 0.0
+    if not 0.0 <= args.push_probability <= 1.0:
+        raise UserError(f"--push_probability must be from 0 to 1, not {args.push_probability}")
+    if not math.isfinite(args.push_velocity) or args.push_velocity < 0.0:
+        raise UserError(f"--push_velocity must not be negative, it is {args.push_velocity}")
+    if args.command and not np.isfinite(args.command).all():
+        raise UserError(f"--command must be three finite numbers, not {args.command}")
+    return args
+
+
+def main() -> None:
+    """Load a policy and a robot, let it walk, print the metrics, write JSON and video if asked to."""
+    args = parse_args()
+    policy = Policy(args.policy)
+    xml = args.xml or ROOT_DIR / policy.description["robot"]["file"]
+    robot = Robot(xml, policy.description)
+    events = Events(args.command, args.push_velocity, args.push_probability)
+    simulation = Simulation(policy, robot, events)
+    recorder = Recorder(simulation) if args.video else None
+    sums = []
+    with viewer(simulation) if args.viewer else contextlib.nullcontext(lambda: None) as show:
+        print_heading(policy, robot, xml)
+        for number in range(args.robots):
+            record = recorder.add_step if recorder and number == 0 else lambda: None
+            sums.append(simulation.run(args.steps, [args.seed, number], lambda record=record: (record(), show())))
+    control_step = 1.0 / policy.description["timing"]["control_frequency"]
+    metrics = estimates(np.array(sums), robot.weight, control_step)
+    print(f"  {args.robots} robots x {args.steps} steps of {control_step:g} s")
+    for name, value in metrics.items():
+        print(f"  {name:<18} {value['mean']:10.4f} +- {value['standard_error']:.4f} {UNITS[name]}")
+    if args.json:
+        write_json(args, policy, robot, metrics)
+    if recorder:
+        save_video(recorder, args.video)
+
+
+def print_heading(policy: Policy, robot: Robot, xml: Path) -> None:
+    """Print what is simulated, and where the MJCF differs from what the policy is for."""
+    training = policy.description["training"]
+    print(f"{policy.description['task']}, {training['checkpoint']} of {training['run']}, in MuJoCo with '{xml}':")
+    for note in robot.notes:
+        print(f"  note: {note}")
+
+
+def write_json(args: argparse.Namespace, policy: Policy, robot: Robot, metrics: dict[str, dict[str, float]]) -> None:
+    """Write what was run and what came out; null stands for what was not measured."""
+    result = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
+    result["task"], result["training"] = policy.description["task"], policy.description["training"]
+    result["notes"], result["versions"] = robot.notes, {"mujoco": mujoco.__version__, "numpy": np.__version__}
+    result["metrics"] = {
+        name: {key: number if math.isfinite(number) else None for key, number in value.items()}
+        for name, value in metrics.items()
+    }
+    args.json.parent.mkdir(parents=True, exist_ok=True)
+    args.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+def save_video(recorder: Recorder, file: Path) -> None:
+    """Draw and write the video, or say why there is none."""
+    try:
+        if NO_RENDERER:
+            raise UserError(NO_RENDERER)
+        recorder.save(file)
+        print(f"video: {file}")
+    except UserError as error:
+        print(f"no video: {error}")
+
+
+@contextlib.contextmanager
+def viewer(simulation: Simulation) -> Iterator[Callable[[], None]]:
+    """Open MuJoCo's viewer; what is returned shows the state after a control step, in real time."""
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise UserError("--viewer needs a screen; --video writes a film without one")
+    try:
+        import mujoco.viewer
+
+        window = mujoco.viewer.launch_passive(simulation.robot.model, simulation.robot.data)
+    except Exception as error:  # whatever the window system raises
+        raise UserError(f"the viewer does not start: {' '.join(str(error).split())}") from None
+    control_step = 1.0 / simulation.policy.description["timing"]["control_frequency"]
+    due = time.perf_counter()
+
+    def show() -> None:
+        nonlocal due
+        if not window.is_running():
+            raise KeyboardInterrupt
+        window.sync()
+        now = time.perf_counter()
+        due = max(due + control_step, now)
+        time.sleep(due - now)
+
+    with window:
+        yield show
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)

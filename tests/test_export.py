@@ -1,0 +1,327 @@
+"""Export: what a robot computes from the files is what the task computes, and what does not fit is refused."""
+
+import copy
+import re
+import shutil
+import sys
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from settings import error_of
+from test_scripts import SMALL, assert_told_in_one_line, run_here
+
+from legged_torque.deploy import description as description_module
+from legged_torque.envs import task_registry
+
+for package in ("onnx", "onnxruntime", "jsonschema"):
+    pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
+
+from legged_torque.deploy.export import export_policy, nominal_cfg
+from legged_torque.deploy.policy import Policy, State
+
+TASKS = ["a1_position", "a1_torque", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
+TRAINING = {"run": "run", "checkpoint": "model_7.pt", "iterations": 7, "total_steps": 20_000_000}
+CHANGED = {
+    "env.history_length": 3,
+    "control.stiffness": 35.0,
+    "control.damping": 1.5,
+    "control.action_scale": 0.5,
+    "control.torque_scale": 7.0,
+    "control.decimation": 2,
+    "sim.dt": 0.004,
+    "normalization.clip_actions": 0.2,
+    "normalization.clip_observations": 1.5,
+    "normalization.obs_scales.lin_vel": 1.7,
+    "normalization.obs_scales.ang_vel": 0.6,
+    "normalization.obs_scales.dof_pos": 0.8,
+    "normalization.obs_scales.dof_vel": 0.3,
+}
+"""Settings that all differ from what they are by default."""
+SETTINGS = {"default": {}, "changed": CHANGED, "torques_once": {"control.refresh_torques": False}}
+
+
+def export_random(make_task, name, folder, normalization=False, **overrides):
+    """Export a small random network of a task after 20 million steps; return the task and the model."""
+    task = make_task(name, num_envs=3, **overrides)
+    task.load_state_dict({"total_steps": torch.tensor(TRAINING["total_steps"]), "num_diverged": torch.tensor(0)})
+    _, train_cfg = task_registry.get_cfgs(name)
+    train_cfg.actor.hidden_dims = [16, 16]
+    train_cfg.actor.obs_normalization = normalization
+    torch.manual_seed(3)
+    runner, _ = task_registry.make_alg_runner(task, name, train_cfg=train_cfg, log_root=None)
+    model = runner.alg.get_policy()
+    if normalization:
+        model.obs_normalizer._mean.normal_()
+        model.obs_normalizer._std.uniform_(0.5, 2.0)
+    model.eval()
+    assert export_policy(task, model, folder, name, TRAINING) < 1e-5
+    return task, model
+
+
+def scramble(task, generator):
+    """Put a task's robots into random states, in place of its physics."""
+    qpos = torch.randn(task.sim.qpos.shape, generator=generator)
+    qpos[:, 3:7] /= qpos[:, 3:7].norm(dim=1, keepdim=True)
+    task.sim.qpos.copy_(qpos)
+    task.sim.qvel.copy_(4.0 * torch.randn(task.sim.qvel.shape, generator=generator))
+
+
+def measured(task, world):
+    """What the robot of a world would measure; the policy computes the direction of gravity itself."""
+    parts = (task.base_ang_vel, task.dof_pos, task.dof_vel)
+    return State(*(part[world].numpy().copy() for part in parts), quaternion=task.base_quat[world].numpy().copy())
+
+
+PARITY = [(name, settings) for name in TASKS for settings in ("default", "changed")]
+
+
+@pytest.mark.parametrize(("name", "settings"), [*PARITY, ("a1_torque_multihead", "torques_once")])
+def test_parity(make_task, tmp_path, name, settings):
+    """Observations, actions and torques are the task's to 1e-5, over several steps of random states and commands."""
+    overrides = SETTINGS[settings] | {"commands.resampling_probability": 1.0}
+    task, model = export_random(make_task, name, tmp_path / "out", settings == "changed", **overrides)
+    policies = [Policy(tmp_path / "out") for _ in range(task.num_envs)]
+    generator = torch.Generator().manual_seed(8)
+    physics_steps = []  # of the current control step: positions, velocities and torques of all joints
+
+    def random_physics(sense=True):
+        physics_steps.append([part.clone().numpy() for part in (task.dof_pos, task.dof_vel, task.sim.ctrl)])
+        scramble(task, generator)
+
+    task.sim.step = random_physics
+    close = {"rtol": 1e-5, "atol": 1e-5}
+    largest = 0.0
+    for step in range(8):
+        if step in (0, 5):
+            obs = task.reset()
+            for policy in policies:
+                policy.reset()
+        ours = [p.observation(measured(task, i), task.commands[i].numpy()) for i, p in enumerate(policies)]
+        np.testing.assert_allclose(ours, obs["policy"].numpy(), **close)
+        largest = max(largest, float(obs["policy"].abs().max()))
+        physics_steps.clear()
+        with torch.inference_mode():
+            obs = task.step(model(obs))[0]
+        actions = [p.act(o) for p, o in zip(policies, ours, strict=True)]
+        np.testing.assert_allclose(actions, task.actions.numpy(), **close)
+        assert len(physics_steps) == task.cfg.control.decimation
+        for q, qd, torques in physics_steps:
+            if settings == "torques_once":
+                q, qd = physics_steps[0][:2]
+            ours = [p.torques(*parts) for p, *parts in zip(policies, actions, q, qd, strict=True)]
+            np.testing.assert_allclose(ours, torques, **close)
+    if settings == "changed":
+        assert largest == 1.5 and np.abs(actions).max() == pytest.approx(0.2)  # both were clipped
+        assert obs["policy"].shape[1] == 3 * (33 + task.num_actions)
+
+
+@pytest.mark.parametrize(("name", "end"), [("a1_torque_multihead", 0.0), ("a1_multihead", 0.1)])
+def test_mixing_weights(make_task, tmp_path, name, end):
+    """The description holds the mixing weights of the checkpoint, by hand from eq. 1."""
+    export_random(make_task, name, tmp_path / "out")
+    terms = yaml.safe_load((tmp_path / "out" / "policy.yaml").read_text())["actions"]["terms"]
+    theta = 1.0 + (end - 1.0) * (20_000_000 // 64_000 * 64_000) / 50e6
+    assert [term["name"] for term in terms] == ["position_residual", "torque"]
+    assert [term["mixing_weight"] for term in terms] == pytest.approx([theta, 1.0])
+    assert 0.5 < theta < 0.7
+
+
+@pytest.fixture(scope="module")
+def exported(make_task, tmp_path_factory):
+    """Folder of an export with two kinds of actions."""
+    folder = tmp_path_factory.mktemp("export") / "out"
+    export_random(make_task, "a1_torque_multihead", folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def description(exported):
+    """What the export has written."""
+    return yaml.safe_load((exported / "policy.yaml").read_text())
+
+
+def test_description(exported, description):
+    """The files are complete, the numbers those of the A1, and the schema accepts them."""
+    assert sorted(path.name for path in exported.iterdir()) == ["policy.onnx", "policy.pt", "policy.yaml"]
+    assert list(exported.parent.iterdir()) == [exported]
+    description_module.check(description)
+    assert description["joint_order"][:3] == ["FR_hip_joint", "FR_thigh_joint", "FR_calf_joint"]
+    assert description["nominal_pose"]["RL_thigh_joint"] == 1.0
+    assert description["gains"]["stiffness"]["FL_calf_joint"] == 20.0
+    assert description["torque_limits"]["FL_calf_joint"] == [-33.5, 33.5]
+    assert [term["size"] for term in description["observations"]["terms"]] == [3, 3, 3, 12, 12, 24]
+    assert description["timing"] == {
+        "control_frequency": 50.0,
+        "physics_frequency": 200.0,
+        "decimation": 4,
+        "refresh_torques": True,
+    }
+    assert description["training"] == TRAINING
+    text = (exported / "policy.yaml").read_text()
+    assert "&id" not in text and max(map(len, text.splitlines())) <= 120
+
+
+def test_torchscript_and_batches(exported):
+    """Both networks take any number of rows and agree."""
+    obs = torch.randn(5, 57, generator=torch.Generator().manual_seed(1))
+    session = Policy(exported).session
+    with torch.inference_mode():
+        expected = torch.jit.load(str(exported / "policy.pt"))(obs).numpy()
+    (actions,) = session.run(["actions"], {"obs": obs.numpy()})
+    np.testing.assert_allclose(actions, expected, atol=1e-5)
+
+
+def test_actions_that_are_not_finite(exported):
+    """They are refused instead of sent, and arrays of a wrong size as well."""
+    policy = Policy(exported)
+    assert "actions are not finite" in error_of(policy.act, np.full(57, np.nan))
+    state = State(np.zeros(3), np.zeros(12), np.zeros(12), projected_gravity=np.array([0.0, 0.0, -1.0]))
+    with pytest.raises(ValueError, match="56 observations, not 57"):
+        policy.observation(state, np.zeros(2))
+    with pytest.raises(ValueError, match=r"12 joints, the array has shape \(11,\)"):
+        policy.torques(np.zeros(24), np.zeros(11), np.zeros(12))
+    with pytest.raises(ValueError, match="projected_gravity or quaternion"):
+        policy.observation(State(np.zeros(3), np.zeros(12), np.zeros(12)), np.zeros(3))
+
+
+def test_double_precision(exported):
+    """In float64 all that is computed here is in float64, and the same."""
+    single, double = Policy(exported), Policy(exported, np.float64)
+    state = State(np.ones(3), np.full(12, 0.3), np.ones(12), projected_gravity=np.array([0.0, 0.6, -0.8]))
+    results = []
+    for policy in (single, double):
+        obs = policy.observation(state, np.ones(3))
+        actions = policy.act(obs)
+        results.append((obs, actions, policy.torques(actions, state.joint_positions, state.joint_velocities)))
+        assert {part.dtype for part in results[-1]} == {np.dtype(policy.dtype)}
+    for first, second in zip(*results, strict=True):
+        np.testing.assert_allclose(first, second, rtol=1e-5, atol=1e-5)
+
+
+def change(path, value):
+    """A change of one entry by its dotted path; None deletes it."""
+
+    def apply(description):
+        *parents, last = [int(key) if key.isdigit() else key for key in path.split(".")]
+        for key in parents:
+            description = description[key]
+        if value is None:
+            del description[last]
+        else:
+            description[last] = value
+
+    return apply
+
+
+DAMAGE = [
+    ("format_version", 2, "format_version"),
+    ("task", None, "'task' is a required property"),
+    ("gain", {}, "'gain' was unexpected"),
+    ("nominal_pose.FR_knee_joint", 0.1, "unknown joint in nominal_pose of policy.yaml 'FR_knee_joint'"),
+    ("nominal_pose.FR_hip_joint", None, "nominal_pose lacks the joint 'FR_hip_joint'"),
+    ("nominal_pose.FR_hip_joint", "left", "nominal_pose.FR_hip_joint: 'left' is not of type 'number'"),
+    ("nominal_pose.FR_hip_joint", float("nan"), "nominal_pose.FR_hip_joint is not a finite number"),
+    ("joint_order.0", "FR_thigh_joint", "non-unique"),
+    ("joint_order.0", "FR_knee_joint", "did you mean"),
+    ("gains.stiffness.FR_hip_joint", -1.0, "less than the minimum"),
+    ("gains.damping.FR_hip_joint", None, "gains.damping lacks the joint 'FR_hip_joint'"),
+    ("torque_limits.FR_hip_joint", [33.5], "torque_limits.FR_hip_joint"),
+    ("torque_limits.FR_hip_joint", [33.5, -33.5], "must be [lowest, highest]"),
+    ("observations.terms.3.size", 11, "the term 'joint_position' must have size 12, not 11"),
+    ("observations.terms.2.scale", [2.0, 2.0], "the term 'command' must have one scale or 3, not 2"),
+    ("observations.terms.2.name", "comand", "observations.terms.2.name"),
+    ("observations.terms.4", None, "network.num_observations is 57, but the terms have 45 numbers"),
+    ("observations.history_length", 2, "network.num_observations is 57, but the terms have 114 numbers"),
+    ("actions.terms.1", None, "the term 'last_action' must have size 12, not 24"),
+    ("actions.terms.1.name", "position_residual", "the term 'position_residual' occurs more than once"),
+    ("actions.clip", [1.0, -1.0], "actions.clip must be [lowest, highest]"),
+    ("timing.decimation", 0, "timing.decimation"),
+    ("timing.decimation", 5, "timing.physics_frequency is not control_frequency times decimation"),
+    ("timing.refresh_torques", "often", "timing.refresh_torques"),
+    ("commands.resampling_probability", 1.5, "commands.resampling_probability"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "message"), DAMAGE)
+def test_damaged_descriptions(description, path, value, message):
+    """What does not fit is told in one line that names the entry."""
+    damaged = copy.deepcopy(description)
+    change(path, value)(damaged)
+    assert message in error_of(description_module.check, damaged)
+
+
+@pytest.mark.parametrize("text", ["task: [", "walk", "", "3"])
+def test_no_description(exported, tmp_path, text):
+    """Neither is a file that holds something else."""
+    folder = shutil.copytree(exported, tmp_path / "copy")
+    (folder / "policy.yaml").write_text(text)
+    assert "policy.yaml'" in error_of(Policy, folder)
+
+
+def test_other_tasks_are_refused(make_task, exported, tmp_path, monkeypatch):
+    """A task with torques or observations of its own is not exported, and an earlier export stays as it is."""
+    folder = shutil.copytree(exported, tmp_path / "out")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    robot = task_registry.get_task_class("a1_position")
+    for method, message in {"_compute_torques": "torques", "_with_history": "observations"}.items():
+        with monkeypatch.context() as patch:
+            own = getattr(robot, method)
+            patch.setattr(robot, method, lambda self, values, own=own: 1.1 * own(self, values))
+            error = error_of(export_random, make_task, "a1_position", folder)
+        assert re.match(f"the {message} of LeggedRobot are not what policy.yaml can describe: they differ by", error)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert list(tmp_path.iterdir()) == [folder]
+
+
+def test_replaces_an_export(make_task, exported, tmp_path):
+    """An export into a folder with an earlier one replaces it and leaves other files alone."""
+    folder = shutil.copytree(exported, tmp_path / "out")
+    (folder / "notes.txt").write_text("mine")
+    export_random(make_task, "a1_torque", folder)
+    assert Policy(folder).description["task"] == "a1_torque"
+    assert (folder / "notes.txt").read_text() == "mine" and list(tmp_path.iterdir()) == [folder]
+
+
+def test_nominal_settings():
+    """A run with randomization is exported with the gains and scales of its settings."""
+    cfg, _ = task_registry.get_cfgs("a1_position")
+    cfg.domain_rand.randomize_parameters = cfg.domain_rand.push_robots = cfg.noise.add_noise = True
+    cfg.domain_rand.action_delay = [1, 2]
+    cfg = nominal_cfg(cfg)
+    assert not (cfg.domain_rand.randomize_parameters or cfg.domain_rand.push_robots or cfg.noise.add_noise)
+    assert cfg.domain_rand.action_delay == [0, 0]
+
+
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime", "jsonschema"])
+def test_missing_extras(make_task, exported, tmp_path, monkeypatch, package):
+    """A package that is not installed is told with the extra's name, by the export and by what it has written."""
+    task = make_task("a1_torque", num_envs=3)
+    monkeypatch.setitem(sys.modules, package, None)
+    told = f"{package} is not installed; exported policies need the extra: pip install -e .[export]"
+    assert error_of(export_policy, task, None, tmp_path / "out", "a1_torque", TRAINING) == told
+    assert not list(tmp_path.iterdir())
+    if package != "onnx":
+        assert error_of(Policy, exported) == told
+
+
+def test_script(tmp_path):
+    """export.py writes into the run's folder; a checkpoint that does not fit is refused and nothing is written."""
+    assert run_here("train.py", *SMALL, root=tmp_path)[0] == 0
+    (run,) = (tmp_path / "logs" / "a1_position").iterdir()
+    words = ["--task=a1_position", "--device=cpu"]
+    result = run_here("export.py", *words, "--set=actor.hidden_dims=[8]", root=tmp_path)
+    assert_told_in_one_line(result, "does not fit this task")
+    assert_told_in_one_line(run_here("export.py", *words, "--checkpoint=9", root=tmp_path), "unknown checkpoint '9'")
+    assert not list(run.glob("exported*"))
+    status, output, error = run_here("export.py", *words, root=tmp_path)
+    assert (status, error) == (0, "")
+    assert f"exported to {run / 'exported_2'}" in output
+    policy = Policy(run / "exported_2")
+    assert policy.description["training"] == {
+        "run": run.name,
+        "checkpoint": "model_2.pt",
+        "iterations": 2,
+        "total_steps": 16,
+    }

@@ -1,0 +1,401 @@
+"""An exported policy in plain MuJoCo: joints by name, metrics and physics as in the task, mistakes in one line."""
+
+import json
+import math
+import re
+import shutil
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import yaml
+from settings import error_of
+from test_scripts import assert_told_in_one_line, run_here
+
+for package in ("onnx", "onnxruntime", "jsonschema"):
+    pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
+
+from test_export import export_random
+
+from legged_torque.deploy.metrics import estimates, step_sums
+from legged_torque.deploy.policy import Policy
+from legged_torque.deploy.robot import Robot
+from legged_torque.deploy.simulation import Events, Simulation, quaternion
+from legged_torque.evaluation.metrics import WalkingMetrics
+
+XML = Path(__file__).resolve().parents[1] / "resources" / "robots" / "a1" / "a1.xml"
+
+
+@pytest.fixture(scope="module")
+def exported(make_task, tmp_path_factory):
+    """Folder of an exported policy, and its task."""
+    folder = tmp_path_factory.mktemp("export") / "out"
+    task, _ = export_random(make_task, "a1_torque_multihead", folder)
+    return folder, task
+
+
+@pytest.fixture(scope="module")
+def policy(exported):
+    """The policy; whoever uses it resets it."""
+    return Policy(exported[0])
+
+
+def changed_xml(folder, change):
+    """The A1's MJCF with a change of its tree, as a file."""
+    tree = ElementTree.parse(XML)
+    change(tree.getroot())
+    tree.write(folder / "robot.xml")
+    return folder / "robot.xml"
+
+
+def permute(root):
+    """Legs from the last to the first, motors in an order that is neither the old one nor that of the joints."""
+    trunk = root.find("worldbody/body")
+    legs = trunk.findall("body")
+    for leg in legs:
+        trunk.remove(leg)
+    trunk.extend(reversed(legs))
+    actuator, keyframe = root.find("actuator"), root.find("keyframe")
+    motors = list(actuator)
+    actuator[:] = motors[5:] + motors[:5]
+    root.remove(keyframe)
+
+
+def random_state(seed, height=0.3):
+    """Arguments of :meth:`Robot.reset` in the policy's order of joints."""
+    rng = np.random.default_rng(seed)
+    q = np.tile([0.0, 0.9, -1.8], 4) + rng.uniform(-0.2, 0.2, 12)
+    velocities = tuple(rng.uniform(-1, 1, size) for size in (3, 3, 12))
+    return np.array([0.0, 0.0, height]), quaternion(*rng.uniform(-0.3, 0.3, 3)), q, velocities
+
+
+# --------------------------------------------------------------------------------------------------- independence
+
+
+def test_imports_neither_torch_nor_warp():
+    """What runs on a robot needs none of the packages of training."""
+    modules = ["description", "policy", "robot", "metrics", "simulation", "video"]
+    code = "import sys\n" + "".join(f"import legged_torque.deploy.{name}\n" for name in modules)
+    code += "print([name for name in sys.modules if name.split('.')[0] in ('torch', 'warp', 'mujoco_warp', 'rsl_rl')"
+    code += " or name.startswith(('legged_torque.envs', 'legged_torque.learning', 'legged_torque.sim'))])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=XML.parents[3])
+    assert (result.stdout.strip(), result.stderr) == ("[]", "")
+
+
+# --------------------------------------------------------------------------------------------------- the robot
+
+
+def test_permuted_joints(policy, tmp_path):
+    """With joints and motors in another order in the MJCF, observations, torques and motion are the same."""
+    robots = [Robot(XML, policy.description), Robot(changed_xml(tmp_path, permute), policy.description)]
+    order = [robots[1].model.joint(i).name for i in range(1, 13)]
+    assert order[0] == "RL_hip_joint" and order != policy.joint_order
+    seen, torques, moved = [], [], []
+    for robot in robots:
+        assert robot.notes == []
+        robot.reset(*random_state(2))
+        for name, angle in zip(policy.joint_order, random_state(2)[2], strict=True):
+            assert robot.data.joint(name).qpos[0] == angle
+        policy.reset()
+        seen.append(policy.observation(robot.state(), [0.5, -0.2, 0.1]))
+        torques.append(policy.torques(policy.act(seen[-1]), robot.joint_positions(), robot.joint_velocities()))
+        robot.step(torques[-1])
+        for name, torque in zip(policy.joint_order, torques[-1], strict=True):
+            assert robot.data.joint(name).qfrc_actuator[0] == pytest.approx(torque)
+            assert robot.data.actuator(name.removesuffix("_joint")).force[0] == pytest.approx(torque)
+        np.testing.assert_allclose(robot.applied_torques(), torques[-1], rtol=1e-6)
+        moved.append(np.concatenate([robot.joint_positions(), robot.position(), robot.quat()]))
+    for pair in (seen, torques, moved):
+        np.testing.assert_allclose(pair[0], pair[1], atol=1e-6)
+    assert np.unique(np.abs(torques[0])).size == 12
+
+
+def test_physics_is_the_task_s(make_task, policy):
+    """From the states of the task, the same actions lead to the same states and forces, on the ground too."""
+    converged = {"sim.solver_iterations": 100, "sim.ls_iterations": 50}
+    task = make_task("a1_torque_multihead", num_envs=3, **converged)
+    task.load_state_dict({"total_steps": torch.tensor(20_000_000), "num_diverged": torch.tensor(0)})
+    robots = [Robot(XML, policy.description) for _ in range(task.num_envs)]
+    for i, robot in enumerate(robots):
+        q, v = task.sim.qpos[i].numpy(), task.sim.qvel[i].numpy()
+        robot.reset(q[:3], q[3:7], q[7:], (v[:3], v[3:6], v[6:]))
+    on_ground = 0
+    for _ in range(15):
+        actions = 0.3 * torch.randn(task.num_envs, 24)
+        task.step(actions)
+        assert not task.reset_buf.any()
+        for i, robot in enumerate(robots):
+            for _ in range(4):
+                torques = policy.torques(actions[i].numpy(), robot.joint_positions(), robot.joint_velocities())
+                robot.step(torques)
+            np.testing.assert_allclose(robot.data.qpos, task.sim.qpos[i].numpy(), atol=1e-3)
+            force = float(task.sim.contact_force[i].norm(dim=1).sum())
+            assert robot.contact_force() == pytest.approx(force, rel=0.02, abs=1.0)
+            on_ground += force > 20.0
+    assert on_ground > 5
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda root: root.find(".//joint[@name='RR_calf_joint']").set("name", "RR_knee"), "'RR_calf_joint'; did you"),
+        (lambda root: root.find("actuator").remove(root.find("actuator")[3]), "one motor for the joint 'FL_hip_joint'"),
+        (lambda root: setattr(root.find("actuator")[3], "tag", "position"), "'FL_hip_joint' must be a motor"),
+        (lambda root: root.find("worldbody/body").remove(root.find(".//freejoint")), "one free joint"),
+    ],
+)
+def test_robots_that_do_not_fit(exported, tmp_path, change, message):
+    """A missing joint or motor is told before a step is taken."""
+
+    def edit(root):
+        root.remove(root.find("keyframe"))
+        change(root)
+        for motor in root.findall("actuator/*"):
+            if not root.findall(f".//joint[@name='{motor.get('joint')}']"):
+                root.find("actuator").remove(motor)
+
+    result = run_here("sim2sim.py", str(exported[0]), f"--xml={changed_xml(tmp_path, edit)}", root=tmp_path)
+    assert_told_in_one_line(result, message)
+    assert result[1] == ""
+
+
+def test_differences_are_told(policy, tmp_path):
+    """Time step and motor limits are compared with the policy's, a floor is added, an unnamed trunk is found."""
+
+    def edit(root):
+        root.find("option").set("timestep", "0.002")
+        root.find("actuator")[1].set("ctrlrange", "-20 25")
+        root.find("worldbody").remove(root.find("worldbody/geom"))
+        trunk = root.find("worldbody/body")
+        trunk.set("name", "base")
+        del trunk.find("geom[@name='trunk']").attrib["name"]
+
+    robot = Robot(changed_xml(tmp_path, edit), policy.description)
+    assert robot.notes == [
+        "the MJCF has no floor: a plane at height 0 is added",
+        "time step: the MJCF has 0.002 s, policy.yaml's 0.005 s is used",
+        "motor limits: the MJCF has -20 to 25 N m, policy.yaml -33.5 to 33.5 N m; the tighter ones act "
+        "(FR_thigh_joint)",
+        "no geom is called like trunk: those of 'base' count as it",
+    ]
+    assert robot.model.opt.timestep == 0.005
+    robot.reset(*random_state(1, height=0.04))
+    robot.step(np.zeros(12))
+    assert robot.has_fallen() and robot.contact_force() > 10.0
+
+
+def test_standing_robot(policy):
+    """A robot that stands still weighs on the ground with its weight, and has not fallen."""
+    robot = Robot(XML, policy.description)
+    robot.reset([0.0, 0.0, 0.31], quaternion(0, 0, 1.0), policy.nominal_pose, (np.zeros(3), np.zeros(3), np.zeros(12)))
+    for _ in range(400):
+        robot.step(60 * (policy.nominal_pose - robot.joint_positions()) - 2 * robot.joint_velocities())
+        assert not robot.has_fallen()
+    assert robot.weight == pytest.approx(122.2, abs=0.1)
+    assert robot.contact_force() == pytest.approx(robot.weight, rel=0.1)
+    assert np.linalg.norm(robot.trunk_velocity()) < 0.02
+    robot.velocity()[:] = [math.cos(1.0), math.sin(1.0), 0.0]
+    np.testing.assert_allclose(robot.trunk_velocity()[:2], [1.0, 0.0], atol=0.1)
+
+
+# --------------------------------------------------------------------------------------------------- metrics, events
+
+
+def test_metrics_are_the_task_s(make_task):
+    """On the steps of a task, with falls and commands of 0, they are those of ``evaluation/metrics.py``."""
+    task = make_task("a1_torque", num_envs=3, **{"env.episode_length_s": 0.5, "commands.ranges.lin_vel_y": [0.0, 0.0]})
+    metrics = WalkingMetrics(task)
+    sums = np.zeros((3, 10))
+    for _ in range(60):
+        commands = task.commands.clone()
+        task.step(torch.randn(3, 12))
+        metrics.add_step(commands)
+        velocity = torch.cat([task.base_lin_vel[:, :2], task.base_ang_vel[:, 2:]], dim=1).double().numpy()
+        for i in range(3):
+            force = float(task.sim.contact_force[i].norm(dim=1).sum())
+            power = float((task.torques[i] * task.dof_vel[i]).abs().sum())
+            ended, timed_out = bool(task.reset_buf[i]), bool(task.time_out_buf[i])
+            height = float(task.base_pos[i, 2])
+            parts = (commands[i].double().numpy(), velocity[i], force, power, height, ended and not timed_out, ended)
+            sums[i] += step_sums(*parts)
+    ours = estimates(sums, metrics._weight, task.dt)
+    for name, estimate in metrics.estimates().items():
+        expected = {"mean": estimate.mean, "standard_error": estimate.standard_error}
+        assert ours[name] == pytest.approx(expected, rel=1e-4, nan_ok=True), name
+    assert ours["falls_per_minute"]["mean"] > 0
+
+
+def test_random_numbers(policy):
+    """A robot's walk depends on its seed alone, and commands are drawn from their ranges or fixed."""
+    robot = Robot(XML, policy.description)
+    simulation = Simulation(policy, robot, Events(push_velocity=1.0, push_probability=0.1))
+    runs = [simulation.run(30, seed) for seed in ([1, 0], [1, 1], [1, 0])]
+    np.testing.assert_array_equal(runs[0], runs[2])
+    assert not np.array_equal(runs[0], runs[1])
+    drawn = []
+    for seed in range(200):
+        simulation.run(0, seed)
+        drawn.append(np.concatenate([simulation.command, robot.joint_positions() / policy.nominal_pose]))
+    low, high = np.min(drawn, axis=0), np.max(drawn, axis=0)
+    assert (low[:3] > -1).all() and (low[:3] < -0.9).all() and (high[:3] < 1).all() and (high[:3] > 0.9).all()
+    assert (low[3:] < 0.7).all() and (low[3:] > 0.499).all() and (high[3:] > 1.4).all() and (high[3:] < 1.501).all()
+    simulation = Simulation(policy, robot, Events(command=(0.5, 0.0, -0.2)))
+    simulation.run(3, 1)
+    assert simulation.command.tolist() == [0.5, 0.0, -0.2]
+
+
+@pytest.mark.parametrize(("refresh", "computed"), [(True, 4), (False, 1)])
+def test_torques_are_refreshed(policy, monkeypatch, refresh, computed):
+    """Torques are computed anew at every physics step, or once per control step, as the description says."""
+    calls, own = [], policy.torques
+    monkeypatch.setattr(policy, "torques", lambda *values: calls.append(values) or own(*values))
+    monkeypatch.setitem(policy.description["timing"], "refresh_torques", refresh)
+    Simulation(policy, Robot(XML, policy.description), Events()).run(1, 1)
+    assert len(calls) == computed
+
+
+def test_pushes(policy):
+    """Half of the pushes set the trunk's velocity within the limits, half are added to it."""
+    robot = Robot(XML, policy.description)
+    simulation = Simulation(policy, robot, Events(push_velocity=0.5, push_probability=1.0))
+    simulation.run(1, 1)
+    added = []
+    for _ in range(300):
+        robot.velocity()[:] = 10.0
+        simulation._push()
+        added.append(robot.velocity().copy())
+    is_added = np.min(added, axis=1) > 5.0
+    assert 0.4 < is_added.mean() < 0.6
+    assert (np.abs(np.array(added) - 10.0 * is_added[:, None]) <= 0.5).all() and np.std(added, axis=0).min() > 0.2
+
+
+def test_episodes_end(policy):
+    """After 20 s, or with the trunk on the ground, an episode starts anew; such steps count only as falls."""
+    robot = Robot(XML, policy.description)
+    simulation = Simulation(policy, robot, Events())
+    assert simulation._max_steps == 1000
+    simulation.run(0, 1)
+    robot.reset(*random_state(1, height=0.03))
+    simulation._control_step()
+    assert simulation._finish_step(simulation.command).tolist() == [0.0] * 9 + [1.0]
+    assert robot.position()[2] == 0.4 and simulation._steps == 0 and (policy.last_action == 0).all()
+    simulation._control_step()
+    simulation._steps = 1000
+    assert simulation._finish_step(simulation.command).tolist() == [0.0] * 10
+    assert simulation._steps == 0
+
+
+# --------------------------------------------------------------------------------------------------- the script
+
+
+def test_script(exported, tmp_path):
+    """It prints the metrics with standard errors and writes them; any of the three paths names the policy."""
+    words = ["--steps=20", "--robots=2", "--push_velocity=0.5", "--command", "0.5", "0", "-0.2"]
+    outputs = []
+    for path in (exported[0], exported[0] / "policy.yaml", exported[0] / "policy.onnx"):
+        file = tmp_path / "results" / "result.json"
+        status, output, error = run_here("sim2sim.py", str(path), *words, f"--json={file}", root=tmp_path)
+        assert (status, error) == (0, "")
+        outputs.append(output)
+    assert outputs[0] == outputs[1] == outputs[2]
+    result = json.loads(file.read_text())
+    for name in ("track_percentage", "track_xy", "track_angular", "collision_force", "cost_of_transport"):
+        mean, error = (float(number) for number in re.search(rf"{name} +(\S+) \+- (\S+)", output).groups())
+        assert result["metrics"][name] == pytest.approx({"mean": mean, "standard_error": error}, abs=1e-4)
+    assert (result["robots"], result["command"], result["task"]) == (2, [0.5, 0.0, -0.2], "a1_torque_multihead")
+
+
+MISTAKES = [
+    ("--steps=0", "--steps must be at least 1, not 0"),
+    ("--robots=0", "--robots must be at least 1, not 0"),
+    ("--seed=-1", "--seed must not be negative"),
+    ("--push_probability=0.1", "--push_probability needs --push_velocity"),
+    ("--push_velocity=1 --push_probability=2", "--push_probability must be from 0 to 1"),
+    ("--push_velocity=nan", "--push_velocity must not be negative"),
+    ("--step=3", "unrecognized arguments: --step=3"),
+    ("--viewer", "--viewer needs a screen"),
+    ("--xml=nothing.xml", "there is no MJCF file 'nothing.xml'"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), MISTAKES)
+def test_mistakes(exported, tmp_path, monkeypatch, words, message):
+    """Exit status 2 and one line."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    result = run_here("sim2sim.py", str(exported[0]), *words.split(), root=tmp_path)
+    assert_told_in_one_line(result, message)
+
+
+def damage_onnx(folder):
+    """Half of the network."""
+    content = (folder / "policy.onnx").read_bytes()
+    (folder / "policy.onnx").write_bytes(content[: len(content) // 2])
+
+
+def edit_yaml(old, new):
+    """A change of the description's text."""
+
+    def edit(folder):
+        text = (folder / "policy.yaml").read_text()
+        assert old in text
+        (folder / "policy.yaml").write_text(text.replace(old, new, 1))
+
+    return edit
+
+
+def longer_history(folder):
+    """A description that is valid in itself, of another network."""
+    description = yaml.safe_load((folder / "policy.yaml").read_text())
+    description["observations"]["history_length"] = 2
+    description["network"]["num_observations"] *= 2
+    (folder / "policy.yaml").write_text(yaml.safe_dump(description))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (damage_onnx, "policy.onnx' is not a readable network"),
+        (lambda folder: (folder / "policy.onnx").write_bytes(b""), "policy.onnx' is not a readable network"),
+        (lambda folder: (folder / "policy.onnx").unlink(), "there is no network"),
+        (lambda folder: (folder / "policy.yaml").unlink(), "there is no policy.yaml in"),
+        (lambda folder: (folder / "policy.yaml").write_bytes(b"\xff\xfe"), "is not valid YAML"),
+        (edit_yaml("decimation: 4", "decimation: four"), "timing.decimation: 'four' is not of type 'integer'"),
+        (edit_yaml("FR_hip_joint: 20.0", "FR_hip_joint: -20.0"), "gains.stiffness.FR_hip_joint"),
+        (edit_yaml("sha256: ", "sha256: 0"), "network.sha256"),
+        (longer_history, "input 'obs' has shape ['batch', 57], not [batch, 114]"),
+    ],
+)
+def test_damaged_files(exported, tmp_path, damage, message):
+    """A policy that is not whole is refused in one line."""
+    folder = shutil.copytree(exported[0], tmp_path / "copy")
+    damage(folder)
+    result = run_here("sim2sim.py", str(folder), "--steps=5", root=tmp_path)
+    assert_told_in_one_line(result, message)
+    assert result[1] == ""
+
+
+def test_another_network(exported, tmp_path, make_task):
+    """A network of the right size that is not the exported one is refused."""
+    export_random(make_task, "a1_multihead", tmp_path / "other", True)
+    shutil.copy(exported[0] / "policy.onnx", tmp_path / "other")
+    assert "is not the network that was exported" in error_of(Policy, tmp_path / "other")
+
+
+def test_quaternion():
+    """Turns are about fixed axes, first x, then y, then z."""
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, quaternion(0.3, -0.4, 1.2))
+    turns = []
+    for axis, angle in enumerate((0.3, -0.4, 1.2)):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        turn = np.eye(3)
+        turn[i, i] = turn[j, j] = math.cos(angle)
+        turn[i, j], turn[j, i] = -math.sin(angle), math.sin(angle)
+        turns.append(turn)
+    np.testing.assert_allclose(matrix.reshape(3, 3), turns[2] @ turns[1] @ turns[0], atol=1e-12)
