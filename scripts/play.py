@@ -1,37 +1,95 @@
-"""Watch a trained policy walk: ``python scripts/play.py --task=a1_torque_multihead``."""
+"""Watch a trained policy walk: ``python scripts/play.py --task=a1_torque_multihead``, live with ``--viewer web``."""
 
 from legged_torque.utils.rendering import choose_offscreen_renderer
 
 NO_RENDERER = choose_offscreen_renderer()  # before anything imports mujoco
 
+import argparse
+import functools
 from pathlib import Path
 
+from legged_torque import ROOT_DIR
 from legged_torque.envs import task_registry
+from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.evaluation.metrics import UNITS, measure
 from legged_torque.evaluation.video import Recorder
+from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.args import Parser, add_task_args, run_script
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import find_checkpoint
 from legged_torque.utils.task_registry import load_run, set_seed
 
+NUM_ENVS = {"none": 16, "web": 4, "native": 1}
+"""Default number of worlds, by viewer."""
+
 
 def main() -> None:
-    """Load a run, roll it out with mean actions, print how it walks, save a video."""
+    """Load a run; roll it out, or let it be watched live."""
     parser = Parser(__doc__)
     add_task_args(parser)
-    parser.set_defaults(num_envs=16, seed=1)
+    parser.set_defaults(seed=1)
     parser.add_argument(
         "--steps", type=int, default=500, help="control steps, 50 of them a second; default: %(default)s"
     )
     parser.add_argument("--video", type=Path, help="mp4 to write; default: in the run's folder")
+    parser.add_argument(
+        "--viewer",
+        choices=NUM_ENVS,
+        default="none",
+        help="none: roll out, print how it walks, save a video; web: a page to watch and steer it; native: MuJoCo's "
+        "window; default: %(default)s",
+    )
+    parser.add_argument("--host", default="127.0.0.1", help="address of the page; default: %(default)s, this machine")
+    parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
     args = parser.parse_args()
     if args.steps < 1:
         raise UserError(f"--steps must be at least 1, not {args.steps}")
+    if not 1 <= args.port <= 65535:
+        raise UserError(f"--port must be from 1 to 65535, not {args.port}")
+    args.num_envs = NUM_ENVS[args.viewer] if args.num_envs is None else args.num_envs
     run_dir, env_cfg, train_cfg = load_run(args)
     checkpoint = find_checkpoint(run_dir, args.checkpoint)
+    watch = import_viewer(args.viewer)
     set_seed(args.seed)
     env, _ = task_registry.make_env(args.task, args, env_cfg)
     runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
+    if watch is None:
+        roll_out(args, env, runner, checkpoint)
+        return
+    from legged_torque.viewer.session import Session
+
+    make_task = functools.partial(type(env), device=env.device)
+    number = int(checkpoint.stem.removeprefix("model_"))
+    session = Session(make_task, env_cfg, runner, run_dir, number)
+    robot = ROOT_DIR / env_cfg.asset.file
+    if args.viewer == "web":
+        watch(session, robot, args.task, args.host, args.port)
+    else:
+        watch(session, robot)
+
+
+def import_viewer(name: str):
+    """Return the function that shows a session, or None for no viewer; before anything slow is done.
+
+    Raises:
+        UserError: If what it needs is not there.
+    """
+    if name == "web":
+        try:
+            from legged_torque.viewer.web import watch
+        except ImportError as error:
+            raise UserError(f"--viewer web needs the extra: pip install -e .[viewer] ({error})") from None
+        return watch
+    if name == "native":
+        from legged_torque.viewer.native import check_display, watch
+
+        check_display()
+        return watch
+    return None
+
+
+def roll_out(args: argparse.Namespace, env: LeggedRobot, runner: OnPolicyRunner, checkpoint: Path) -> None:
+    """Roll out mean actions, print how it walks, save a video."""
     runner.load(str(checkpoint))
     recorder = Recorder(env)
     policy = runner.get_inference_policy(env.device)
@@ -39,7 +97,7 @@ def main() -> None:
     print(f"{checkpoint}, after {int(runner.logger.tot_timesteps):,} steps of training:")
     for name, value in metrics.means().items():
         print(f"  {name:<18} {value:8.4f} {UNITS[name]}")
-    video = args.video or run_dir / "videos" / f"{checkpoint.stem}.mp4"
+    video = args.video or checkpoint.parent / "videos" / f"{checkpoint.stem}.mp4"
     try:
         if NO_RENDERER:
             raise UserError(NO_RENDERER)

@@ -60,14 +60,20 @@ def train(args: argparse.Namespace, env_cfg: LeggedRobotCfg, train_cfg: LeggedRo
         settings |= {"processes": num_processes, "max_iterations": total}
         place = f"{num_processes} x " * (num_processes > 1) + device_name(env.device)
         print(f"Training {args.task} on {place}: {num_processes * env.num_envs} worlds, {total} iterations.")
-        print(f"Curves: tensorboard --logdir {runner.log_dir}", flush=True)
+        print(f"Curves: tensorboard --logdir {runner.log_dir}")
+        print(f"See it learn: python scripts/play.py {run_words(args.task, runner.log_dir)} --viewer web", flush=True)
         save_config(runner.log_dir, settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     runner.learn(remaining, init_at_random_ep_len=True)
     if distributed.rank() == 0:
-        print(
-            f"The run is in {runner.log_dir}\nSee it walk: python scripts/play.py --task={args.task} --load_run={runner.log_dir}"
-        )
+        print(f"The run is in {runner.log_dir}")
+        for what, script in {"See it walk": "play", "Measure it": "evaluate", "Take it elsewhere": "export"}.items():
+            print(f"{what}: python scripts/{script}.py {run_words(args.task, runner.log_dir)}")
     runner.close()
+
+
+def run_words(task: str, run_dir: str) -> str:
+    """Return the options with which other scripts find a run."""
+    return f"--task={task} --load_run={run_dir}"
 
 
 if __name__ == "__main__":

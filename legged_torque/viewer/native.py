@@ -1,0 +1,149 @@
+"""A session in MuJoCo's own window: ``play.py --viewer native``."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import warnings
+from pathlib import Path
+
+import mujoco
+
+from legged_torque.utils.errors import UserError
+from legged_torque.viewer.session import Session, stopping_on_ctrl_c
+from legged_torque.viewer.state import State
+
+KEYS = """Keys: arrows up/down  v_x    arrows left/right  yaw rate    comma/period  v_y    0  stand still
+      space  pause           R  reset                       P  push         Esc or Ctrl-C  end"""
+STEP = 0.1
+"""By how much a key changes a command [m/s or rad/s]."""
+FRAME_INTERVAL = 1.0 / 60.0
+"""Seconds between drawings."""
+PUSH_SPEED, PUSH_ANGLE = 0.8, 1.5708
+"""A push: speed [m/s] and direction from the robot's front, to its left [rad]."""
+
+_SPACE, _COMMA, _PERIOD, _ZERO, _P, _R = 32, 44, 46, 48, 80, 82
+_RIGHT, _LEFT, _DOWN, _UP = 262, 263, 264, 265
+_COMMAND_KEYS = {
+    _UP: (0, STEP),
+    _DOWN: (0, -STEP),
+    _COMMA: (1, STEP),
+    _PERIOD: (1, -STEP),
+    _LEFT: (2, STEP),
+    _RIGHT: (2, -STEP),
+}
+"""Key codes of GLFW: which command they change, and by how much."""
+
+
+def check_display() -> None:
+    """Make sure that there is a screen to open a window on.
+
+    Raises:
+        UserError: If there is none.
+    """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise UserError("--viewer native needs a display; --viewer web works without one")
+    if sys.platform == "darwin" and not sys.argv[0].endswith("mjpython"):
+        raise UserError("--viewer native needs mjpython in place of python on macOS; --viewer web does not")
+    if sys.platform != "darwin":
+        import glfw
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if not glfw.init():  # MuJoCo would wait for its window for ever
+                raise UserError("--viewer native cannot open a window on this display; --viewer web works without one")
+        glfw.terminate()
+
+
+class Keyboard:
+    """What keys ask a session for. Keys come from the window's thread, so it only leaves requests."""
+
+    def __init__(self, session: Session) -> None:
+        """Start with the command 0 in place of random ones."""
+        self._session = session
+        self._command = [0.0, 0.0, 0.0]
+        self._is_paused = False
+        ranges = session.task.cfg.commands.ranges
+        self._limits = [ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw]
+        session.set_command((0.0, 0.0, 0.0))
+
+    def press(self, key: int) -> None:
+        """Do what a key stands for.
+
+        Args:
+            key: GLFW's code.
+        """
+        if key in _COMMAND_KEYS:
+            index, change = _COMMAND_KEYS[key]
+            low, high = self._limits[index]
+            self._command[index] = round(min(max(self._command[index] + change, low), high), 3)
+            self._session.set_command(tuple(self._command))
+        elif key == _ZERO:
+            self._command = [0.0, 0.0, 0.0]
+            self._session.set_command((0.0, 0.0, 0.0))
+        elif key == _SPACE:
+            self._is_paused = not self._is_paused
+            self._session.set_paused(self._is_paused)
+        elif key == _R:
+            self._session.reset()
+        elif key == _P:
+            self._session.push(PUSH_ANGLE, PUSH_SPEED)
+
+
+def watch(session: Session, robot: Path) -> None:
+    """Show the first world in a window, until it is closed or Ctrl-C.
+
+    Args:
+        session: What is watched; steps in a thread of its own.
+        robot: MJCF of the robot, with what is to be seen.
+    """
+    import mujoco.viewer  # only where there is a screen
+
+    model = mujoco.MjModel.from_xml_path(str(robot))
+    data = mujoco.MjData(model)
+    keyboard = Keyboard(session)
+    print(KEYS, flush=True)
+    before = set(threading.enumerate())
+    window = mujoco.viewer.launch_passive(
+        model, data, key_callback=keyboard.press, show_left_ui=False, show_right_ui=False
+    )
+    drawing = set(threading.enumerate()) - before
+    with window:
+        window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+        window.cam.trackbodyid = 1
+        window.cam.distance, window.cam.azimuth, window.cam.elevation = 1.8, 130.0, -18.0
+        stepping = threading.Thread(target=session.run, name="session")  # drawing must not hold up the steps
+        stepping.start()
+        with stopping_on_ctrl_c(session):
+            while window.is_running() and stepping.is_alive():
+                draw(session.state, window, model, data)
+                stepping.join(FRAME_INTERVAL)
+            session.stop()
+            stepping.join()
+    for thread in drawing:
+        thread.join(timeout=5.0)  # ending Python while it still draws would be a crash
+
+
+def draw(state: State, window: mujoco.viewer.Handle, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Show the first world, and in words what is commanded and done.
+
+    Args:
+        state: The session's newest state.
+        window: Where.
+        model: The robot with what is to be seen.
+        data: Its state, which the window draws.
+    """
+    if state.reading is None:
+        return
+    with window.lock():
+        window.opt.geomgroup[0] = 1  # MuJoCo's own key 0 hides this group, which has the floor
+        data.qpos[:] = state.reading.qpos[0]
+        mujoco.mj_forward(model, data)
+    command, velocity = state.reading.commands[0], state.reading.velocities[0]
+    names = ("v_x [m/s]", "v_y [m/s]", "yaw [rad/s]")
+    rows = [f"{told:+.2f}   {done:+.2f}" for told, done in zip(command, velocity, strict=True)]
+    running = "paused" if state.is_paused else f"{state.real_time:.2f} x real time"
+    labels, values = ["", *names, f"model_{state.checkpoint}"], ["commanded, actual", *rows, running]
+    window.set_texts((None, None, "\n".join(labels), "\n".join(values)))
+    window.sync()

@@ -1,0 +1,181 @@
+"""Drawing robots on a viser page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import trimesh
+import viser
+from viser import transforms
+
+COMMAND_COLOR, VELOCITY_COLOR = (10, 150, 50), (20, 90, 230)
+VISUAL_GROUPS = (0, 1, 2)
+"""Groups of geoms that are seen; the others are what collides."""
+SPACING = 2.0
+"""Distance between the places where worlds start [m]."""
+ARROW_LENGTH = 0.5
+"""Length of the arrow of a velocity of 1 m/s [m]."""
+
+
+class Scene:
+    """The robots of all worlds, their ground and light.
+
+    Worlds lie side by side, though they all start at the same place in the simulator. What is drawn is moved so that
+    the followed robot stays where the page's camera looks, which a user can then turn and zoom freely.
+
+    Attributes:
+        is_following: Whether the camera follows.
+        shows_others: Whether the other worlds are drawn too.
+    """
+
+    def __init__(self, server: viser.ViserServer, robot: Path, num_envs: int) -> None:
+        """Build everything.
+
+        Args:
+            server: The page.
+            robot: MJCF of the robot, with what is to be seen.
+            num_envs: Number of worlds.
+        """
+        self._server = server
+        self._model = mujoco.MjModel.from_xml_path(str(robot))
+        self._data = mujoco.MjData(self._model)
+        self.is_following, self.shows_others = True, True
+        self._places, self._offset = places(num_envs), np.zeros(3)
+        self._ground = self._add_surroundings()
+        self._bodies = {}
+        for body in range(1, self._model.nbody):
+            glb = body_glb(self._model, body)
+            if glb is not None:
+                quats, positions = np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1)), np.zeros((num_envs, 3))
+                name = f"/{self._model.body(body).name}"
+                self._bodies[body] = server.scene.add_batched_glb(name, glb, quats, positions, lod="off")
+        self._arrows = [
+            server.scene.add_arrows(
+                f"/{name}", np.zeros((1, 2, 3)), color, shaft_radius=0.009, head_radius=0.024, head_length=0.05
+            )
+            for name, color in (("command", COMMAND_COLOR), ("velocity", VELOCITY_COLOR))
+        ]
+
+    def update(self, qpos: np.ndarray, command: np.ndarray, velocity: np.ndarray, world: int) -> None:
+        """Draw a state.
+
+        Args:
+            qpos: Positions of all worlds. Shape: (num_envs, nq).
+            command: Command of the followed world [m/s, m/s, rad/s]. Shape: (3,).
+            velocity: What its trunk does, in its own frame. Shape: (3,).
+            world: The followed world.
+        """
+        positions, quats = self._poses(qpos)
+        shown = slice(None) if self.shows_others else slice(world, world + 1)
+        if self.is_following:
+            self._offset[:2] = -positions[world, 1, :2]
+        positions += self._offset
+        trunk, rotation = positions[world, 1], transforms.SO3(quats[world, 1]).as_matrix()
+        with self._server.atomic():
+            self._ground.position = self._offset
+            for body, handle in self._bodies.items():
+                handle.batched_positions = positions[shown, body]
+                handle.batched_wxyzs = quats[shown, body]
+            for handle, vector, height in zip(self._arrows, (command, velocity), (0.22, 0.17), strict=True):
+                start = trunk + [0.0, 0.0, height]
+                end = start + ARROW_LENGTH * rotation @ [vector[0], vector[1], 0.0]
+                handle.points = np.stack([start, end])[None].astype(np.float32)
+                handle.visible = bool(np.hypot(vector[0], vector[1]) > 0.05)
+
+    def _poses(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and quaternions of all bodies. Shapes: (num_envs, nbody, 3), (num_envs, nbody, 4)."""
+        positions = np.zeros((len(qpos), self._model.nbody, 3), np.float32)
+        quats = np.zeros((len(qpos), self._model.nbody, 4), np.float32)
+        for world, row in enumerate(qpos):
+            self._data.qpos[:] = row
+            mujoco.mj_kinematics(self._model, self._data)
+            positions[world] = self._data.xpos + self._places[world]
+            quats[world] = self._data.xquat
+        return positions, quats
+
+    def _add_surroundings(self) -> viser.GridHandle:
+        """Add the light and the ground, say from where the robot is seen at first, and return the ground."""
+        scene = self._server.scene
+        ground = scene.add_grid(
+            "/ground",
+            infinite_grid=True,
+            cell_size=0.25,
+            section_size=1.0,
+            cell_color=(196, 201, 208),
+            section_color=(150, 157, 168),
+            plane_color=(226, 229, 234),
+            plane_opacity=1.0,
+            shadow_opacity=0.35,
+            fade_distance=18.0,
+        )
+        scene.configure_default_lights(True, cast_shadow=True)
+        scene.configure_environment_map("studio", environment_intensity=0.5)
+        camera = self._server.initial_camera
+        camera.position, camera.look_at, camera.fov = (1.2, -1.2, 0.62), (0.0, 0.0, 0.24), 0.75
+        return ground
+
+
+def places(num_envs: int) -> np.ndarray:
+    """Return where worlds are drawn: on a square grid, the first one in its middle. Shape: (num_envs, 3)."""
+    side = int(np.ceil(np.sqrt(num_envs)))
+    rows = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), axis=-1).reshape(-1, 2)
+    rows = SPACING * (rows - (side - 1) // 2)
+    order = np.argsort(np.linalg.norm(rows, axis=1), kind="stable")
+    return np.pad(rows[order][:num_envs], ((0, 0), (0, 1)))
+
+
+def body_glb(model: mujoco.MjModel, body: int) -> bytes | None:
+    """Return what is seen of a body as a binary glTF in its own frame, one mesh per material; None for nothing."""
+    by_material: dict[int, list[trimesh.Trimesh]] = {}
+    for geom in range(model.ngeom):
+        if model.geom_bodyid[geom] == body and model.geom_group[geom] in VISUAL_GROUPS:
+            by_material.setdefault(int(model.geom_matid[geom]), []).append(geom_mesh(model, geom))
+    if not by_material:
+        return None
+    drawing = trimesh.Scene()
+    for material, meshes in by_material.items():
+        mesh = trimesh.util.concatenate(meshes)
+        mesh.visual = trimesh.visual.TextureVisuals(material=pbr_material(model, material))
+        drawing.add_geometry(mesh)
+    return drawing.export(file_type="glb")
+
+
+def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
+    """Return a geom as triangles in its body's frame; edges of more than 40 degrees stay sharp."""
+    kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        part = model.mesh(model.geom_dataid[geom])
+        vertices = model.mesh_vert[part.vertadr[0] :][: part.vertnum[0]]
+        faces = model.mesh_face[part.faceadr[0] :][: part.facenum[0]]
+        mesh = trimesh.Trimesh(vertices, faces)
+    elif kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        mesh = trimesh.creation.icosphere(subdivisions=3, radius=size[0])
+    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        mesh = trimesh.creation.capsule(height=2.0 * size[1], radius=size[0], count=(16, 16))
+    elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        mesh = trimesh.creation.cylinder(radius=size[0], height=2.0 * size[1], sections=40)
+    elif kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+        mesh = trimesh.creation.icosphere(subdivisions=3).apply_scale(size)
+    else:
+        mesh = trimesh.creation.box(extents=2.0 * size)
+    mesh = trimesh.graph.smooth_shade(mesh, angle=np.radians(40.0))
+    pose = np.eye(4)
+    pose[:3, :3] = transforms.SO3(model.geom_quat[geom]).as_matrix()
+    pose[:3, 3] = model.geom_pos[geom]
+    return mesh.apply_transform(pose)
+
+
+def pbr_material(model: mujoco.MjModel, material: int) -> trimesh.visual.material.PBRMaterial:
+    """Return a material of the model as glTF knows it; -1 is a geom's without one."""
+    if material < 0:
+        return trimesh.visual.material.PBRMaterial(baseColorFactor=(0.5, 0.5, 0.5, 1.0), roughnessFactor=0.7)
+    color, shininess = model.mat_rgba[material].copy(), float(model.mat_shininess[material])
+    color[:3] **= 2.2  # glTF's are linear
+    return trimesh.visual.material.PBRMaterial(
+        baseColorFactor=tuple(color),
+        emissiveFactor=tuple(color[:3] * model.mat_emission[material]),
+        metallicFactor=0.2 * float(model.mat_specular[material]),
+        roughnessFactor=0.9 - 0.6 * shininess,
+    )

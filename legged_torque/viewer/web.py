@@ -1,0 +1,151 @@
+"""A page that shows and steers a session: ``play.py --viewer web``."""
+
+from __future__ import annotations
+
+import errno
+import html
+import socket
+import threading
+import time
+from pathlib import Path
+
+import viser
+
+from legged_torque.utils.errors import UserError
+from legged_torque.viewer.controls import Controls
+from legged_torque.viewer.plots import Plots
+from legged_torque.viewer.scene import Scene
+from legged_torque.viewer.session import Session, stopping_on_ctrl_c
+from legged_torque.viewer.state import State
+
+FRAME_INTERVAL = 1.0 / 30.0
+"""Seconds between drawings of the robots."""
+PLOT_INTERVAL = 0.2
+"""Seconds between drawings of the plots and the status."""
+
+
+class Page:
+    """Draws a session, in a thread of its own that never touches the task.
+
+    Attributes:
+        server: The page's server.
+        controls: The panel with controls.
+    """
+
+    def __init__(self, session: Session, robot: Path, title: str, host: str, port: int) -> None:
+        """Serve the page.
+
+        Args:
+            session: What is watched.
+            robot: MJCF of the robot, with what is to be seen.
+            title: What is watched, in a few words.
+            host: Address to serve at.
+            port: Port to serve at; if it is taken, the next free one is.
+
+        Raises:
+            UserError: If there is no such address.
+        """
+        self._session = session
+        self.server = viser.ViserServer(host, free_port(host, port), label=title, verbose=False)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 125, 246))
+        self._scene = Scene(self.server, robot, session.task.num_envs)
+        self.controls = Controls(self.server, session, self._scene)
+        self._plots = Plots(self.server, session)
+        self.server.gui.main_panel.dock_right()
+        self._message_shown = 0
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="page", daemon=True)
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        """Where a browser on this machine finds the page."""
+        host = self.server.get_host()
+        return f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{self.server.get_port()}"
+
+    def close(self) -> None:
+        """Stop drawing and serving."""
+        self._closed.set()
+        self._thread.join(timeout=2.0)
+        self.server.stop()
+
+    def _run(self) -> None:
+        """Draw until closed; plots and status less often than the robots."""
+        next_plots = 0.0
+        while not self._closed.wait(FRAME_INTERVAL):
+            state = self._session.state
+            if state.reading is not None:
+                reading, world = state.reading, state.world
+                self._scene.update(reading.qpos, reading.commands[world], reading.velocities[world], world)
+            if time.perf_counter() >= next_plots:
+                next_plots = time.perf_counter() + PLOT_INTERVAL
+                with self.server.atomic():
+                    self._plots.update(state)
+                    self.controls.status.content = status_html(state)
+                    self.controls.update(state)
+                    self._notify(state)
+
+    def _notify(self, state: State) -> None:
+        """Let what went wrong pop up on the page."""
+        if state.message_number == self._message_shown:
+            return
+        self._message_shown = state.message_number
+        if state.is_error:
+            for client in self.server.get_clients().values():
+                client.add_notification("That did not work", state.message, color="red", auto_close_seconds=10)
+
+
+def free_port(host: str, port: int) -> int:
+    """Return the first free port from ``port`` on; viser itself would wait for ever at a wrong address.
+
+    Raises:
+        UserError: If nothing can be served at that address, or no port is free.
+    """
+    for candidate in range(port, min(port + 100, 65536)):
+        try:
+            (family, _, _, _, address), *_ = socket.getaddrinfo(host, candidate, type=socket.SOCK_STREAM)
+            with socket.socket(family, socket.SOCK_STREAM) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+            return candidate
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise UserError(f"cannot serve at {host}:{candidate}: {error.strerror or error}") from None
+    raise UserError(f"no port from {port} on is free")
+
+
+def status_html(state: State) -> str:
+    """Return what is going on, in three lines."""
+    if state.is_paused:
+        running = "paused"
+    else:
+        running = f"{state.real_time:.2f} x real time"
+    color = "#e03131" if state.is_error else "inherit"
+    lines = [
+        f"<b>model_{state.checkpoint}</b>, after {state.trained_steps / 1e6:,.1f} million steps",
+        f"{state.time:.1f} s simulated, {running}, {state.falls} falls",
+        f'<span style="color:{color}">{html.escape(state.message) or "&nbsp;"}</span>',
+    ]
+    return f'<div style="font-size:13px;line-height:1.5;padding:4px 12px">{"<br>".join(lines)}</div>'
+
+
+def watch(session: Session, robot: Path, title: str, host: str, port: int) -> None:
+    """Serve a page and step until Ctrl-C.
+
+    Args:
+        session: What is watched.
+        robot: MJCF of the robot, with what is to be seen.
+        title: What is watched, in a few words.
+        host: Address to serve at.
+        port: Port to serve at, or a later one.
+    """
+    page = Page(session, robot, title, host, port)
+    if page.server.get_port() != port:
+        print(f"Port {port} is taken.")
+    print(f"See it walk: {page.url} (Ctrl-C ends)", flush=True)
+
+    try:
+        with stopping_on_ctrl_c(session):
+            session.run()
+    finally:
+        page.close()

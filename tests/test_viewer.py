@@ -1,0 +1,435 @@
+"""A session that is watched live: what can be asked of it takes effect between steps, and mistakes do no harm."""
+
+import functools
+import math
+import runpy
+import shutil
+import sys
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from legged_torque import ROOT_DIR
+from legged_torque.envs import task_registry
+from legged_torque.utils.errors import UserError
+from legged_torque.viewer import native
+from legged_torque.viewer.pacing import MAX_LAG, Pacer
+from legged_torque.viewer.session import FASTEST, SCAN_INTERVAL, SLOWEST, Session
+from legged_torque.viewer.state import AS_LOADED
+
+NUM_ENVS = 2
+
+
+class Clock:
+    """A clock that only moves when someone sleeps, or by hand."""
+
+    def __init__(self):
+        self.now, self.slept = 100.0, []
+
+    def __call__(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.slept.append(seconds)
+        self.now += seconds
+
+
+def make_runner(make_task, name, **overrides):
+    """A runner of a task with two worlds, and the task's settings."""
+    env = make_task(name, num_envs=NUM_ENVS, **overrides)
+    return task_registry.make_alg_runner(env, name, log_root=None)[0]
+
+
+def save(runner, folder, number, steps=0, seed=0):
+    """Save a checkpoint of random weights after a number of steps."""
+    torch.manual_seed(seed + number)
+    with torch.no_grad():
+        for parameter in runner.alg.actor.parameters():
+            parameter.normal_(0.0, 0.02)
+    runner.env.total_steps.fill_(steps)
+    runner.current_learning_iteration, runner.logger.tot_timesteps = number, steps
+    runner.save(str(folder / f"model_{number}.pt"))
+
+
+@pytest.fixture(scope="module")
+def runs(make_task, tmp_path_factory):
+    """Folders of runs with checkpoints 1 and 2, by task."""
+    folders = {}
+    for name in ("a1_position", "a1_torque", "a1_torque_multihead"):
+        folders[name] = tmp_path_factory.mktemp(name)
+        runner = make_runner(make_task, name)
+        for number in (1, 2):
+            save(runner, folders[name], number, steps=number * 10_000_000)
+    return folders
+
+
+@pytest.fixture
+def make_session(runs, make_task, tmp_path):
+    """Factory of sessions with checkpoint 2 of a task in a folder of their own, and a clock that does not run."""
+
+    def make(name="a1_torque_multihead", **overrides):
+        runner = make_runner(make_task, name, **overrides)
+        folder = shutil.copytree(runs[name], tmp_path / "run")
+        clock = Clock()
+        make_env = functools.partial(type(runner.env), device="cpu")
+        session = Session(make_env, runner.env.cfg, runner, folder, 2, clock, clock.sleep)
+        return session, clock, folder
+
+    return make
+
+
+def ticks(session, count):
+    """Step some times."""
+    for _ in range(count):
+        session.tick()
+
+
+def actor_weights(session):
+    """All numbers of the policy, in one row."""
+    return torch.cat([weight.flatten() for weight in session._runner.alg.actor.state_dict().values()])
+
+
+def test_steps_and_readings(make_session):
+    """Each tick is one control step, and what is read is the task's state."""
+    session, _, _ = make_session()
+    assert session.state.reading is None and session.state.checkpoints == (1, 2)
+    assert (session.state.checkpoint, session.state.trained_steps) == (2, 20_000_000)
+    ticks(session, 3)
+    state, task = session.state, session.task
+    assert state.time == pytest.approx(3 * task.dt)
+    np.testing.assert_array_equal(state.reading.qpos, task.sim.qpos.numpy())
+    np.testing.assert_array_equal(state.reading.torques, task.torques[0].numpy())
+    np.testing.assert_array_equal(state.reading.velocities[:, :2], task.base_lin_vel[:, :2].numpy())
+    past = session.history.read(task.num_dof)
+    assert past["time"] == pytest.approx([task.dt, 2 * task.dt, 3 * task.dt])
+    np.testing.assert_array_equal(past["torques"][-1], state.reading.torques)
+    assert int(task.total_steps) == 20_000_000  # curricula stay where they were
+
+
+def test_reward_terms(make_session):
+    """The terms are those of one step, weighted and per second; where an episode ends, they are still its own."""
+    session, _, _ = make_session("a1_torque", **{"env.episode_length_s": 0.06})
+    for step in range(1, 5):
+        before = session.task.episode_sums.clone()
+        session.tick()
+        rewards, task = session.state.reading.rewards, session.task
+        assert rewards.shape == (len(task.reward_names),)
+        if step % 3:
+            expected = (task.episode_sums - before)[:, 0] / task.dt
+            np.testing.assert_allclose(rewards, expected.numpy(), rtol=1e-4, atol=1e-6)
+    assert set(session.state.rewards) == set(task.reward_names)
+
+
+@pytest.mark.parametrize("name", ["a1_position", "a1_torque", "a1_torque_multihead"])
+def test_torque_parts(make_session, name):
+    """PD part and torque part sum to the torque, and a task with one kind of control has one part only."""
+    session, _, _ = make_session(name)
+    session.task.motor_strength.fill_(0.9)
+    ticks(session, 3)
+    low, high = session.task.torque_limits.numpy()
+    pd, direct = session.state.reading.torque_parts
+    applied = session.state.reading.torques
+    np.testing.assert_allclose(np.clip(pd + direct, low, high), applied, rtol=1e-5, atol=1e-5)
+    assert np.any(pd) == (name != "a1_torque") and np.any(direct) == (name != "a1_position")
+    past = session.history.read(session.task.num_dof)
+    np.testing.assert_array_equal(past["pd"][-1], pd)
+    np.testing.assert_array_equal(past["direct"][-1], direct)
+
+
+def test_command(make_session):
+    """A command holds in all worlds, through resets, until commands are drawn again."""
+    session, _, _ = make_session(**{"commands.resampling_probability": 0.5})
+    session.set_command((0.5, -0.25, 0.75))
+    assert session.state.command is None  # only a note so far
+    ticks(session, 2)
+    session.reset()
+    ticks(session, 2)
+    assert session.state.command == (0.5, -0.25, 0.75)
+    np.testing.assert_array_equal(session.state.reading.commands, [[0.5, -0.25, 0.75]] * NUM_ENVS)
+    scales = session.task._command_scales
+    observed = session._obs["policy"][:, 6:9] / scales
+    torch.testing.assert_close(observed, session.task.commands)
+    session.set_command(None)
+    ticks(session, 4)
+    drawn = session.task.commands
+    assert drawn.abs().max() <= 1.0 and len(drawn.unique()) == 3 * NUM_ENVS
+
+
+def test_push(make_session):
+    """A push adds a velocity in the direction in which each trunk looks, once."""
+    session, _, _ = make_session()
+    session.set_paused(True)
+    session.tick()
+    for world, yaw in enumerate((0.0, math.pi / 2)):
+        session.task.base_quat[world] = torch.tensor([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)])
+    before = session.task.sim.qvel.clone()
+    session.push(0.0, 1.5)
+    ticks(session, 2)
+    change = session.task.sim.qvel - before
+    expected = torch.zeros_like(change)
+    expected[0, 0] = expected[1, 1] = 1.5
+    torch.testing.assert_close(change, expected, atol=1e-5, rtol=0.0)
+    session.push(math.pi / 2, 1.0)
+    session.tick()
+    torch.testing.assert_close((session.task.sim.qvel - before)[0, :2], torch.tensor([1.5, 1.0]), atol=1e-5, rtol=0.0)
+
+
+def test_pause_and_reset(make_session):
+    """While paused nothing moves and requests still count; a reset starts episodes in all worlds."""
+    session, _, _ = make_session()
+    ticks(session, 2)
+    session.set_paused(True)
+    session.tick()
+    qpos, simulated = session.task.sim.qpos.clone(), session.state.time
+    ticks(session, 3)
+    assert session.state.is_paused and session.state.time == simulated
+    torch.testing.assert_close(session.task.sim.qpos, qpos, rtol=0.0, atol=0.0)
+    session.reset()
+    session.tick()
+    assert not torch.equal(session.task.sim.qpos, qpos)
+    torch.testing.assert_close(session.task.base_pos[:, 2], torch.full((NUM_ENVS,), 0.4))
+    assert session.task.episode_length_buf.tolist() == [0] * NUM_ENVS
+    session.set_paused(False)
+    session.tick()
+    assert session.state.time > simulated
+
+
+def test_follow_world(make_session):
+    """History, torques and rewards are those of the followed world; a world that does not exist is the last one."""
+    session, _, _ = make_session()
+    ticks(session, 2)
+    session.follow_world(7)
+    session.tick()
+    assert session.state.world == NUM_ENVS - 1
+    np.testing.assert_array_equal(session.state.reading.torques, session.task.torques[-1].numpy())
+    assert len(session.history.read(session.task.num_dof)["time"]) == 1
+
+
+def test_mixing(make_session):
+    """Weights can be set and given back to the curriculum, and stay set in a rebuilt task."""
+    session, _, _ = make_session()
+    trained = session.task.mixing.clone()
+    assert session.state.mixing == pytest.approx(trained.tolist()) and 0.0 < trained[0] < 1.0
+    session.set_mixing((0.25, 0.5))
+    session.tick()
+    assert session.task.mixing.tolist() == [0.25, 0.5] and session.state.is_mixing_set
+    session.set_perturbation("low")
+    session.load_checkpoint(1)
+    session.tick()
+    assert session.task.mixing.tolist() == [0.25, 0.5] and session.state.mixing == (0.25, 0.5)
+    session.set_mixing(None)
+    session.tick()
+    assert session.task.mixing[0] > trained[0] and not session.state.is_mixing_set  # checkpoint 1 is an earlier one
+
+
+def test_no_mixing(make_session):
+    """Other tasks have no weights, and asking for some does nothing."""
+    session, _, _ = make_session("a1_torque")
+    session.set_mixing((1.0, 1.0))
+    session.tick()
+    assert session.state.mixing is None and not session.state.is_mixing_set
+
+
+def test_checkpoints(make_session):
+    """Another checkpoint acts after a switch, while the robots walk on and curricula follow it."""
+    session, _, _ = make_session()
+    ticks(session, 2)
+    before, simulated = actor_weights(session), session.state.time
+    session.load_checkpoint(1)
+    session.tick()
+    assert (session.state.checkpoint, session.state.trained_steps) == (1, 10_000_000)
+    assert not torch.equal(actor_weights(session), before)
+    assert session.state.time == pytest.approx(simulated + session.task.dt) and "model_1" in session.state.message
+    assert session.task.episode_length_buf.min() == 3  # no reset
+    session.load_checkpoint(2)
+    session.tick()
+    assert torch.equal(actor_weights(session), before)
+
+
+def test_new_checkpoint(make_session, make_task):
+    """A checkpoint that appears is found, and acts if the newest one is wanted."""
+    session, clock, folder = make_session()
+    session.tick()
+    save(make_runner(make_task, "a1_torque_multihead"), folder, 10, steps=30_000_000)
+    session.tick()
+    assert session.state.checkpoints == (1, 2)  # it does not look all the time
+    clock.now += SCAN_INTERVAL
+    session.tick()
+    assert session.state.checkpoints == (1, 2, 10) and session.state.checkpoint == 2
+    session.follow_newest(True)
+    ticks(session, 2)
+    assert (session.state.checkpoint, session.state.trained_steps) == (10, 30_000_000)
+
+
+@pytest.mark.parametrize("content", ["text", "half", "other task", "gone"])
+def test_broken_checkpoint(make_session, runs, content):
+    """A checkpoint that cannot be loaded is told in one line, and the old one acts on."""
+    session, clock, folder = make_session()
+    good = (folder / "model_2.pt").read_bytes()
+    other = (runs["a1_torque"] / "model_2.pt").read_bytes()
+    broken = {"text": b"no checkpoint\n", "half": good[: len(good) // 2], "other task": other}
+    if content in broken:
+        (folder / "model_3.pt").write_bytes(broken[content])
+    session.tick()
+    weights, steps = actor_weights(session), int(session.task.total_steps)
+    session.load_checkpoint(3)
+    session.tick()
+    assert session.state.is_error and "model_3.pt" in session.state.message and "\n" not in session.state.message
+    assert session.state.checkpoint == 2 and torch.equal(actor_weights(session), weights)
+    assert int(session.task.total_steps) == steps
+    session.follow_newest(True)
+    numbers = []
+    for _ in range(4):
+        clock.now += SCAN_INTERVAL
+        session.tick()
+        numbers.append(session.state.message_number)
+    assert session.state.checkpoint == 2 and numbers[-1] == numbers[1]  # it is tried once, not every second
+
+
+def test_perturbation(make_session):
+    """The task is rebuilt with the preset, in place, with command and counters kept; a wrong name changes nothing."""
+    session, _, _ = make_session()
+    old = session.task
+    assert session.perturbations()[0] == AS_LOADED and "high" in session.perturbations()
+    session.set_command((0.5, 0.0, 0.0))
+    session.set_perturbation("high")
+    ticks(session, 2)
+    task = session.task
+    assert task is not old and task.cfg.domain_rand.push_robots and not old.cfg.domain_rand.push_robots
+    assert (session.state.perturbation, session.state.task_number) == ("high", 2)
+    assert int(task.total_steps) == 20_000_000 and session._runner.env is task
+    np.testing.assert_array_equal(session.state.reading.commands, [[0.5, 0.0, 0.0]] * NUM_ENVS)
+    assert len(session.history.read(task.num_dof)["time"]) == 2
+    session.set_perturbation("hihg")
+    session.tick()
+    assert session.state.is_error and "did you mean 'high'" in session.state.message
+    assert session.task is task and session.state.perturbation == "high"
+    session.set_perturbation(AS_LOADED)
+    session.tick()
+    assert not session.task.cfg.domain_rand.push_robots and session.state.perturbation == AS_LOADED
+
+
+def test_requests_from_other_threads(make_session):
+    """Many threads may ask while another one steps; every request is carried out, in that thread."""
+    session, _, _ = make_session("a1_torque")
+    threads_seen = set()
+    carry_out = session._push
+    session._push = lambda *args: (threads_seen.add(threading.current_thread().name), carry_out(*args))
+    stepping = threading.Thread(target=session.run, name="stepping")
+    stepping.start()
+
+    def ask():
+        for _ in range(10):
+            session.push(0.0, 0.0)
+
+    asking = [threading.Thread(target=ask) for _ in range(3)]
+    for thread in asking:
+        thread.start()
+    for thread in asking:
+        thread.join()
+    session.set_paused(True)
+    while not session.state.is_paused:
+        pass
+    session.stop()
+    stepping.join(timeout=10)
+    assert not stepping.is_alive() and threads_seen == {"stepping"} and session.state.message_number >= 30
+
+
+def test_pacer_real_time():
+    """Steps come in time, however long they take, as long as that is shorter than a step."""
+    clock = Clock()
+    pacer = Pacer(0.02, clock, clock.sleep)
+    begun = []
+    for work in [0.005, 0.015, 0.0, 0.019] * 10:
+        pacer.wait()
+        begun.append(clock.now)
+        clock.now += work
+    assert begun == pytest.approx([100.0 + 0.02 * i for i in range(40)])
+    assert pacer.achieved() == pytest.approx(1.0)
+
+
+def test_pacer_speed():
+    """At a tenth of real time steps come every tenth part as often."""
+    clock = Clock()
+    pacer = Pacer(0.02, clock, clock.sleep)
+    pacer.speed = 0.1
+    for _ in range(11):
+        pacer.wait()
+    assert clock.now == pytest.approx(100.0 + 10 * 0.2) and pacer.achieved() == pytest.approx(0.1)
+
+
+def test_pacer_behind():
+    """A short delay is caught up, a long one forgotten; a machine that is too slow never sleeps and says how slow."""
+    clock = Clock()
+    pacer = Pacer(0.02, clock, clock.sleep)
+    pacer.wait()
+    clock.now += 0.05
+    for _ in range(3):
+        pacer.wait()
+    assert clock.now == pytest.approx(100.06)
+    clock.now += 2 * MAX_LAG
+    slept = len(clock.slept)
+    pacer.wait()
+    assert len(clock.slept) == slept
+    pacer.wait()
+    assert len(clock.slept) == slept + 1  # no rush of steps
+    pacer.restart()
+    clock.slept.clear()
+    for _ in range(60):
+        pacer.wait()
+        clock.now += 0.04
+    assert not clock.slept and pacer.achieved() == pytest.approx(0.5)
+
+
+def test_speed_of_a_session(make_session):
+    """The speed stays within its limits, and the clock shows it."""
+    session, clock, _ = make_session("a1_torque")
+    for asked, speed in ((0.5, 0.5), (0.0, SLOWEST), (9.0, FASTEST)):
+        session.set_speed(asked)
+        session.tick()
+        start = clock.now
+        ticks(session, 3)
+        assert session.state.speed == speed == pytest.approx(3 * session.task.dt / (clock.now - start))
+
+
+def test_keys(make_session):
+    """The keys of the native viewer ask for what stands beside them, within the limits of the training."""
+    session, _, _ = make_session("a1_torque")
+    keyboard = native.Keyboard(session)
+    for key, count in ((265, 3), (264, 1), (44, 15), (46, 1), (263, 2), (262, 3)):
+        for _ in range(count):
+            keyboard.press(key)
+    session.tick()
+    assert session.state.command == pytest.approx((0.2, 0.9, -0.1))
+    keyboard.press(ord("0"))
+    keyboard.press(ord("P"))
+    keyboard.press(ord("A"))  # means nothing
+    session.tick()
+    assert session.state.command == (0.0, 0.0, 0.0) and "pushed" in session.state.message
+    keyboard.press(ord(" "))
+    keyboard.press(ord("R"))
+    session.tick()
+    assert session.state.is_paused and session.state.message == "reset"
+
+
+def test_no_display(monkeypatch):
+    """Without a screen the native viewer says so."""
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(UserError, match="needs a display"):
+        native.check_display()
+
+
+def test_missing_extra(monkeypatch):
+    """Without the extra, one line says which one it is; the session needs none."""
+    monkeypatch.setenv("MUJOCO_GL", "disable")  # given back afterwards: play.py chooses another one
+    monkeypatch.setitem(sys.modules, "viser", None)
+    for name in ("web", "scene", "controls", "plots"):
+        monkeypatch.delitem(sys.modules, f"legged_torque.viewer.{name}", raising=False)
+    play = runpy.run_path(str(ROOT_DIR / "scripts" / "play.py"))
+    with pytest.raises(UserError, match=r"pip install -e \.\[viewer\]"):
+        play["import_viewer"]("web")
+    assert play["import_viewer"]("none") is None

@@ -1,0 +1,142 @@
+"""The viewer's page in a real browser: the robot is drawn, a slider changes its speed, and nothing is complained of."""
+
+import functools
+import shutil
+import threading
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
+webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+CHROMIUM, DRIVER = (shutil.which("chromium") or shutil.which("google-chrome")), shutil.which("chromedriver")
+if not (CHROMIUM and DRIVER):
+    pytest.skip("Chromium or its driver is not installed", allow_module_level=True)
+
+from PIL import Image
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+
+from legged_torque import ROOT_DIR
+from legged_torque.envs import task_registry
+from legged_torque.utils.errors import UserError
+from legged_torque.viewer.session import Session
+from legged_torque.viewer.web import Page, free_port
+
+TIMEOUT = 120.0
+"""Seconds that the page may take for something: a software renderer draws about a frame a second."""
+OPTIONS = (
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
+    "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
+    "--window-size=1000,640"
+)
+
+
+def wait_for(condition):
+    """Wait until a condition holds, and return its value."""
+    end = time.monotonic() + TIMEOUT
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.1)
+    raise AssertionError(f"waited in vain for {condition.__name__}")
+
+
+@pytest.fixture
+def session(make_task, tmp_path):
+    """A running session of two multi-head robots that glide as they are told to, without any training."""
+    env = make_task("a1_torque_multihead", num_envs=2)
+    runner = task_registry.make_alg_runner(env, "a1_torque_multihead", log_root=None)[0]
+    runner.save(str(tmp_path / "model_0.pt"))
+    session = Session(functools.partial(type(env), device="cpu"), env.cfg, runner, tmp_path, 0)
+
+    def glide(obs):
+        """Hold the nominal pose, and move and turn the trunk by hand."""
+        task = session.task
+        task.base_quat.copy_(task._tensor([1.0, 0.0, 0.0, 0.0]).expand(2, 4))
+        task.sim.qvel[:, :6] = 0.0
+        task.sim.qvel[:, :2] = task.commands[:, :2]
+        return task.actions * 0.0
+
+    session._policy = glide
+    thread = threading.Thread(target=session.run, daemon=True)
+    thread.start()
+    yield session
+    session.stop()
+    thread.join(timeout=10)
+
+
+@pytest.fixture
+def page(session):
+    """The session's page."""
+    page = Page(session, ROOT_DIR / session.task.cfg.asset.file, "a1_torque_multihead", "127.0.0.1", 8480)
+    yield page
+    page.close()
+
+
+@pytest.fixture
+def browser(tmp_path):
+    """A browser without a window, and with a profile of its own."""
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for option in (*OPTIONS.split(), f"--user-data-dir={tmp_path / 'profile'}"):
+        options.add_argument(option)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    yield driver
+    driver.quit()
+
+
+def test_page(session, page, browser, tmp_path):
+    """From opening the page to a robot that goes faster."""
+    browser.get(page.url)
+    wait_for(lambda: browser.find_elements(By.TAG_NAME, "canvas"))
+
+    def robot_is_drawn():
+        """Whether there are many colors, and dark ones in the middle: ground and sky are light."""
+        browser.save_screenshot(str(tmp_path / "page.png"))
+        picture = np.array(Image.open(tmp_path / "page.png").convert("RGB"))
+        height, width, _ = picture.shape
+        middle = picture[height // 3 : 4 * height // 5, width * 2 // 5 : width * 3 // 5]
+        colors = len(np.unique(picture.reshape(-1, 3), axis=0))
+        return colors > 1000 and (middle.max(axis=2) < 90).mean() > 0.01
+
+    wait_for(robot_is_drawn)
+    print(f"the page: {tmp_path / 'page.png'}")
+    text = browser.find_element(By.TAG_NAME, "body").text
+    for words in ("model_0", "Command", "x [m/s]", "yaw [rad/s]", "Mixing weights", "v_x, forward [m/s]", "FR thigh"):
+        assert words in text
+
+    def told_to_go():
+        """Type a speed into the field beside the first slider."""
+        field = browser.find_element(
+            By.XPATH, "//label[contains(., 'x [m/s]')]/following::input[not(@type='hidden')][1]"
+        )
+        field.send_keys(Keys.CONTROL + "a")
+        field.send_keys("0.8", Keys.TAB)
+        time.sleep(0.5)
+        return session.state.command == (0.8, 0.0, 0.0)
+
+    wait_for(told_to_go)
+    wait_for(lambda: abs(session.state.reading.velocities[:, 0] - 0.8).max() < 0.1)
+
+    def stopped():
+        """Click the button that stops."""
+        browser.find_element(By.XPATH, "//button[contains(., 'Stand still')]").click()
+        time.sleep(0.5)
+        return session.state.command == (0.0, 0.0, 0.0)
+
+    wait_for(stopped)
+    wait_for(lambda: abs(session.state.reading.velocities[:, 0]).max() < 0.1)
+    complaints = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    assert not complaints
+
+
+def test_taken_port(page):
+    """The next free port is taken; an address that is not this machine's is told."""
+    port = page.server.get_port()
+    assert free_port("127.0.0.1", port) == port + 1
+    with pytest.raises(UserError, match="cannot serve at 192.0.2.1:8480"):
+        free_port("192.0.2.1", 8480)
