@@ -161,9 +161,8 @@ def lanes_per_world(branches: int, on_gpu: bool) -> int:
 def _require(holds: bool, reason: str) -> None:
     """Raise a UserError with the reason if something does not hold."""
     if not holds:
-        raise UserError(
-            f"sim.engine 'fused' cannot simulate this robot: {reason}; use sim.engine = 'mujoco_warp', without randomize_parameters"
-        )
+        advice = "use sim.engine = 'mujoco_warp', without randomize_parameters"
+        raise UserError(f"sim.engine 'fused' cannot simulate this robot: {reason}; {advice}")
 
 
 def _check(model: mujoco.MjModel) -> None:
