@@ -30,11 +30,11 @@ setup(
         "pyyaml",
     ],
     extras_require={
-        "video": ["imageio", "imageio-ffmpeg"],
+        "video": ["imageio", "imageio-ffmpeg", "pillow>=10.1"],
         "plots": ["matplotlib"],
         "viewer": ["viser>=1.1,<2", "trimesh>=4.8,<6", "pillow"],
         "wandb": ["wandb"],
         "export": EXPORT,
-        "test": ["pytest", "matplotlib", "imageio", "imageio-ffmpeg", *EXPORT],
+        "test": ["pytest", "matplotlib", "imageio", "imageio-ffmpeg", "pillow>=10.1", *EXPORT],
     },
 )

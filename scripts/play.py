@@ -6,6 +6,7 @@ NO_RENDERER = choose_offscreen_renderer()  # before anything imports mujoco
 
 import argparse
 import functools
+import math
 from pathlib import Path
 
 from legged_torque import ROOT_DIR
@@ -21,6 +22,8 @@ from legged_torque.utils.task_registry import load_run, set_seed
 
 NUM_ENVS = {"none": 16, "web": 4, "native": 1}
 """Default number of worlds, by viewer."""
+MAX_GRID = 25
+"""Robots of a video at most; in more of them one would see nothing."""
 
 
 def main() -> None:
@@ -32,6 +35,9 @@ def main() -> None:
         "--steps", type=int, default=500, help="control steps, 50 of them a second; default: %(default)s"
     )
     parser.add_argument("--video", type=Path, help="mp4 to write; default: in the run's folder")
+    parser.add_argument(
+        "--grid", type=int, help="draw that many robots, those of the first worlds: 4, 9, 16 or 25; default: one"
+    )
     parser.add_argument(
         "--viewer",
         choices=NUM_ENVS,
@@ -46,7 +52,7 @@ def main() -> None:
         raise UserError(f"--steps must be at least 1, not {args.steps}")
     if not 1 <= args.port <= 65535:
         raise UserError(f"--port must be from 1 to 65535, not {args.port}")
-    args.num_envs = NUM_ENVS[args.viewer] if args.num_envs is None else args.num_envs
+    choose_worlds(args)
     run_dir, env_cfg, train_cfg = load_run(args)
     checkpoint = find_checkpoint(run_dir, args.checkpoint)
     watch = import_viewer(args.viewer)
@@ -66,6 +72,23 @@ def main() -> None:
         watch(session, robot, args.task, args.host, args.port)
     else:
         watch(session, robot)
+
+
+def choose_worlds(args: argparse.Namespace) -> None:
+    """Fill in the number of worlds and how many of them are drawn.
+
+    Raises:
+        UserError: If that many cannot be drawn.
+    """
+    if args.grid is not None and args.viewer != "none":
+        raise UserError(f"--grid is for videos, which --viewer {args.viewer} does not make")
+    args.grid = 1 if args.grid is None else args.grid
+    if not 1 <= args.grid <= MAX_GRID or math.isqrt(args.grid) ** 2 != args.grid:
+        raise UserError(f"--grid must be 1, 4, 9, 16 or {MAX_GRID}, not {args.grid}")
+    if args.num_envs is None:
+        args.num_envs = max(NUM_ENVS[args.viewer], args.grid)
+    elif 1 <= args.num_envs < args.grid:
+        raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
 
 
 def import_viewer(name: str):
@@ -91,7 +114,7 @@ def import_viewer(name: str):
 def roll_out(args: argparse.Namespace, env: LeggedRobot, runner: OnPolicyRunner, checkpoint: Path) -> None:
     """Roll out mean actions, print how it walks, save a video."""
     runner.load(str(checkpoint))
-    recorder = Recorder(env)
+    recorder = Recorder(env, args.grid)
     policy = runner.get_inference_policy(env.device)
     metrics = measure(env, policy, args.steps, lambda commands: recorder.add_step())
     print(f"{checkpoint}, after {int(runner.logger.tot_timesteps):,} steps of training:")

@@ -22,6 +22,7 @@ for package in ("onnx", "onnxruntime", "jsonschema"):
 
 from test_export import export_random
 
+from legged_torque.deploy import video
 from legged_torque.deploy.metrics import estimates, step_sums
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import Robot
@@ -82,7 +83,7 @@ def test_imports_neither_torch_nor_warp():
     modules = ["description", "policy", "robot", "metrics", "simulation", "video"]
     code = "import sys\n" + "".join(f"import legged_torque.deploy.{name}\n" for name in modules)
     code += "print([name for name in sys.modules if name.split('.')[0] in ('torch', 'warp', 'mujoco_warp', 'rsl_rl')"
-    code += " or name.startswith(('legged_torque.envs', 'legged_torque.learning', 'legged_torque.sim'))])"
+    code += " or name.removeprefix('legged_torque.').split('.')[0] in ('envs', 'evaluation', 'learning', 'sim')])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=XML.parents[3])
     assert (result.stdout.strip(), result.stderr) == ("[]", "")
 
@@ -257,6 +258,26 @@ def test_torques_are_refreshed(policy, monkeypatch, refresh, computed):
     monkeypatch.setitem(policy.description["timing"], "refresh_torques", refresh)
     Simulation(policy, Robot(XML, policy.description), Events()).run(1, 1)
     assert len(calls) == computed
+
+
+def test_recorder(policy, monkeypatch):
+    """A video shows the states, commands and velocities that the robot has had."""
+    saved, seen = [], []
+    monkeypatch.setattr(video, "write_video", lambda *args: saved.append(args))
+    robot = Robot(XML, policy.description)
+    simulation = Simulation(policy, robot, Events(command=(0.5, -0.1, 0.2)))
+    recorder = video.Recorder(simulation)
+
+    def on_step():
+        recorder.add_step()
+        velocity = [*robot.trunk_velocity()[:2], robot.trunk_angular_velocity()[2]]
+        seen.append((robot.data.qpos.tolist(), [0.5, -0.1, 0.2], velocity))
+
+    simulation.run(3, 1, on_step)
+    recorder.save(Path("out.mp4"))
+    ((file, model, trunk, steps, control_step),) = saved
+    assert (file, model, control_step) == (Path("out.mp4"), robot.model, 0.02) and model.body(trunk).name == "trunk"
+    assert [(m.qpos.tolist(), m.command.tolist(), m.velocity.tolist()) for (m,) in steps] == seen
 
 
 def test_pushes(policy):

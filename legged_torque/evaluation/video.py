@@ -1,86 +1,44 @@
-"""Recording a robot and drawing it afterwards."""
+"""Recording worlds of a task, to draw them afterwards."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import mujoco
-import numpy as np
+import torch
 
 from legged_torque import ROOT_DIR
+from legged_torque.deploy.video import Moment, write_video
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.utils.errors import UserError
-from legged_torque.utils.rendering import INSTALL_HINT
-
-WIDTH, HEIGHT = 960, 540
-COMMAND_COLOR = (0.1, 0.8, 0.2, 0.9)
-VELOCITY_COLOR = (0.1, 0.4, 1.0, 0.9)
 
 
 class Recorder:
-    """Keeps what one world does, to draw it as a video: the one with the fastest command at the start."""
+    """Keeps what some worlds do, to draw them as a video."""
 
-    def __init__(self, task: LeggedRobot) -> None:
-        """Record one world of ``task``."""
+    def __init__(self, task: LeggedRobot, num_worlds: int = 1) -> None:
+        """Prepare.
+
+        Args:
+            task: What is recorded.
+            num_worlds: How many worlds, from the first one on; 1 is the one with the fastest command at the start.
+        """
         self._task = task
-        self._world: int | None = None
-        self._frames: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self._num_worlds = num_worlds
+        self._worlds: torch.Tensor | None = None
+        self._steps: list[list[Moment]] = []
 
     def add_step(self) -> None:
         """Keep the state after a control step."""
         task = self._task
-        if self._world is None:
-            self._world = int(task.commands[:, :2].norm(dim=1).argmax())
-        world = self._world
-        parts = (task.sim.qpos, task.commands, task.base_lin_vel)
-        self._frames.append(tuple(part[world].double().cpu().numpy() for part in parts))
+        if self._worlds is None:
+            self._worlds = torch.arange(self._num_worlds, device=task.device)
+            if self._num_worlds == 1:
+                self._worlds = task.commands[:, :2].norm(dim=1).argmax().view(1)
+        velocity = torch.cat([task.base_lin_vel[:, :2], task.base_ang_vel[:, 2:]], dim=1)
+        parts = [part[self._worlds].double().cpu().numpy() for part in (task.sim.qpos, task.commands, velocity)]
+        self._steps.append([Moment(*moment) for moment in zip(*parts, strict=True)])
 
     def save(self, file: Path) -> None:
-        """Draw what was recorded and write it as mp4, in real time, every second control step.
-
-        A green arrow is the commanded velocity, a blue one the actual velocity.
-
-        Raises:
-            UserError: If there is no renderer or no video encoder.
-        """
-        try:
-            import imageio
-            import imageio_ffmpeg  # noqa: F401
-        except ImportError:
-            raise UserError("videos need the extra: pip install -e .[video]") from None
+        """Draw what was recorded, see :func:`~legged_torque.deploy.video.write_video`."""
         model = mujoco.MjModel.from_xml_path(str(ROOT_DIR / self._task.cfg.asset.file))
-        model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
-        data = mujoco.MjData(model)
-        try:
-            renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
-        except Exception as error:  # whatever the graphics driver raises
-            raise UserError(f"the renderer does not start: {error} ({INSTALL_HINT})") from None
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with renderer, imageio.get_writer(file, fps=round(0.5 / self._task.dt), macro_block_size=1) as writer:
-            for qpos, command, velocity in self._frames[::2]:
-                data.qpos[:] = qpos
-                mujoco.mj_forward(model, data)
-                renderer.update_scene(data, camera=_follow(qpos))
-                rotation = data.xmat[1].reshape(3, 3)
-                for vector, color, height in ((command, COMMAND_COLOR, 0.24), (velocity, VELOCITY_COLOR, 0.2)):
-                    start = qpos[:3] + [0.0, 0.0, height]
-                    _add_arrow(renderer.scene, start, rotation @ [vector[0], vector[1], 0.0], color)
-                writer.append_data(renderer.render())
-
-
-def _follow(qpos: np.ndarray) -> mujoco.MjvCamera:
-    """Return a camera that looks at the robot from the side and keeps its direction."""
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = (qpos[0], qpos[1], 0.25)
-    camera.distance, camera.azimuth, camera.elevation = 1.6, 130.0, -18.0
-    return camera
-
-
-def _add_arrow(scene: mujoco.MjvScene, start: np.ndarray, vector: np.ndarray, color: tuple[float, ...]) -> None:
-    """Draw a velocity [m/s] as an arrow, 0.5 m long for 1 m/s."""
-    if np.linalg.norm(vector) < 1e-3 or scene.ngeom >= scene.maxgeom:
-        return
-    geom = scene.geoms[scene.ngeom]
-    mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.zeros(9), np.float32(color))
-    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.012, start, start + 0.5 * vector)
-    scene.ngeom += 1
+        write_video(file, model, 1, self._steps, self._task.dt)

@@ -1,0 +1,132 @@
+"""Videos: size and number of frames, the numbers in the corner, which worlds are drawn."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("PIL", reason="Pillow is not installed: pip install -e .[video]")
+
+from legged_torque.deploy import video
+from legged_torque.deploy.video import Moment, add_overlay, write_video
+from legged_torque.evaluation.video import Recorder
+
+XML = Path(__file__).resolve().parents[1] / "resources" / "robots" / "a1" / "a1.xml"
+
+DRAW = """
+import sys
+from pathlib import Path
+from legged_torque.utils.rendering import choose_offscreen_renderer
+reason = choose_offscreen_renderer()
+if reason:
+    sys.exit("no renderer: " + reason)
+import mujoco, numpy as np
+from legged_torque.deploy.video import Moment, write_video
+from legged_torque.utils.errors import UserError
+model = mujoco.MjModel.from_xml_path(sys.argv[1])
+qpos = model.key_qpos[0] if model.nkey else model.qpos0
+moments = [Moment(qpos, np.array([0.5, i, 0.0]), np.zeros(3)) for i in range(int(sys.argv[3]))]
+try:
+    write_video(Path(sys.argv[2]), model, 1, [moments] * 5, 0.02)
+except UserError as error:
+    if "the renderer does not start" not in str(error):
+        raise
+    sys.exit("no renderer: " + str(error))
+"""
+
+
+def moment(command=(0.5, -0.25, 0.0), velocity=(0.3, 0.4, -0.001)):
+    """What a robot does, its state being of no interest."""
+    return Moment(np.zeros(19), np.array(command), np.array(velocity))
+
+
+@pytest.mark.parametrize(("robots", "width", "height"), [(1, 960, 540), (4, 1280, 720), (9, 1278, 720)])
+def test_frames(tmp_path, robots, width, height):
+    """An mp4 has every second step, and its size is that of all tiles; all of them show a robot."""
+    for package in ("imageio", "imageio_ffmpeg"):
+        pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[video]")
+    import imageio
+
+    file = tmp_path / "new" / "out.mp4"
+    command = [sys.executable, "-c", DRAW, str(XML), str(file), str(robots)]
+    # conftest.py tells MuJoCo not to render in this process, so another one draws
+    environment = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
+    result = subprocess.run(command, capture_output=True, text=True, cwd=XML.parents[3], env=environment)
+    if result.stderr.startswith("no renderer: "):
+        pytest.skip(result.stderr.strip())
+    assert (result.returncode, result.stderr) == (0, "")
+    with imageio.get_reader(file) as reader:
+        assert reader.get_meta_data()["fps"] == 25
+        frames = [np.asarray(frame) for frame in reader]
+    assert [frame.shape for frame in frames] == [(height, width, 3)] * 3
+    side = int(robots**0.5)
+    for rows in np.split(frames[-1], side):
+        for tile in np.split(rows, side, axis=1):
+            h, w = tile.shape[:2]
+            assert tile[h // 3 : -h // 4, w // 3 : -w // 3].min() < 40 < 150 < tile.mean()  # black robot, light ground
+
+
+@pytest.mark.parametrize("gray", [0, 128, 255])
+def test_overlay_is_readable(gray):
+    """Text is bright on dark whatever is behind it, and only the corner changes."""
+    image = np.full((270, 480, 3), gray, np.uint8)
+    rows = video._table(1.0, moment())
+    result = add_overlay(image, rows)
+    assert (image == gray).all() and result.shape == image.shape and result.dtype == np.uint8
+    ys, xs = np.nonzero((result != gray).any(axis=2))
+    assert 0 < xs.min() and xs.max() < 0.5 * 480 and 0 < ys.min() and ys.max() < 0.4 * 270
+    box = result[ys.min() : ys.max(), xs.min() : xs.max()]
+    assert np.median(box) < 90 and box.max() > 240
+
+
+@pytest.mark.parametrize("write", [lambda time, what: video._table(time, what), lambda time, what: video._line(what)])
+def test_overlay_shows_numbers(write):
+    """Another command or velocity is another picture."""
+    image = np.full((360, 640, 3), 100, np.uint8)
+    moments = [moment(), moment(command=(0.5, 0.5, 0.0)), moment(velocity=(0.9, 0.4, 0.0))]
+    pictures = [add_overlay(image, write(1.0, what)).tobytes() for what in moments]
+    assert len({*pictures, image.tobytes()}) == 4
+
+
+def test_numbers():
+    """Time, command and velocity with two digits, without the flicker of a negative zero."""
+    words = [row for _, row in video._table(3.14159, moment())]
+    assert words[0] == ["3.14 s", "v_x", "v_y", "yaw"]
+    assert words[1:3] == [["command", "+0.50", "-0.25", "+0.00"], ["actual", "+0.30", "+0.40", "+0.00"]]
+    assert [row for _, row in video._line(moment())] == [["command", "0.56 m/s"], ["actual", "0.50 m/s"]]
+
+
+def test_recorded_worlds(make_task, monkeypatch):
+    """One world is the fastest one, more are the first ones; what is kept is the task's state."""
+    saved = []
+    monkeypatch.setattr("legged_torque.evaluation.video.write_video", lambda *args: saved.append(args))
+    task = make_task("a1_torque", num_envs=5)
+    task.reset()
+    task.commands[:] = 0.1
+    task.commands[3, 0] = -0.9
+    one, four = Recorder(task), Recorder(task, 4)
+    for _ in range(2):
+        for recorder in (one, four):
+            recorder.add_step()
+        task.commands[:, 0] = 0.2  # the robot of the video stays the same
+    for recorder, worlds in ((one, [3]), (four, [0, 1, 2, 3])):
+        recorder.save(Path("out.mp4"))
+        file, model, trunk, steps, control_step = saved[-1]
+        assert (file, model.body(trunk).name, control_step) == (Path("out.mp4"), "trunk", task.dt)
+        for number, moments in enumerate(steps):
+            assert len(moments) == len(worlds)
+            for world, kept in zip(worlds, moments, strict=True):
+                np.testing.assert_array_equal(kept.qpos, task.sim.qpos[world].double().numpy())
+                assert kept.command[0] == pytest.approx([-0.9 if world == 3 else 0.1, 0.2][number])
+                velocity = [*task.base_lin_vel[world, :2].tolist(), float(task.base_ang_vel[world, 2])]
+                assert kept.velocity == pytest.approx(velocity)
+
+
+def test_missing_extra(monkeypatch, tmp_path):
+    """Without an encoder the extra is named."""
+    monkeypatch.setitem(sys.modules, "imageio", None)
+    with pytest.raises(video.UserError, match=r"videos need the extra: pip install -e \.\[video\]"):
+        write_video(tmp_path / "out.mp4", None, 1, [[moment()]], 0.02)
