@@ -17,7 +17,6 @@ def plot(tmp_path, *words):
 @pytest.mark.parametrize(
     "words",
     [
-        (),
         ("--perturbation=none",),
         ("--task=a1_torque_multihead", "--perturbation=doubled", "--set=env.history_length=3"),
         ("--set=domain_rand.action_delay=[1, 4]", "--set=domain_rand.keep_fixed=[gravity, trunk_mass_offset]"),

@@ -43,7 +43,7 @@ def moment(command=(0.5, -0.25, 0.0), velocity=(0.3, 0.4, -0.001)):
     return Moment(np.zeros(19), np.array(command), np.array(velocity))
 
 
-@pytest.mark.parametrize(("robots", "width", "height"), [(1, 960, 540), (4, 1280, 720), (9, 1278, 720)])
+@pytest.mark.parametrize(("robots", "width", "height"), [(1, 960, 540), (4, 1280, 720)])
 def test_frames(tmp_path, robots, width, height):
     """An mp4 has every second step, and its size is that of all tiles; all of them show a robot."""
     for package in ("imageio", "imageio_ffmpeg"):
