@@ -10,9 +10,10 @@ import math
 from pathlib import Path
 
 from legged_torque import ROOT_DIR
+from legged_torque.deploy.metrics import UNITS
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.evaluation.metrics import UNITS, measure
+from legged_torque.evaluation.metrics import measure
 from legged_torque.evaluation.video import Recorder
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.args import Parser, add_task_args, run_script

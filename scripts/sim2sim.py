@@ -27,6 +27,7 @@ from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import Robot
 from legged_torque.deploy.simulation import Events, Simulation
 from legged_torque.deploy.video import Recorder
+from legged_torque.utils.cli import run_script
 from legged_torque.utils.errors import UserError
 
 
@@ -165,11 +166,4 @@ def viewer(simulation: Simulation) -> Iterator[Callable[[], None]]:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
+    run_script(main)

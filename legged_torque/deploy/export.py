@@ -229,6 +229,7 @@ def check_task(task: LeggedRobot, policy: Policy) -> None:
     generator = torch.Generator().manual_seed(0)
 
     def draw(like: Tensor, scale: float) -> None:
+        """Fill a tensor with normal random numbers."""
         like.copy_(scale * torch.randn(like.shape, generator=generator))
 
     draw(task.sim.qpos, 1.0)

@@ -28,8 +28,8 @@ class TrainingEvaluator:
     """Evaluates the policy of a training now and then.
 
     Its worlds have their own random numbers, no rewards, and go on where the last evaluation left them: an evaluation
-    has as many steps of robots as the paper's 16 worlds x 2000 steps, in as many worlds as a GPU steps in little more
-    time than 16. Training is the same with and without it.
+    has as many steps of robots as the paper's 16 worlds x 2000 steps, but in many worlds at once. Training is the same
+    with and without it.
     """
 
     def __init__(self, task: LeggedRobot, policy: Callable[[TensorDict], Tensor], settings: dict, seed: int) -> None:

@@ -12,18 +12,6 @@ from torch import Tensor
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
 
-UNITS = {
-    "track_percentage": "",
-    "track_xy": "m^2/s^2",
-    "track_angular": "rad^2/s^2",
-    "collision_force": "N",
-    "cost_of_transport": "",
-    "height": "m",
-    "speed": "m/s",
-    "falls_per_minute": "1/min",
-}
-"""The metrics of :class:`WalkingMetrics`, the paper's five first, and their units."""
-
 COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")
 NUM_BINS = 4
 """Into how many equal parts the range of each command is split."""

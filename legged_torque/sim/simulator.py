@@ -102,7 +102,7 @@ class Simulator:
             self._overflow = wp.zeros(num_envs, dtype=wp.int32)
             self._reference_pose = wp.array(model.qpos0, dtype=wp.float32)
         self._constants = DerivedConstants(model, self.model, num_envs) if per_world else None
-        self._step = self._make_step(engine)
+        self._step = FusedStep(model, self.model, self.data) if engine == "fused" else WarpStep(self.model, self.data)
         self.qpos = wp.to_torch(self.data.qpos)
         self.qvel = wp.to_torch(self.data.qvel)
         self.qacc_warmstart = wp.to_torch(self.data.qacc_warmstart)
@@ -111,12 +111,6 @@ class Simulator:
         sensors = wp.to_torch(self.data.sensordata).view(num_envs, -1, CONTACT_DATA)
         self.contact_found = sensors[:, :, 0]
         self.contact_force = sensors[:, :, 1:]
-
-    def _make_step(self, engine: str) -> FusedStep | WarpStep:
-        """Return what steps the worlds."""
-        if engine == "mujoco_warp":
-            return WarpStep(self.model, self.data)
-        return FusedStep(self.mj_model, self.model, self.data)
 
     def field(self, name: str) -> Tensor:
         """Return a field of the model, or "gravity", that is writable.

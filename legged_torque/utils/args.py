@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
-from collections.abc import Callable
 from typing import Any, NoReturn
 
 import torch
 
 from legged_torque.learning import distributed
+from legged_torque.utils.cli import run_script as run_script
 from legged_torque.utils.config import section_keys, set_by_path, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
 
@@ -202,15 +201,3 @@ def device_name(device: str) -> str:
     if torch.device(device).type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"CPU, {torch.get_num_threads()} threads"
-
-
-def run_script(main: Callable[[], None]) -> None:
-    """Run a script's main function; a user's mistake ends it with one line and exit status 2, Ctrl-C with 130."""
-    try:
-        main()
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)

@@ -1,0 +1,20 @@
+"""Ending a script as a user expects it, without torch."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+from legged_torque.utils.errors import UserError
+
+
+def run_script(main: Callable[[], None]) -> None:
+    """Run a script's main function; a user's mistake ends it with one line and exit status 2, Ctrl-C with 130."""
+    try:
+        main()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
