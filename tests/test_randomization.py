@@ -333,6 +333,7 @@ def test_everything_at_once(make_task, task):
     """With all random events on, a task runs, and worlds that fall are drawn anew."""
     cfg = get_cfgs("--perturbation=doubled", task=task)[0]
     settings = {f"domain_rand.{key}": value for key, value in to_dict(cfg.domain_rand).items()}
+    settings["domain_rand.resampling_probability"] = 0.05
     world = make_task(task, 16, **settings, **{"noise.add_noise": True})
     masses = world.sim.field("body_mass").clone()
     for _ in range(60):

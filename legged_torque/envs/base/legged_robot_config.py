@@ -253,7 +253,7 @@ class LeggedRobotCfgPPO(BaseConfig):
         num_learning_epochs = 5
         num_mini_batches = 4
         clip_param = 0.2
-        gamma = 0.99
+        gamma = 0.98
         lam = 0.95
         value_loss_coef = 1.0
         entropy_coef = 5e-4
@@ -280,6 +280,7 @@ class LeggedRobotCfgPPO(BaseConfig):
                 "num_learning_epochs": 5,
                 "num_mini_batches": 32,
                 "clip_param": 0.1,
+                "gamma": 0.99,
                 "lam": 0.9,
                 "entropy_coef": 5e-4,
                 "learning_rate": 1e-4,
