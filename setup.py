@@ -35,6 +35,6 @@ setup(
         "viewer": ["viser>=1.1,<2", "trimesh>=4.8,<6", "pillow"],
         "wandb": ["wandb"],
         "export": EXPORT,
-        "test": ["pytest", "matplotlib", "imageio", "imageio-ffmpeg", "pillow>=10.1", *EXPORT],
+        "test": ["pytest", "pytest-xdist>=3.6,<4", "matplotlib", "imageio", "imageio-ffmpeg", "pillow>=10.1", *EXPORT],
     },
 )

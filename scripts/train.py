@@ -11,6 +11,7 @@ os.environ["MUJOCO_GL"] = "disable"  # training draws nothing, and MuJoCo must n
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 from legged_torque.learning import distributed
+from legged_torque.learning.pretrained import find_pretrained, start_from
 from legged_torque.utils.args import Parser, add_task_args, add_train_args, device_name, run_script
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
@@ -46,9 +47,13 @@ def main() -> None:
 
 
 def train(args: argparse.Namespace, env_cfg: LeggedRobotCfg, train_cfg: LeggedRobotCfgPPO) -> None:
-    """Build the task and train it."""
+    """Build the task and train it, from a pre-trained policy if the task has one."""
+    starts_pretrained = train_cfg.pretraining.function and not args.resume and distributed.rank() == 0
+    pretrained = find_pretrained(args, env_cfg, train_cfg) if starts_pretrained else None
     env, _ = task_registry.make_env(args.task, args, env_cfg)
     runner, _ = task_registry.make_alg_runner(env, args.task, args, train_cfg)
+    if pretrained:
+        start_from(runner, pretrained)  # the other processes get the networks of the first one
     total = args.max_iterations or num_iterations(env, train_cfg)
     remaining = total - runner.current_learning_iteration
     if remaining < 1:

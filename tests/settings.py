@@ -6,7 +6,7 @@ from legged_torque.envs import task_registry
 from legged_torque.utils.args import Parser, add_task_args, add_train_args
 from legged_torque.utils.errors import UserError
 
-TASKS = ["a1_position", "a1_torque", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
+TASKS = ["a1_position", "a1_torque", "a1_torque_gravity", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
 
 
 def parse(*words):

@@ -21,7 +21,7 @@ for package in ("onnx", "onnxruntime", "jsonschema"):
 from legged_torque.deploy.export import export_policy, nominal_cfg
 from legged_torque.deploy.policy import Policy, State
 
-TASKS = ["a1_position", "a1_torque", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
+TASKS = ["a1_position", "a1_torque", "a1_torque_gravity", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
 TRAINING = {"run": "run", "checkpoint": "model_7.pt", "iterations": 7, "total_steps": 20_000_000}
 CHANGED = {
     "env.history_length": 3,

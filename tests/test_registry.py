@@ -23,6 +23,7 @@ def test_registered_tasks():
     assert classes == {
         "a1_position": "LeggedRobot",
         "a1_torque": "TorqueRobot",
+        "a1_torque_gravity": "TorqueRobot",
         "a1_torque_curriculum": "TorqueCurriculumRobot",
         "a1_torque_multihead": "MultiHeadRobot",
         "a1_multihead": "MultiHeadRobot",

@@ -26,7 +26,7 @@ TABLE_III = {  # weight without Delta t, at the start of training
     "feet_air_time": 0.1,
     "symmetry": -0.5,
 }
-TASKS = ("a1_position", "a1_torque", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead")
+TASKS = ("a1_position", "a1_torque", "a1_torque_gravity", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead")
 
 
 def contact_flags(*names):

@@ -21,7 +21,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from legged_torque.utils import task_registry
 
 ROOT = Path(__file__).resolve().parents[1]
-TASKS = ["a1_position", "a1_torque", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
+TASKS = ["a1_position", "a1_torque", "a1_torque_gravity", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
 SMALL = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--set=runner.num_steps_per_env=4", "--max_iterations=2"]
 
 

@@ -14,11 +14,13 @@ from legged_torque.envs.a1.torque_curriculum import (
     A1TorqueCurriculumCfgPPO,
     TorqueCurriculumRobot,
 )
+from legged_torque.envs.a1.torque_gravity import A1TorqueGravityCfg, A1TorqueGravityCfgPPO
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.utils.task_registry import task_registry
 
 task_registry.register("a1_position", LeggedRobot, A1Cfg(), A1CfgPPO())
 task_registry.register("a1_torque", TorqueRobot, A1TorqueCfg(), A1TorqueCfgPPO())
+task_registry.register("a1_torque_gravity", TorqueRobot, A1TorqueGravityCfg(), A1TorqueGravityCfgPPO())
 task_registry.register(
     "a1_torque_curriculum", TorqueCurriculumRobot, A1TorqueCurriculumCfg(), A1TorqueCurriculumCfgPPO()
 )

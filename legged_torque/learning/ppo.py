@@ -80,11 +80,16 @@ class OnDevicePPO(PPO):
             fused=True,
             capturable=True,
         )
+        self._actor_learns = torch.ones((), device=self.device)
         self._skip = torch.zeros((), device=self.device)
         self.optimizer.found_inf = self._skip  # where torch's own gradient scaler tells a fused optimizer to skip
         self._losses = torch.zeros(len(LOSS_NAMES), device=self.device)
         self._indices = torch.zeros(self._batch_size, dtype=torch.long, device=self.device)
         self.update_graph = CudaGraph(self._update_minibatch, self.device)
+
+    def learn_actor(self, enabled: bool) -> None:
+        """Say whether the next updates train the policy too, or the value function alone."""
+        self._actor_learns.fill_(float(enabled))
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions and keep the transition, with a copy of observations that a task may overwrite in its step."""
@@ -150,10 +155,11 @@ class OnDevicePPO(PPO):
         kl = self._mean_kl(batch)
         surrogate_loss = self._surrogate_loss(batch, log_prob)
         value_loss = self._value_loss(batch, values)
-        loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
+        actor_loss = surrogate_loss - self.entropy_coef * entropy
         if self.symmetry and self.symmetry.use_mirror_loss:
             mirror_loss = self.symmetry.compute_loss(self.actor, batch, self._batch_size)
-            loss = loss + self.symmetry.mirror_loss_coeff * mirror_loss
+            actor_loss = actor_loss + self.symmetry.mirror_loss_coeff * mirror_loss
+        loss = self._actor_learns * actor_loss + self.value_loss_coef * value_loss
         self.optimizer.zero_grad()
         loss.backward()
         if self.is_multi_gpu:
@@ -204,6 +210,7 @@ class OnDevicePPO(PPO):
             lower = kl > 2.0 * self.desired_kl
             higher = (kl < 0.5 * self.desired_kl) & (kl > 0.0)
             factor = torch.where(lower, 1.0 / 1.5, torch.where(higher, 1.5, 1.0))
+            factor = torch.where(self._actor_learns.bool(), factor, 1.0)  # a policy that stays says nothing
             self.learning_rate.mul_(factor).clamp_(MIN_LEARNING_RATE, MAX_LEARNING_RATE)
 
     def _surrogate_loss(self, batch: RolloutStorage.Batch, log_prob: Tensor) -> Tensor:

@@ -87,6 +87,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self.logger.init_logging_writer()
         start_it = self.current_learning_iteration
         total_it = start_it + num_learning_iterations
+        warmup = self.cfg["pretraining"]["critic_warmup_iterations"]
         with StopRequest() as stop:
             for _ in range(num_learning_iterations):
                 if distributed.any_process(stop.requested, self.device):
@@ -95,6 +96,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
                 self.collect_rollout()
                 self._wait()
                 collected = time.perf_counter()
+                self.alg.learn_actor(self.current_learning_iteration >= warmup)
                 losses = self.alg.update()
                 measured = self._evaluate(losses, start)
                 learned = time.perf_counter()

@@ -147,9 +147,14 @@ def load_run(args: argparse.Namespace) -> tuple[Path, Any, Any]:
 
 
 def experiment_dir(train_cfg: Any, args: argparse.Namespace | None = None) -> Path:
-    """Return the folder that holds the runs of an experiment: below ``--log_root``, or ``logs/`` in the repository."""
+    """Return the folder that holds the runs of an experiment."""
+    return all_experiments_dir(args) / train_cfg.runner.experiment_name
+
+
+def all_experiments_dir(args: argparse.Namespace | None = None) -> Path:
+    """Return the folder that holds all experiments: ``--log_root``, or ``logs/`` in the repository."""
     root = getattr(args, "log_root", None)
-    return (Path(root) if root else ROOT_DIR / "logs") / train_cfg.runner.experiment_name
+    return Path(root) if root else ROOT_DIR / "logs"
 
 
 def num_iterations(env: VecEnv, train_cfg: Any) -> int:

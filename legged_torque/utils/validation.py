@@ -30,6 +30,9 @@ def check_train_cfg(train_cfg: Any) -> None:
                 raise UserError(f"{section}.{key} must be at least 1, not {value}")
     if train_cfg.evaluation.interval < 0:
         raise UserError(f"evaluation.interval must be at least 0, not {train_cfg.evaluation.interval}")
+    if train_cfg.pretraining.critic_warmup_iterations < 0:
+        iterations = train_cfg.pretraining.critic_warmup_iterations
+        raise UserError(f"pretraining.critic_warmup_iterations must be at least 0, not {iterations}")
     for key in ("learning_rate", "max_grad_norm", "clip_param"):
         value = getattr(train_cfg.algorithm, key)
         if not value > 0.0:

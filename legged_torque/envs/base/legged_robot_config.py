@@ -219,6 +219,13 @@ class LeggedRobotCfgPPO(BaseConfig):
         num_envs = 4000  # worlds, at most as many as train
         perturbation = ""  # environment, one of ``perturbations``; empty: that of the training
 
+    class pretraining:
+        """A policy that is made by supervision before training starts, and from which it starts."""
+
+        function = ""  # what makes it: "module:function"; empty: training starts from random networks
+        file = ""  # where it is kept; empty: pretrained/<task>.pt in the folder of all experiments
+        critic_warmup_iterations = 0  # iterations in which only the critic learns
+
     class obs_groups:
         """Which observations which network reads."""
 

@@ -1,0 +1,156 @@
+"""Contact forces inside friction cones and limits that give the trunk a wanted wrench, for many states at once.
+
+Batched solvers exist, but none fits: qpth and qpax stop when the worst problem of the batch has converged, which waits
+for the host at every iteration (and qpax needs JAX); ProxSuite's batches run on the CPU; cuML's nnls takes one matrix
+for all problems and has no upper limits. The problems here are small and alike, so a primal-dual interior point method
+of a fixed number of iterations does, on torch.linalg's batched Cholesky factorization.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from legged_torque.utils.errors import UserError
+
+ITERATIONS = 12
+"""Enough to reach single precision from any start; each further one gains about a digit in double precision."""
+CENTERING = 0.1
+"""Factor by which each iteration is to reduce the complementarity."""
+TO_BOUNDARY = 0.99
+"""Share of the way to the nearest limit that a step may go."""
+
+
+@dataclass(frozen=True)
+class ForceLimits:
+    """What a contact can bear, on level ground.
+
+    Attributes:
+        friction: Coefficient mu of the friction pyramid |f_x| + |f_y| <= mu f_z, which lies inside the cone.
+        lowest: Lowest normal force of a contact [N], at least 0.
+        highest: Highest normal force of a contact [N].
+    """
+
+    friction: float
+    lowest: float
+    highest: float
+
+
+class ForceDistribution:
+    """Finds the contact forces nearest to wanted ones that the contacts can bear."""
+
+    def __init__(
+        self, limits: ForceLimits, arm: float, regularization: float, device: str, dtype: torch.dtype = torch.float32
+    ) -> None:
+        """Keep the settings and the constants on the device.
+
+        Args:
+            limits: What each contact can bear.
+            arm: Length that makes moments comparable with forces [m].
+            regularization: Weight of single forces against the wrench, small against 1.
+            device: Name of the device.
+            dtype: Floating point type of all that follows.
+
+        Raises:
+            UserError: If no force is inside the limits.
+        """
+        if limits.friction <= 0.0 or not 0.0 <= limits.lowest < limits.highest:
+            raise UserError(f"contact forces need friction > 0 and 0 <= lowest < highest, not {limits}")
+        mu, lowest = limits.friction, limits.lowest / limits.highest
+        rows = [[x, y, -mu] for x in (1.0, -1.0) for y in (1.0, -1.0)] + [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]
+        self._rows = torch.tensor(rows, dtype=dtype, device=device)
+        self._outer = (self._rows.unsqueeze(2) * self._rows.unsqueeze(1)).flatten(1)
+        self._bounds = torch.tensor([0.0] * 4 + [1.0, -lowest], dtype=dtype, device=device)
+        self._start = torch.tensor([0.0, 0.0, 0.5 * (1.0 + lowest)], dtype=dtype, device=device)
+        self._weights = torch.tensor([1.0] * 3 + [1.0 / arm**2] * 3, dtype=dtype, device=device).unsqueeze(1)
+        self._highest, self._regularization = limits.highest, regularization
+
+    def __call__(
+        self, grasp: Tensor, wrench: Tensor, reference: Tensor, mask: Tensor, iterations: int = ITERATIONS
+    ) -> tuple[Tensor, Tensor]:
+        """Return the contact forces f_csd (eq. 10), and what the trunk feels of the limits.
+
+        With G the grasp matrix and W weighing moments against forces, f_csd minimizes
+
+            |W (G f - wrench)|^2 + regularization |f - reference|^2
+
+        inside the friction pyramids and limits. As in eq. 10, forces stay as they are if they give the wrench within
+        all limits; otherwise they change such that the trunk feels as little of it as possible.
+
+        Args:
+            grasp: G, the first six rows of J_c^T, from contact forces to the wrench on the trunk, force [N] and moment
+                [N m]. Shape: (n, 6, 3 k).
+            wrench: Wanted wrench. Shape: (n, 6).
+            reference: Forces on the robot in the world frame [N] that settle what the wrench leaves open.
+                Shape: (n, k, 3).
+            mask: Which contacts touch the ground. Shape: (n, k), bool.
+            iterations: Iterations of the solver.
+
+        Returns:
+            Forces [N], exactly zero where nothing touches (n, k, 3); the residual G f - wrench [N, N m] (n, 6).
+        """
+        active = mask.unsqueeze(2)
+        reference = torch.where(active, reference, 0.0).flatten(1).unsqueeze(2) / self._highest
+        wrench = wrench.unsqueeze(2) / self._highest
+        grasp = torch.where(mask.repeat_interleave(3, dim=1).unsqueeze(1), grasp, 0.0)
+        weighted = (self._weights * grasp).mT
+        hessian = weighted @ grasp
+        hessian.diagonal(dim1=1, dim2=2).add_(self._regularization)
+        forces = self._solve(hessian, weighted @ wrench + self._regularization * reference, active, iterations)
+        residual = grasp @ forces.flatten(1).unsqueeze(2) - wrench
+        return self._highest * forces, self._highest * residual.squeeze(2)
+
+    def _solve(self, hessian: Tensor, linear: Tensor, active: Tensor, iterations: int) -> Tensor:
+        """Minimize 1/2 f^T H f - b^T f within the limits, all in units of the highest normal force.
+
+        Every iterate is inside the limits: the start is, and steps stop before them.
+
+        Args:
+            hessian: H. Shape: (n, 3 k, 3 k).
+            linear: b. Shape: (n, 3 k, 1).
+            active: Shape: (n, k, 1), bool.
+            iterations: Number of steps.
+
+        Returns:
+            The forces. Shape: (n, k, 3).
+        """
+        forces = torch.where(active, self._start, 0.0)
+        multipliers = active.to(forces).expand(*forces.shape[:2], len(self._bounds))
+        limits_in_force = (multipliers.sum(dim=(1, 2), keepdim=True)).clamp(min=1.0)
+        floor = 100.0 * torch.finfo(forces.dtype).eps  # below it, rounding decides which limits are reached
+        for _ in range(iterations):
+            slack = torch.where(active, self._bounds - forces @ self._rows.T, 1.0).clamp(min=0.01 * floor)
+            gap = (slack * multipliers).sum(dim=(1, 2), keepdim=True) / limits_in_force
+            target = torch.where(active, (CENTERING * gap).clamp(min=floor), 0.0)
+            stiffness = multipliers / slack
+            gradient = (hessian @ forces.flatten(1).unsqueeze(2) - linear).view_as(forces)
+            step = self._newton_step(hessian, stiffness, gradient + (target / slack) @ self._rows)
+            slack_step = -step @ self._rows.T
+            multiplier_step = target / slack - multipliers - stiffness * slack_step
+            nearest = torch.minimum(_room(slack, slack_step), _room(multipliers, multiplier_step))
+            length = (TO_BOUNDARY * nearest).clamp(max=1.0).view(-1, 1, 1)
+            forces = forces + length * step
+            multipliers = multipliers + length * multiplier_step
+        return forces
+
+    def _newton_step(self, hessian: Tensor, stiffness: Tensor, gradient: Tensor) -> Tensor:
+        """Solve (H + E^T D E) step = -gradient, E being the rows of all limits. Shapes of step, gradient: (n, k, 3)."""
+        n, k, _ = stiffness.shape
+        matrix = hessian.clone()
+        blocks = matrix.view(n, k, 3, k, 3).diagonal(dim1=1, dim2=3)
+        blocks.add_((stiffness @ self._outer).view(n, k, 3, 3).permute(0, 2, 3, 1))
+        matrix.diagonal(dim1=1, dim2=2).mul_(
+            1.0 + 4.0 * torch.finfo(matrix.dtype).eps
+        )  # rounding must not make it singular
+        factor = torch.linalg.cholesky_ex(matrix).L
+        # A CUDA graph can capture triangular solves, but not cholesky_solve.
+        half = torch.linalg.solve_triangular(factor, gradient.reshape(n, 3 * k, 1), upper=False)
+        return -torch.linalg.solve_triangular(factor.mT, half, upper=True).view(n, k, 3)
+
+
+def _room(values: Tensor, steps: Tensor) -> Tensor:
+    """Return how much of its step each state can go until the first of its values is zero. Shape: (n,)."""
+    return torch.where(steps < 0.0, -values / steps, math.inf).amin(dim=(1, 2))

@@ -1,0 +1,328 @@
+"""Gravity pre-training (paper, III-A): a torque policy learns to stand from what the whole-body controller does."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from rsl_rl.models import MLPModel
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged_torque.control.dynamics import RobotDynamics
+from legged_torque.control.standing import measure_standing, place_on_ground, use_standing_trials
+from legged_torque.control.whole_body import WholeBodyController, WholeBodySettings, WholeBodyTorques
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.utils.args import device_name, resolve_device
+from legged_torque.utils.config import to_dict
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.random_state import own_random_numbers, seeded_state
+from legged_torque.utils.task_registry import task_registry
+
+Act = Callable[[LeggedRobot], Tensor]
+"""Returns the torques for a task's state [N m]. Shape: (num_envs, num_dof)."""
+STANDING_SECONDS = 5.0
+"""Time after which the learned policy must stand."""
+
+
+@dataclass
+class Pairs:
+    """What the policy sees, and the actions that the controller takes there.
+
+    Attributes:
+        observations: Group "policy" of the task's observations. Shape: (pairs, size).
+        actions: Torques of the controller over the torque scale. Shape: (pairs, num_actions).
+    """
+
+    observations: Tensor
+    actions: Tensor
+
+    def split(self, size: int) -> list[Pairs]:
+        """Return the pairs in parts of at most ``size``."""
+        parts = zip(self.observations.split(size), self.actions.split(size), strict=True)
+        return [Pairs(observations, actions) for observations, actions in parts]
+
+    def shuffled(self) -> Pairs:
+        """Return the pairs in random order."""
+        order = torch.randperm(len(self.actions), device=self.actions.device)
+        return Pairs(self.observations[order], self.actions[order])
+
+
+@dataclass
+class Collection:
+    """What came of following random configurations.
+
+    Attributes:
+        training: Pairs to learn from.
+        held_out: Pairs of other configurations, to measure what was learned.
+        dropped: How many pairs were dropped, by reason.
+        mean_torques: Mean absolute torque of every pair, dropped ones included [N m]. Shape: (all pairs,).
+        residuals: Wrench residual of every pair, see :func:`residual_share`. Shape: (all pairs,).
+    """
+
+    training: Pairs
+    held_out: Pairs
+    dropped: dict[str, int]
+    mean_torques: Tensor
+    residuals: Tensor
+
+
+def pretrain(args: argparse.Namespace, env_cfg: Any, train_cfg: Any) -> tuple[MLPModel, dict[str, Any]]:
+    """Make a policy that stands: the ``pretraining.function`` of ``a1_torque_gravity``.
+
+    Its random numbers are its own, so that a training is the same whether it had to make its policy or found one.
+
+    Args:
+        args: Parsed command line; says which task on which device.
+        env_cfg: Settings of the task.
+        train_cfg: Settings of its training; those of this function are ``pretraining``.
+
+    Returns:
+        The actor, and a report of plain values.
+    """
+    cfg, settings = copy.deepcopy(env_cfg), train_cfg.pretraining
+    use_standing_trials(cfg, env_cfg.control.decimation)
+    device = resolve_device(args.device)
+    with own_random_numbers(device, seeded_state(device, settings.seed)):
+        task, _ = task_registry.make_env(args.task, args, cfg)
+        actor = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=None)[0].alg.actor
+        controller = make_controller(task, WholeBodySettings(**to_dict(settings.controller)))
+        start = time.perf_counter()
+        collection, errors = learn_to_stand(task, controller, actor, settings)
+        seconds = time.perf_counter() - start
+        standing = standing_shares(task, controller, actor)
+    print(f"Standing after 5 s: {' and '.join(f'the {who} {share:.1%}' for who, share in standing.items())}.")
+    report = {
+        "task": args.task,
+        "device": device_name(task.device),
+        "settings": to_dict(settings),
+        "pairs": len(collection.training.actions) + len(collection.held_out.actions),
+        "dropped": collection.dropped,
+        "rms_error": errors,
+        "standing": standing,
+        "seconds": seconds,
+        "histograms": {
+            "mean_torque": histogram(collection.mean_torques, 40.0),
+            "residual": histogram(collection.residuals, 5.0),
+        },
+    }
+    return actor, report
+
+
+def learn_to_stand(
+    task: LeggedRobot, controller: WholeBodyController, actor: MLPModel, settings: Any
+) -> tuple[Collection, dict[str, list[float]]]:
+    """Let the actor imitate the controller, first where that goes, then also where the actor itself goes (DAgger).
+
+    Args:
+        task: The task, whose episodes start from random states.
+        controller: What is imitated.
+        actor: The policy, changed in place.
+        settings: ``pretraining`` of the training's settings.
+
+    Returns:
+        All pairs, and the errors after every epoch of every round, see :func:`supervise`.
+    """
+    followed: list[Followed] = []
+    errors: dict[str, list[float]] = {"training": [], "held_out": []}
+    for i in range(settings.num_rounds):
+        act = act_by_policy(actor) if i else act_by_controller(controller)
+        count = settings.num_configurations * (i + 1) // settings.num_rounds - sum(p.upright.shape[1] for p in followed)
+        print(f"Round {i + 1} of {settings.num_rounds}: following {count} configurations.", flush=True)
+        followed.append(follow(task, controller, act, count, settings.num_steps))
+        collection = select(followed, settings)
+        for name, values in supervise(task, actor, collection, settings).items():
+            errors[name] += values
+    return collection, errors
+
+
+@dataclass
+class Followed:
+    """Configurations that were followed in closed loop, the controller's opinion at each step, and who was acting.
+
+    Attributes:
+        observations: What the policy sees. Shape: (num_steps, configurations, size).
+        actions: The controller's torques over the torque scale. Shape: (num_steps, configurations, num_actions).
+        mean_torques: Mean absolute torque of the controller [N m]. Shape: (num_steps, configurations).
+        residuals: See :func:`residual_share`. Shape: (num_steps, configurations).
+        upright: Whether the robot has not fallen before. Shape: (num_steps, configurations), bool.
+    """
+
+    observations: Tensor
+    actions: Tensor
+    mean_torques: Tensor
+    residuals: Tensor
+    upright: Tensor
+
+
+def follow(
+    task: LeggedRobot, controller: WholeBodyController, act: Act, num_configurations: int, num_steps: int
+) -> Followed:
+    """Draw random configurations and follow each for some control steps.
+
+    Args:
+        task: The task; its worlds are used again and again.
+        controller: Whose torques are noted.
+        act: Who moves the robot, controller or policy; torques hold for a control step.
+        num_configurations: How many to follow.
+        num_steps: Control steps of each.
+    """
+    parts: list[list[Tensor]] = []
+    for start in range(0, num_configurations, task.num_envs):
+        place_on_ground(task, controller.dynamics)
+        upright = torch.ones_like(task.reset_buf)
+        steps = []
+        for _ in range(num_steps):
+            decided = controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0)
+            observations = task.get_observations()["policy"]
+            torques, residuals = decided.total, residual_share(controller, decided)
+            steps.append([observations, torques / task.torque_scale, torques.abs().mean(dim=1), residuals, upright])
+            task.step(act(task) / task.torque_scale)
+            upright = upright & ~task.reset_buf
+        count = min(task.num_envs, num_configurations - start)
+        parts.append([torch.stack(numbers)[:, :count] for numbers in zip(*steps, strict=True)])
+    return Followed(*(torch.cat(numbers, dim=1) for numbers in zip(*parts, strict=True)))
+
+
+def select(followed: list[Followed], settings: Any) -> Collection:
+    """Keep the pairs that are worth learning, and hold back those of some configurations.
+
+    As in the paper, pairs of large torques are dropped, and so are those whose contacts cannot bear what the controller
+    wants by far, and what comes after a fall.
+
+    Args:
+        followed: What was followed.
+        settings: ``pretraining`` of the training's settings.
+    """
+    names = [field.name for field in dataclasses.fields(Followed)]
+    everything = Followed(*(torch.cat([getattr(part, name) for part in followed], dim=1) for name in names))
+    reasons = {
+        "after a fall": ~everything.upright,
+        f"mean torque over {settings.max_mean_torque:g} N m": everything.mean_torques > settings.max_mean_torque,
+        f"wrench residual over {settings.max_residual:g}": everything.residuals > settings.max_residual,
+    }
+    keep, dropped = torch.ones_like(everything.upright), {}
+    for reason, mask in reasons.items():
+        dropped[reason] = int((keep & mask).sum())
+        keep = keep & ~mask
+    held_out = torch.rand(keep.shape[1], device=keep.device) < settings.held_out
+    sets = [keep & ~held_out, keep & held_out]
+    training, measured = (Pairs(everything.observations[chosen], everything.actions[chosen]) for chosen in sets)
+    if not len(training.actions) or not len(measured.actions):
+        raise UserError("pre-training has kept no pairs: raise pretraining.num_configurations or its limits")
+    texts = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
+    print(f"Kept {int(keep.sum())} of {keep.numel()} pairs; dropped: {texts}.", flush=True)
+    return Collection(training, measured, dropped, everything.mean_torques.flatten(), everything.residuals.flatten())
+
+
+def residual_share(controller: WholeBodyController, decided: WholeBodyTorques) -> Tensor:
+    """Return what the limits of the contacts leave out of the wanted wrench, as a share of the weight. Shape: (n,).
+
+    Moments count by the arm of the controller's settings.
+    """
+    model = controller.dynamics.mj_model
+    weight = float(model.body_mass.sum() * abs(model.opt.gravity[2]))
+    force, moment = decided.wrench_residual.split(3, dim=1)
+    return torch.cat([force, moment / controller.settings.arm], dim=1).norm(dim=1) / weight
+
+
+def supervise(task: LeggedRobot, actor: MLPModel, collection: Collection, settings: Any) -> dict[str, list[float]]:
+    """Train the actor's mean on the pairs and on their mirror images by their mean square error.
+
+    The last action, which the policy sees too, is that of another pair: it would tell the next one so well that the
+    policy would learn to copy it, and could not correct its own mistakes.
+
+    Args:
+        task: The task, which knows mirror images.
+        actor: The policy, changed in place.
+        collection: The pairs.
+        settings: ``pretraining`` of the training's settings.
+
+    Returns:
+        Root mean square errors after every epoch [N m]: "training" and "held_out".
+    """
+    num_batches = math.ceil(len(collection.training.actions) / settings.batch_size)
+    optimizer = torch.optim.Adam(actor.parameters(), lr=settings.learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.num_epochs * num_batches)
+    errors: dict[str, list[float]] = {"training": [], "held_out": []}
+    for epoch in range(settings.num_epochs):
+        losses = []
+        for pairs in collection.training.shuffled().split(settings.batch_size):
+            loss = imitation_loss(task, actor, pairs)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+            losses.append(loss.detach())
+        with torch.no_grad():
+            held_out = [imitation_loss(task, actor, pairs) for pairs in collection.held_out.split(settings.batch_size)]
+        for name, values in (("training", losses), ("held_out", held_out)):
+            errors[name].append(task.cfg.control.torque_scale * float(torch.stack(values).mean().sqrt()))
+        now = ", ".join(f"{name.replace('_', ' ')} {values[-1]:.2f} N m" for name, values in errors.items())
+        print(f"Epoch {epoch + 1} of {settings.num_epochs}: root mean square error {now}.", flush=True)
+    return errors
+
+
+def imitation_loss(task: LeggedRobot, actor: MLPModel, pairs: Pairs) -> Tensor:
+    """Return the mean square error of the actor's mean actions on pairs and their mirror images. Scalar."""
+    observations = exchange_last_actions(pairs.observations, task.num_actions, task.cfg.env.history_length)
+    observations = torch.cat([observations, task.mirror("policy", observations)])
+    actions = torch.cat([pairs.actions, task.mirror("actions", pairs.actions)])
+    predicted = actor(TensorDict({"policy": observations}, [len(observations)]))
+    return (predicted - actions).square().mean()
+
+
+def exchange_last_actions(observations: Tensor, num_actions: int, history_length: int) -> Tensor:
+    """Return observations whose last actions are those of other samples, drawn at random.
+
+    Args:
+        observations: What the policy sees; each of its steps ends with the last action. Shape: (samples, size).
+        num_actions: Number of actions.
+        history_length: Number of steps.
+    """
+    steps = observations.unflatten(1, (history_length, -1))
+    others = steps[torch.randperm(len(steps), device=steps.device)]
+    return torch.cat([steps[..., :-num_actions], others[..., -num_actions:]], dim=2).flatten(1)
+
+
+def make_controller(task: LeggedRobot, settings: WholeBodySettings | None = None) -> WholeBodyController:
+    """Return the whole-body controller for the worlds of a task; without settings, with its own defaults."""
+    dynamics = RobotDynamics(task.sim.mj_model, task.num_envs, task.device, task.foot_names)
+    return WholeBodyController(dynamics, task.default_dof_pos.tolist(), settings)
+
+
+def act_by_controller(controller: WholeBodyController) -> Act:
+    """Return the function that asks the controller for the torques of a task's state [N m]."""
+    return lambda task: controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0).total
+
+
+def act_by_policy(actor: MLPModel) -> Act:
+    """Return the function that asks a policy for its mean torques [N m]."""
+
+    def torques(task: LeggedRobot) -> Tensor:
+        with torch.no_grad():
+            return task.torque_scale * actor(task.get_observations())
+
+    return torques
+
+
+def standing_shares(task: LeggedRobot, controller: WholeBodyController, actor: MLPModel) -> dict[str, float]:
+    """Return the shares of worlds in which each stands after 5 s from a random state, acting once per control step."""
+    shares = {}
+    for name, torques in {"controller": act_by_controller(controller), "policy": act_by_policy(actor)}.items():
+        place_on_ground(task, controller.dynamics)
+        shares[name] = measure_standing(task, torques, STANDING_SECONDS).share
+    return shares
+
+
+def histogram(values: Tensor, highest: float, bins: int = 50) -> dict[str, list[float]]:
+    """Return how many values fall into equal bins from 0; those beyond the highest count in the last one."""
+    counts = torch.histc(values.clamp(max=highest), bins, 0.0, highest)
+    return {"edges": torch.linspace(0.0, highest, bins + 1).tolist(), "counts": counts.tolist()}

@@ -1,0 +1,194 @@
+r"""The contact-consistent operational space of Park and Khatib (eqs. 2 to 6, 9 and 11), in pure batched torch.
+
+With the joint space dynamics A qacc + h = S_k^T Gamma + J_c^T f_c, where h = C + g, and with contact points that do not
+accelerate, J_c qacc + dJ_c/dt qvel = 0, it follows that
+
+    qacc = N_c A^-1 (S_k^T Gamma - h) - J_c_bar dJ_c/dt qvel.
+
+Contact forces are those that the ground exerts on the robot; the paper's eq. 11 counts them the other way.
+
+Each state has the same number of candidate contacts, and a mask says which of them touch the ground. The rows of
+J_c of the others are zero, and ones on their part of the diagonal keep J_c A^-1 J_c^T invertible; nothing couples them
+with the rest, so that all results are exactly what matrices of only the touching contacts would give. So the contact
+state may change from step to step and differ from state to state, and no matrix changes its size.
+
+Floating point type and device are those of the arguments; nothing waits for the host.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+TRUNK_DOFS = 6
+"""Virtual joints in front of the actuated ones, which S_k removes."""
+
+
+@dataclass
+class ContactSpace:
+    """The space of contacts, and the motions that leave it alone.
+
+    Attributes:
+        jacobian: J_c (eq. 9) with rows of zeros where nothing touches. Shape: (n, 3 k, nv).
+        inertia: Lambda_c = (J_c A^-1 J_c^T)^-1, zero where nothing touches. Shape: (n, 3 k, 3 k).
+        inverse: J_c_bar = A^-1 J_c^T Lambda_c, the dynamically consistent inverse of J_c. Shape: (n, nv, 3 k).
+        projector: N_c = 1 - J_c_bar J_c, onto motions that leave all contact points at rest. Shape: (n, nv, nv).
+        mobility: N_c A^-1, symmetric: acceleration per generalized force with the contacts held. Shape: (n, nv, nv).
+        bias: dJ_c/dt qvel [m/s^2], zero where nothing touches. Shape: (n, 3 k).
+    """
+
+    jacobian: Tensor
+    inertia: Tensor
+    inverse: Tensor
+    projector: Tensor
+    mobility: Tensor
+    bias: Tensor
+
+
+@dataclass
+class TaskSpace:
+    """The contact-consistent dynamics of a task x: Lambda d^2x/dt^2 + mu + p = F (eq. 2).
+
+    Attributes:
+        inertia: Lambda = (J N_c A^-1 J^T)^-1. Shape: (n, m, m).
+        coriolis: mu, Coriolis and centrifugal forces, those that hold the contacts included. Shape: (n, m).
+        gravity: p, gravity forces. Shape: (n, m).
+        inverse: J_bar^T = Lambda J N_c A^-1, which turns generalized forces into F. Shape: (n, m, nv).
+    """
+
+    inertia: Tensor
+    coriolis: Tensor
+    gravity: Tensor
+    inverse: Tensor
+
+
+def invert(matrix: Tensor) -> Tensor:
+    """Return the inverses of symmetric positive definite matrices; zero for one that rounding made indefinite.
+
+    That happens in single precision where a leg is stretched. Shape: (..., m, m).
+    """
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    inverse = inverse_triangle(factor)
+    return torch.where((info > 0)[..., None, None], 0.0, inverse.mT @ inverse)
+
+
+def inverse_triangle(factor: Tensor) -> Tensor:
+    """Return the inverses of lower triangular matrices; unlike cholesky_inverse, a CUDA graph can capture it.
+
+    Shape: (..., m, m).
+    """
+    return torch.linalg.solve_triangular(factor, _eye(factor), upper=False)
+
+
+def contact_space(inertia: Tensor, jacobians: Tensor, bias: Tensor, mask: Tensor) -> ContactSpace:
+    """Compute what the contacts in ``mask`` demand and leave free (eq. 9).
+
+    Args:
+        inertia: Joint space inertia A. Shape: (n, nv, nv).
+        jacobians: J_c of all candidate contacts. Shape: (n, k, 3, nv).
+        bias: dJ_c/dt qvel [m/s^2]. Shape: (n, k, 3).
+        mask: Which contacts touch the ground. Shape: (n, k), bool.
+    """
+    rows = mask.repeat_interleave(3, dim=1)
+    jacobian = torch.where(rows.unsqueeze(2), jacobians.flatten(1, 2), 0.0)
+    root = inverse_triangle(torch.linalg.cholesky_ex(inertia).L)
+    half = root @ jacobian.mT
+    free = invert(half.mT @ half + torch.diag_embed((~rows).to(inertia)))
+    lambda_c = torch.where(rows.unsqueeze(1) & rows.unsqueeze(2), free, 0.0)
+    inverse_inertia = root.mT @ root
+    inverse = inverse_inertia @ jacobian.mT @ lambda_c
+    projector = _eye(inertia) - inverse @ jacobian
+    mobility = projector @ inverse_inertia
+    return ContactSpace(jacobian, lambda_c, inverse, projector, mobility, torch.where(rows, bias.flatten(1), 0.0))
+
+
+def task_space(contacts: ContactSpace, jacobian: Tensor, coriolis: Tensor, gravity: Tensor) -> TaskSpace:
+    """Compute the contact-consistent dynamics of a task whose dJ/dt qvel is zero, such as the trunk's pose (eq. 2).
+
+    Args:
+        contacts: The contacts.
+        jacobian: J of the task. Shape: (n, m, nv).
+        coriolis: C, Coriolis and centrifugal generalized forces. Shape: (n, nv).
+        gravity: g, generalized gravity forces. Shape: (n, nv).
+    """
+    moved = jacobian @ contacts.mobility
+    inertia = invert(moved @ jacobian.mT)
+    inverse = inertia @ moved
+    held = inertia @ (jacobian @ apply(contacts.inverse, contacts.bias).unsqueeze(-1))
+    return TaskSpace(inertia, apply(inverse, coriolis) + held.squeeze(-1), apply(inverse, gravity), inverse)
+
+
+def torque_map(task: TaskSpace, joints: Tensor, damping: float) -> Tensor:
+    """Return J_k^T, which turns task forces F into the least joint torques that exert them (eq. 4).
+
+    J_bar^T S_k^T is what torques exert; J_k^T is its pseudo-inverse. Torques that only press contacts against each
+    other exert nothing, and the least torques have no such part: they accelerate the robot as the task demands and as
+    little as possible beyond.
+
+    Args:
+        task: The task.
+        joints: Which joints may serve the task. Shape: (n, nv - 6), bool.
+        damping: Tikhonov damping relative to the mean square singular value: with fewer than three contacts some
+            forces F can hardly be exerted.
+
+    Returns:
+        The map, with rows of zeros for other joints. Shape: (n, nv - 6, m).
+    """
+    exerted = torch.where(joints.unsqueeze(1), task.inverse[:, :, TRUNK_DOFS:], 0.0)
+    gram = exerted @ exerted.mT
+    mean = gram.diagonal(dim1=1, dim2=2).mean(dim=1) + torch.finfo(gram.dtype).eps
+    damped = gram + damping * mean[:, None, None] * _eye(gram)
+    return exerted.mT @ invert(damped)
+
+
+def task_force(task: TaskSpace, acceleration: Tensor) -> Tensor:
+    """Return F = Lambda f* + mu + p (eqs. 2 and 4).
+
+    Args:
+        task: The task.
+        acceleration: f*, the wanted acceleration of the task [m/s^2, rad/s^2]. Shape: (n, m).
+    """
+    return apply(task.inertia, acceleration) + task.coriolis + task.gravity
+
+
+def posture_torques(task: TaskSpace, to_torques: Tensor, torques: Tensor) -> Tensor:
+    """Return N^T Gamma_0, the part of posture torques that does not disturb the task (eq. 5).
+
+    N^T = 1 - J_k^T J_bar^T S_k^T.
+
+    Args:
+        task: The task.
+        to_torques: J_k^T, see :func:`torque_map`. Shape: (n, nv - 6, m).
+        torques: Gamma_0 [N m]. Shape: (n, nv - 6).
+    """
+    return torques - apply(to_torques, apply(task.inverse[:, :, TRUNK_DOFS:], torques))
+
+
+def contact_forces(contacts: ContactSpace, torques: Tensor, bias_forces: Tensor) -> Tensor:
+    """Return the contact forces f_c that joint torques cause (eq. 11), by the ground on the robot.
+
+    f_c = J_c_bar^T (h - S_k^T Gamma) - Lambda_c dJ_c/dt qvel = -(J_c_bar^T S_k^T Gamma - mu_c - p_c).
+
+    Args:
+        contacts: The contacts.
+        torques: Gamma [N m]. Shape: (n, nv - 6).
+        bias_forces: h, Coriolis, centrifugal and gravity forces. Shape: (n, nv).
+
+    Returns:
+        Forces in the world frame [N], zero where nothing touches. Shape: (n, k, 3).
+    """
+    applied = torch.nn.functional.pad(torques, (TRUNK_DOFS, 0)) - bias_forces
+    forces = -apply(contacts.inverse.mT, applied) - apply(contacts.inertia, contacts.bias)
+    return forces.unflatten(1, (-1, 3))
+
+
+def apply(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Multiply matrices with vectors. Shapes: (n, rows, columns) and (n, columns) to (n, rows)."""
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def _eye(matrix: Tensor) -> Tensor:
+    """Return the identity of a square matrix's size, type and device."""
+    return torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device).expand_as(matrix)

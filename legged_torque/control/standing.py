@@ -1,0 +1,185 @@
+"""Standing up from random states: where such trials start, what counts as standing, and how often it works."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import torch
+from torch import Tensor
+
+from legged_torque.control.dynamics import RobotDynamics
+from legged_torque.envs.a1.torque import TorqueRobot
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.utils.args import apply_perturbation
+from legged_torque.utils.config import update_from_dict
+from legged_torque.utils.errors import UserError
+
+START_CLEARANCE = (0.0, 0.02)
+"""Lowest and highest clearance of the lowest foot at the start [m]."""
+MAX_DRAWS = 20
+"""How often states are drawn until no other part of the robot is below the ground."""
+LOWEST_HEIGHT = 0.2
+"""Lowest height of a standing robot's trunk [m]."""
+HIGHEST_GRAVITY_Z = -0.9
+"""Highest z of the unit gravity vector in a standing robot's trunk frame: tilted by up to 26 degrees."""
+HIGHEST_SPEED = 0.3
+"""Highest speed of a standing robot's trunk [m/s]."""
+
+
+@dataclass
+class StandingResult:
+    """How a trial went.
+
+    Attributes:
+        standing: Which worlds stand at the end and have not fallen before. Shape: (num_envs,), bool.
+        share: Share of these worlds.
+        mean_torque: Mean absolute torque over joints, time and worlds that have not fallen [N m].
+    """
+
+    standing: Tensor
+    share: float
+    mean_torque: float
+
+
+def use_standing_trials(cfg: LeggedRobotCfg, decimation: int = 1) -> None:
+    """Change a task's settings such that episodes start from the random states of ``--perturbation low``.
+
+    Parameters are not random, nobody pushes and sensors have no noise.
+
+    Args:
+        cfg: Settings of a task that is to be made.
+        decimation: Physics steps per control step: 1 for a controller at 200 Hz, 4 for a policy at 50 Hz.
+    """
+    apply_perturbation(cfg, "low")
+    quiet = {"randomize_parameters": False, "push_robots": False}
+    update_from_dict(cfg, {"domain_rand": quiet, "noise": {"add_noise": False}, "control": {"decimation": decimation}})
+
+
+def place_on_ground(
+    task: LeggedRobot, dynamics: RobotDynamics, clearance: tuple[float, float] = START_CLEARANCE
+) -> None:
+    """Start an episode in every world, the lowest foot just above the ground.
+
+    The task draws its initial states; then trunks are moved up or down until the lowest point of the lowest foot has a
+    random clearance. States in which another collision geom would be below the ground are drawn again, at most
+    :data:`MAX_DRAWS` times; what is left then is raised until that geom touches the ground. Waits for the host.
+
+    Args:
+        task: The task; worlds are level at z = 0.
+        dynamics: Kinematics of its robot, for as many states as it has worlds.
+        clearance: Lowest and highest clearance [m].
+
+    Raises:
+        UserError: If a collision geom is neither sphere, capsule nor box.
+    """
+    geoms = _LowestPoints(task, dynamics)
+    qpos, qvel = torch.zeros_like(task.sim.qpos), torch.zeros_like(task.sim.qvel)
+    missing = torch.ones(task.num_envs, dtype=torch.bool, device=task.device)
+    for draw in range(MAX_DRAWS):
+        task.reset()
+        dynamics.update(task.sim.qpos, task.sim.qvel)
+        foot, other = geoms()
+        down = foot - torch.empty_like(foot).uniform_(*clearance)
+        if draw == MAX_DRAWS - 1:
+            down = torch.minimum(down, other)
+        take = missing & (other >= down)
+        task.base_pos[:, 2] -= down
+        qpos = torch.where(take.unsqueeze(1), task.sim.qpos, qpos)
+        qvel = torch.where(take.unsqueeze(1), task.sim.qvel, qvel)
+        missing &= ~take
+        if not missing.any():
+            break
+    task.sim.qpos.copy_(qpos)
+    task.sim.qvel.copy_(qvel)
+    task._update_state()
+    task.compute_observations()
+    task._keep_last()
+
+
+def is_standing(task: LeggedRobot) -> Tensor:
+    """Return which worlds stand: high, level and slow, with nothing but feet on the ground.
+
+    Contacts are those of the last physics step. Whether a world has fallen before and was reset is not known here, see
+    :func:`measure_standing`.
+
+    Returns:
+        Shape: (num_envs,), bool.
+    """
+    upright = (task.base_pos[:, 2] > LOWEST_HEIGHT) & (task.projected_gravity[:, 2] < HIGHEST_GRAVITY_Z)
+    only_feet = task.contacts.sum(dim=1) == task.feet_contact.sum(dim=1)
+    slow = torch.linalg.vector_norm(task.base_lin_vel, dim=1) < HIGHEST_SPEED
+    return upright & only_feet & slow
+
+
+def measure_standing(task: LeggedRobot, torques: Callable[[LeggedRobot], Tensor], duration: float) -> StandingResult:
+    """Let a controller or policy act from the present state on, and see who stands in the end.
+
+    Worlds that the task resets, because the trunk touched the ground or the state diverged, have fallen.
+
+    Args:
+        task: A task whose actions are torques, after :func:`place_on_ground`.
+        torques: Returns the torques [N m] (num_envs, num_dof) that the task applies for its next control step. Which
+            feet touch the ground is best told by ``task.feet_contact``.
+        duration: [s], shorter than an episode.
+
+    Raises:
+        UserError: If the task cannot apply torques or its episodes are too short.
+    """
+    if not isinstance(task, TorqueRobot):
+        raise UserError("torques can only be measured in a task whose actions are torques, such as a1_torque")
+    steps = round(duration / task.dt)
+    if steps >= task.max_episode_length:
+        raise UserError(f"{duration} s do not fit into an episode of {task.max_episode_length * task.dt:g} s")
+    upright = torch.ones(task.num_envs, dtype=torch.bool, device=task.device)
+    total, count = (torch.zeros((), device=task.device) for _ in range(2))
+    for _ in range(steps):
+        task.step(torques(task) / task.torque_scale)
+        upright &= ~task.reset_buf
+        total += (task.torques.abs().mean(dim=1) * upright).sum()
+        count += upright.sum()
+    standing = upright & is_standing(task)
+    return StandingResult(standing, standing.float().mean().item(), (total / count.clamp(min=1)).item())
+
+
+class _LowestPoints:
+    """Heights of the lowest points of feet and of all other collision geoms."""
+
+    def __init__(self, task: LeggedRobot, dynamics: RobotDynamics) -> None:
+        """Describe every geom as a rounded box: half sizes along its own axes, and a radius."""
+        model = dynamics.mj_model
+        names = [model.geom(i).name for i in range(model.ngeom)]
+        feet = [names.index(name) for name in task.foot_names]
+        others = [i for i in range(model.ngeom) if model.geom_bodyid[i] > 0 and i not in feet]
+        shapes = [_rounded_box(model, i) for i in feet + others]
+        self._half_sizes, self._radii = (
+            torch.tensor(values, dtype=torch.float32, device=task.device) for values in zip(*shapes, strict=True)
+        )
+        self._geoms = torch.tensor(feet + others, device=task.device)
+        self._sizes = [len(feet), len(others)]
+        self._dynamics = dynamics
+
+    def __call__(self) -> tuple[Tensor, Tensor]:
+        """Return the heights [m] of the lowest foot and of the lowest other geom. Shapes: (n,)."""
+        vertical = self._dynamics.geom_rotations[:, self._geoms, 2].abs()
+        heights = self._dynamics.geom_positions[:, self._geoms, 2] - (vertical * self._half_sizes).sum(dim=2)
+        feet, others = (heights - self._radii).split(self._sizes, dim=1)
+        return feet.amin(dim=1), others.amin(dim=1)
+
+
+def _rounded_box(model: mujoco.MjModel, geom: int) -> tuple[list[float], float]:
+    """Return half sizes [m] and radius [m] of a geom.
+
+    Raises:
+        UserError: If it is neither sphere, capsule nor box.
+    """
+    kind, size = model.geom_type[geom], model.geom_size[geom].tolist()
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return [0.0, 0.0, 0.0], size[0]
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return [0.0, 0.0, size[1]], size[0]
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        return size, 0.0
+    raise UserError(f"the collision geom '{model.geom(geom).name}' is neither sphere, capsule nor box")

@@ -1,0 +1,140 @@
+"""Policies that were made by supervision before reinforcement learning: their files, and trainings that start from one.
+
+A file holds the policy's network and the settings that decide what its inputs and outputs mean, so that it is used
+again wherever these are the same, and refused where they are not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from rsl_rl.utils import resolve_callable
+
+from legged_torque.learning.runner import OnPolicyRunner, last_line
+from legged_torque.utils.config import to_dict
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.task_registry import all_experiments_dir
+
+SPACES = {
+    "env": ("asset.file", "env.num_actions", "env.history_length", "sim.dt", "control", "normalization"),
+    "train": ("actor.class_name", "actor.hidden_dims", "actor.activation", "obs_groups.actor"),
+}
+"""Settings of task and training in which a pre-trained policy must agree: observations, actions and network."""
+STANDARD_DEVIATION = "distribution."
+"""Start of the names of parameters that are not taken over: how much a training explores is its own setting."""
+
+
+def pretrained_file(args: argparse.Namespace, train_cfg: Any) -> Path:
+    """Return where a task's pre-trained policy is kept: ``pretraining.file``, or in the folder of all experiments."""
+    if train_cfg.pretraining.file:
+        return Path(train_cfg.pretraining.file)
+    return all_experiments_dir(args) / "pretrained" / f"{args.task}.pt"
+
+
+def find_pretrained(args: argparse.Namespace, env_cfg: Any, train_cfg: Any) -> Path:
+    """Return the file of a task's pre-trained policy, after making it if it is missing.
+
+    Args:
+        args: Parsed command line.
+        env_cfg: Settings of the task.
+        train_cfg: Settings of its training.
+
+    Raises:
+        UserError: If there is one, but its inputs or outputs mean something else.
+    """
+    file = pretrained_file(args, train_cfg)
+    if not file.exists():
+        print(f"There is no pre-trained policy '{file}' yet; making it.", flush=True)
+        make_pretrained(file, args, env_cfg, train_cfg)
+    check_spaces(file, env_cfg, train_cfg)
+    print(f"Starting from the pre-trained policy '{file}'.")
+    return file
+
+
+def make_pretrained(file: Path, args: argparse.Namespace, env_cfg: Any, train_cfg: Any) -> dict[str, Any]:
+    """Make a task's pre-trained policy, and return what its making reports.
+
+    Args:
+        file: Where to keep it; it is either complete or absent.
+        args: Parsed command line.
+        env_cfg: Settings of the task.
+        train_cfg: Settings of the training; ``pretraining.function`` makes the policy.
+
+    Raises:
+        UserError: If the task has no pre-training.
+    """
+    if not train_cfg.pretraining.function:
+        raise UserError(f"task '{args.task}' has no pre-training: its pretraining.function is empty")
+    actor, report = resolve_callable(train_cfg.pretraining.function)(args, env_cfg, train_cfg)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_name(f"{file.name}.{os.getpid()}.part")
+    try:
+        content = {"actor_state_dict": actor.state_dict(), "spaces": spaces(env_cfg, train_cfg), "report": report}
+        torch.save(content, part)
+        part.replace(file)
+    finally:
+        part.unlink(missing_ok=True)
+    return report
+
+
+def start_from(runner: OnPolicyRunner, file: Path) -> None:
+    """Give the actor of a runner the network of a pre-trained policy, all but its standard deviation."""
+    actor = runner.alg.actor
+    state = actor.state_dict()
+    pretrained = read_pretrained(file)["actor_state_dict"]
+    state.update((key, value) for key, value in pretrained.items() if not key.startswith(STANDARD_DEVIATION))
+    actor.load_state_dict(state)
+
+
+def check_spaces(file: Path, env_cfg: Any, train_cfg: Any) -> None:
+    """Refuse a pre-trained policy whose inputs, outputs or network are not those of a task.
+
+    Raises:
+        UserError: Naming the first setting that differs.
+    """
+    own = spaces(env_cfg, train_cfg)
+    for name, value in read_pretrained(file)["spaces"].items():
+        if own.get(name) != value:
+            raise UserError(
+                f"the pre-trained policy '{file}' does not fit this task: its {name} is {value!r}, here it is "
+                f"{own.get(name)!r}; make another one in a file of its own: --set pretraining.file=FILE"
+            )
+
+
+def read_pretrained(file: Path) -> dict[str, Any]:
+    """Return what a file of a pre-trained policy holds.
+
+    Raises:
+        UserError: If it is not one.
+    """
+    try:
+        content = torch.load(file, weights_only=True, map_location="cpu")
+    except Exception as error:  # torch raises about anything for a file that is not its own
+        raise UserError(f"'{file}' is not a readable pre-trained policy: {last_line(error)}") from None
+    if not isinstance(content, dict) or not {"actor_state_dict", "spaces", "report"} <= content.keys():
+        raise UserError(f"'{file}' is not a pre-trained policy")
+    return content
+
+
+def spaces(env_cfg: Any, train_cfg: Any) -> dict[str, Any]:
+    """Return the settings of :data:`SPACES`, by dotted path."""
+    settings = {"env": to_dict(env_cfg), "train": to_dict(train_cfg)}
+    result: dict[str, Any] = {}
+    for part, paths in SPACES.items():
+        for path in paths:
+            value = settings[part]
+            for key in path.split("."):
+                value = value[key]
+            result |= flat(path, value)
+    return result
+
+
+def flat(path: str, value: Any) -> dict[str, Any]:
+    """Return nested settings as one dictionary with dotted paths."""
+    if not isinstance(value, dict):
+        return {path: value}
+    return {name: item for key, part in value.items() for name, item in flat(f"{path}.{key}", part).items()}

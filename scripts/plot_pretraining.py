@@ -1,0 +1,75 @@
+"""Draw what gravity pre-training was like: ``python scripts/plot_pretraining.py report.json --out pretraining.png``."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from legged_torque.utils.args import Parser, run_script
+from legged_torque.utils.errors import UserError
+
+BLUE, ORANGE = "#0072B2", "#D55E00"  # told apart by colour-blind eyes
+PARTS = {"histograms", "settings", "rms_error", "standing"}
+
+
+def main() -> None:
+    """Draw torques, residuals, learning and standing."""
+    parser = Parser(__doc__)
+    parser.add_argument("file", type=Path, help="report that pretrain_gravity.py --json has written")
+    parser.add_argument("--out", type=Path, required=True, help="picture to write (png, svg, pdf)")
+    args = parser.parse_args()
+    try:
+        import matplotlib
+
+        matplotlib.use("agg")
+        from matplotlib import pyplot
+    except ImportError:
+        raise UserError("plots need the extra: pip install -e .[plots]") from None
+    report = read(args.file)
+    figure, axes = pyplot.subplots(1, 4, figsize=(17, 4), layout="constrained")
+    settings = report["settings"]
+    draw_histogram(axes[0], report["histograms"]["mean_torque"], settings["max_mean_torque"])
+    axes[0].set(title="torques", xlabel="mean absolute torque [N m]", ylabel="pairs")
+    draw_histogram(axes[1], report["histograms"]["residual"], settings["max_residual"])
+    axes[1].set(title="what the contacts cannot give", xlabel="wrench residual [weight]", ylabel="pairs")
+    draw_errors(axes[2], report["rms_error"])
+    names = list(report["standing"])
+    bars = axes[3].bar(names, [100 * report["standing"][name] for name in names], color=[ORANGE, BLUE], width=0.6)
+    axes[3].bar_label(bars, fmt="%.1f %%")
+    axes[3].set(title="standing after 5 s", ylabel="worlds [%]", ylim=(0, 110))
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(args.out, dpi=130)
+
+
+def draw_histogram(axis: Any, histogram: dict[str, list[float]], limit: float) -> None:
+    """Draw counts on a logarithmic axis, and the limit beyond which pairs are dropped."""
+    axis.stairs(histogram["counts"], histogram["edges"], fill=True, color=BLUE)
+    axis.axvline(limit, color=ORANGE, linestyle="--", label=f"dropped beyond {limit:g}")
+    axis.set_yscale("log")
+    axis.legend()
+
+
+def draw_errors(axis: Any, errors: dict[str, list[float]]) -> None:
+    """Draw the error of the learned torques by epoch."""
+    for (name, values), color, line in zip(errors.items(), (BLUE, ORANGE), ("-", "--"), strict=True):
+        axis.plot(range(1, len(values) + 1), values, line, color=color, label=name.replace("_", " "))
+    axis.set(title="learned torques", xlabel="epoch", ylabel="root mean square error [N m]", ylim=(0, None))
+    axis.legend()
+
+
+def read(file: Path) -> dict[str, Any]:
+    """Return a report.
+
+    Raises:
+        UserError: If the file is not one.
+    """
+    try:
+        report = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read '{file}': {error}") from None
+    if not isinstance(report, dict) or not PARTS <= report.keys():
+        raise UserError(f"'{file}' is not a report of pretrain_gravity.py")
+    return report
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,178 @@
+"""The batched solver for contact forces against bounds on the optimum, another solver and numbers found by hand."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from legged_torque.control.contact_forces import ForceDistribution, ForceLimits
+from legged_torque.utils.errors import UserError
+
+LIMITS = ForceLimits(friction=0.6, lowest=4.0, highest=160.0)
+ARM = 0.2
+REGULARIZATION = 1e-2
+CONVERGED = 30
+"""Iterations after which double precision is exhausted."""
+
+
+def grasp_matrix(points):
+    """The wrench about the origin of unit forces at points (n, k, 3)."""
+    n, k, _ = points.shape
+    axes = torch.eye(3, dtype=points.dtype).expand(n, k, 3, 3)
+    moments = torch.linalg.cross(points.unsqueeze(2).expand(n, k, 3, 3), axes, dim=-1)
+    return torch.cat([axes, moments], dim=3).permute(0, 3, 1, 2).flatten(2)
+
+
+def random_problems(count=300, dtype=torch.float64):
+    """Feet around a trunk, wrenches and reference forces that many of them cannot bear, and any contact state."""
+    generator = torch.Generator().manual_seed(0)
+    feet = torch.tensor([[0.2, -0.13, -0.3], [0.2, 0.13, -0.3], [-0.2, -0.13, -0.3], [-0.2, 0.13, -0.3]])
+    points = feet + 0.05 * torch.randn(count, 4, 3, generator=generator)
+    wrench = torch.tensor([0.0, 0.0, 120.0, 0.0, 0.0, 0.0]) + torch.randn(count, 6, generator=generator) * torch.tensor(
+        [60.0, 60.0, 80.0, 15.0, 15.0, 5.0]
+    )
+    reference = torch.tensor([0.0, 0.0, 30.0]) + 40.0 * torch.randn(count, 4, 3, generator=generator)
+    mask = torch.rand(count, 4, generator=generator) < 0.75
+    return grasp_matrix(points.to(dtype)), wrench.to(dtype), reference.to(dtype), mask
+
+
+def cost_and_gradient(problem, forces, regularization):
+    """The documented objective of each problem, halved, and its gradient by the forces, masked ones left out."""
+    grasp, wrench, reference, mask = (part.numpy().astype(float) for part in problem)
+    forces = forces.numpy().astype(float)
+    weights = np.array([1.0, 1.0, 1.0, ARM**-2, ARM**-2, ARM**-2])
+    error = np.einsum("nij,nj->ni", grasp, (forces * mask[..., None]).reshape(len(forces), -1)) - wrench
+    deviation = (forces - reference) * mask[..., None]
+    cost = 0.5 * (weights * error**2).sum(1) + 0.5 * regularization * (deviation**2).sum((1, 2))
+    gradient = np.einsum("nij,ni->nj", grasp, weights * error).reshape(forces.shape) + regularization * deviation
+    return cost, gradient * mask[..., None]
+
+
+def above_optimum(gradient, forces, mask, limits):
+    """The most by which a convex cost can be above its minimum: over the corners of each contact's allowed forces."""
+    mu = limits.friction
+    sides = np.array([[mu, 0, 1], [-mu, 0, 1], [0, mu, 1], [0, -mu, 1]])
+    corners = np.concatenate([limits.lowest * sides, limits.highest * sides])
+    least = (gradient @ corners.T).min(axis=2)
+    return (((gradient * forces.numpy()).sum(2) - least) * mask.numpy()).sum(1)
+
+
+def test_forces_are_allowed_and_optimal():
+    """Inside pyramids and limits, exactly zero where nothing touches, and no allowed forces cost less."""
+    problem = random_problems()
+    mask = problem[3]
+    forces, residual = ForceDistribution(LIMITS, ARM, REGULARIZATION, "cpu", torch.float64)(*problem, CONVERGED)
+    assert (forces[~mask] == 0.0).all()
+    tangential, normal = forces[mask][:, :2].abs().sum(1), forces[mask][:, 2]
+    assert (tangential <= LIMITS.friction * normal).all()
+    assert (normal >= LIMITS.lowest).all() and (normal <= LIMITS.highest).all()
+    for at_limit in (
+        tangential > 0.999 * LIMITS.friction * normal,
+        normal < 1.001 * LIMITS.lowest,
+        normal > 0.999 * LIMITS.highest,
+    ):
+        assert at_limit.sum() > 10  # every kind of limit matters in these problems
+    cost, gradient = cost_and_gradient(problem, forces, REGULARIZATION)
+    assert (above_optimum(gradient, forces, mask, LIMITS) <= 1e-6 * cost + 1e-6).all()
+    given = (problem[0] @ (forces * mask.unsqueeze(2)).flatten(1).unsqueeze(2)).squeeze(2)
+    torch.testing.assert_close(residual, given - problem[1], rtol=0, atol=1e-9)
+
+
+def test_agrees_with_another_solver():
+    """MuJoCo's solver for quadratic programs, on weights of the pyramid's sides, finds the same forces."""
+    limits = ForceLimits(LIMITS.friction, 0.0, 1e4)
+    grasp, wrench, reference, mask = problem = random_problems(40)
+    forces, _ = ForceDistribution(limits, ARM, REGULARIZATION, "cpu", torch.float64)(*problem, CONVERGED)
+    mu = limits.friction
+    sides = np.array([[mu, 0, 1], [-mu, 0, 1], [0, mu, 1], [0, -mu, 1]]).T
+    weights = np.diag([1.0, 1.0, 1.0, ARM**-2, ARM**-2, ARM**-2])
+    for i in range(len(forces)):
+        touching = np.flatnonzero(mask[i].numpy())
+        if not len(touching):
+            continue
+        to_forces = np.kron(np.eye(len(touching)), sides)
+        columns = (3 * touching[:, None] + np.arange(3)).ravel()
+        matrix, target = grasp[i].numpy()[:, columns], reference[i].numpy()[touching].ravel()
+        hessian = matrix.T @ weights @ matrix + REGULARIZATION * np.eye(len(columns))
+        linear = matrix.T @ weights @ wrench[i].numpy() + REGULARIZATION * target
+        size = to_forces.shape[1]
+        quadratic = to_forces.T @ hessian @ to_forces + 1e-7 * np.eye(size)  # sides may cancel; that must cost a little
+        found, work = np.zeros(size), np.zeros((size, size + 7))
+        rank = mujoco.mju_boxQP(found, work, None, quadratic, -to_forces.T @ linear, np.zeros(size), np.full(size, 1e6))
+        assert rank >= 0
+        np.testing.assert_allclose(forces[i][touching].flatten(), to_forces @ found, rtol=0, atol=2e-2)
+
+
+def test_forces_within_all_limits_stay():
+    """Forces that give the wrench and that the contacts can bear are not changed (eq. 10)."""
+    grasp, _, _, mask = random_problems()
+    generator = torch.Generator().manual_seed(1)
+    normal = 20.0 + 100.0 * torch.rand(len(mask), 4, 1, generator=generator)
+    tangential = 0.25 * normal * (2.0 * torch.rand(len(mask), 4, 2, generator=generator) - 1.0)
+    reference = torch.where(mask.unsqueeze(2), torch.cat([tangential, normal], dim=2), 0.0).double()
+    wrench = (grasp @ reference.flatten(1).unsqueeze(2)).squeeze(2)
+    solve = ForceDistribution(LIMITS, ARM, REGULARIZATION, "cpu", torch.float64)
+    forces, residual = solve(grasp, wrench, reference, mask, CONVERGED)
+    torch.testing.assert_close(forces, reference, rtol=0, atol=1e-3)
+    torch.testing.assert_close(residual, torch.zeros_like(residual), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        ((0.0, 0.0, 100.0), (0.0, 0.0, 100.0)),
+        ((0.0, 0.0, 500.0), (0.0, 0.0, 160.0)),  # too much
+        ((0.0, 0.0, -50.0), (0.0, 0.0, 4.0)),  # the ground does not pull
+        ((100.0, 0.0, 50.0), (48.5294, 0.0, 80.8824)),  # onto f_x = 0.6 f_z: f_z = (0.6 x 100 + 50) / (1 + 0.6^2)
+    ],
+)
+def test_one_contact_by_hand(wanted, expected):
+    """A contact right under the trunk gives the nearest allowed force."""
+    grasp = grasp_matrix(torch.tensor([[[0.0, 0.0, 0.0]]], dtype=torch.float64))
+    wrench = torch.tensor([[*wanted, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    solve = ForceDistribution(LIMITS, ARM, 1e-9, "cpu", torch.float64)
+    mask = torch.ones(1, 1, dtype=torch.bool)
+    forces, residual = solve(grasp, wrench, torch.zeros(1, 1, 3, dtype=torch.float64), mask, CONVERGED)
+    np.testing.assert_allclose(forces[0, 0], expected, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(residual[0, :3], np.array(expected) - wanted, rtol=0, atol=1e-3)
+
+
+def test_masked_equals_resized():
+    """With two contacts masked, the others bear what they bear in a problem of two contacts."""
+    grasp, wrench, reference, mask = random_problems(50)
+    kept = torch.tensor([0, 3])
+    mask[:] = torch.tensor([True, False, False, True])
+    solve = ForceDistribution(LIMITS, ARM, REGULARIZATION, "cpu", torch.float64)
+    forces, residual = solve(grasp, wrench, reference, mask)
+    small = grasp.view(50, 6, 4, 3)[:, :, kept].flatten(2)
+    few, few_residual = solve(small, wrench, reference[:, kept], mask[:, kept])
+    torch.testing.assert_close(forces[:, kept], few, rtol=0, atol=1e-9)
+    torch.testing.assert_close(residual, few_residual, rtol=0, atol=1e-9)
+
+
+def test_without_contact_the_wrench_is_missing():
+    """Without any contact all forces are zero, and the residual is the whole wrench."""
+    grasp, wrench, reference, mask = random_problems(5)
+    solve = ForceDistribution(LIMITS, ARM, REGULARIZATION, "cpu", torch.float64)
+    forces, residual = solve(grasp, wrench, reference, torch.zeros_like(mask))
+    assert (forces == 0.0).all()
+    torch.testing.assert_close(residual, -wrench)
+
+
+def test_single_precision_suffices():
+    """With the controller's precision and iterations, forces are worse than the best ones by no more than 3 N."""
+    problem = random_problems()
+    exact, _ = ForceDistribution(LIMITS, ARM, REGULARIZATION, "cpu", torch.float64)(*problem, CONVERGED)
+    single = tuple(part.float() for part in problem[:3])
+    forces, _ = ForceDistribution(LIMITS, ARM, REGULARIZATION, "cpu")(*single, problem[3])
+    lowest, _ = cost_and_gradient(problem, exact, REGULARIZATION)
+    cost, _ = cost_and_gradient(problem, forces, REGULARIZATION)
+    assert torch.isfinite(forces).all()
+    assert (cost - lowest <= 0.5 * 3.0**2).all()
+
+
+@pytest.mark.parametrize("limits", [(0.0, 0.0, 100.0), (0.5, -1.0, 100.0), (0.5, 10.0, 10.0)])
+def test_refuses_empty_limits(limits):
+    """Limits that no force is inside of are refused."""
+    with pytest.raises(UserError, match="friction > 0"):
+        ForceDistribution(ForceLimits(*limits), ARM, REGULARIZATION, "cpu")

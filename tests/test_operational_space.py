@@ -1,0 +1,265 @@
+"""Dynamics against plain MuJoCo, and the equations of contact-consistent control against their definitions."""
+
+import copy
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from legged_torque import ROOT_DIR
+from legged_torque.control import operational_space as osc
+from legged_torque.control.dynamics import RobotDynamics
+from legged_torque.sim.model import build_model, collision_geoms, read_spec
+from legged_torque.utils.errors import UserError
+
+FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
+MASKS = [(1, 1, 1, 1), (1, 1, 0, 1), (0, 1, 1, 0), (0, 0, 1, 0), (0, 0, 0, 0)]
+ENOUGH = MASKS[:2]
+"""Masks with which joints can accelerate the trunk at will."""
+
+
+@pytest.fixture(scope="module")
+def model():
+    """The A1 of the tasks."""
+    spec = read_spec(ROOT_DIR / "resources/robots/a1/a1.xml")
+    return build_model(spec, collision_geoms(spec))
+
+
+def random_states(model, count, seed=0):
+    """Positions and velocities around the nominal pose, anywhere and at any orientation; exact in single precision."""
+    rng = np.random.default_rng(seed)
+    qpos = np.tile(model.key_qpos[0], (count, 1))
+    qpos[:, :3] = rng.normal(size=(count, 3))
+    quat = rng.normal(size=(count, 4))
+    qpos[:, 3:7] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+    qpos[:, 7:] += 0.3 * rng.normal(size=(count, 12))
+    qvel = 2.0 * rng.normal(size=(count, 18))
+    return qpos.astype(np.float32).astype(float), qvel.astype(np.float32).astype(float)
+
+
+def reference(model, qpos, qvel):
+    """What plain MuJoCo says of one state, in double precision."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_forward(model, data)
+    inertia, still = np.zeros((18, 18)), mujoco.MjData(model)
+    mujoco.mj_fullM(model, data, inertia)
+    still.qpos[:] = qpos
+    mujoco.mj_forward(model, still)
+    points, jacobians, bias = [], [], []
+    for name in FEET:
+        geom = model.geom(name).id
+        point = data.geom_xpos[geom] - [0.0, 0.0, model.geom_size[geom, 0]]
+        jacobian, rate = np.zeros((3, 18)), np.zeros((3, 18))
+        mujoco.mj_jac(model, data, jacobian, None, point, model.geom_bodyid[geom])
+        mujoco.mj_jacDot(model, data, rate, None, point, model.geom_bodyid[geom])
+        points.append(point), jacobians.append(jacobian), bias.append(rate @ qvel)
+    trunk, trunk_rate = np.zeros((6, 18)), np.zeros((6, 18))
+    mujoco.mj_jacBody(model, data, trunk[:3], trunk[3:], 1)
+    mujoco.mj_jacDot(model, data, trunk_rate[:3], trunk_rate[3:], data.xpos[1], 1)
+    np.testing.assert_allclose(trunk_rate @ qvel, 0.0, atol=1e-12)
+    return {
+        "inertia": inertia,
+        "gravity": still.qfrc_bias,
+        "coriolis": data.qfrc_bias - still.qfrc_bias,
+        "contact_points": np.array(points),
+        "contact_jacobians": np.array(jacobians),
+        "contact_bias": np.array(bias),
+        "trunk_jacobian": trunk,
+        "com": data.subtree_com[1],
+    }
+
+
+@pytest.fixture(scope="module")
+def states(model):
+    """MuJoCo's quantities of a few states, stacked, as tensors in double precision."""
+    each = [reference(model, *state) for state in zip(*random_states(model, 6), strict=True)]
+    return {name: torch.tensor(np.array([one[name] for one in each])) for name in each[0]}
+
+
+def spaces(states, mask):
+    """Contact and task space of all states with the same contacts."""
+    mask = torch.tensor(mask, dtype=torch.bool).expand(len(states["inertia"]), -1)
+    contacts = osc.contact_space(states["inertia"], states["contact_jacobians"], states["contact_bias"], mask)
+    return contacts, osc.task_space(contacts, states["trunk_jacobian"], states["coriolis"], states["gravity"])
+
+
+def joints_of(mask):
+    """Which joints carry the feet in a mask; there are three to a leg."""
+    return torch.tensor(mask, dtype=torch.bool).repeat_interleave(3).expand(6, -1)
+
+
+def constrained_motion(states, mask, torques):
+    """Accelerations and contact forces from the equations of motion and the constraints, as one linear system."""
+    rows = np.repeat(np.array(mask, dtype=bool), 3)
+    accelerations, forces = [], []
+    for i in range(len(torques)):
+        inertia = states["inertia"][i].numpy()
+        jacobian = states["contact_jacobians"][i].reshape(12, 18).numpy()[rows]
+        applied = np.r_[np.zeros(6), torques[i]] - (states["coriolis"] + states["gravity"])[i].numpy()
+        count = len(jacobian)
+        system = np.block([[inertia, -jacobian.T], [jacobian, np.zeros((count, count))]])
+        solution = np.linalg.solve(system, np.r_[applied, -states["contact_bias"][i].flatten().numpy()[rows]])
+        force = np.zeros(12)
+        force[rows] = solution[18:]
+        accelerations.append(solution[:18])
+        forces.append(force.reshape(4, 3))
+    return torch.tensor(np.array(accelerations)), torch.tensor(np.array(forces))
+
+
+def random_torques(seed):
+    """Torques of the twelve joints in all six states [N m]."""
+    return 10.0 * torch.randn(6, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+# --------------------------------------------------------------------------------------------------- dynamics
+
+
+def test_dynamics_matches_mujoco(model):
+    """All quantities agree with plain MuJoCo's to single precision, relative to the largest entry of each."""
+    qpos, qvel = random_states(model, 8, seed=3)
+    robot = RobotDynamics(model, 8, "cpu")
+    robot.update(torch.tensor(qpos), torch.tensor(qvel))
+    for i in range(8):
+        truth = reference(model, qpos[i], qvel[i])
+        for name, expected in truth.items():
+            error = np.abs(getattr(robot, name)[i].numpy() - expected).max()
+            scale = "gravity" if name == "coriolis" else name  # MuJoCo Warp computes their sum
+            assert error <= 1e-5 * np.abs(truth[scale]).max(), f"{name}, state {i}"
+
+
+def test_contact_joints(model):
+    """Every foot is carried by the three joints of its own leg."""
+    robot = RobotDynamics(model, 1, "cpu", ["RR_foot", "FL_foot"])
+    carrying = [[model.joint(j + 1).name[:2] for j in row.nonzero().flatten()] for row in robot.contact_joints]
+    assert carrying == [["RR"] * 3, ["FL"] * 3]
+
+
+@pytest.mark.parametrize(
+    ("geoms", "message"), [(["FR_fot"], "FR_foot"), (["trunk"], "must be a sphere"), ([], "at least one geom")]
+)
+def test_dynamics_refuses_contact_geoms(model, geoms, message):
+    """A geom that does not exist or has no lowest point of its own is named."""
+    with pytest.raises(UserError, match=message):
+        RobotDynamics(model, 1, "cpu", geoms)
+
+
+def test_dynamics_refuses_a_fixed_robot():
+    """The formulas need a free trunk."""
+    fixed = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint/><geom name='foot' size='0.1'/></body></worldbody></mujoco>"
+    )
+    with pytest.raises(UserError, match="free trunk"):
+        RobotDynamics(fixed, 1, "cpu")
+
+
+# --------------------------------------------------------------------------------------------------- contacts
+
+
+@pytest.mark.parametrize("mask", MASKS)
+def test_contact_space(states, mask):
+    """J_c J_c_bar = 1 for the touching feet, N_c is a projector, its motions leave these feet at rest."""
+    contacts, _ = spaces(states, mask)
+    touching = np.repeat(np.array(mask), 3)
+    expected = torch.tensor(np.diag(touching), dtype=torch.float64).expand(6, -1, -1)
+    torch.testing.assert_close(contacts.jacobian @ contacts.inverse, expected, rtol=0, atol=1e-9)
+    projector, active = contacts.projector, states["contact_jacobians"].flatten(1, 2)[:, touching == 1]
+    torch.testing.assert_close(projector @ projector, projector, rtol=0, atol=1e-9)
+    torch.testing.assert_close(active @ projector, torch.zeros_like(active), rtol=0, atol=1e-9)
+    torch.testing.assert_close(contacts.mobility @ states["inertia"], projector, rtol=0, atol=1e-9)
+    assert torch.linalg.matrix_rank(projector, rtol=1e-9).tolist() == [18 - touching.sum()] * 6
+
+
+@pytest.mark.parametrize("mask", MASKS)
+def test_contact_forces_and_task_dynamics(states, mask):
+    """Under any torques, contact forces and the trunk's acceleration solve the equations of motion (eqs. 2, 11)."""
+    contacts, task = spaces(states, mask)
+    torques = random_torques(0)
+    acceleration, forces = constrained_motion(states, mask, torques)
+    found = osc.contact_forces(contacts, torques, states["coriolis"] + states["gravity"])
+    torch.testing.assert_close(found, forces, rtol=1e-8, atol=1e-8)
+    assert (found[:, np.array(mask) == 0] == 0.0).all()
+    exerted = osc.apply(task.inverse[:, :, 6:], torques)
+    trunk = osc.apply(states["trunk_jacobian"], acceleration)
+    needed = osc.apply(task.inertia, trunk) + task.coriolis + task.gravity
+    torch.testing.assert_close(needed, exerted, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("mask", ENOUGH)
+def test_task_torques_accelerate_the_trunk_as_wanted(states, mask):
+    """Task torques give the trunk f*, and posture torques do not change that (eqs. 4, 5)."""
+    contacts, task = spaces(states, mask)
+    wanted = torch.randn(6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    to_torques = osc.torque_map(task, joints_of(mask), 0.0)
+    torques = osc.apply(to_torques, osc.task_force(task, wanted))
+    posture = osc.posture_torques(task, to_torques, random_torques(2))
+    assert posture.abs().amax(dim=1).min() > 0.1
+    for gamma in (torques, torques + posture):
+        acceleration, _ = constrained_motion(states, mask, gamma)
+        found = osc.apply(states["trunk_jacobian"], acceleration)
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6)
+
+
+def test_torque_map_is_park_and_khatibs(states):
+    """J_k^T is that of the definition J_k = J S_k N_c's dynamically consistent inverse, by pseudo-inverses."""
+    _, task = spaces(states, ENOUGH[0])
+    found = osc.torque_map(task, joints_of(ENOUGH[0]), 0.0)
+    for i in range(6):
+        inverse_inertia = np.linalg.inv(states["inertia"][i].numpy())
+        jacobian = states["contact_jacobians"][i].reshape(12, 18).numpy()
+        lambda_c = np.linalg.inv(jacobian @ inverse_inertia @ jacobian.T)
+        projector = np.eye(18) - inverse_inertia @ jacobian.T @ lambda_c @ jacobian
+        moved = np.eye(18)[6:] @ projector
+        inverse = inverse_inertia @ moved.T @ np.linalg.pinv(moved @ inverse_inertia @ moved.T, rcond=1e-9)
+        np.testing.assert_allclose(found[i].mT, states["trunk_jacobian"][i].numpy() @ inverse, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("mask", MASKS[1:])
+def test_masked_equals_resized(states, mask):
+    """With some contacts masked, everything is as with matrices of the other contacts only."""
+    kept = [i for i in range(4) if mask[i]]
+    fewer = states | {name: states[name][:, kept] for name in ("contact_jacobians", "contact_bias")}
+    (contacts, task), (small, small_task) = spaces(states, mask), spaces(fewer, [1] * len(kept))
+    torques, bias = random_torques(3), states["coriolis"] + states["gravity"]
+    close = {"rtol": 1e-9, "atol": 1e-9}
+    torch.testing.assert_close(contacts.mobility, small.mobility, **close)
+    for name in ("inertia", "coriolis", "gravity", "inverse"):
+        torch.testing.assert_close(getattr(task, name), getattr(small_task, name), **close)
+    forces = osc.contact_forces(contacts, torques, bias)
+    torch.testing.assert_close(forces[:, kept], osc.contact_forces(small, torques, bias), **close)
+
+
+def test_static_balance_is_inverse_dynamics(model):
+    """Standing still, torques and contact forces together are what mj_inverse says, contacts disabled."""
+    qpos, _ = random_states(model, 6, seed=5)
+    each = [reference(model, one, np.zeros(18)) for one in qpos]
+    states = {name: torch.tensor(np.array([one[name] for one in each])) for name in each[0]}
+    contacts, task = spaces(states, ENOUGH[0])
+    to_torques = osc.torque_map(task, joints_of(ENOUGH[0]), 0.0)
+    torques = osc.apply(to_torques, osc.task_force(task, torch.zeros(6, 6, dtype=torch.float64)))
+    forces = osc.contact_forces(contacts, torques, states["gravity"])
+    total = torch.nn.functional.pad(torques, (6, 0)) + osc.apply(contacts.jacobian.mT, forces.flatten(1))
+    free = copy.copy(model)
+    free.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    for i in range(6):
+        data = mujoco.MjData(free)
+        data.qpos[:] = qpos[i]
+        mujoco.mj_inverse(free, data)
+        np.testing.assert_allclose(total[i], data.qfrc_inverse, rtol=0, atol=1e-6)
+
+
+def test_no_contact_leaves_no_task_torques(states):
+    """Without contact no joint may serve the task, and posture torques stay whole."""
+    _, task = spaces(states, MASKS[-1])
+    to_torques = osc.torque_map(task, joints_of(MASKS[-1]), 1e-3)
+    assert (to_torques == 0.0).all()
+    torques = random_torques(4)
+    assert torch.equal(osc.posture_torques(task, to_torques, torques), torques)
+
+
+def test_invert_survives_rounding():
+    """A matrix that rounding made indefinite has the inverse zero; others in the batch are inverted."""
+    matrices = torch.tensor([[[2.0, 0.0], [0.0, 4.0]], [[1.0, 1.0], [1.0, 1.0 - 1e-6]]])
+    expected = torch.tensor([[[0.5, 0.0], [0.0, 0.25]], [[0.0, 0.0], [0.0, 0.0]]])
+    torch.testing.assert_close(osc.invert(matrices), expected)

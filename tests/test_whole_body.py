@@ -1,0 +1,233 @@
+"""The whole-body controller: its torques against MuJoCo's dynamics, and whether robots under it stand."""
+
+import argparse
+import copy
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from legged_torque.control.dynamics import RobotDynamics
+from legged_torque.control.standing import is_standing, measure_standing, place_on_ground, use_standing_trials
+from legged_torque.control.whole_body import WholeBodyController, WholeBodySettings
+from legged_torque.envs import task_registry
+from legged_torque.utils.errors import UserError
+
+TORQUE_LIMIT = 33.5
+WEIGHT = 12.453 * 9.81
+FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
+AT_REST = WholeBodySettings(
+    position_stiffness=0.0, attitude_stiffness=0.0, joint_stiffness=0.0, foot_stiffness=0.0, task_damping=0.0
+)
+"""No wish but to accelerate nothing."""
+
+
+def make_trial(num_envs, name="a1_torque", **env):
+    """A task that starts standing trials."""
+    cfg, _ = task_registry.get_cfgs(name)
+    use_standing_trials(cfg)
+    for key, value in {"num_envs": num_envs, **env}.items():
+        setattr(cfg.env, key, value)
+    torch.manual_seed(1)
+    return task_registry.make_env(name, argparse.Namespace(device="cpu"), cfg)[0]
+
+
+def make_controller(task, num_states, settings=None):
+    """A controller of the task's robot."""
+    dynamics = RobotDynamics(task.sim.mj_model, num_states, "cpu", task.foot_names)
+    return WholeBodyController(dynamics, task.default_dof_pos.tolist(), settings)
+
+
+@pytest.fixture(scope="module")
+def task():
+    """A few worlds with random states in the air, moving."""
+    return make_trial(16)
+
+
+@pytest.fixture(scope="module")
+def state(task):
+    """Positions and velocities that no test changes."""
+    return task.sim.qpos.clone(), task.sim.qvel.clone()
+
+
+# --------------------------------------------------------------------------------------------------- torques
+
+
+def test_torques_and_contact_forces_hold_the_robot(task, state):
+    """On four feet at rest, clipped torques and contact forces balance gravity as mj_inverse says."""
+    qpos, qvel = state[0].clone(), torch.zeros_like(state[1])
+    qpos[:, 7:] = task.default_dof_pos + 0.1 * (qpos[:, 7:] - task.default_dof_pos)
+    result = make_controller(task, 16, AT_REST)(qpos, qvel, torch.ones(16, 4, dtype=torch.bool))
+    model = copy.copy(task.sim.mj_model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    data, jacobian = mujoco.MjData(model), np.zeros((3, 18))
+    for i in range(16):
+        data.qpos[:] = qpos[i]
+        mujoco.mj_inverse(model, data)
+        total = np.r_[np.zeros(6), result.total[i]]
+        for foot, force in zip(FEET, result.contact_forces[i].numpy(), strict=True):
+            geom = model.geom(foot).id
+            lowest = data.geom_xpos[geom] - [0.0, 0.0, 0.02]
+            mujoco.mj_jac(model, data, jacobian, None, lowest, model.geom_bodyid[geom])
+            total += jacobian.T @ force
+        np.testing.assert_allclose(total, data.qfrc_inverse, rtol=0, atol=0.15)
+    torch.testing.assert_close(result.contact_forces.sum(1)[:, 2], torch.full((16,), WEIGHT), rtol=0, atol=0.15)
+    torch.testing.assert_close(result.wrench_residual, torch.zeros(16, 6), rtol=0, atol=0.15)
+
+
+def test_residual_is_what_the_contacts_cannot_give(task, state):
+    """Feet whose normal force is too limited leave the rest of the robot's weight uncarried."""
+    settings = dataclasses.replace(AT_REST, highest_force=20.0, force_regularization=1e-4)
+    qpos, qvel = state[0].clone(), torch.zeros_like(state[1])
+    qpos[:, 7:] = task.default_dof_pos
+    result = make_controller(task, 16, settings)(qpos, qvel, torch.ones(16, 4, dtype=torch.bool))
+    carried = result.contact_forces.sum(1)[:, 2]
+    assert (carried <= 80.0).all() and (carried > 70.0).all()
+    torch.testing.assert_close(result.wrench_residual[:, 2], carried - WEIGHT, rtol=0, atol=0.15)
+
+
+def test_parts_add_up_within_the_limits(task, state):
+    """The total is the sum of the three parts (eq. 3), clipped; all of it finite for any contacts and velocities."""
+    masks = torch.tensor([[bool(i >> foot & 1) for foot in range(4)] for i in range(16)])
+    result = make_controller(task, 16)(state[0], 3.0 * state[1], masks)
+    assert all(torch.isfinite(part).all() for part in vars(result).values())
+    total = result.task + result.posture + result.force
+    torch.testing.assert_close(result.total, total.clamp(-TORQUE_LIMIT, TORQUE_LIMIT))
+    assert (total.abs() > TORQUE_LIMIT).any()
+    assert (result.contact_forces[~masks] == 0.0).all()
+    tangential, normal = result.contact_forces[masks][:, :2].abs().sum(1), result.contact_forces[masks][:, 2]
+    assert (tangential <= 0.8 * normal + 1e-3).all() and (normal >= 3.0 - 1e-3).all() and (normal <= 200.0).all()
+
+
+def test_without_contact_only_posture_remains(task, state):
+    """In the air, torques are the PD control within the limits; feet already in place are not drawn elsewhere."""
+    qpos, qvel = state[0].clone(), torch.zeros_like(state[1])
+    qpos[:, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    qpos[:, 7:] = task.default_dof_pos
+    qvel[:, 6:] = 40.0 * torch.linspace(-1.0, 1.0, 16 * 12).view(16, 12)
+    nothing = torch.zeros(16, 4, dtype=torch.bool)
+    result = make_controller(task, 16)(qpos, qvel, nothing)
+    assert (result.task == 0.0).all() and (result.force == 0.0).all()
+    torch.testing.assert_close(result.total, (-1.0 * qvel[:, 6:]).clamp(-TORQUE_LIMIT, TORQUE_LIMIT), rtol=0, atol=1e-3)
+    assert (make_controller(task, 16)(*state, nothing).total.abs() <= TORQUE_LIMIT).all()
+
+
+def test_refuses_another_pose(task):
+    """The nominal pose must have as many joints as the robot."""
+    with pytest.raises(UserError, match="3 joints, the robot 12"):
+        WholeBodyController(RobotDynamics(task.sim.mj_model, 1, "cpu"), [0.0, 0.8, -1.5])
+
+
+def test_refuses_a_robot_without_torque_limits(task):
+    """Torques could not be clipped."""
+    model = copy.copy(task.sim.mj_model)
+    model.actuator_forcelimited[:] = 0
+    with pytest.raises(UserError, match="one motor with a force range per joint"):
+        WholeBodyController(RobotDynamics(model, 1, "cpu"), task.default_dof_pos.tolist())
+
+
+# --------------------------------------------------------------------------------------------------- standing
+
+
+def test_place_on_ground():
+    """Nothing is below the ground, and some foot is at most 2 cm above it, according to MuJoCo's contacts."""
+    task = make_trial(64)
+    place_on_ground(task, RobotDynamics(task.sim.mj_model, 64, "cpu"))
+    model = task.sim.mj_model
+    data = mujoco.MjData(model)
+    clearance_used = []
+    for qpos in task.sim.qpos.double().numpy():
+        for down in (0.0, 0.005, 0.01, 0.0201):
+            data.qpos[:] = qpos - np.r_[0.0, 0.0, down, np.zeros(16)]
+            mujoco.mj_fwdPosition(model, data)
+            touched = {model.geom(geom).name for geom in data.contact.geom[:, 1]}
+            if down == 0.0:
+                assert all(contact.dist > -1e-5 for contact in data.contact)
+            if touched & set(FEET):
+                clearance_used.append(down)
+                break
+        else:
+            pytest.fail(f"no foot within 2 cm of the ground, touched: {touched}")
+    assert len(set(clearance_used)) >= 3
+    spread = task.sim.qpos[:, 7:].std(dim=0)
+    assert (spread[1::3] > 0.1).all() and (task.sim.qvel[:, 6:].abs() > 8.0).any()
+    torch.testing.assert_close(task.projected_gravity.norm(dim=1), torch.ones(64))
+    assert (task.projected_gravity[:, 2] < -0.95).all() and (task.projected_gravity[:, 2] > -0.99999).any()
+
+
+def test_controller_stands_up():
+    """At 200 Hz, at least 95% of random initial states stand after 3 s, with little torque."""
+    task = make_trial(80)
+    controller = make_controller(task, 80)
+    place_on_ground(task, controller.dynamics)
+    result = measure_standing(task, lambda t: controller(t.sim.qpos, t.sim.qvel, t.feet_contact > 0).total, 3.0)
+    assert result.share >= 0.95
+    assert result.share == result.standing.float().mean()
+    assert 1.0 < result.mean_torque < 8.0
+
+
+def test_limp_robots_do_not_stand():
+    """Without torques all of them collapse, though those that were reset are in the air again."""
+    task = make_trial(8)
+    place_on_ground(task, RobotDynamics(task.sim.mj_model, 8, "cpu"))
+    result = measure_standing(task, lambda t: torch.zeros(8, 12), 1.5)
+    assert result.share == 0.0 and result.mean_torque == 0.0
+
+
+def test_is_standing(task):
+    """Each of the conditions is needed."""
+    task.base_pos[:, 2] = 0.3
+    task.projected_gravity[:] = torch.tensor([0.0, 0.0, -1.0])
+    task.base_lin_vel[:] = 0.0
+    task.contacts[:] = 0.0
+    task.contacts[:, task.feet_indices] = 1.0
+    task.feet_contact[:] = 1.0
+    task.base_pos[1, 2] = 0.19
+    task.projected_gravity[2, 2] = -0.89
+    task.base_lin_vel[3, 1] = 0.31
+    task.contacts[4, task.penalized_contact_indices[1]] = 1.0
+    assert is_standing(task).tolist() == [True] + 4 * [False] + 11 * [True]
+
+
+def test_measuring_refuses_what_it_cannot_do():
+    """Tasks whose actions are no torques, and trials longer than episodes."""
+    with pytest.raises(UserError, match="actions are torques"):
+        measure_standing(make_trial(1, "a1_position"), lambda t: torch.zeros(1, 12), 1.0)
+    with pytest.raises(UserError, match="do not fit"):
+        measure_standing(make_trial(1, episode_length_s=1.0), lambda t: torch.zeros(1, 12), 1.0)
+
+
+def pull(model, data, foot, height):
+    """Draw a foot up with a spring and damper, as a hand would, by a force in the generalized coordinates."""
+    geom = model.geom(foot).id
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jac(model, data, jacobian, None, data.geom_xpos[geom], model.geom_bodyid[geom])
+    force = 3000.0 * (height - data.geom_xpos[geom, 2]) - 60.0 * jacobian[2] @ data.qvel
+    data.qfrc_applied[:] = jacobian[2] * max(force, 0.0)
+
+
+def test_stands_on_three_feet(task):
+    """With one foot after the other drawn 6 cm up by a hand, the other three carry the robot, in plain MuJoCo."""
+    model = task.sim.mj_model
+    controller = make_controller(task, 4)
+    worlds = [mujoco.MjData(model) for _ in FEET]
+    for data in worlds:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    for step in range(400):
+        touching = [{model.geom(geom).name for geom in data.contact.geom[:, 1]} for data in worlds]
+        mask = torch.tensor([[foot in names for foot in FEET] for names in touching])
+        qpos, qvel = (
+            torch.tensor(np.array([getattr(data, name) for data in worlds])).float() for name in ("qpos", "qvel")
+        )
+        torques = controller(qpos, qvel, mask).total
+        for data, foot, torque in zip(worlds, FEET, torques, strict=True):
+            data.ctrl[:] = torque
+            pull(model, data, foot, 0.02 + 0.06 * min(step / 100, 1.0))
+            mujoco.mj_step(model, data)
+    for data, foot, names in zip(worlds, FEET, touching, strict=True):
+        assert names == set(FEET) - {foot}
+        assert data.geom_xpos[model.geom(foot).id, 2] > 0.05
+        assert data.qpos[2] > 0.25 and data.xmat[1, 8] > 0.95
+        assert np.linalg.norm(data.qvel[:3]) < 0.1
