@@ -5,6 +5,7 @@ from pathlib import Path
 
 from legged_torque.utils.args import Parser, run_script
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.plotting import load_pyplot
 
 PANELS = {
     "track_percentage": "tracking (1 is perfect)",
@@ -29,13 +30,7 @@ def main() -> None:
     parser.add_argument("files", type=Path, nargs="+", help="files that learning_curve.py has written")
     parser.add_argument("--out", type=Path, required=True, help="picture to write (png, svg, pdf)")
     args = parser.parse_args()
-    try:
-        import matplotlib
-
-        matplotlib.use("agg")
-        from matplotlib import pyplot
-    except ImportError:
-        raise UserError("plots need the extra: pip install -e .[plots]") from None
+    pyplot = load_pyplot()
     runs = [read(file) for file in args.files]
     tasks = sorted({run["task"] for run in runs})
     figure, axes = pyplot.subplots(1, len(PANELS), figsize=(15, 4.5), layout="constrained")

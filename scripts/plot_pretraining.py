@@ -6,6 +6,7 @@ from typing import Any
 
 from legged_torque.utils.args import Parser, run_script
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.plotting import load_pyplot
 
 BLUE, ORANGE = "#0072B2", "#D55E00"  # told apart by colour-blind eyes
 PARTS = {"histograms", "settings", "rms_error", "standing"}
@@ -17,13 +18,7 @@ def main() -> None:
     parser.add_argument("file", type=Path, help="report that pretrain_gravity.py --json has written")
     parser.add_argument("--out", type=Path, required=True, help="picture to write (png, svg, pdf)")
     args = parser.parse_args()
-    try:
-        import matplotlib
-
-        matplotlib.use("agg")
-        from matplotlib import pyplot
-    except ImportError:
-        raise UserError("plots need the extra: pip install -e .[plots]") from None
+    pyplot = load_pyplot()
     report = read(args.file)
     figure, axes = pyplot.subplots(1, 4, figsize=(17, 4), layout="constrained")
     settings = report["settings"]

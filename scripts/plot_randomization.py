@@ -19,6 +19,7 @@ from legged_torque.envs.base.domain_rand import TRUNK
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.utils.args import Parser, add_build_args, run_script
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.plotting import load_pyplot
 from legged_torque.utils.task_registry import set_seed
 
 GROUPS = ("initial state", "robot", "ground", "controller", "events", "sensors")
@@ -202,12 +203,8 @@ def events(task: LeggedRobot) -> list[Panel]:
 
 def draw(panels: list[Panel], file: Path) -> None:
     """Draw all panels into a picture."""
-    try:
-        from matplotlib import pyplot
-    except ImportError:
-        raise UserError("plots need the extra: pip install -e .[plots]") from None
+    pyplot = load_pyplot()
     rows = -(-len(panels) // COLUMNS)
-    pyplot.switch_backend("agg")
     pyplot.rcParams.update({"font.size": 9, "axes.titlesize": 9})
     figure, axes = pyplot.subplots(rows, COLUMNS, figsize=(2.05 * COLUMNS, 1.6 * rows + 0.6), layout="constrained")
     for axis, panel in zip(axes.flat, panels + [None] * (axes.size - len(panels)), strict=True):

@@ -25,6 +25,7 @@ from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.random_state import own_random_numbers, seeded_state
 from legged_torque.utils.task_registry import task_registry
+from legged_torque.utils.threads import single_threaded
 
 Act = Callable[[LeggedRobot], Tensor]
 """Returns the torques for a task's state [N m]. Shape: (num_envs, num_dof)."""
@@ -88,6 +89,7 @@ def pretrain(args: argparse.Namespace, env_cfg: Any, train_cfg: Any) -> tuple[ML
         The actor, and a report of plain values.
     """
     cfg, settings = copy.deepcopy(env_cfg), train_cfg.pretraining
+    check_settings(settings)
     use_standing_trials(cfg, env_cfg.control.decimation)
     device = resolve_device(args.device)
     with own_random_numbers(device, seeded_state(device, settings.seed)):
@@ -116,6 +118,24 @@ def pretrain(args: argparse.Namespace, env_cfg: Any, train_cfg: Any) -> tuple[ML
     return actor, report
 
 
+def check_settings(settings: Any) -> None:
+    """Refuse settings that make no sense.
+
+    Raises:
+        UserError: Naming the first one.
+    """
+    for name in ("num_configurations", "num_steps", "num_rounds", "num_epochs", "batch_size"):
+        if getattr(settings, name) < 1:
+            raise UserError(f"pretraining.{name} must be at least 1, not {getattr(settings, name)}")
+    for name in ("learning_rate", "max_mean_torque", "max_residual"):
+        if not getattr(settings, name) > 0.0:
+            raise UserError(f"pretraining.{name} must be greater than 0, not {getattr(settings, name)}")
+    if settings.num_rounds > settings.num_configurations:
+        raise UserError(f"pretraining.num_rounds is {settings.num_rounds}, more than there are configurations")
+    if not 0.0 < settings.held_out < 1.0:
+        raise UserError(f"pretraining.held_out must be between 0 and 1, not {settings.held_out}")
+
+
 def learn_to_stand(
     task: LeggedRobot, controller: WholeBodyController, actor: MLPModel, settings: Any
 ) -> tuple[Collection, dict[str, list[float]]]:
@@ -133,7 +153,7 @@ def learn_to_stand(
     followed: list[Followed] = []
     errors: dict[str, list[float]] = {"training": [], "held_out": []}
     for i in range(settings.num_rounds):
-        act = act_by_policy(actor) if i else act_by_controller(controller)
+        act = act_by_policy(actor) if i else None
         count = settings.num_configurations * (i + 1) // settings.num_rounds - sum(p.upright.shape[1] for p in followed)
         print(f"Round {i + 1} of {settings.num_rounds}: following {count} configurations.", flush=True)
         followed.append(follow(task, controller, act, count, settings.num_steps))
@@ -162,15 +182,16 @@ class Followed:
     upright: Tensor
 
 
+@single_threaded()
 def follow(
-    task: LeggedRobot, controller: WholeBodyController, act: Act, num_configurations: int, num_steps: int
+    task: LeggedRobot, controller: WholeBodyController, act: Act | None, num_configurations: int, num_steps: int
 ) -> Followed:
     """Draw random configurations and follow each for some control steps.
 
     Args:
         task: The task; its worlds are used again and again.
         controller: Whose torques are noted.
-        act: Who moves the robot, controller or policy; torques hold for a control step.
+        act: Who moves the robot instead of the controller; torques hold for a control step.
         num_configurations: How many to follow.
         num_steps: Control steps of each.
     """
@@ -184,7 +205,7 @@ def follow(
             observations = task.get_observations()["policy"]
             torques, residuals = decided.total, residual_share(controller, decided)
             steps.append([observations, torques / task.torque_scale, torques.abs().mean(dim=1), residuals, upright])
-            task.step(act(task) / task.torque_scale)
+            task.step((act(task) if act else torques) / task.torque_scale)
             upright = upright & ~task.reset_buf
         count = min(task.num_envs, num_configurations - start)
         parts.append([torch.stack(numbers)[:, :count] for numbers in zip(*steps, strict=True)])
@@ -192,7 +213,7 @@ def follow(
 
 
 def select(followed: list[Followed], settings: Any) -> Collection:
-    """Keep the pairs that are worth learning, and hold back those of some configurations.
+    """Keep the pairs that are worth learning, and hold back those of some configurations, of the same ones every time.
 
     As in the paper, pairs of large torques are dropped, and so are those whose contacts cannot bear what the controller
     wants by far, and what comes after a fall.
@@ -212,11 +233,12 @@ def select(followed: list[Followed], settings: Any) -> Collection:
     for reason, mask in reasons.items():
         dropped[reason] = int((keep & mask).sum())
         keep = keep & ~mask
-    held_out = torch.rand(keep.shape[1], device=keep.device) < settings.held_out
+    counts = [part.upright.shape[1] for part in followed]
+    held_out = torch.cat([torch.arange(count, device=keep.device) < settings.held_out * count for count in counts])
     sets = [keep & ~held_out, keep & held_out]
     training, measured = (Pairs(everything.observations[chosen], everything.actions[chosen]) for chosen in sets)
     if not len(training.actions) or not len(measured.actions):
-        raise UserError("pre-training has kept no pairs: raise pretraining.num_configurations or its limits")
+        raise UserError("pre-training has kept too few pairs: raise pretraining.num_configurations or its limits")
     texts = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
     print(f"Kept {int(keep.sum())} of {keep.numel()} pairs; dropped: {texts}.", flush=True)
     return Collection(training, measured, dropped, everything.mean_torques.flatten(), everything.residuals.flatten())

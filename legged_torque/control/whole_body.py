@@ -13,6 +13,7 @@ from legged_torque.control import operational_space as osc
 from legged_torque.control.contact_forces import ForceDistribution, ForceLimits
 from legged_torque.control.dynamics import TRUNK_DOFS, RobotDynamics
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.threads import single_threaded
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,7 @@ class WholeBodyController:
         self._distribute = ForceDistribution(limits, settings.arm, settings.force_regularization, device)
         self._nominal_feet = self._feet_in_nominal_pose()
 
+    @single_threaded()
     def __call__(self, qpos: Tensor, qvel: Tensor, mask: Tensor) -> WholeBodyTorques:
         """Compute the torques for many states at once.
 

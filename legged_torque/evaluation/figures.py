@@ -16,7 +16,7 @@ import numpy as np
 
 from legged_torque.evaluation.paper_values import ENVIRONMENTS, METRICS, MODELS, paper_value
 from legged_torque.evaluation.report import Experiment, Run, Summary, Table
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.plotting import load_pyplot
 
 STYLES = {  # colours of Okabe and Ito, which colour-blind eyes tell apart; near those of the paper
     "a1_position": ("#0072B2", "-", ""),
@@ -66,15 +66,9 @@ def draw_all(experiment: Experiment, table: Table, out: Path) -> list[str]:
     Raises:
         UserError: If matplotlib is missing.
     """
-    try:
-        import matplotlib
-
-        matplotlib.use("agg")
-        from matplotlib import pyplot
-    except ImportError:
-        raise UserError("plots need the extra: pip install -e .[plots]") from None
+    pyplot = load_pyplot()
     figures = {}
-    with matplotlib.rc_context(SETTINGS):
+    with pyplot.rc_context(SETTINGS):
         for name, settings in CURVES.items():
             figures[name] = draw_curves(pyplot, experiment, *settings)
         for name, settings in BARS.items():
