@@ -1,131 +1,317 @@
 """Gravity pre-training: the pairs, the supervision, the file, and trainings that start from it."""
 
+import copy
 import json
-import math
 
 import pytest
 import torch
 from settings import error_of, get_cfgs, parse
-from test_ppo import make_ppo, record_rollout, state_of
-from test_scripts import assert_told_in_one_line, run_here
+from test_ppo import make_ppo, record_rollout, shift_policy, state_of
+from test_scripts import assert_told_in_one_line, contents, run_here
 
+from legged_torque.control import gravity_pretraining
+from legged_torque.control.dynamics import RobotDynamics
 from legged_torque.control.gravity_pretraining import (
+    Collection,
+    Followed,
     Pairs,
     act_by_controller,
     exchange_last_actions,
     follow,
     histogram,
     imitation_loss,
+    learn_to_stand,
     make_controller,
+    pretrain,
     residual_share,
     select,
     supervise,
 )
 from legged_torque.control.standing import use_standing_trials
+from legged_torque.control.whole_body import WholeBodyController, WholeBodySettings
 from legged_torque.envs import task_registry
 from legged_torque.learning.pretrained import check_spaces, read_pretrained
+from legged_torque.utils.config import to_dict
 
 TASK = "a1_torque_gravity"
-SMALL = ["--device=cpu", "--num_envs=16", "--set=pretraining.num_epochs=3", "--set=pretraining.batch_size=64"]
-FEW = ["--num_configurations=40", "--num_steps=6"]
+SMALL = ["--device=cpu", "--num_envs=16"]
+FEW = {"num_rounds": 2, "num_epochs": 3, "batch_size": 16}
+CONFIGURATIONS, STEPS = 41, 6
 WEIGHT = 12.453 * 9.81
+TORQUE_SCALE, TORQUE_LIMIT = 4.0, 33.5
+STD = "distribution.log_std_param"
+LAST_ACTION = slice(33, 45)
+"""Where the last action is in what the policy sees, after 9 numbers of the trunk, 12 angles and 12 velocities."""
+
+# The left-right mirror image of joints in the order FR, FL, RR, RL, each with hip, thigh and calf, and of what the
+# policy sees: gravity, angular velocity, command, then angles, velocities and last actions of the joints.
+OTHER_SIDE = torch.tensor([3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8])
+JOINT_SIGNS = torch.tensor([-1.0, 1.0, 1.0] * 4)
+OTHER_SIDE_SEEN = torch.cat([torch.arange(9), 9 + OTHER_SIDE, 21 + OTHER_SIDE, 33 + OTHER_SIDE])
+SEEN_SIGNS = torch.cat([torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0]), *[JOINT_SIGNS] * 3])
+
+
+def words_of(**changes):
+    """Changes of the settings of pre-training, as words of a command line."""
+    return [f"--set=pretraining.{name}={value}" for name, value in changes.items()]
+
+
+def settings_of(**changes):
+    """The task's settings of pre-training, some of them changed."""
+    return get_cfgs(*words_of(**changes), task=TASK)[1].pretraining
+
+
+def imitated():
+    """Gains of the controller that is imitated."""
+    return WholeBodySettings(**to_dict(settings_of().controller))
+
+
+def make_actor(task):
+    """The policy of a training, with random weights that are the same every time."""
+    torch.manual_seed(0)
+    return task_registry.make_alg_runner(task, train_cfg=get_cfgs(task=TASK)[1], log_root=None)[0].alg.actor
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A folder in which pretrain_gravity.py has made a small policy: the folder, its file, the report, the output."""
     root = tmp_path_factory.mktemp("pretrained")
-    words = [*SMALL, *FEW, f"--json={root / 'report.json'}"]
-    status, output, error = run_here("pretrain_gravity.py", *words, root=root)
+    few = [f"--num_configurations={CONFIGURATIONS}", f"--num_steps={STEPS}", *words_of(**FEW)]
+    status, output, error = run_here("pretrain_gravity.py", *SMALL, *few, f"--json={root / 'report.json'}", root=root)
     assert (status, error) == (0, ""), output + error
     file = root / "logs" / "pretrained" / f"{TASK}.pt"
     return root, file, json.loads((root / "report.json").read_text()), output
 
 
 @pytest.fixture(scope="module")
-def teacher():
-    """A task of 32 worlds as pre-training has it, its controller, and the settings."""
-    env_cfg, train_cfg = get_cfgs("--num_envs=32", task=TASK)
+def task():
+    """A task of 16 worlds as pre-training has it."""
+    env_cfg, _ = get_cfgs("--num_envs=16", task=TASK)
     use_standing_trials(env_cfg, env_cfg.control.decimation)
     torch.manual_seed(0)
-    task, _ = task_registry.make_env(TASK, parse(), env_cfg)
-    settings = train_cfg.pretraining
-    settings.num_configurations, settings.num_steps, settings.batch_size = 50, 8, 100
-    return task, make_controller(task), train_cfg
+    return task_registry.make_env(TASK, parse(), env_cfg)[0]
+
+
+@pytest.fixture(scope="module")
+def controller(task):
+    """The controller that is imitated, for the worlds of the task."""
+    return make_controller(task, imitated())
+
+
+def follow_noting(task, controller, act, num_configurations, num_steps):
+    """Follow configurations, and note what the task's state was each time that somebody acted.
+
+    Returns:
+        What :func:`follow` returns, and what was noted: positions, velocities, contacts of the feet, control steps
+        since the start of the episode, and the torques that were given. Each is (num_steps, configurations, ...).
+    """
+    noted = []
+
+    def noting(task):
+        torques = act(task)
+        state = (task.sim.qpos, task.sim.qvel, task.feet_contact > 0, task.episode_length_buf, torques)
+        noted.append([part.clone() for part in state])
+        return torques
+
+    followed = follow(task, controller, noting, num_configurations, num_steps)
+    parts = [torch.stack(part).unflatten(0, (-1, num_steps)) for part in zip(*noted, strict=True)]
+    return followed, [part.transpose(0, 1).flatten(1, 2)[:, :num_configurations] for part in parts]
+
+
+# ----------------------------------------------------------------------------------------------------- report
 
 
 def test_report(made):
     """Every pair is kept or dropped for a reason, each configuration counts once, and errors fall."""
     _, file, report, output = made
-    dropped = report["dropped"]
-    assert set(dropped) == {"after a fall", "mean torque over 30 N m", "wrench residual over 0.2"}
-    assert report["pairs"] + sum(dropped.values()) == 40 * 6 and report["pairs"] > 120
+    kept, dropped = report["pairs"], report["dropped"]
+    assert set(dropped) == {"after a fall", "mean torque over 30 N m", "wrench residual over 3"}
+    assert kept + sum(dropped.values()) == 41 * 6 and kept > 200
     for numbers in report["histograms"].values():
-        assert sum(numbers["counts"]) == 40 * 6 and len(numbers["edges"]) == len(numbers["counts"]) + 1
-    assert len(report["rms_error"]["training"]) == len(report["rms_error"]["held_out"]) == 3
-    assert report["rms_error"]["training"][2] < report["rms_error"]["training"][0]
-    assert report["standing"]["controller"] > 0.8 and 0.0 <= report["standing"]["policy"] <= 1.0
-    assert set(report["seconds"]) == {"data", "supervision"}
-    assert "Followed 40 of 40 configurations." in output and f"Kept {report['pairs']} of 240 pairs; dropped: " in output
-    assert "Epoch 3 of 3: root mean square error training " in output and f"The policy is in {file}" in output
+        assert sum(numbers["counts"]) == 41 * 6 and len(numbers["edges"]) == len(numbers["counts"]) + 1
+    for errors in report["rms_error"].values():
+        assert len(errors) == 2 * 3 and all(0.0 < error < TORQUE_LIMIT for error in errors)
+    training = report["rms_error"]["training"]
+    assert training[2] < training[0] and training[5] < training[3]
+    assert report["standing"]["controller"] > 0.7 and 0.0 <= report["standing"]["policy"] <= 1.0
+    assert report["task"] == TASK and "CPU" in report["device"] and 0.0 < report["seconds"] < 60.0
+    given = {**FEW, "num_configurations": 41, "num_steps": 6, "seed": 1, "max_mean_torque": 30.0}
+    assert {name: report["settings"][name] for name in given} == given
+    for line in (
+        "Round 1 of 2: following 20 configurations.",
+        "Round 2 of 2: following 21 configurations.",
+        f"Kept {kept} of 246 pairs; dropped: ",
+        f"Epoch 3 of 3: root mean square error training {training[5]:.2f} N m, held out ",
+        f"Standing after 5 s: the controller {report['standing']['controller']:.1%} and the policy ",
+        f"The policy is in {file}",
+    ):
+        assert line in output
+
+
+def test_file(made):
+    """The policy's file holds the report as well, and nothing but the file is left."""
+    root, file, report, _ = made
     assert read_pretrained(file)["report"] == report
+    assert {path for path in root.rglob("*") if path.is_file()} == {file, root / "report.json"}
 
 
-def test_pairs_are_what_the_controller_does(teacher):
-    """Actions are its torques over the scale, in the states that the policy sees; both sets share no configuration."""
-    task, controller, train_cfg = teacher
+def test_histogram():
+    """Values beyond the highest count in the last bin."""
+    counts = histogram(torch.tensor([0.1, 0.9, 1.1, 9.0, 100.0]), 10.0, bins=10)
+    assert counts == {"edges": [float(i) for i in range(11)], "counts": [2.0, 1.0, *[0.0] * 7, 2.0]}
+
+
+# ------------------------------------------------------------------------------------------------------ pairs
+
+
+@pytest.mark.parametrize("who", ["controller", "policy"])
+def test_pairs_are_what_the_controller_does(task, controller, who):
+    """Whoever acts, actions are the controller's torques over 4 N m in exactly the states that the policy sees there.
+
+    There are more configurations than worlds, and not a multiple of them.
+    """
+    act = act_by_controller(controller) if who == "controller" else lambda task: 3.0 * torch.randn(16, 12)
     torch.manual_seed(1)
-    settings = train_cfg.pretraining
-    collection = collect(task, controller, settings)
-    held_out, training = len(collection.held_out.actions), len(collection.training.actions)
-    assert held_out + training + sum(collection.dropped.values()) == 50 * 8 == len(collection.mean_torques)
-    assert 0 < held_out <= 0.1 * 50 * 8
-    for pairs in (collection.training, collection.held_out):
-        assert pairs.observations.shape[1] == 45 and (pairs.actions.abs() * 4.0 <= 33.5 + 1e-4).all()
-    torques = 4.0 * torch.cat([collection.held_out.actions, collection.training.actions])
-    kept = torques.abs().mean(dim=1)
-    assert kept.max() <= 30.0
-    everything = torch.sort(collection.mean_torques).values
-    assert torch.isclose(kept.unsqueeze(1), everything.unsqueeze(0), atol=1e-4).any(dim=1).all()
-    standing = collection.training.observations[:, 9:33].abs().sum(dim=1) < 0.5  # near the nominal pose and at rest
-    carried = torques[held_out:][standing]
-    assert len(carried) == 0 or carried.abs().mean() < 6.0
+    followed, (qpos, qvel, touching, _, given) = follow_noting(task, controller, act, 21, 5)
+    dynamics = RobotDynamics(task.sim.mj_model, 21 * 5, "cpu", task.foot_names)
+    fresh = WholeBodyController(dynamics, task.default_dof_pos.tolist(), imitated())
+    decided = fresh(qpos.flatten(0, 1), qvel.flatten(0, 1), touching.flatten(0, 1))
+    torques = decided.total.unflatten(0, (5, 21))
+    assert touching.any(dim=2)[-1].float().mean() > 0.2 and torques.abs().max() > 5.0
+    torch.testing.assert_close(TORQUE_SCALE * followed.actions, torques, rtol=0, atol=1e-3)
+    assert (torch.allclose(given, torques, atol=1e-3)) == (who == "controller")
+    torch.testing.assert_close(followed.mean_torques, torques.abs().sum(dim=2) / 12, rtol=0, atol=1e-3)
+    force, moment = decided.wrench_residual.unflatten(0, (5, 21)).split(3, dim=2)
+    residuals = (force.square().sum(dim=2) + (moment / 0.2).square().sum(dim=2)).sqrt() / WEIGHT
+    torch.testing.assert_close(followed.residuals, residuals, rtol=0, atol=1e-3)
+
+    w, x, y, z = qpos[..., 3:7].unbind(dim=2)
+    gravity = torch.stack([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1], dim=2)
+    angles = qpos[..., 7:] - torch.tensor([task.cfg.init_state.default_joint_angles[name] for name in task.dof_names])
+    seen = followed.observations
+    assert seen.shape == (5, 21, 45) and followed.upright.all()
+    torch.testing.assert_close(seen[..., :3], gravity, rtol=0, atol=1e-5)
+    torch.testing.assert_close(seen[..., 3:6], 0.25 * qvel[..., 3:6])
+    torch.testing.assert_close(seen[..., 9:21], angles)
+    torch.testing.assert_close(seen[..., 21:33], 0.05 * qvel[..., 6:])
+    assert (seen[0, :, LAST_ACTION] == 0.0).all()
+    torch.testing.assert_close(seen[1:, :, LAST_ACTION], given[:-1] / TORQUE_SCALE)
 
 
-def test_first_pair_by_hand(teacher):
-    """In the air there are no contacts: the action is the posture PD's torque of eq. 8, from the policy's own numbers."""
-    task, controller, train_cfg = teacher
+def test_without_another_one_the_controller_acts(task, controller):
+    """Following is the same whether the controller is asked to act or nobody is."""
+    runs = []
+    for act in (None, act_by_controller(controller)):
+        torch.manual_seed(6)
+        runs.append(vars(follow(task, controller, act, 18, 6)))
+    assert runs[0]["actions"].shape == (6, 18, 12)
+    for name, values in runs[0].items():
+        assert torch.equal(values, runs[1][name]), name
+
+
+def test_first_pair_by_hand(task, controller):
+    """In the air nothing touches: the action is the torque of eq. 8's PD, from the numbers that the policy sees."""
     torch.manual_seed(2)
-    pairs = collect(task, controller, train_cfg.pretraining).training
-    first = pairs.observations[:, 33:].abs().sum(dim=1) == 0.0  # no action before: nothing has touched yet
-    observations, actions = pairs.observations[first], pairs.actions[first]
-    assert len(actions) >= 30
-    expected = -20.0 * observations[:, 9:21] - 0.5 * observations[:, 21:33] / 0.05
-    torch.testing.assert_close(4.0 * actions, expected.clamp(-33.5, 33.5), atol=1e-3, rtol=0)
+    followed = follow(task, controller, None, 40, 1)
+    seen = followed.observations[0]
+    expected = -20.0 * seen[:, 9:21] - 0.5 * seen[:, 21:33] / 0.05
+    assert 3.0 < expected.abs().mean() < 10.0
+    expected = expected.clamp(-TORQUE_LIMIT, TORQUE_LIMIT)
+    torch.testing.assert_close(TORQUE_SCALE * followed.actions[0], expected, rtol=0, atol=1e-3)
 
 
-def test_dropped_pairs(teacher):
-    """A limit of 0 drops every pair that has any torque, or any residual, and says so."""
-    task, controller, train_cfg = teacher
-    settings = train_cfg.pretraining
-    for name, reason in (("max_mean_torque", "mean torque over 0 N m"), ("max_residual", "wrench residual over 0")):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(settings, name, 0.0)
-            torch.manual_seed(3)
-            dropped = collect(task, controller, settings).dropped
-        assert dropped[reason] > (350 if name == "max_mean_torque" else 10)
+def test_gains_of_the_imitated_controller(monkeypatch):
+    """Those of ``pretraining.controller`` are imitated: without damping, nothing acts in the air in the nominal pose.
+
+    With the controller's own defaults, damping and the springs of the feet would.
+    """
+    monkeypatch.setattr(gravity_pretraining, "STANDING_SECONDS", 0.1)  # not looked at here
+    changes = {"num_configurations": 12, "num_steps": 1, "num_rounds": 1, "num_epochs": 1, "held_out": 0.5}
+    words = [*SMALL, f"--task={TASK}", *words_of(**changes), "--set=domain_rand.init_dof_pos_scale=[1, 1]"]
+    words.append("--set=pretraining.controller.joint_damping=0")
+    _, report = pretrain(parse(*words), *get_cfgs(*words, task=TASK))
+    assert report["histograms"]["mean_torque"]["counts"] == [12.0, *[0.0] * 49]
+    assert report["pairs"] == 12 and report["settings"]["controller"]["joint_damping"] == 0.0
 
 
-def test_residual_share(teacher):
+def test_falls(task, controller):
+    """Limp robots collapse; from the reset on, which starts their clocks anew, none of them counts as upright."""
+    torch.manual_seed(3)
+    followed, (*_, clocks, _) = follow_noting(task, controller, lambda task: torch.zeros(16, 12), 20, 40)
+    whole = clocks == torch.arange(40).unsqueeze(1)
+    assert torch.equal(followed.upright, whole)
+    assert whole[:5].all() and whole[-1].float().mean() < 0.5
+
+
+def some_followed(first, last):
+    """Three steps of the configurations from the first number to the last: each pair knows its configuration."""
+    numbers = torch.arange(first, last, dtype=torch.float32).expand(3, -1)
+    steps = torch.arange(3.0).unsqueeze(1).expand_as(numbers)
+    observations = torch.stack([numbers, steps], dim=2)
+    return Followed(observations, -observations, 0.1 * steps, 0.0 * steps, torch.ones_like(numbers, dtype=torch.bool))
+
+
+def test_dropped_pairs(capsys):
+    """A pair is dropped for the first reason that holds; limits themselves are allowed; all rounds are kept."""
+    followed = [some_followed(0, 300), some_followed(300, 400)]
+    first, second = followed
+    first.upright[1:, 0] = False
+    first.mean_torques[1, 0] = first.residuals[2, 0] = 99.0  # counts as fallen
+    first.mean_torques[:, 1] = 30.01
+    first.residuals[0, 1] = 99.0  # counts as a large torque
+    first.mean_torques[:, 2] = 30.0
+    second.residuals[2, 3] = 3.01
+    second.residuals[1, 4] = 3.0
+    collection = select(followed, settings_of())
+    assert collection.dropped == {"after a fall": 2, "mean torque over 30 N m": 3, "wrench residual over 3": 1}
+    assert "Kept 1194 of 1200 pairs; dropped: 2 after a fall, 3 mean torque over 30 N m, 1 " in capsys.readouterr().out
+    sets = [
+        [tuple(pair) for pair in pairs.observations.tolist()] for pairs in (collection.training, collection.held_out)
+    ]
+    everything = {(number, step) for number in range(400) for step in range(3)}
+    assert sorted(sets[0] + sets[1]) == sorted(everything - {(0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (303, 2)})
+    for pairs in (collection.training, collection.held_out):
+        assert torch.equal(pairs.actions, -pairs.observations)
+    training, held_out = ({number for number, _ in pairs} for pairs in sets)
+    assert not training & held_out and 38 <= len(held_out) <= 42
+    for name in ("mean_torques", "residuals"):  # dropped ones included
+        values = torch.cat([getattr(part, name).flatten() for part in followed])
+        assert torch.equal(getattr(collection, name).sort().values, values.sort().values)
+
+
+def test_held_out_configurations_stay_so():
+    """What measures the policy in the end has never been learned from in an earlier round, and some of it is new."""
+    followed = [some_followed(0, 200), some_followed(200, 300), some_followed(300, 330)]
+    rounds = []
+    for count in (1, 2, 3):
+        collection = select(followed[:count], settings_of())
+        rounds.append([set(pairs.observations[:, 0].tolist()) for pairs in (collection.training, collection.held_out)])
+    measured = rounds[-1][1]
+    assert all(not training & measured for training, _ in rounds)
+    assert [
+        sum(first <= number < last for number in measured) for first, last in ((0, 200), (200, 300), (300, 330))
+    ] == [20, 10, 3]
+
+
+def test_no_pairs_are_kept():
+    """If nothing is left to learn from, that is told."""
+    followed = some_followed(0, 10)
+    followed.upright[:] = False
+    assert "pre-training has kept too few pairs" in error_of(select, [followed], settings_of())
+
+
+def test_residual_share(task, controller):
     """A force of the weight is 1, and so is a moment of the weight at the arm of 0.2 m."""
-    task, controller, _ = teacher
     decided = controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0)
-    decided.wrench_residual = torch.zeros(32, 6)
+    decided.wrench_residual = torch.zeros(16, 6)
     decided.wrench_residual[0, 1] = WEIGHT
     decided.wrench_residual[1, 3] = 0.2 * WEIGHT
     decided.wrench_residual[2] = torch.tensor([0.0, 0.6 * WEIGHT, 0.0, 0.0, 0.0, 0.16 * WEIGHT])
     shares = residual_share(controller, decided)
     torch.testing.assert_close(shares[:4], torch.tensor([1.0, 1.0, 1.0, 0.0]), atol=1e-4, rtol=0)
+
+
+# ------------------------------------------------------------------------------------------------ supervision
 
 
 @pytest.mark.parametrize("history", [1, 2])
@@ -136,117 +322,279 @@ def test_last_actions_are_exchanged(history):
     exchanged = exchange_last_actions(observations, 3, history)
     before, after = observations.view(50, history, 20), exchanged.view(50, history, 20)
     assert torch.equal(after[..., :17], before[..., :17])
-    assert not torch.equal(after[..., 17:], before[..., 17:])
+    assert (after[..., 17:] != before[..., 17:]).float().mean() > 0.8
     order = after[:, 0, 17].argsort()
     assert torch.equal(after[order][..., 17:], before[..., 17:])
 
 
-def test_supervision(teacher):
-    """The loss is the mean square error on pairs and mirror images; learning linear actions makes it small."""
-    task, controller, train_cfg = teacher
-    actor = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=None)[0].alg.actor
-    torch.manual_seed(0)
+def test_loss_by_hand(task):
+    """It is the mean square error on the pairs and on their mirror images."""
+    actor = make_actor(task)
+    pairs = Pairs(torch.randn(30, 45), torch.randn(30, 12))
+    pairs.observations[:, LAST_ACTION] = 0.0  # so that exchanging them changes nothing
+    with torch.no_grad():
+        there = actor({"policy": pairs.observations}) - pairs.actions
+        mirrored = pairs.observations[:, OTHER_SIDE_SEEN] * SEEN_SIGNS
+        here = actor({"policy": mirrored}) - pairs.actions[:, OTHER_SIDE] * JOINT_SIGNS
+    expected = (there.square().sum() + here.square().sum()) / (2 * 30 * 12)
+    torch.testing.assert_close(imitation_loss(task, actor, pairs).detach(), expected)
+
+
+def test_supervision(task):
+    """A spring is learned from its pairs; errors are those of the policy, in N m; exploration stays what it was."""
+    actor = make_actor(task)
     observations = torch.randn(400, 45)
-    pairs = Pairs(observations, -observations[:, 9:21])  # -(q - q_nominal): the same on both sides
-    for parameter in list(actor.parameters())[-2:]:
-        torch.nn.init.zeros_(parameter)
-    torch.testing.assert_close(imitation_loss(task, actor, pairs), pairs.actions.square().mean())
-    collection = collect(task, controller, train_cfg.pretraining)
-    collection.training, collection.held_out = Pairs(*(part[50:] for part in vars(pairs).values())), pairs.split(50)[0]
-    settings = train_cfg.pretraining
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(settings, "num_epochs", 40)
-        errors = supervise(task, actor, collection, settings)
-    assert len(errors["held_out"]) == 40 and errors["held_out"][0] > 2.0 > 1.5 > errors["held_out"][-1]
+    observations[:, LAST_ACTION] = 0.0
+    pairs = Pairs(observations, -observations[:, 9:21])
+    held_out = Pairs(pairs.observations[:50], pairs.actions[:50])
+    training = Pairs(pairs.observations[50:], pairs.actions[50:])
+    collection = Collection(training, held_out, {}, torch.zeros(0), torch.zeros(0))
+    errors = supervise(task, actor, collection, settings_of(num_epochs=20, batch_size=50))
+    assert {name: len(values) for name, values in errors.items()} == {"training": 20, "held_out": 20}
     assert errors["training"][-1] < 0.5 * errors["training"][0]
+    assert errors["held_out"][-1] < 0.6 * TORQUE_SCALE  # without learning: 4 N m, since actions are standard normal
+    assert errors["held_out"][-1] > errors["training"][-1]
+    with torch.no_grad():
+        mirrored = held_out.observations[:, OTHER_SIDE_SEEN] * SEEN_SIGNS
+        wrong = [actor({"policy": held_out.observations}) - held_out.actions]
+        wrong.append(actor({"policy": mirrored}) - held_out.actions[:, OTHER_SIDE] * JOINT_SIGNS)
+    expected = TORQUE_SCALE * torch.cat(wrong).square().mean().sqrt().item()
+    assert errors["held_out"][-1] == pytest.approx(expected, rel=1e-3)
+    assert (dict(actor.named_parameters())[STD] == 0.0).all()
 
 
-def test_histogram():
-    """Values beyond the highest count in the last bin."""
-    counts = histogram(torch.tensor([0.1, 0.9, 1.1, 9.0, 100.0]), 10.0, bins=10)
-    assert counts == {"edges": [float(i) for i in range(11)], "counts": [2.0, 1.0, *[0.0] * 6, 0.0, 2.0]}
+def test_the_last_action_is_no_help(task):
+    """A policy cannot learn to copy its last action, even where that tells everything and nothing else does."""
+    actor = make_actor(task)
+    pairs = Pairs(torch.zeros(400, 45), torch.randn(400, 12))
+    pairs.observations[:, LAST_ACTION] = pairs.actions
+    collection = Collection(pairs, pairs.split(100)[0], {}, torch.zeros(0), torch.zeros(0))
+    errors = supervise(task, actor, collection, settings_of(num_epochs=10, batch_size=50))
+    assert errors["held_out"][-1] > 0.95 * TORQUE_SCALE
 
 
-def test_a_policy_is_found_or_made(made):
-    """Training starts from the file if there is one, and makes it if there is none, with the same result."""
+def test_rounds(task, controller, capsys):
+    """Rounds share the configurations; in the first the controller moves the robot, in the others the policy does."""
+    actor, acted, ignorant = make_actor(task), [], []
+    untrained = copy.deepcopy(actor)
+    changes = {"num_configurations": 20, "num_steps": 5, "num_rounds": 3, "num_epochs": 2, "batch_size": 32}
+    nothing_dropped = {"max_mean_torque": 1e6, "max_residual": 1e6, "held_out": 0.3}
+
+    def note(module, inputs, output):
+        if "critic" in inputs[0].keys():  # asked by the task: what is learned from has no such observations
+            acted.append(output.clone())
+            ignorant.append(untrained(*inputs))
+
+    with actor.register_forward_hook(note):
+        collection, errors = learn_to_stand(task, controller, actor, settings_of(**changes, **nothing_dropped))
+    output = capsys.readouterr().out
+    for i, (count, pairs) in enumerate(((6, 30), (7, 65), (7, 100))):
+        assert f"Round {i + 1} of 3: following {count} configurations." in output
+        assert f"Kept {pairs} of {pairs} pairs" in output
+    assert {name: len(values) for name, values in errors.items()} == {"training": 6, "held_out": 6}
+    assert len(acted) == 2 * 5
+    assert all((now - then).abs().mean() > 0.01 for now, then in zip(acted, ignorant, strict=True))  # it has learned
+    pairs = Pairs(
+        *(
+            torch.cat([getattr(collection.training, name), getattr(collection.held_out, name)])
+            for name in ("observations", "actions")
+        )
+    )
+    last = pairs.observations[:, LAST_ACTION]
+
+    def found_in(actions):
+        return torch.isclose(last.unsqueeze(1), actions.unsqueeze(0), rtol=0, atol=1e-6).all(dim=2).any(dim=1)
+
+    at_first, by_policy, by_controller = (last == 0.0).all(dim=1), found_in(torch.cat(acted)), found_in(pairs.actions)
+    assert [int(mask.sum()) for mask in (at_first, by_policy, by_controller)] == [20, 14 * 4, 6 * 4]
+
+
+# ------------------------------------------------------------------------------------- trainings that start from it
+
+
+@pytest.fixture(scope="module")
+def trained(made):
+    """Two trainings of two iterations: one finds the policy, the other one makes it, under another name.
+
+    The first one explores less than the training whose policy it finds; in the second one, the critic has just one
+    iteration of its own.
+
+    Returns:
+        The file that the second one has made; of each the output, and its checkpoints in the order of time.
+    """
     root, file, _, _ = made
-    few = [f"--set=pretraining.{name}" for name in ("num_configurations=40", "num_steps=6")]
-    words = [*SMALL, *few, f"--task={TASK}", "--max_iterations=1", "--set=runner.num_steps_per_env=8"]
-    network = read_pretrained(file)["actor_state_dict"]
-    changed = file.stat().st_mtime_ns
-    status, output, error = run_here("train.py", *words, root=root)
-    assert (status, error) == (0, "") and f"Starting from the pre-trained policy '{file}'." in output
-    assert file.stat().st_mtime_ns == changed and "Followed" not in output
-    made_anew = root / "anew.pt"
-    words += [f"--set=pretraining.file={made_anew}", "--run_name=anew"]
-    status, output, error = run_here("train.py", *words, root=root)
-    assert (status, error) == (0, "") and f"There is no pre-trained policy '{made_anew}' yet; making it." in output
-    again = read_pretrained(made_anew)["actor_state_dict"]
-    states = [torch.load(run, weights_only=True) for run in sorted(root.glob(f"logs/{TASK}/*/model_1.pt"))]
-    assert len(states) == 2
-    for key, value in network.items():
-        assert torch.equal(again[key], value)
-        for state in states:  # the first iterations train the critic alone
-            trained = state["actor_state_dict"][key]
-            if key == "distribution.log_std_param":
-                torch.testing.assert_close(trained, torch.full((12,), math.log(0.5)))
-            else:
-                assert torch.equal(trained, value)
-    for key, value in states[0]["critic_state_dict"].items():
-        assert torch.equal(states[1]["critic_state_dict"][key], value)
+    other = root / "new" / "other.pt"
+    words = [*SMALL, f"--task={TASK}", "--max_iterations=2", "--logger=none", "--set=evaluation.interval=0"]
+    words += ["--set=runner.num_steps_per_env=8", "--set=runner.save_interval=1", "--seed=3"]
+    words += words_of(**FEW, num_configurations=CONFIGURATIONS, num_steps=STEPS)
+    changes = {
+        "found": ["--set=actor.distribution_cfg.init_std=0.5"],
+        "made": words_of(file=other, critic_warmup_iterations=1),
+    }
+    runs = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gravity_pretraining, "STANDING_SECONDS", 0.1)  # not looked at here
+        for name, more in changes.items():
+            before = contents(file.parent)
+            status, output, error = run_here("train.py", *words, *more, f"--run_name={name}", root=root)
+            assert (status, error) == (0, ""), output + error
+            assert contents(file.parent) == before
+            runs.append((output, sorted(root.glob(f"logs/{TASK}/*_{name}/model_*.pt"))))
+    return other, *runs
+
+
+def load(files):
+    """The actors of checkpoints: their networks, and the logarithm of their standard deviations."""
+    actors = [torch.load(file, weights_only=True)["actor_state_dict"] for file in files]
+    return [({name: value for name, value in actor.items() if name != STD}, actor[STD]) for actor in actors]
+
+
+def same(network, other):
+    """Whether two networks are the same to the bit."""
+    assert network.keys() == other.keys() and len(network) == 8
+    return all(torch.equal(value, other[name]) for name, value in network.items())
+
+
+def test_a_policy_is_found_or_made(made, trained):
+    """Training starts from the file if there is one and else makes it, with the same result whatever its own seed."""
+    _, file, _, _ = made
+    other, (found, _), (made_here, _) = trained
+    assert (
+        f"Starting from the pre-trained policy '{file}'." in found and "making it" not in found and "Round" not in found
+    )
+    assert f"There is no pre-trained policy '{other}' yet; making it." in made_here
+    assert f"Starting from the pre-trained policy '{other}'." in made_here
+    networks = [read_pretrained(path)["actor_state_dict"] for path in (file, other)]
+    for network in networks:
+        network.pop(STD)
+    assert same(*networks)
+
+
+def test_making_leaves_the_training_as_it_is(trained):
+    """Random numbers of a training are the same whether it had to make its policy or found one."""
+    _, (_, found), (_, made_here) = trained
+    infos = [torch.load(files[0], weights_only=True)["infos"] for files in (found, made_here)]
+    assert torch.equal(*(info["random_states"][0]["cpu"] for info in infos))
+    assert [info["total_timesteps"] for info in infos] == [16 * 8] * 2
+
+
+def test_first_iterations_train_the_critic_alone(made, trained):
+    """The policy stays for 10 iterations, or as many as told; exploration starts as the training's settings say."""
+    network = read_pretrained(made[1])["actor_state_dict"]
+    network.pop(STD)
+    _, (_, found), (_, made_here) = trained
+    assert len(found) == len(made_here) == 2
+    for actor, log_std in load(found):
+        assert same(actor, network)
+        torch.testing.assert_close(log_std, torch.full((12,), -0.6931472))  # of 0.5
+    (first, log_std), (second, later_log_std) = load(made_here)
+    assert same(first, network) and not same(second, network)
+    assert (log_std == 0.0).all() and (later_log_std != 0.0).all()
+    critics = [torch.load(file, weights_only=True)["critic_state_dict"] for file in found]
+    assert all(not torch.equal(value, critics[1][name]) for name, value in critics[0].items())
+
+
+def test_a_resumed_training_has_its_policy(trained, tmp_path):
+    """It goes on with its own policy, with what is left of the critic's iterations, and looks for no other one."""
+    _, (_, found), _ = trained
+    words = ["--device=cpu", f"--task={TASK}", "--resume", f"--load_run={found[0].parent}", "--max_iterations=4"]
+    status, output, error = run_here("train.py", *words, *words_of(critic_warmup_iterations=3), root=tmp_path)
+    assert (status, error) == (0, "") and "pre-trained" not in output
+    assert not (tmp_path / "logs" / "pretrained").exists()
+    files = sorted(tmp_path.glob(f"logs/{TASK}/*/model_*.pt"))
+    assert [file.name for file in files] == ["model_3.pt", "model_4.pt"]
+    (before, _), (third, _), (fourth, _) = load([found[1], *files])
+    assert same(before, third) and not same(third, fourth)
 
 
 def test_what_does_not_fit_is_refused(made):
     """The first setting that differs is named, with both values; nothing is trained."""
     root, file, _, _ = made
-    words = [*SMALL, f"--task={TASK}", "--max_iterations=1"]
+    words, before = [*SMALL, f"--task={TASK}", "--max_iterations=1"], contents(root)
     for setting, told in {
         "control.torque_scale=5": "its control.torque_scale is 4.0, here it is 5.0",
         "env.history_length=2": "its env.history_length is 1, here it is 2",
         "normalization.obs_scales.dof_vel=0.1": "its normalization.obs_scales.dof_vel is 0.05, here it is 0.1",
         "actor.hidden_dims=[64]": "its actor.hidden_dims is [512, 256, 128], here it is [64]",
+        "actor.activation=relu": "its actor.activation is 'elu', here it is 'relu'",
+        "obs_groups.actor=[critic]": "its obs_groups.actor is ['policy'], here it is ['critic']",
     }.items():
         result = run_here("train.py", *words, f"--set={setting}", root=root)
         assert_told_in_one_line(result, told)
         assert str(file) in result[2]
+    assert contents(root) == before
     check_spaces(file, *get_cfgs(task="a1_torque"))  # another task with the same spaces may use it
 
 
-@pytest.mark.parametrize("content", [b"nothing", None])
-def test_broken_file(content, tmp_path):
+@pytest.mark.parametrize("content", ["text", "half", "other", "missing"])
+def test_broken_file(made, content, tmp_path):
     """A file that is no pre-trained policy is told in one line."""
     file = tmp_path / "policy.pt"
-    if content:
-        file.write_bytes(content)
-    else:
+    if content == "other":
         torch.save({"weights": torch.zeros(3)}, file)
-    assert f"'{file}' is not a " in error_of(read_pretrained, file)
+    elif content != "missing":
+        whole = made[1].read_bytes()
+        file.write_bytes(b"nothing" if content == "text" else whole[: len(whole) // 2])
+    expected = "a pre-trained policy" if content == "other" else "a readable pre-trained policy: "
+    assert f"'{file}' is not {expected}" in error_of(read_pretrained, file)
 
 
 def test_a_task_without_pretraining(tmp_path):
-    """There is nothing to make for it."""
+    """There is nothing to make for it, and nothing is left behind."""
     result = run_here("pretrain_gravity.py", "--device=cpu", "--task=a1_torque", root=tmp_path)
     assert_told_in_one_line(result, "task 'a1_torque' has no pre-training")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("num_configurations=0", "pretraining.num_configurations must be at least 1, not 0"),
+        ("num_steps=0", "pretraining.num_steps must be at least 1, not 0"),
+        ("num_rounds=0", "pretraining.num_rounds must be at least 1, not 0"),
+        ("num_epochs=-1", "pretraining.num_epochs must be at least 1, not -1"),
+        ("batch_size=0", "pretraining.batch_size must be at least 1, not 0"),
+        ("learning_rate=0", "pretraining.learning_rate must be greater than 0, not 0"),
+        ("max_mean_torque=0", "pretraining.max_mean_torque must be greater than 0, not 0"),
+        ("max_residual=-1", "pretraining.max_residual must be greater than 0, not -1"),
+        ("num_configurations=3", "pretraining.num_rounds is 4, more than there are configurations"),
+        ("held_out=0", "pretraining.held_out must be between 0 and 1, not 0"),
+        ("held_out=1", "pretraining.held_out must be between 0 and 1, not 1"),
+        ("critic_warmup_iterations=-1", "pretraining.critic_warmup_iterations must be at least 0, not -1"),
+        ("controller.nonsense=1", "unknown config key 'pretraining.controller.nonsense'"),
+    ],
+)
+def test_settings_that_make_no_sense(setting, told, tmp_path):
+    """They are refused by their names before anything is made."""
+    assert_told_in_one_line(
+        run_here("pretrain_gravity.py", *SMALL, f"--set=pretraining.{setting}", root=tmp_path), told
+    )
+    assert not list(tmp_path.iterdir())
 
 
 def test_critic_warmup():
-    """While only the critic learns, policy and learning rate stay; then both move."""
-    alg = make_ppo(schedule="adaptive", desired_kl=1e-6)
-    before = state_of(alg)
-    alg.learn_actor(False)
-    record_rollout(alg)
-    alg.update()
-    warm = state_of(alg)
+    """While only the critic learns, it learns as ever; policy and learning rate stay. Then they move."""
+    warm, usual = (make_ppo(schedule="adaptive", desired_kl=1e-3) for _ in range(2))
+    before = state_of(warm)
+    warm.learn_actor(False)
+    usual.schedule = "fixed"
+    for alg in (warm, usual):
+        record_rollout(alg)
+        shift_policy(alg, 0.2)  # as if it had moved far: this would change the learning rate
+        torch.manual_seed(5)
+        alg.update()
+    shift_policy(warm, -0.2)
+    learned, other = state_of(warm), state_of(usual)
     for key, value in before.items():
-        assert torch.equal(warm[key], value) == (key.startswith("actor") or key == "lr"), key
-    alg.learn_actor(True)
-    record_rollout(alg)
-    alg.update()
-    after = state_of(alg)
-    assert all(not torch.equal(after[key], warm[key]) for key in warm if key.startswith("actor"))
-
-
-def test_negative_warmup():
-    """It is refused by its name."""
-    words = ("--set=pretraining.critic_warmup_iterations=-1",)
-    assert "pretraining.critic_warmup_iterations must be at least 0" in error_of(get_cfgs, *words)
+        if key.startswith("critic"):
+            assert not torch.equal(learned[key], value)
+            torch.testing.assert_close(learned[key], other[key])
+        else:
+            torch.testing.assert_close(learned[key], value)
+    warm.learn_actor(True)
+    record_rollout(warm)
+    shift_policy(warm, 0.2)
+    shifted = state_of(warm)
+    warm.update()
+    after = state_of(warm)
+    assert all(not torch.equal(after[key], shifted[key]) for key in before) and after["lr"] < shifted["lr"]
