@@ -1,0 +1,200 @@
+"""Trainings that start from a pre-trained policy: its file, what fits, and the critic's head start."""
+
+import pytest
+import torch
+from settings import error_of, get_cfgs
+from test_gravity_pretraining import CONFIGURATIONS, FEW, SMALL, STD, STEPS, TASK, words_of
+from test_gravity_pretraining import made as made  # a fixture
+from test_ppo import make_ppo, record_rollout, shift_policy, state_of
+from test_scripts import assert_told_in_one_line, contents, run_here
+
+from legged_torque.control import gravity_pretraining
+from legged_torque.learning.pretrained import check_spaces, read_pretrained
+
+
+@pytest.fixture(scope="module")
+def trained(made):
+    """Two trainings of two iterations: one finds the policy, the other one makes it, under another name.
+
+    The first one explores less than the training whose policy it finds; in the second one, the critic has just one
+    iteration of its own.
+
+    Returns:
+        The file that the second one has made; of each the output, and its checkpoints in the order of time.
+    """
+    root, file, _, _ = made
+    other = root / "new" / "other.pt"
+    words = [*SMALL, f"--task={TASK}", "--max_iterations=2", "--logger=none", "--set=evaluation.interval=0"]
+    words += ["--set=runner.num_steps_per_env=8", "--set=runner.save_interval=1", "--seed=3"]
+    words += words_of(**FEW, num_configurations=CONFIGURATIONS, num_steps=STEPS)
+    changes = {
+        "found": ["--set=actor.distribution_cfg.init_std=0.5"],
+        "made": words_of(file=other, critic_warmup_iterations=1),
+    }
+    runs = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gravity_pretraining, "STANDING_SECONDS", 0.1)  # not looked at here
+        for name, more in changes.items():
+            before = contents(file.parent)
+            status, output, error = run_here("train.py", *words, *more, f"--run_name={name}", root=root)
+            assert (status, error) == (0, ""), output + error
+            assert contents(file.parent) == before
+            runs.append((output, sorted(root.glob(f"logs/{TASK}/*_{name}/model_*.pt"))))
+    return other, *runs
+
+
+def load(files):
+    """The actors of checkpoints: their networks, and the logarithm of their standard deviations."""
+    actors = [torch.load(file, weights_only=True)["actor_state_dict"] for file in files]
+    return [({name: value for name, value in actor.items() if name != STD}, actor[STD]) for actor in actors]
+
+
+def same(network, other):
+    """Whether two networks are the same to the bit."""
+    assert network.keys() == other.keys() and len(network) == 8
+    return all(torch.equal(value, other[name]) for name, value in network.items())
+
+
+def test_a_policy_is_found_or_made(made, trained):
+    """Training starts from the file if there is one and else makes it, with the same result whatever its own seed."""
+    _, file, _, _ = made
+    other, (found, _), (made_here, _) = trained
+    assert (
+        f"Starting from the pre-trained policy '{file}'." in found and "making it" not in found and "Round" not in found
+    )
+    assert f"There is no pre-trained policy '{other}' yet; making it." in made_here
+    assert f"Starting from the pre-trained policy '{other}'." in made_here
+    networks = [read_pretrained(path)["actor_state_dict"] for path in (file, other)]
+    for network in networks:
+        network.pop(STD)
+    assert same(*networks)
+
+
+def test_making_leaves_the_training_as_it_is(trained):
+    """Random numbers of a training are the same whether it had to make its policy or found one."""
+    _, (_, found), (_, made_here) = trained
+    infos = [torch.load(files[0], weights_only=True)["infos"] for files in (found, made_here)]
+    assert torch.equal(*(info["random_states"][0]["cpu"] for info in infos))
+    assert [info["total_timesteps"] for info in infos] == [16 * 8] * 2
+
+
+def test_first_iterations_train_the_critic_alone(made, trained):
+    """The policy stays for 10 iterations, or as many as told; exploration starts as the training's settings say."""
+    network = read_pretrained(made[1])["actor_state_dict"]
+    network.pop(STD)
+    _, (_, found), (_, made_here) = trained
+    assert len(found) == len(made_here) == 2
+    for actor, log_std in load(found):
+        assert same(actor, network)
+        torch.testing.assert_close(log_std, torch.full((12,), -0.6931472))  # of 0.5
+    (first, log_std), (second, later_log_std) = load(made_here)
+    assert same(first, network) and not same(second, network)
+    assert (log_std == 0.0).all() and (later_log_std != 0.0).all()
+    critics = [torch.load(file, weights_only=True)["critic_state_dict"] for file in found]
+    assert all(not torch.equal(value, critics[1][name]) for name, value in critics[0].items())
+
+
+def test_a_resumed_training_has_its_policy(trained, tmp_path):
+    """It goes on with its own policy, with what is left of the critic's iterations, and looks for no other one."""
+    _, (_, found), _ = trained
+    words = ["--device=cpu", f"--task={TASK}", "--resume", f"--load_run={found[0].parent}", "--max_iterations=4"]
+    status, output, error = run_here("train.py", *words, *words_of(critic_warmup_iterations=3), root=tmp_path)
+    assert (status, error) == (0, "") and "pre-trained" not in output
+    assert not (tmp_path / "logs" / "pretrained").exists()
+    files = sorted(tmp_path.glob(f"logs/{TASK}/*/model_*.pt"))
+    assert [file.name for file in files] == ["model_3.pt", "model_4.pt"]
+    (before, _), (third, _), (fourth, _) = load([found[1], *files])
+    assert same(before, third) and not same(third, fourth)
+
+
+def test_what_does_not_fit_is_refused(made):
+    """The first setting that differs is named, with both values; nothing is trained."""
+    root, file, _, _ = made
+    words, before = [*SMALL, f"--task={TASK}", "--max_iterations=1"], contents(root)
+    for setting, told in {
+        "control.torque_scale=5": "its control.torque_scale is 4.0, here it is 5.0",
+        "env.history_length=2": "its env.history_length is 1, here it is 2",
+        "normalization.obs_scales.dof_vel=0.1": "its normalization.obs_scales.dof_vel is 0.05, here it is 0.1",
+        "actor.hidden_dims=[64]": "its actor.hidden_dims is [512, 256, 128], here it is [64]",
+        "actor.activation=relu": "its actor.activation is 'elu', here it is 'relu'",
+        "obs_groups.actor=[critic]": "its obs_groups.actor is ['policy'], here it is ['critic']",
+    }.items():
+        result = run_here("train.py", *words, f"--set={setting}", root=root)
+        assert_told_in_one_line(result, told)
+        assert str(file) in result[2]
+    assert contents(root) == before
+    check_spaces(file, *get_cfgs(task="a1_torque"))  # another task with the same spaces may use it
+
+
+@pytest.mark.parametrize("content", ["text", "half", "other", "missing"])
+def test_broken_file(made, content, tmp_path):
+    """A file that is no pre-trained policy is told in one line."""
+    file = tmp_path / "policy.pt"
+    if content == "other":
+        torch.save({"weights": torch.zeros(3)}, file)
+    elif content != "missing":
+        whole = made[1].read_bytes()
+        file.write_bytes(b"nothing" if content == "text" else whole[: len(whole) // 2])
+    expected = "a pre-trained policy" if content == "other" else "a readable pre-trained policy: "
+    assert f"'{file}' is not {expected}" in error_of(read_pretrained, file)
+
+
+def test_a_task_without_pretraining(tmp_path):
+    """There is nothing to make for it, and nothing is left behind."""
+    result = run_here("pretrain_gravity.py", "--device=cpu", "--task=a1_torque", root=tmp_path)
+    assert_told_in_one_line(result, "task 'a1_torque' has no pre-training")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("num_configurations=0", "pretraining.num_configurations must be at least 1, not 0"),
+        ("num_steps=0", "pretraining.num_steps must be at least 1, not 0"),
+        ("num_rounds=0", "pretraining.num_rounds must be at least 1, not 0"),
+        ("num_epochs=-1", "pretraining.num_epochs must be at least 1, not -1"),
+        ("batch_size=0", "pretraining.batch_size must be at least 1, not 0"),
+        ("learning_rate=0", "pretraining.learning_rate must be greater than 0, not 0"),
+        ("max_mean_torque=0", "pretraining.max_mean_torque must be greater than 0, not 0"),
+        ("max_residual=-1", "pretraining.max_residual must be greater than 0, not -1"),
+        ("num_configurations=3", "pretraining.num_rounds is 4, more than there are configurations"),
+        ("held_out=0", "pretraining.held_out must be between 0 and 1, not 0"),
+        ("held_out=1", "pretraining.held_out must be between 0 and 1, not 1"),
+        ("critic_warmup_iterations=-1", "pretraining.critic_warmup_iterations must be at least 0, not -1"),
+        ("controller.nonsense=1", "unknown config key 'pretraining.controller.nonsense'"),
+    ],
+)
+def test_settings_that_make_no_sense(setting, told, tmp_path):
+    """They are refused by their names before anything is made."""
+    assert_told_in_one_line(
+        run_here("pretrain_gravity.py", *SMALL, f"--set=pretraining.{setting}", root=tmp_path), told
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_critic_warmup():
+    """While only the critic learns, it learns as ever; policy and learning rate stay. Then they move."""
+    warm, usual = (make_ppo(schedule="adaptive", desired_kl=1e-3) for _ in range(2))
+    before = state_of(warm)
+    warm.learn_actor(False)
+    usual.schedule = "fixed"
+    for alg in (warm, usual):
+        record_rollout(alg)
+        shift_policy(alg, 0.2)  # as if it had moved far: this would change the learning rate
+        torch.manual_seed(5)
+        alg.update()
+    shift_policy(warm, -0.2)
+    learned, other = state_of(warm), state_of(usual)
+    for key, value in before.items():
+        if key.startswith("critic"):
+            assert not torch.equal(learned[key], value)
+            torch.testing.assert_close(learned[key], other[key])
+        else:
+            torch.testing.assert_close(learned[key], value)
+    warm.learn_actor(True)
+    record_rollout(warm)
+    shift_policy(warm, 0.2)
+    shifted = state_of(warm)
+    warm.update()
+    after = state_of(warm)
+    assert all(not torch.equal(after[key], shifted[key]) for key in before) and after["lr"] < shifted["lr"]
