@@ -28,8 +28,7 @@ def measured(tmp_path_factory):
     root = tmp_path_factory.mktemp("root")
     words = [*SMALL, "--num_envs", "2", "4", "--endurance=4", f"--json={root / 'new' / 'numbers.json'}"]
     status, output, error = run_here("benchmark.py", *words, root=root)
-    assert status == 0
-    assert all(line.startswith(("compiling", "compiled")) for line in error.splitlines())  # on a cold cache
+    assert (status, error) == (0, "")
     assert [path.name for path in root.iterdir()] == ["new"]  # it leaves no run behind
     return output, json.loads((root / "new" / "numbers.json").read_text())
 
