@@ -5,7 +5,7 @@ from pathlib import Path
 
 from legged_torque.utils.args import Parser, run_script
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.plotting import load_pyplot
+from legged_torque.utils.plotting import load_pyplot, save_figure
 
 PANELS = {
     "track_percentage": "tracking (1 is perfect)",
@@ -47,8 +47,7 @@ def main() -> None:
         axis.set(title=title, xlabel="environment steps [millions]", xlim=(0, None), ylim=(0, None))
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize="small")
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(args.out, dpi=130)
+    save_figure(figure, args.out)
 
 
 def read(file: Path) -> dict:

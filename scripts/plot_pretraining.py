@@ -6,7 +6,7 @@ from typing import Any
 
 from legged_torque.utils.args import Parser, run_script
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.plotting import load_pyplot
+from legged_torque.utils.plotting import load_pyplot, save_figure
 
 BLUE, ORANGE = "#0072B2", "#D55E00"  # told apart by colour-blind eyes
 PARTS = {"histograms", "settings", "rms_error", "standing"}
@@ -31,8 +31,7 @@ def main() -> None:
     bars = axes[3].bar(names, [100 * report["standing"][name] for name in names], color=[ORANGE, BLUE], width=0.6)
     axes[3].bar_label(bars, fmt="%.1f %%")
     axes[3].set(title="standing after 5 s", ylabel="worlds [%]", ylim=(0, 110))
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(args.out, dpi=130)
+    save_figure(figure, args.out)
 
 
 def draw_histogram(axis: Any, histogram: dict[str, list[float]], limit: float) -> None:

@@ -18,8 +18,7 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.domain_rand import TRUNK
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.utils.args import Parser, add_build_args, run_script
-from legged_torque.utils.errors import UserError
-from legged_torque.utils.plotting import load_pyplot
+from legged_torque.utils.plotting import load_pyplot, save_figure
 from legged_torque.utils.task_registry import set_seed
 
 GROUPS = ("initial state", "robot", "ground", "controller", "events", "sensors")
@@ -213,11 +212,7 @@ def draw(panels: list[Panel], file: Path) -> None:
     handles = [pyplot.Rectangle((0, 0), 1, 1, color=color) for color in COLORS.values()]
     handles += [pyplot.Line2D([], [], color="black"), pyplot.Line2D([], [], color=OWN, linestyle="--")]
     figure.legend(handles, [*GROUPS, "should be", "without draws"], loc="outside upper center", ncols=8, frameon=False)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(file, dpi=130)
-    except (OSError, ValueError) as error:  # ValueError: of an unknown format
-        raise UserError(f"cannot write '{file}': {error}") from None
+    save_figure(figure, file)
 
 
 def draw_panel(axis, panel: Panel) -> None:

@@ -131,3 +131,10 @@ def test_without_matplotlib(made, tmp_path, monkeypatch):
 def test_out_is_needed(made, tmp_path):
     """A picture without a name is a mistake."""
     assert_told_in_one_line(run_here("plot_pretraining.py", str(made[2]), root=tmp_path), "--out")
+
+
+def test_unknown_format(made, tmp_path):
+    """A picture of a format that nobody knows is refused in one line."""
+    pytest.importorskip("matplotlib", reason="needs the extra: pip install -e .[plots]")
+    words = [str(made[2]), f"--out={tmp_path / 'picture.xyz'}"]
+    assert_told_in_one_line(run_here("plot_pretraining.py", *words, root=tmp_path), "cannot write")

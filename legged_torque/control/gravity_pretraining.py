@@ -124,6 +124,8 @@ def check_settings(settings: Any) -> None:
     Raises:
         UserError: Naming the first one.
     """
+    if not hasattr(settings, "num_configurations"):
+        raise UserError("these training settings have no gravity pre-training; inherit those of a1_torque_gravity")
     for name in ("num_configurations", "num_steps", "num_rounds", "num_epochs", "batch_size"):
         if getattr(settings, name) < 1:
             raise UserError(f"pretraining.{name} must be at least 1, not {getattr(settings, name)}")
@@ -226,11 +228,11 @@ def select(followed: list[Followed], settings: Any) -> Collection:
     everything = Followed(*(torch.cat([getattr(part, name) for part in followed], dim=1) for name in names))
     reasons = {
         "after a fall": ~everything.upright,
-        f"mean torque over {settings.max_mean_torque:g} N m": everything.mean_torques > settings.max_mean_torque,
-        f"wrench residual over {settings.max_residual:g}": everything.residuals > settings.max_residual,
+        f"mean torque over {settings.max_mean_torque:g} N m": ~(everything.mean_torques <= settings.max_mean_torque),
+        f"wrench residual over {settings.max_residual:g}": ~(everything.residuals <= settings.max_residual),
     }
     keep, dropped = torch.ones_like(everything.upright), {}
-    for reason, mask in reasons.items():
+    for reason, mask in reasons.items():  # comparisons are written so that NaN fails them
         dropped[reason] = int((keep & mask).sum())
         keep = keep & ~mask
     counts = [part.upright.shape[1] for part in followed]
