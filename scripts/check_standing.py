@@ -12,6 +12,7 @@ os.environ["MUJOCO_GL"] = "disable"  # nothing is drawn, and MuJoCo must not loo
 
 from torch import Tensor
 
+from legged_torque.control.dynamics import RobotDynamics
 from legged_torque.control.gravity_pretraining import act_by_controller, act_by_policy, make_controller
 from legged_torque.control.standing import StandingResult, measure_standing, place_on_ground, use_standing_trials
 from legged_torque.envs import task_registry
@@ -62,7 +63,7 @@ def trial(args: Any, env_cfg: Any, make_actor: Callable, decimation: int, second
     set_seed(args.seed)
     task, _ = task_registry.make_env(args.task, args, cfg)
     act = make_actor(task)
-    place_on_ground(task, make_controller(task).dynamics)
+    place_on_ground(task, RobotDynamics(task.sim.mj_model, task.num_envs, task.device, task.foot_names))
     return measure_standing(task, act, seconds)
 
 
