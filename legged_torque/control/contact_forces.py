@@ -17,7 +17,7 @@ from torch import Tensor
 from legged_torque.utils.errors import UserError
 
 ITERATIONS = 12
-"""Enough for single precision, in which forces were seen to be up to 3 N off; in double each more gains about a digit."""
+"""Enough for single precision, where forces were seen to be up to 3 N off; in double each more gains about a digit."""
 CENTERING = 0.1
 """Factor by which each iteration is to reduce the complementarity."""
 TO_BOUNDARY = 0.99
