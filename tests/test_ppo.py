@@ -219,6 +219,16 @@ def test_adaptive_learning_rate(shift, old_rate, new_rate):
         assert float(alg.optimizer.param_groups[0]["lr"]) == pytest.approx(new_rate, rel=1e-6)
 
 
+def test_highest_learning_rate():
+    """An adaptive rate rises to the highest one that is allowed, and a higher one falls to it."""
+    for old_rate, new_rate in ((1e-3, 1.5e-3), (1.4e-3, 2e-3), (5e-3, 2e-3)):
+        alg = make_ppo(num_mini_batches=1, schedule="adaptive", learning_rate=old_rate, max_learning_rate=2e-3)
+        record_rollout(alg)
+        shift_policy(alg, 0.02)
+        alg.update()
+        assert float(alg.learning_rate) == pytest.approx(new_rate, rel=1e-6)
+
+
 def test_learning_rate_adapts_on_after_loading():
     """A loaded algorithm changes its learning rate, and steps with it, just as the one that was saved."""
     saved, loaded = make_ppo(schedule="adaptive"), make_ppo(schedule="adaptive", seed=9)

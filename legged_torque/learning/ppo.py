@@ -15,8 +15,8 @@ from legged_torque.learning import distributed
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils.errors import UserError, unknown_name
 
-MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2
-"""Bounds of the adaptive learning rate, those of rsl_rl."""
+MIN_LEARNING_RATE = 1e-5
+"""Lower bound of the adaptive learning rate, that of rsl_rl."""
 
 LOSS_NAMES = ("value", "surrogate", "entropy", "kl", "gradient_norm", "critic_gradient_norm", "skipped_updates")
 """What an update reports: means over the minibatches that were learned from, and how many were not."""
@@ -41,6 +41,7 @@ class OnDevicePPO(PPO):
         storage: RolloutStorage,
         learning_rate: float = 1e-3,
         optimizer: str = "adam",
+        max_learning_rate: float = 1e-2,
         **kwargs,
     ) -> None:
         """Create the algorithm; arguments are those of rsl_rl's PPO.
@@ -51,6 +52,7 @@ class OnDevicePPO(PPO):
             storage: Where rollouts are kept.
             learning_rate: Learning rate, the first one if it adapts.
             optimizer: "adam" or "adamw", which torch can skip on the device.
+            max_learning_rate: Upper bound of an adaptive learning rate; rsl_rl's is 1e-2.
             kwargs: All other settings of rsl_rl's PPO.
 
         Raises:
@@ -73,6 +75,7 @@ class OnDevicePPO(PPO):
                 f"algorithm.num_mini_batches is {self.num_mini_batches}, more than the samples of a rollout "
                 f"({storage.num_envs} worlds x {storage.num_transitions_per_env} steps)"
             )
+        self._max_learning_rate = max_learning_rate
         self.learning_rate = torch.tensor(learning_rate, device=self.device)
         self.optimizer = type(self.optimizer)(
             chain(self.actor.parameters(), self.critic.parameters()),
@@ -211,7 +214,7 @@ class OnDevicePPO(PPO):
             higher = (kl < 0.5 * self.desired_kl) & (kl > 0.0)
             factor = torch.where(lower, 1.0 / 1.5, torch.where(higher, 1.5, 1.0))
             factor = torch.where(self._actor_learns.bool(), factor, 1.0)  # a policy that stays says nothing
-            self.learning_rate.mul_(factor).clamp_(MIN_LEARNING_RATE, MAX_LEARNING_RATE)
+            self.learning_rate.mul_(factor).clamp_(MIN_LEARNING_RATE, self._max_learning_rate)
 
     def _surrogate_loss(self, batch: RolloutStorage.Batch, log_prob: Tensor) -> Tensor:
         """Return PPO's clipped policy loss."""

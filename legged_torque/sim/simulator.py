@@ -166,6 +166,22 @@ class Simulator:
             device=self._wp_device,
         )
 
+    def push(self, mask: Tensor, velocity: Tensor, add: Tensor) -> None:
+        """Change velocities of trunks.
+
+        Args:
+            mask: In which worlds. Shape: (num_envs,), bool.
+            velocity: In the world frame [m/s]. Shape: (num_envs, 3).
+            add: Where it is added; elsewhere it replaces the trunk's own. Shape: (num_envs,), bool.
+        """
+        wp.launch(
+            _push,
+            dim=self.num_envs,
+            inputs=[wp.from_torch(mask), wp.from_torch(velocity), wp.from_torch(add)],
+            outputs=[self.data.qvel],
+            device=self._wp_device,
+        )
+
     def clear_diverged(self) -> None:
         """Forget which worlds have diverged."""
         self.diverged.zero_()
@@ -230,6 +246,20 @@ def _set_orientation(
         qpos[world, 3] = quat[3]
         for i in range(3):
             qpos[world, 4 + i] = quat[i]
+
+
+@wp.kernel(enable_backward=False)
+def _push(
+    mask: wp.array(dtype=wp.bool),
+    velocity: wp.array2d(dtype=wp.float32),
+    add: wp.array(dtype=wp.bool),
+    qvel: wp.array2d(dtype=wp.float32),
+):
+    """Set or add the trunk's linear velocity of one world."""
+    world = wp.tid()
+    if mask[world]:
+        for i in range(3):
+            qvel[world, i] = velocity[world, i] + wp.where(add[world], qvel[world, i], 0.0)
 
 
 @wp.kernel(enable_backward=False)

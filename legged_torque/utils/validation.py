@@ -33,7 +33,7 @@ def check_train_cfg(train_cfg: Any) -> None:
     if train_cfg.pretraining.critic_warmup_iterations < 0:
         iterations = train_cfg.pretraining.critic_warmup_iterations
         raise UserError(f"pretraining.critic_warmup_iterations must be at least 0, not {iterations}")
-    for key in ("learning_rate", "max_grad_norm", "clip_param"):
+    for key in ("learning_rate", "max_learning_rate", "max_grad_norm", "clip_param"):
         value = getattr(train_cfg.algorithm, key)
         if not value > 0.0:
             raise UserError(f"algorithm.{key} must be greater than 0, not {value}")

@@ -268,6 +268,7 @@ class LeggedRobotCfgPPO(BaseConfig):
         max_grad_norm = 1.0
         schedule = "adaptive"
         desired_kl = 0.01
+        max_learning_rate = 1e-2
         use_clipped_value_loss = True
 
         class symmetry_cfg:

@@ -31,10 +31,12 @@ class RandomEvents:
         self.episode_sums.masked_fill_(mask, 0.0)
         self.episode_return.masked_fill_(mask, 0.0)
         rand = self.cfg.domain_rand
-        new_commands, new_parameters, push, add = torch.rand(4, self.num_envs, device=self.device) < self._probabilities
-        self._resample_commands(mask | new_commands)
+        happens = torch.rand(4, self.num_envs, device=self.device) < self._probabilities
+        new_commands, new_parameters = happens[:2] | mask
+        self._resample_commands(new_commands)
         if rand.randomize_parameters:
-            self._randomize_parameters(mask | new_parameters)
+            self._randomize_parameters(new_parameters)
+        push, add = happens[2:]
         if rand.push_robots:
             self._push_robots(push, add)
         self._update_state()
@@ -70,10 +72,8 @@ class RandomEvents:
 
     def _push_robots(self, mask: Tensor, add: Tensor) -> None:
         """Push the worlds in ``mask``: in those of ``add`` a drawn velocity is added, elsewhere set."""
-        velocity = self.sim.qvel[:, :3]
-        drawn = self._uniform(velocity, self.cfg.domain_rand.push_velocity)
-        pushed = torch.where(add.unsqueeze(1), drawn + velocity, drawn)
-        torch.where(mask.unsqueeze(1), pushed, velocity, out=velocity)
+        velocity = self._uniform(self.base_lin_vel, self.cfg.domain_rand.push_velocity)
+        self.sim.push(mask, velocity, add)
 
     def _resample_commands(self, mask: Tensor) -> None:
         """Draw new commands for the worlds in ``mask``."""

@@ -36,8 +36,11 @@ class DerivedConstants:
         self._num_envs, self._device = num_envs, model.qpos0.device
         for name in ("body_invweight0", "dof_invweight0"):
             expand(model, name, num_envs)
-        self._lanes = lanes_per_world(len(tree.joints), self._device.is_cuda)
-        self._kernel = make_kernel(*tree.joints.shape, self._lanes)
+        branches, depth = tree.joints.shape
+        lanes = lanes_per_world(branches, self._device.is_cuda)
+        parts = depth + 1 if self._device.is_cuda else 1
+        self._threads = lanes * parts
+        self._kernel = make_kernel(branches, depth, lanes, parts)
         with wp.ScopedDevice(self._device):
             self._robot = make_robot(mj_model, model, tree)
             self._reference = wp.array(model.qpos0.numpy().repeat(num_envs, axis=0), dtype=wp.float32)
@@ -51,7 +54,7 @@ class DerivedConstants:
         """
         wp.launch(
             self._kernel,
-            dim=(self._num_envs, self._lanes),
+            dim=(self._num_envs, self._threads),
             inputs=[self._robot, mask, self._reference, self._rest],
             outputs=[self._robot.body_invweight0, self._robot.dof_invweight0],
             device=self._device,
@@ -72,11 +75,20 @@ def forward_solve(lower: mat66, b: vec6) -> vec6:
 
 
 @functools.cache
-def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
-    """Return the kernel for a robot's structure; for the arguments see :func:`~.step.make_kernel`.
+def make_kernel(branches: int, depth: int, lanes: int, parts: int) -> wp.Kernel:
+    """Return the kernel for a robot's structure.
+
+    A step rarely changes more than a few worlds, so that the time of one counts, not their number: on a GPU each world
+    has a group of threads per depth and one for the trunk, which all factorize its equations and then divide the rows.
 
     With the inertia matrix as an arrow, J M^-1 J^T of a body on a branch is that of the branch alone, with its trunk
     held, plus what the trunk's motion adds, seen through the branch: u^T S^-1 u, S being the trunk's six equations.
+
+    Args:
+        branches: Number of branches.
+        depth: Joints per branch.
+        lanes: Threads per group, a power of two; 1 on a CPU.
+        parts: Groups per world: depth + 1, or 1, which does everything.
     """
     per_lane = -(-branches // lanes)
     dynamics, algebra = branch_dynamics(depth), linear_algebra(depth)
@@ -157,30 +169,33 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
 
     @wp.func
     def branch_constants(
-        robot: Robot, world: int, branch: int, leg: Leg, rot: wp.mat33, trunk_factor: mat66,
+        robot: Robot, world: int, branch: int, part: int, leg: Leg, rot: wp.mat33, trunk_factor: mat66,
         positions: wp.array(dtype=wp.vec3), rotations: wp.array(dtype=wp.mat33),
         body_invweight0: wp.array2d(dtype=wp.vec2), dof_invweight0: wp.array2d(dtype=float),
     ):  # fmt: skip
-        """Write the inverse weights of a branch's joints and bodies."""
+        """Write the inverse weights of a branch's joints and bodies, or of those at the depth of this part."""
         for j in range(wp.static(depth)):
-            joint = robot.branch_joint[branch, j]
-            unit = vector()
-            unit[j] = 1.0
-            dof_invweight0[world, joint + 5] = inverse_weight(
-                leg.branch, leg.factor, trunk_factor, wp.vec3(0.0), wp.vec3(0.0), unit
-            )
-            ipos = robot.body_ipos[row(world, robot.body_ipos.shape[0]), joint + 1]
-            com = positions[j + 1] + rotations[j + 1] * ipos
-            body_invweight0[world, joint + 1] = body_inverse_weights(
-                leg.branch, leg.factor, trunk_factor, rot, com, j + 1
-            )
+            if wp.static(parts == 1) or part == j:
+                joint = robot.branch_joint[branch, j]
+                unit = vector()
+                unit[j] = 1.0
+                dof_invweight0[world, joint + 5] = inverse_weight(
+                    leg.branch, leg.factor, trunk_factor, wp.vec3(0.0), wp.vec3(0.0), unit
+                )
+                ipos = robot.body_ipos[row(world, robot.body_ipos.shape[0]), joint + 1]
+                com = positions[j + 1] + rotations[j + 1] * ipos
+                body_invweight0[world, joint + 1] = body_inverse_weights(
+                    leg.branch, leg.factor, trunk_factor, rot, com, j + 1
+                )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def derive_constants(
         robot: Robot, mask: wp.array(dtype=wp.bool), qpos: wp.array2d(dtype=float), rest: wp.array2d(dtype=float),
         body_invweight0: wp.array2d(dtype=wp.vec2), dof_invweight0: wp.array2d(dtype=float),
     ):  # fmt: skip
-        world, lane = wp.tid()
+        world, thread = wp.tid()
+        lane = thread % wp.static(lanes)
+        part = thread // wp.static(lanes)
         if mask[world]:
             positions = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
             rotations = wp.zeros(shape=wp.static(depth + 1), dtype=wp.mat33)
@@ -196,7 +211,7 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
                     total = add_bodies(total, leg.branch.total)
             whole = whole_body(trunk, total, wp.static(lanes))
             trunk_factor = wp.static(linear_algebra(6).cholesky)(trunk_matrix(whole, system, wp.static(lanes)))
-            if lane == 0:
+            if thread == wp.static((parts - 1) * lanes):
                 trunk_constants(robot, world, trunk.rot, trunk_factor, body_invweight0, dof_invweight0)
             for i in range(wp.static(per_lane)):
                 branch = lane + i * wp.static(lanes)
@@ -204,8 +219,8 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
                     if wp.static(per_lane > 1):  # a CPU's thread has several branches, of which it kept the last one
                         leg = leg_at_rest(robot, world, branch, trunk, qpos, rest, positions, rotations)
                     branch_constants(
-                        robot, world, branch, leg, trunk.rot, trunk_factor, positions, rotations, body_invweight0,
-                        dof_invweight0,
+                        robot, world, branch, part, leg, trunk.rot, trunk_factor, positions, rotations,
+                        body_invweight0, dof_invweight0,
                     )  # fmt: skip
 
     return derive_constants
