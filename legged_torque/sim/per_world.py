@@ -1,7 +1,6 @@
 """Giving every world a row of its own in a field of MuJoCo Warp's model."""
 
 import mujoco_warp as mjw
-import numpy as np
 import warp as wp
 
 
@@ -13,8 +12,6 @@ def owner(model: mjw.Model, name: str) -> mjw.Model | mjw.Option:
 def expand(model: mjw.Model, name: str, num_envs: int) -> None:
     """Replace a field that all worlds share by one with a row per world, all alike at first.
 
-    Numbers of neighbouring worlds lie side by side in memory, since neighbouring threads read them at the same time.
-
     Args:
         model: Model on the device; a field that has been expanded before stays as it is.
         name: Name of the field.
@@ -22,6 +19,5 @@ def expand(model: mjw.Model, name: str, num_envs: int) -> None:
     """
     field = getattr(owner(model, name), name)
     if field.shape[0] != num_envs:
-        columns = np.repeat(np.moveaxis(field.numpy(), 0, field.ndim - 1), num_envs, axis=field.ndim - 1)
-        array = wp.array(columns, dtype=field.dtype, device=field.device)
-        setattr(owner(model, name), name, array.transpose())
+        rows = field.numpy().repeat(num_envs, axis=0)
+        setattr(owner(model, name), name, wp.array(rows, dtype=field.dtype, device=field.device))

@@ -6,15 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
 Range = tuple[float, float]
 """Lowest and highest value."""
-LANES = wp.constant(16)
-"""Threads per world: most worlds draw nothing, and more threads would only look at the mask."""
 
 
 @dataclass
@@ -23,8 +20,8 @@ class Parameter:
 
     Attributes:
         name: Key of its ranges in the settings.
-        field: Where the numbers are kept. Shape: (num_envs, ...), in any order in memory.
-        columns: Which numbers of a world, counted as in its flattened entry.
+        field: Where the numbers are kept, one row per world. Shape: (num_envs, any).
+        columns: Which numbers of a row.
         base: What is added to, per column; None is the value at the start.
         weight: Factor on the offset, per column or for all.
         offset: Range of the offset.
@@ -83,7 +80,7 @@ class Randomization:
                 num_draws += 2 * count
             for i, (column, row) in enumerate(zip(parameter.columns, table(parameter, keep_probability), strict=True)):
                 rows.append(row)
-                addresses.append(address(parameter.field, column))
+                addresses.append(parameter.field.data_ptr() + column * parameter.field.element_size())
                 strides.append(parameter.field.stride(0) * parameter.field.element_size())
                 draws.append(start + (0 if parameter.shared else 2 * i))
                 places.append(len(at_start) if is_new and i < count else -1)
@@ -107,7 +104,7 @@ class Randomization:
         self._uniform.uniform_()
         wp.launch(
             _draw,
-            dim=(self._num_envs, LANES),
+            dim=(self._num_envs, len(self._rows)),
             inputs=[
                 wp.from_torch(mask),
                 wp.from_torch(self._uniform),
@@ -151,11 +148,9 @@ def _draw(
     places: wp.array(dtype=wp.int32),
     values: wp.array2d(dtype=wp.float32),
 ):
-    """Write the numbers of one world; each thread takes every :data:`LANES`-th."""
-    world, lane = wp.tid()
-    if not mask[world]:
-        return
-    for column in range(lane, rows.shape[0], LANES):
+    """Write one number of one world."""
+    world, column = wp.tid()
+    if mask[world]:
         row = rows[column]
         first = draws[column]
         offset = row.offset_low + row.offset_span * uniform[world, first]
@@ -171,7 +166,7 @@ def _draw(
 
 def table(parameter: Parameter, keep_probability: float) -> list[_Row]:
     """Return how each column of a parameter is drawn."""
-    defaults = parameter.field[0].flatten()[list(parameter.columns)].tolist()
+    defaults = parameter.field[0, list(parameter.columns)].tolist()
     bases = defaults if parameter.base is None else per_column(parameter.base, len(defaults))
     weights = per_column(parameter.weight, len(defaults))
     lowest, highest = parameter.limits or ([-math.inf] * len(defaults), [math.inf] * len(defaults))
@@ -189,13 +184,6 @@ def table(parameter: Parameter, keep_probability: float) -> list[_Row]:
         row.per_half_range = 1.0 / half_range if half_range > 0.0 else 0.0
         rows.append(row)
     return rows
-
-
-def address(field: Tensor, column: int) -> int:
-    """Return where the first world keeps a number of its flattened entry."""
-    places = np.unravel_index(column, field.shape[1:])
-    offset = sum(int(place) * stride for place, stride in zip(places, field.stride()[1:], strict=True))
-    return field.data_ptr() + offset * field.element_size()
 
 
 def per_column(value: Sequence[float] | float, count: int) -> list[float]:

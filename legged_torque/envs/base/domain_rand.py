@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from torch import Tensor
+
 from legged_torque.sim.randomization import Parameter
 
 if TYPE_CHECKING:
@@ -71,7 +73,7 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
     inertia_per_mass = list(model.body_inertia[TRUNK] / model.body_mass[TRUNK])
 
     def drawn(name: str, field: str, columns: Any, **settings: Any) -> Parameter:
-        return Parameter(name, task.sim.field(field), list(columns), **settings)
+        return Parameter(name, view(task, field), list(columns), **settings)
 
     def of_joints(name: str, field: str, columns: Any) -> Parameter:
         return drawn(name, field, columns, may_keep=True, **absolute(cfg, name))
@@ -99,18 +101,18 @@ def ground_parameters(task: LeggedRobot) -> list[Parameter]:
     kinds = list((model.geom_friction[geoms] / model.geom_friction[geoms, :1]).ravel())
     return [
         Parameter(
-            "ground_friction", task.sim.field("geom_friction"), entries(3, geoms), shared=True,
+            "ground_friction", view(task, "geom_friction"), entries(3, geoms), shared=True,
             **absolute(cfg, "ground_friction", kinds),
         ),
         Parameter(
-            "contact_stiffness", task.sim.field("geom_solref"), [2 * geom for geom in geoms], shared=True,
+            "contact_stiffness", view(task, "geom_solref"), [2 * geom for geom in geoms], shared=True,
             **absolute(cfg, "contact_stiffness", -1.0),
         ),
         Parameter(
-            "contact_damping", task.sim.field("geom_solref"), [2 * geom + 1 for geom in geoms], shared=True,
+            "contact_damping", view(task, "geom_solref"), [2 * geom + 1 for geom in geoms], shared=True,
             same_draw_as="contact_stiffness", **absolute(cfg, "contact_damping", -1.0),
         ),
-        Parameter("gravity", task.sim.field("gravity"), [2], **absolute(cfg, "gravity", -1.0)),
+        Parameter("gravity", view(task, "gravity"), [2], **absolute(cfg, "gravity", -1.0)),
     ]  # fmt: skip
 
 
@@ -136,6 +138,11 @@ def control_parameters(task: LeggedRobot) -> list[Parameter]:
             **offset(cfg, "damping_offset") | scale(cfg, "damping_scale"),
         ),
     ]  # fmt: skip
+
+
+def view(task: LeggedRobot, field: str) -> Tensor:
+    """Return a field of the model as one row of numbers per world."""
+    return task.sim.field(field).flatten(1)
 
 
 def entries(width: int, rows: list[int]) -> list[int]:

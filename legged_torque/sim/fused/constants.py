@@ -13,6 +13,9 @@ from legged_torque.sim.fused.robot import Robot, lanes_per_world, make_robot, re
 from legged_torque.sim.fused.trunk import TrunkSystem, mat66, trunk_matrix, whole_body
 from legged_torque.sim.per_world import expand
 
+ROWS = 9
+"""Rows of Jacobians per body: translations, rotations, and three times its joint's own."""
+
 
 class DerivedConstants:
     """Keeps ``body_invweight0`` and ``dof_invweight0`` of every world in step with its other parameters.
@@ -38,9 +41,8 @@ class DerivedConstants:
             expand(model, name, num_envs)
         branches, depth = tree.joints.shape
         lanes = lanes_per_world(branches, self._device.is_cuda)
-        parts = depth + 1 if self._device.is_cuda else 1
-        self._threads = lanes * parts
-        self._kernel = make_kernel(branches, depth, lanes, parts)
+        self._threads = lanes * (depth + 1)
+        self._kernel = make_kernel(branches, depth, lanes)
         with wp.ScopedDevice(self._device):
             self._robot = make_robot(mj_model, model, tree)
             self._reference = wp.array(model.qpos0.numpy().repeat(num_envs, axis=0), dtype=wp.float32)
@@ -55,7 +57,7 @@ class DerivedConstants:
         wp.launch(
             self._kernel,
             dim=(self._num_envs, self._threads),
-            inputs=[self._robot, mask, self._reference, self._rest],
+            inputs=[self._robot, mask, self._reference, self._rest, ROWS],
             outputs=[self._robot.body_invweight0, self._robot.dof_invweight0],
             device=self._device,
         )
@@ -75,25 +77,24 @@ def forward_solve(lower: mat66, b: vec6) -> vec6:
 
 
 @functools.cache
-def make_kernel(branches: int, depth: int, lanes: int, parts: int) -> wp.Kernel:
+def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
     """Return the kernel for a robot's structure.
-
-    A step rarely changes more than a few worlds, so that the time of one counts, not their number: on a GPU each world
-    has a group of threads per depth and one for the trunk, which all factorize its equations and then divide the rows.
 
     With the inertia matrix as an arrow, J M^-1 J^T of a body on a branch is that of the branch alone, with its trunk
     held, plus what the trunk's motion adds, seen through the branch: u^T S^-1 u, S being the trunk's six equations.
+
+    A step rarely changes more than a few worlds, so that it is one world's time that counts: a world has a group of
+    threads per depth, the trunk's included, which all factorize its equations and then take the rows of their bodies.
+    All of them run the same loop, which is short, since code that runs once must first be fetched.
 
     Args:
         branches: Number of branches.
         depth: Joints per branch.
         lanes: Threads per group, a power of two; 1 on a CPU.
-        parts: Groups per world: depth + 1, or 1, which does everything.
     """
     per_lane = -(-branches // lanes)
     dynamics, algebra = branch_dynamics(depth), linear_algebra(depth)
-    vector, matrix, column = dynamics.vector, dynamics.matrix, dynamics.column
-    Branch, make_branch = dynamics.Branch, dynamics.make_branch
+    vector, column, make_branch = dynamics.vector, dynamics.column, dynamics.make_branch
     cholesky_solve = algebra.cholesky_solve
     Leg, assemble_damping, eliminate = (
         branch_newton(depth).Leg, branch_newton(depth).assemble_damping, branch_newton(depth).eliminate,
@@ -113,114 +114,82 @@ def make_kernel(branches: int, depth: int, lanes: int, parts: int) -> wp.Kernel:
         return assemble_damping(leg, 0.0)
 
     @wp.func
-    def inverse_weight(
-        branch: Branch, factor: matrix, trunk_factor: mat66, jac_lin: wp.vec3, jac_ang: wp.vec3, jac: vector
-    ) -> float:
-        """Return j M^-1 j^T of one row j = (trunk's translation, trunk's rotation, branch)."""
-        solved = cholesky_solve(factor, jac)
-        lin = jac_lin - branch.mass_lin * solved
-        ang = jac_ang - branch.mass_ang * solved
-        u = forward_solve(trunk_factor, vec6(lin[0], lin[1], lin[2], ang[0], ang[1], ang[2]))
-        return wp.dot(jac, solved) + wp.dot(u, u)
+    def inverse_weights(
+        leg: Leg, trunk_factor: mat66, rot: wp.mat33, com: wp.vec3, body_depth: int, rows: int
+    ) -> wp.vec3:
+        """Return mean inverse weights: of a body's translation at its centre of mass, its rotation, and its own joint.
 
-    @wp.func
-    def body_inverse_weights(
-        branch: Branch, factor: matrix, trunk_factor: mat66, rot: wp.mat33, com: wp.vec3, body_depth: int
-    ) -> wp.vec2:
-        """Return the mean inverse weights of a body's centre of mass against translation, and of its rotation."""
+        A row j of a Jacobian is (trunk's translation in world axes, its rotation in its own axes, branch); its weight
+        is j M^-1 j^T. The trunk (depth 0) has its own translations in the joint's place.
+        """
         lever = -wp.skew(com) * rot
-        translation = float(0.0)
-        rotation = float(0.0)
-        for r in range(3):
-            jac = vector()
-            turn = vector()
-            for j in range(wp.static(depth)):
-                if j < body_depth:
-                    motion = column(branch.lever, j) + wp.cross(column(branch.axis, j), com)
-                    jac[j] = motion[r]
-                    turn[j] = branch.axis[r, j]
+        weights = wp.vec3()
+        for k in range(rows):
+            kind = k // 3
             unit = wp.vec3()
-            unit[r] = 1.0
-            row_ang = wp.vec3(lever[r, 0], lever[r, 1], lever[r, 2])
-            row_rot = wp.vec3(rot[r, 0], rot[r, 1], rot[r, 2])
-            translation += inverse_weight(branch, factor, trunk_factor, unit, row_ang, jac) / 3.0
-            rotation += inverse_weight(branch, factor, trunk_factor, wp.vec3(0.0), row_rot, turn) / 3.0
-        return wp.vec2(translation, rotation)
-
-    @wp.func
-    def trunk_constants(
-        robot: Robot, world: int, rot: wp.mat33, trunk_factor: mat66, body_invweight0: wp.array2d(dtype=wp.vec2),
-        dof_invweight0: wp.array2d(dtype=float),
-    ):  # fmt: skip
-        """Write the inverse weights of the trunk: means over its translations and over its rotations."""
-        mean_lin = float(0.0)
-        mean_ang = float(0.0)
-        for r in range(6):
-            unit = vec6()
-            unit[r] = 1.0
-            u = forward_solve(trunk_factor, unit)
-            mean_lin += wp.where(r < 3, wp.dot(u, u) / 3.0, 0.0)
-            mean_ang += wp.where(r < 3, 0.0, wp.dot(u, u) / 3.0)
-        for r in range(3):
-            dof_invweight0[world, r] = mean_lin
-            dof_invweight0[world, r + 3] = mean_ang
-        com = rot * robot.body_ipos[row(world, robot.body_ipos.shape[0]), 1]
-        body_invweight0[world, 1] = body_inverse_weights(Branch(), matrix(), trunk_factor, rot, com, 0)
-
-    @wp.func
-    def branch_constants(
-        robot: Robot, world: int, branch: int, part: int, leg: Leg, rot: wp.mat33, trunk_factor: mat66,
-        positions: wp.array(dtype=wp.vec3), rotations: wp.array(dtype=wp.mat33),
-        body_invweight0: wp.array2d(dtype=wp.vec2), dof_invweight0: wp.array2d(dtype=float),
-    ):  # fmt: skip
-        """Write the inverse weights of a branch's joints and bodies, or of those at the depth of this part."""
-        for j in range(wp.static(depth)):
-            if wp.static(parts == 1) or part == j:
-                joint = robot.branch_joint[branch, j]
-                unit = vector()
-                unit[j] = 1.0
-                dof_invweight0[world, joint + 5] = inverse_weight(
-                    leg.branch, leg.factor, trunk_factor, wp.vec3(0.0), wp.vec3(0.0), unit
-                )
-                ipos = robot.body_ipos[row(world, robot.body_ipos.shape[0]), joint + 1]
-                com = positions[j + 1] + rotations[j + 1] * ipos
-                body_invweight0[world, joint + 1] = body_inverse_weights(
-                    leg.branch, leg.factor, trunk_factor, rot, com, j + 1
-                )
+            unit[k - 3 * kind] = 1.0
+            jac_lin = wp.where(kind == 0 or (kind == 2 and body_depth == 0), unit, wp.vec3(0.0))
+            jac_ang = wp.vec3(0.0)
+            jac = vector()
+            if kind == 0:
+                jac_ang = wp.transpose(lever) * unit
+            if kind == 1:
+                jac_ang = wp.transpose(rot) * unit
+            for j in range(wp.static(depth)):
+                axis = column(leg.branch.axis, j)
+                if kind == 2:
+                    jac[j] = wp.where(j == body_depth - 1, 1.0, 0.0)
+                elif j < body_depth:
+                    motion = column(leg.branch.lever, j) + wp.cross(axis, com)
+                    jac[j] = wp.dot(wp.where(kind == 0, motion, axis), unit)
+            solved = cholesky_solve(leg.factor, jac)
+            lin = jac_lin - leg.branch.mass_lin * solved
+            ang = jac_ang - leg.branch.mass_ang * solved
+            u = forward_solve(trunk_factor, vec6(lin[0], lin[1], lin[2], ang[0], ang[1], ang[2]))
+            weights[kind] = weights[kind] + (wp.dot(jac, solved) + wp.dot(u, u)) / 3.0
+        return weights
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def derive_constants(
         robot: Robot, mask: wp.array(dtype=wp.bool), qpos: wp.array2d(dtype=float), rest: wp.array2d(dtype=float),
-        body_invweight0: wp.array2d(dtype=wp.vec2), dof_invweight0: wp.array2d(dtype=float),
+        rows: int, body_invweight0: wp.array2d(dtype=wp.vec2), dof_invweight0: wp.array2d(dtype=float),
     ):  # fmt: skip
         world, thread = wp.tid()
-        lane = thread % wp.static(lanes)
-        part = thread // wp.static(lanes)
-        if mask[world]:
-            positions = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
-            rotations = wp.zeros(shape=wp.static(depth + 1), dtype=wp.mat33)
-            trunk = make_trunk(robot, world, qpos, rest)
-            total = Body()
-            system = TrunkSystem()
-            leg = Leg()
-            for i in range(wp.static(per_lane)):
-                branch = lane + i * wp.static(lanes)
-                if branch < wp.static(branches):
+        if not mask[world]:
+            return
+        body_depth = thread // wp.static(lanes)
+        lane = thread - body_depth * wp.static(lanes)
+        positions = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
+        rotations = wp.zeros(shape=wp.static(depth + 1), dtype=wp.mat33)
+        trunk = make_trunk(robot, world, qpos, rest)
+        total = Body()
+        system = TrunkSystem()
+        leg = Leg()
+        for i in range(wp.static(per_lane)):
+            branch = lane + i * wp.static(lanes)
+            if branch < wp.static(branches):
+                leg = leg_at_rest(robot, world, branch, trunk, qpos, rest, positions, rotations)
+                system = eliminate(leg, system, TrunkSystem())
+                total = add_bodies(total, leg.branch.total)
+        whole = whole_body(trunk, total, wp.static(lanes))
+        trunk_factor = wp.static(linear_algebra(6).cholesky)(trunk_matrix(whole, system, wp.static(lanes)))
+        for i in range(wp.static(per_lane)):
+            branch = lane + i * wp.static(lanes)
+            if branch < wp.static(branches):
+                if wp.static(per_lane > 1):  # a CPU's thread has several branches, of which it kept the last one
                     leg = leg_at_rest(robot, world, branch, trunk, qpos, rest, positions, rotations)
-                    system = eliminate(leg, system, TrunkSystem())
-                    total = add_bodies(total, leg.branch.total)
-            whole = whole_body(trunk, total, wp.static(lanes))
-            trunk_factor = wp.static(linear_algebra(6).cholesky)(trunk_matrix(whole, system, wp.static(lanes)))
-            if thread == wp.static((parts - 1) * lanes):
-                trunk_constants(robot, world, trunk.rot, trunk_factor, body_invweight0, dof_invweight0)
-            for i in range(wp.static(per_lane)):
-                branch = lane + i * wp.static(lanes)
-                if branch < wp.static(branches):
-                    if wp.static(per_lane > 1):  # a CPU's thread has several branches, of which it kept the last one
-                        leg = leg_at_rest(robot, world, branch, trunk, qpos, rest, positions, rotations)
-                    branch_constants(
-                        robot, world, branch, part, leg, trunk.rot, trunk_factor, positions, rotations,
-                        body_invweight0, dof_invweight0,
-                    )  # fmt: skip
+                body = int(1)
+                if body_depth > 0:
+                    body = robot.branch_joint[branch, body_depth - 1] + 1
+                ipos = robot.body_ipos[row(world, robot.body_ipos.shape[0]), body]
+                com = positions[body_depth] + rotations[body_depth] * ipos
+                weights = inverse_weights(leg, trunk_factor, trunk.rot, com, body_depth, rows)
+                body_invweight0[world, body] = wp.vec2(weights[0], weights[1])
+                if body_depth > 0:
+                    dof_invweight0[world, body + 4] = weights[2]
+                else:
+                    for r in range(3):
+                        dof_invweight0[world, r] = weights[2]
+                        dof_invweight0[world, r + 3] = weights[1]  # the mean is the same about any three axes
 
     return derive_constants
