@@ -25,3 +25,6 @@ class A1TorqueCfgPPO(A1CfgPPO):
 
     class runner(A1CfgPPO.runner):
         experiment_name = "a1_torque"
+
+    class algorithm(A1CfgPPO.algorithm):
+        max_learning_rate = 2e-3  # as long as nothing is rewarded, it rises until the critic diverges
