@@ -173,41 +173,6 @@ def contact_stiffness(contact: Contact, normal: wp.vec3, x: vec4) -> wp.mat33:
     return result
 
 
-@wp.struct
-class Point:
-    """A point that can touch the floor: the centre of a sphere, an end of a capsule or a corner of a box."""
-
-    geom: wp.int32
-    depth: wp.int32  # of its body; 0 is the trunk
-    centre: wp.vec3  # from the trunk's origin, in world axes [m]
-    arm: wp.vec3  # from the geom's centre, likewise
-    axis: wp.vec3  # third axis of the geom
-    radius: wp.float32  # how thick the geom is around it [m]
-
-
-@wp.func
-def place_point(
-    robot: Robot, world: int, branch: int, index: int, positions: wp.array(dtype=wp.vec3),
-    rotations: wp.array(dtype=wp.mat33),
-) -> Point:  # fmt: skip
-    """Return one of a branch's points, given the poses of the branch's bodies."""
-    point = Point()
-    point.geom = robot.point_geom[branch, index]
-    point.depth = robot.point_depth[branch, index]
-    size = robot.geom_size[row(world, robot.geom_size.shape[0]), point.geom]
-    half = size
-    if robot.geom_type[point.geom] == CAPSULE:
-        half = wp.vec3(0.0, 0.0, size[1])
-    rot = rotations[point.depth]
-    turn = rot * quat_to_matrix(robot.geom_quat[row(world, robot.geom_quat.shape[0]), point.geom])
-    place = positions[point.depth] + rot * robot.geom_pos[row(world, robot.geom_pos.shape[0]), point.geom]
-    point.arm = turn * wp.cw_mul(robot.point_offset[branch, index], half)
-    point.centre = place + point.arm
-    point.axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
-    point.radius = robot.point_radius[branch, index] * size[0]
-    return point
-
-
 @functools.cache
 def branch_constraints(n: int) -> SimpleNamespace:
     """Return the types and functions for the constraints of branches of ``n`` joints."""
@@ -262,35 +227,39 @@ def branch_constraints(n: int) -> SimpleNamespace:
         rotations: wp.array(dtype=wp.mat33), ang_vels: wp.array(dtype=wp.vec3), lin_vels: wp.array(dtype=wp.vec3),
         contacts: wp.array(dtype=Contact), start: int,
     ) -> int:  # fmt: skip
-        """Write the contacts of a branch with the floor from index ``start`` on and return how many there are.
-
-        Few points touch. A first loop finds them and writes nothing, so that the reads of its turns can overlap.
-        """
-        height = origin - robot.geom_pos[row(world, robot.geom_pos.shape[0]), robot.floor]
-        touching = wp.uint64(0)
+        """Write the contacts of a branch with the floor from index ``start`` on and return how many there are."""
+        count = int(0)
         last_geom = int(-1)
         in_geom = int(0)
-        for index in range(robot.point_count[branch]):
-            point = place_point(robot, world, branch, index, positions, rotations)
-            if point.geom != last_geom:
-                last_geom = point.geom
+        height = origin - robot.geom_pos[row(world, robot.geom_pos.shape[0]), robot.floor]
+        for point in range(robot.point_count[branch]):
+            geom = robot.point_geom[branch, point]
+            depth = robot.point_depth[branch, point]
+            size = robot.geom_size[row(world, robot.geom_size.shape[0]), geom]
+            is_capsule = robot.geom_type[geom] == CAPSULE
+            half = size
+            if is_capsule:
+                half = wp.vec3(0.0, 0.0, size[1])
+            turn = rotations[depth] * quat_to_matrix(robot.geom_quat[row(world, robot.geom_quat.shape[0]), geom])
+            centre = positions[depth] + rotations[depth] * robot.geom_pos[row(world, robot.geom_pos.shape[0]), geom]
+            arm = turn * wp.cw_mul(robot.point_offset[branch, point], half)
+            centre += arm
+            radius = robot.point_radius[branch, point] * size[0]
+            dist = wp.dot(height + centre, normal) - radius
+            if geom != last_geom:
+                last_geom = geom
                 in_geom = 0
-            above = robot.geom_type[point.geom] == BOX and (wp.dot(point.arm, normal) > 0.0 or in_geom == MAX_CORNERS)
-            if wp.dot(height + point.centre, normal) < point.radius and not above:
+            if robot.geom_type[geom] == BOX and (wp.dot(arm, normal) > 0.0 or in_geom == MAX_CORNERS):
+                dist = 0.0
+            if dist < 0.0:
                 in_geom += 1
-                touching |= wp.uint64(1) << wp.uint64(index)
-        count = int(0)
-        for index in range(robot.point_count[branch]):
-            if (touching >> wp.uint64(index)) & wp.uint64(1) == wp.uint64(1):
-                point = place_point(robot, world, branch, index, positions, rotations)
-                dist = wp.dot(height + point.centre, normal) - point.radius
                 contact = Contact()
-                contact.pos = point.centre - (point.radius + 0.5 * dist) * normal
-                contact.depth = point.depth
-                contact.sensor = robot.geom_sensor[point.geom]
-                contact.tangent = contact_tangent(normal, point.axis, robot.geom_type[point.geom] == CAPSULE)
-                velocity = lin_vels[point.depth] + wp.cross(ang_vels[point.depth], contact.pos)
-                contacts[start + count] = set_contact_rows(robot, world, point.geom, dist, velocity, normal, contact)
+                contact.pos = centre - (radius + 0.5 * dist) * normal
+                contact.depth = depth
+                contact.sensor = robot.geom_sensor[geom]
+                contact.tangent = contact_tangent(normal, wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2]), is_capsule)
+                velocity = lin_vels[depth] + wp.cross(ang_vels[depth], contact.pos)
+                contacts[start + count] = set_contact_rows(robot, world, geom, dist, velocity, normal, contact)
                 count += 1
         return count
 

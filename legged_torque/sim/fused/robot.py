@@ -12,8 +12,6 @@ from legged_torque.utils.errors import UserError
 
 MAX_BRANCHES = 16
 """Threads of a world must fit into half a warp."""
-MAX_POINTS = 64
-"""Points of a branch that may touch the floor: bits of an integer."""
 _CAPSULE_ENDS = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
 _BOX_CORNERS = [(float(x), float(y), float(z)) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]
 _GEOM_POINTS = {
@@ -124,7 +122,6 @@ def read_tree(model: mujoco.MjModel) -> Tree:
             branch, depth = depths[model.geom_bodyid[geom]]
         offsets, radius = _GEOM_POINTS[mujoco.mjtGeom(model.geom_type[geom])]
         points[branch] += [(geom, depth, offset, radius) for offset in offsets]
-    _require(max(map(len, points)) <= MAX_POINTS, f"a leg has more than {MAX_POINTS} points that may touch")
     return Tree(np.array([[model.body_jntadr[body] for body in chain] for chain in chains]), points)
 
 
