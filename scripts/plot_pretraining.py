@@ -19,8 +19,17 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="picture to write (png, svg, pdf)")
     args = parser.parse_args()
     pyplot = load_pyplot()
-    report = read(args.file)
     figure, axes = pyplot.subplots(1, 4, figsize=(17, 4), layout="constrained")
+    report = read(args.file)
+    try:
+        draw(axes, report)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(f"'{args.file}' is not a whole report of pretrain_gravity.py: {error!r}") from None
+    save_figure(figure, args.out)
+
+
+def draw(axes: Any, report: dict[str, Any]) -> None:
+    """Draw the four pictures."""
     settings = report["settings"]
     draw_histogram(axes[0], report["histograms"]["mean_torque"], settings["max_mean_torque"])
     axes[0].set(title="torques", xlabel="mean absolute torque [N m]", ylabel="pairs")
@@ -31,7 +40,6 @@ def main() -> None:
     bars = axes[3].bar(names, [100 * report["standing"][name] for name in names], color=[ORANGE, BLUE], width=0.6)
     axes[3].bar_label(bars, fmt="%.1f %%")
     axes[3].set(title="standing after 5 s", ylabel="worlds [%]", ylim=(0, 110))
-    save_figure(figure, args.out)
 
 
 def draw_histogram(axis: Any, histogram: dict[str, list[float]], limit: float) -> None:

@@ -159,6 +159,8 @@ MISTAKES = [
     ("--set=actor.hidden_dims=[]", "actor.hidden_dims"),
     ("--set=actor.distribution_cfg.class_name=Gauss", "actor.distribution_cfg.class_name"),
     ("--set=actor.distribution_cfg.std_type=lg", "unknown actor.distribution_cfg.std_type 'lg'; did you mean 'log'?"),
+    ("--set=algorithm.max_learning_rate=0", "algorithm.max_learning_rate must be greater than 0"),
+    ("--set=pretraining.file=policy.pt", "pretraining.file is set, but nothing starts from it"),
     ("--set=actor.distribution_cfg.init_std=0", "actor.distribution_cfg.init_std must be greater than 0"),
     ("--set=obs_groups.actor=[polic]", "did you mean 'policy'?"),
     ("--set=algorithm.schedule=adaptiv", "did you mean 'adaptive'?"),

@@ -105,8 +105,10 @@ def test_picture(made, tmp_path):
         ("\xff\xfe", "cannot read"),
         ("[1, 2]", "is not a report of pretrain_gravity.py"),
         ('{"settings": {}, "standing": {}, "rms_error": {}}', "is not a report of pretrain_gravity.py"),
+        ('{"settings": {}, "standing": {}, "rms_error": {}, "histograms": {}}', "is not a whole report"),
+        ('{"settings": {}, "standing": {}, "rms_error": {}, "histograms": 3}', "is not a whole report"),
     ],
-    ids=["missing", "text", "bytes", "list", "parts"],
+    ids=["missing", "text", "bytes", "list", "parts", "empty parts", "other parts"],
 )
 def test_no_report(tmp_path, content, message):
     """A file that is missing or no report is refused by its name, and nothing is drawn."""

@@ -33,6 +33,8 @@ def check_train_cfg(train_cfg: Any) -> None:
     if train_cfg.pretraining.critic_warmup_iterations < 0:
         iterations = train_cfg.pretraining.critic_warmup_iterations
         raise UserError(f"pretraining.critic_warmup_iterations must be at least 0, not {iterations}")
+    if train_cfg.pretraining.file and not train_cfg.pretraining.function:
+        raise UserError("pretraining.file is set, but nothing starts from it: the task's pretraining.function is empty")
     for key in ("learning_rate", "max_learning_rate", "max_grad_norm", "clip_param"):
         value = getattr(train_cfg.algorithm, key)
         if not value > 0.0:
