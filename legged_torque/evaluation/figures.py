@@ -113,7 +113,9 @@ def draw_curves(pyplot: Any, experiment: Experiment, title: str, metric: str, la
     if scale == "linear":
         axes[0, 0].set_ylim(0, None)
     axes[0, 0].set_ylabel(label)
-    text = "mean over seeds, with a band of one standard error to each side; cross: a training that is not finished"
+    text = "mean over seeds, with a band of one standard error to each side"
+    if not all(curve.is_finished for curves in panels.values() for seeds in curves.values() for curve in seeds):
+        text += "; cross: a training that is not finished"
     figure.suptitle(textwrap.fill(f"{title}: {text}", int(12 * size[0])), fontsize=11)
     return figure
 
