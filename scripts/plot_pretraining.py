@@ -19,8 +19,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="picture to write (png, svg, pdf)")
     args = parser.parse_args()
     pyplot = load_pyplot()
-    figure, axes = pyplot.subplots(1, 4, figsize=(17, 4), layout="constrained")
     report = read(args.file)
+    figure, axes = pyplot.subplots(1, 4, figsize=(17, 4), layout="constrained")
     try:
         draw(axes, report)
     except (LookupError, TypeError, ValueError, AttributeError) as error:

@@ -30,6 +30,8 @@ def main() -> None:
             args.set.append(f"pretraining.{name}={getattr(args, name)}")
     env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
     file = pretrained_file(args, train_cfg)
+    if args.json:
+        args.json.parent.mkdir(parents=True, exist_ok=True)  # minutes before it is written
     print(f"Pre-training {args.task} on {device_name(resolve_device(args.device))}.", flush=True)
     with CompileProgress():
         report = make_pretrained(file, args, env_cfg, train_cfg)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from settings import error_of
+from settings import TASKS, error_of
 from test_scripts import SMALL, assert_told_in_one_line, run_here
 
 from legged_torque.deploy import description as description_module
@@ -21,7 +21,6 @@ for package in ("onnx", "onnxruntime", "jsonschema"):
 from legged_torque.deploy.export import export_policy, nominal_cfg
 from legged_torque.deploy.policy import Policy, State
 
-TASKS = ["a1_position", "a1_torque", "a1_torque_gravity", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
 TRAINING = {"run": "run", "checkpoint": "model_7.pt", "iterations": 7, "total_steps": 20_000_000}
 CHANGED = {
     "env.history_length": 3,

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from settings import TASKS
 
 LEGS = ("FR", "FL", "RR", "RL")
 SENSED = ["trunk", *(f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh", "calf", "foot"))]
@@ -26,7 +27,6 @@ TABLE_III = {  # weight without Delta t, at the start of training
     "feet_air_time": 0.1,
     "symmetry": -0.5,
 }
-TASKS = ("a1_position", "a1_torque", "a1_torque_gravity", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead")
 
 
 def contact_flags(*names):

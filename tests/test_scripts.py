@@ -16,12 +16,12 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from settings import TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.utils import task_registry
 
 ROOT = Path(__file__).resolve().parents[1]
-TASKS = ["a1_position", "a1_torque", "a1_torque_gravity", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
 SMALL = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--set=runner.num_steps_per_env=4", "--max_iterations=2"]
 
 

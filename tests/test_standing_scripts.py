@@ -20,7 +20,7 @@ def made(tmp_path_factory):
     """A folder in which pretrain_gravity.py has made a small policy: the folder, its file, the report's file."""
     root = tmp_path_factory.mktemp("pretrained")
     words = [*SMALL, *(f"--set=pretraining.{name}={value}" for name, value in FEW.items())]
-    report = root / "report.json"
+    report = root / "new" / "report.json"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gravity_pretraining, "STANDING_SECONDS", 0.1)  # not looked at here
         status, output, error = run_here("pretrain_gravity.py", *words, f"--json={report}", root=root)

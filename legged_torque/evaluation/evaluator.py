@@ -29,8 +29,8 @@ class TrainingEvaluator:
 
     Its worlds have their own random numbers, no rewards, and go on where the last evaluation left them: an evaluation
     has as many steps of robots as the paper's 16 worlds x 2000 steps, but in many worlds at once. Training is the same
-    with and without it. A robot that an early policy has left sitting stays there for the rest of its episode, through
-    some hundred evaluations: as long as a task is not learned, its numbers lag behind.
+    with and without it. A robot that an early policy has left sitting may stay there for the rest of its episode,
+    through some hundred evaluations: as long as a task is not learned, its numbers lag behind.
     """
 
     def __init__(self, task: LeggedRobot, policy: Callable[[TensorDict], Tensor], settings: dict, seed: int) -> None:

@@ -14,7 +14,8 @@ from legged_torque.sim.fused.trunk import TrunkSystem, mat66, trunk_matrix, whol
 from legged_torque.sim.per_world import expand
 
 ROWS = 9
-"""Rows of Jacobians per body: translations, rotations, and three times its joint's own."""
+"""Rows of Jacobians per body: translations, rotations, and three times its joint's own. An argument of the kernel, lest
+the compiler unroll their loop."""
 
 
 class DerivedConstants:
@@ -85,7 +86,7 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
 
     A step rarely changes more than a few worlds, so that it is one world's time that counts: a world has a group of
     threads per depth, the trunk's included, which all factorize its equations and then take the rows of their bodies.
-    All of them run the same loop, which is short, since code that runs once must first be fetched.
+    All of them run the same loop, so that threads of a warp do not wait for each other's code.
 
     Args:
         branches: Number of branches.
