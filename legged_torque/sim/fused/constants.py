@@ -6,11 +6,11 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from legged_torque.sim.fused.dynamics import Body, Trunk, add_bodies, branch_dynamics, make_trunk
-from legged_torque.sim.fused.math import linear_algebra, row, vec6
+from legged_torque.sim.fused.dynamics import Body, Trunk, add_bodies, body_dynamics, branch_dynamics, make_trunk
+from legged_torque.sim.fused.math import linear_algebra, quat_multiply, quat_to_matrix, row, vec6
 from legged_torque.sim.fused.newton import branch_newton
 from legged_torque.sim.fused.robot import Robot, lanes_per_world, make_robot, read_tree
-from legged_torque.sim.fused.trunk import TrunkSystem, mat66, trunk_matrix, whole_body
+from legged_torque.sim.fused.trunk import TrunkSystem, mat66, trunk_matrix, whole_inertia
 from legged_torque.sim.per_world import expand
 
 ROWS = 9
@@ -42,7 +42,7 @@ class DerivedConstants:
             expand(model, name, num_envs)
         branches, depth = tree.joints.shape
         lanes = lanes_per_world(branches, self._device.is_cuda)
-        self._threads = lanes * (depth + 1)
+        self._joints, self._threads = depth, lanes * (depth + 1)
         self._kernel = make_kernel(branches, depth, lanes)
         with wp.ScopedDevice(self._device):
             self._robot = make_robot(mj_model, model, tree)
@@ -58,7 +58,7 @@ class DerivedConstants:
         wp.launch(
             self._kernel,
             dim=(self._num_envs, self._threads),
-            inputs=[self._robot, mask, self._reference, self._rest, ROWS],
+            inputs=[self._robot, mask, self._reference, self._rest, self._joints, ROWS],
             outputs=[self._robot.body_invweight0, self._robot.dof_invweight0],
             device=self._device,
         )
@@ -95,7 +95,7 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
     """
     per_lane = -(-branches // lanes)
     dynamics, algebra = branch_dynamics(depth), linear_algebra(depth)
-    vector, column, make_branch = dynamics.vector, dynamics.column, dynamics.make_branch
+    vector, column, with_column, Branch = dynamics.vector, dynamics.column, dynamics.with_column, dynamics.Branch
     cholesky_solve = algebra.cholesky_solve
     Leg, assemble_damping, eliminate = (
         branch_newton(depth).Leg, branch_newton(depth).assemble_damping, branch_newton(depth).eliminate,
@@ -103,15 +103,47 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
 
     @wp.func
     def leg_at_rest(
-        robot: Robot, world: int, branch: int, trunk: Trunk, qpos: wp.array2d(dtype=float),
-        rest: wp.array2d(dtype=float), positions: wp.array(dtype=wp.vec3), rotations: wp.array(dtype=wp.mat33),
+        robot: Robot, world: int, branch: int, joints: int, trunk: Trunk, positions: wp.array(dtype=wp.vec3),
+        rotations: wp.array(dtype=wp.mat33),
     ) -> Leg:  # fmt: skip
-        """Return a branch with its inertia matrix factorized; fill the poses of its bodies."""
-        velocities = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
+        """Return a branch with its inertia matrix in the reference pose, factorized; fill the poses of its bodies.
+
+        It is what ``make_branch`` returns at rest, in loops that are not unrolled.
+        """
+        pos, quat = wp.vec3(0.0), 1.0 * trunk.quat
+        positions[0] = pos
+        rotations[0] = trunk.rot
+        out = Branch()
+        for j in range(joints):
+            joint = robot.branch_joint[branch, j]
+            pos += quat_to_matrix(quat) * robot.body_pos[row(world, robot.body_pos.shape[0]), joint + 1]
+            quat = quat_multiply(quat, robot.body_quat[row(world, robot.body_quat.shape[0]), joint + 1])
+            rot = quat_to_matrix(quat)
+            axis = rot * robot.jnt_axis[row(world, robot.jnt_axis.shape[0]), joint]
+            anchor = pos + rot * robot.jnt_pos[row(world, robot.jnt_pos.shape[0]), joint]
+            positions[j + 1] = pos
+            rotations[j + 1] = rot
+            out.axis = with_column(out.axis, j, axis)
+            out.lever = with_column(out.lever, j, wp.cross(anchor, axis))
+        still = wp.vec3(0.0)
+        for reverse in range(joints):
+            j = joints - 1 - reverse
+            joint = robot.branch_joint[branch, j]
+            body = body_dynamics(
+                robot, world, joint + 1, positions[j + 1], rotations[j + 1], still, still, still, still
+            )
+            out.total = add_bodies(out.total, body)
+            axis, lever = column(out.axis, j), column(out.lever, j)
+            torque = out.total.inertia * axis + wp.cross(out.total.moment, lever)
+            force = out.total.mass * lever + wp.cross(axis, out.total.moment)
+            for i in range(j + 1):
+                out.mass[i, j] = wp.dot(column(out.axis, i), torque) + wp.dot(column(out.lever, i), force)
+                out.mass[j, i] = out.mass[i, j]
+            out.mass[j, j] += robot.dof_armature[row(world, robot.dof_armature.shape[0]), joint + 5]
+            out.mass_lin = with_column(out.mass_lin, j, force)
+            out.mass_ang = with_column(out.mass_ang, j, wp.transpose(trunk.rot) * torque)
         leg = Leg()
-        leg.branch = make_branch(
-            robot, world, branch, trunk, qpos, rest, rest, positions, rotations, velocities, velocities
-        )
+        leg.branch = out
         return assemble_damping(leg, 0.0)
 
     @wp.func
@@ -150,10 +182,10 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
             weights[kind] = weights[kind] + (wp.dot(jac, solved) + wp.dot(u, u)) / 3.0
         return weights
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def derive_constants(
         robot: Robot, mask: wp.array(dtype=wp.bool), qpos: wp.array2d(dtype=float), rest: wp.array2d(dtype=float),
-        rows: int, body_invweight0: wp.array2d(dtype=wp.vec2), dof_invweight0: wp.array2d(dtype=float),
+        joints: int, rows: int, body_invweight0: wp.array2d(dtype=wp.vec2), dof_invweight0: wp.array2d(dtype=float),
     ):  # fmt: skip
         world, thread = wp.tid()
         if not mask[world]:
@@ -169,16 +201,16 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
         for i in range(wp.static(per_lane)):
             branch = lane + i * wp.static(lanes)
             if branch < wp.static(branches):
-                leg = leg_at_rest(robot, world, branch, trunk, qpos, rest, positions, rotations)
+                leg = leg_at_rest(robot, world, branch, joints, trunk, positions, rotations)
                 system = eliminate(leg, system, TrunkSystem())
                 total = add_bodies(total, leg.branch.total)
-        whole = whole_body(trunk, total, wp.static(lanes))
+        whole = whole_inertia(trunk, total, wp.static(lanes))
         trunk_factor = wp.static(linear_algebra(6).cholesky)(trunk_matrix(whole, system, wp.static(lanes)))
         for i in range(wp.static(per_lane)):
             branch = lane + i * wp.static(lanes)
             if branch < wp.static(branches):
                 if wp.static(per_lane > 1):  # a CPU's thread has several branches, of which it kept the last one
-                    leg = leg_at_rest(robot, world, branch, trunk, qpos, rest, positions, rotations)
+                    leg = leg_at_rest(robot, world, branch, joints, trunk, positions, rotations)
                 body = int(1)
                 if body_depth > 0:
                     body = robot.branch_joint[branch, body_depth - 1] + 1

@@ -46,15 +46,22 @@ class TrunkSystem:
 
 
 @wp.func
-def whole_body(trunk: Trunk, branches: Body, lanes: int) -> WholeBody:
-    """Return the equations of the trunk with its branches, given the sum over the branches of this thread."""
+def whole_inertia(trunk: Trunk, branches: Body, lanes: int) -> WholeBody:
+    """Return the inertia of the trunk with its branches, given the sum over the branches of this thread; no bias."""
     out = WholeBody()
     moment = trunk.body.moment + group_sum3(branches.moment, lanes)
     inertia = trunk.body.inertia + group_sum33_symmetric(branches.inertia, lanes)
-    torque = trunk.body.torque + group_sum3(branches.torque, lanes)
     out.mass = trunk.body.mass + group_sum(branches.mass, lanes)
     out.coupling = -wp.skew(moment) * trunk.rot
     out.rotation = wp.transpose(trunk.rot) * inertia * trunk.rot
+    return out
+
+
+@wp.func
+def whole_body(trunk: Trunk, branches: Body, lanes: int) -> WholeBody:
+    """Return the equations of the trunk with its branches, given the sum over the branches of this thread."""
+    out = whole_inertia(trunk, branches, lanes)
+    torque = trunk.body.torque + group_sum3(branches.torque, lanes)
     out.bias_lin = trunk.body.force + group_sum3(branches.force, lanes)
     out.bias_ang = wp.transpose(trunk.rot) * torque
     return out
