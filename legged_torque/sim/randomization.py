@@ -46,7 +46,7 @@ class Parameter:
 
 
 class Randomization:
-    """Draws all parameters of the worlds in a mask in one kernel, from uniform numbers that torch generates.
+    """Draws all parameters of the worlds in a mask in one kernel, from seeds that torch generates, one per world.
 
     Nothing waits for the host and nothing changes its address, so that it may run inside a CUDA graph.
 
@@ -70,25 +70,25 @@ class Randomization:
         self.sizes: dict[str, int] = {}
         rows, addresses, strides, draws, places, at_start = [], [], [], [], [], []
         first_draw: dict[str, int] = {}
-        num_draws = 1  # the first decides what is kept
+        num_draws = 1  # number 0 decides what is kept
         for parameter in parameters:
             count = 1 if parameter.shared else len(parameter.columns)
             start = first_draw.setdefault(parameter.same_draw_as or parameter.name, num_draws)
             is_new = start == num_draws
             if is_new:
                 self.sizes[parameter.name] = count
-                num_draws += 2 * count
+                num_draws += count
             for i, (column, row) in enumerate(zip(parameter.columns, table(parameter, keep_probability), strict=True)):
                 rows.append(row)
                 addresses.append(parameter.field.data_ptr() + column * parameter.field.element_size())
                 strides.append(parameter.field.stride(0) * parameter.field.element_size())
-                draws.append(start + (0 if parameter.shared else 2 * i))
+                draws.append(start + (0 if parameter.shared else i))
                 places.append(len(at_start) if is_new and i < count else -1)
                 if places[-1] >= 0:
                     at_start.append((row.own_value - row.middle) * row.per_half_range)
         self._num_envs, self._device = num_envs, device
         self.values = torch.tensor(at_start, device=device).repeat(num_envs, 1)
-        self._uniform = torch.zeros(num_envs, num_draws, device=device)
+        self._seeds = torch.zeros(num_envs, dtype=torch.int32, device=device)
         self._rows = wp.array(rows, dtype=_Row, device=device)
         self._addresses = wp.array(addresses, dtype=wp.uint64, device=device)
         self._strides = wp.array(strides, dtype=wp.uint64, device=device)
@@ -101,13 +101,13 @@ class Randomization:
         Args:
             mask: In which worlds. Shape: (num_envs,), bool.
         """
-        self._uniform.uniform_()
+        self._seeds.random_()
         wp.launch(
             _draw,
             dim=(self._num_envs, len(self._rows)),
             inputs=[
                 wp.from_torch(mask),
-                wp.from_torch(self._uniform),
+                wp.from_torch(self._seeds),
                 self._rows,
                 self._addresses,
                 self._strides,
@@ -140,7 +140,7 @@ class _Row:
 @wp.kernel(enable_backward=False)
 def _draw(
     mask: wp.array(dtype=wp.bool),
-    uniform: wp.array2d(dtype=wp.float32),
+    seeds: wp.array(dtype=wp.int32),
     rows: wp.array(dtype=_Row),
     addresses: wp.array(dtype=wp.uint64),
     strides: wp.array(dtype=wp.uint64),
@@ -152,11 +152,11 @@ def _draw(
     world, column = wp.tid()
     if mask[world]:
         row = rows[column]
-        first = draws[column]
-        offset = row.offset_low + row.offset_span * uniform[world, first]
-        scale = row.scale_low + row.scale_span * uniform[world, first + 1]
+        random = wp.rand_init(seeds[world], draws[column])
+        offset = row.offset_low + row.offset_span * wp.randf(random)
+        scale = row.scale_low + row.scale_span * wp.randf(random)
         value = wp.clamp((row.base + row.weight * offset) * scale, row.lowest, row.highest)
-        if uniform[world, 0] < row.keep_probability:
+        if wp.randf(wp.rand_init(seeds[world], 0)) < row.keep_probability:
             value = row.own_value
         target = wp.array(ptr=addresses[column] + wp.uint64(world) * strides[column], shape=(1,), dtype=wp.float32)
         target[0] = value
