@@ -1,28 +1,32 @@
 """What MuJoCo's ``mj_setConst`` derives from masses: inverse weights, recomputed in the worlds whose masses changed."""
 
 import functools
+from types import SimpleNamespace
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import warp as wp
 
 from legged_torque.sim.fused.dynamics import Body, Trunk, add_bodies, body_dynamics, branch_dynamics, make_trunk
-from legged_torque.sim.fused.math import linear_algebra, quat_multiply, quat_to_matrix, row, vec6
+from legged_torque.sim.fused.math import linear_algebra, row, vec6
 from legged_torque.sim.fused.newton import branch_newton
 from legged_torque.sim.fused.robot import Robot, lanes_per_world, make_robot, read_tree
 from legged_torque.sim.fused.trunk import TrunkSystem, mat66, trunk_matrix, whole_inertia
 from legged_torque.sim.per_world import expand
 
-ROWS = 9
-"""Rows of Jacobians per body: translations, rotations, and three times its joint's own. An argument of the kernel, lest
-the compiler unroll their loop."""
+KINDS = 3
+"""Inverse weights per body: of its translation, of its rotation, of its joint."""
+ROWS = 3
+"""Rows of Jacobians per inverse weight, their mean: one per axis; the joint's is the same three times."""
 
 
 class DerivedConstants:
     """Keeps ``body_invweight0`` and ``dof_invweight0`` of every world in step with its other parameters.
 
     They scale the softness of contacts, limits and dry friction, and follow from masses, inertias and armatures in the
-    model's reference pose.
+    model's reference pose. Of these, worlds may differ in the trunk's mass, inertia and centre of mass and in
+    armatures. Branches without their armatures are the same in all worlds, and measured once.
     """
 
     def __init__(self, mj_model: mujoco.MjModel, model: mjw.Model, num_envs: int) -> None:
@@ -37,17 +41,24 @@ class DerivedConstants:
             UserError: If the robot's structure is not a trunk with branches.
         """
         tree = read_tree(mj_model)
-        self._num_envs, self._device = num_envs, model.qpos0.device
+        self._device = model.qpos0.device
         for name in ("body_invweight0", "dof_invweight0"):
             expand(model, name, num_envs)
         branches, depth = tree.joints.shape
         lanes = lanes_per_world(branches, self._device.is_cuda)
-        self._joints, self._threads = depth, lanes * (depth + 1)
-        self._kernel = make_kernel(branches, depth, lanes)
+        self._dim = (num_envs, (depth + 1) * KINDS * lanes)
+        kernels = make_kernels(branches, depth, lanes)
+        self._kernel = kernels.derive_constants
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, mj_model.qpos0[3:7])
+        self._rotation = wp.mat33(rotation)
         with wp.ScopedDevice(self._device):
             self._robot = make_robot(mj_model, model, tree)
-            self._reference = wp.array(model.qpos0.numpy().repeat(num_envs, axis=0), dtype=wp.float32)
-            self._rest = wp.zeros((num_envs, model.nv), dtype=wp.float32)
+            self._branches = wp.zeros(branches, dtype=kernels.Branch)
+            self._coms = wp.zeros((branches, depth), dtype=wp.vec3)
+            rest = wp.zeros((1, model.nv), dtype=wp.float32)
+            inputs = [self._robot, wp.array(mj_model.qpos0[None], dtype=wp.float32), rest]
+            wp.launch(kernels.measure_branches, branches, inputs, [self._branches, self._coms])
 
     def update(self, mask: wp.array) -> None:
         """Recompute the constants.
@@ -57,8 +68,8 @@ class DerivedConstants:
         """
         wp.launch(
             self._kernel,
-            dim=(self._num_envs, self._threads),
-            inputs=[self._robot, mask, self._reference, self._rest, self._joints, ROWS],
+            dim=self._dim,
+            inputs=[self._robot, mask, self._rotation, self._branches, self._coms, ROWS],
             outputs=[self._robot.body_invweight0, self._robot.dof_invweight0],
             device=self._device,
         )
@@ -78,15 +89,15 @@ def forward_solve(lower: mat66, b: vec6) -> vec6:
 
 
 @functools.cache
-def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
-    """Return the kernel for a robot's structure.
+def make_kernels(branches: int, depth: int, lanes: int) -> SimpleNamespace:
+    """Return the kernels for a robot's structure, and the type ``Branch``.
 
     With the inertia matrix as an arrow, J M^-1 J^T of a body on a branch is that of the branch alone, with its trunk
     held, plus what the trunk's motion adds, seen through the branch: u^T S^-1 u, S being the trunk's six equations.
 
     A step rarely changes more than a few worlds, so that it is one world's time that counts: a world has a group of
-    threads per depth, the trunk's included, which all factorize its equations and then take the rows of their bodies.
-    All of them run the same loop, so that threads of a warp do not wait for each other's code.
+    threads per body of a branch and kind of weight, which all factorize its equations and then take their own rows.
+    All of them run the same loop, which is short, since code that runs once must first be fetched.
 
     Args:
         branches: Number of branches.
@@ -95,72 +106,55 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
     """
     per_lane = -(-branches // lanes)
     dynamics, algebra = branch_dynamics(depth), linear_algebra(depth)
-    vector, column, with_column, Branch = dynamics.vector, dynamics.column, dynamics.with_column, dynamics.Branch
+    vector, column, Branch, make_branch = dynamics.vector, dynamics.column, dynamics.Branch, dynamics.make_branch
     cholesky_solve = algebra.cholesky_solve
     Leg, assemble_damping, eliminate = (
         branch_newton(depth).Leg, branch_newton(depth).assemble_damping, branch_newton(depth).eliminate,
     )  # fmt: skip
 
-    @wp.func
-    def leg_at_rest(
-        robot: Robot, world: int, branch: int, joints: int, trunk: Trunk, positions: wp.array(dtype=wp.vec3),
-        rotations: wp.array(dtype=wp.mat33),
-    ) -> Leg:  # fmt: skip
-        """Return a branch with its inertia matrix in the reference pose, factorized; fill the poses of its bodies.
+    @wp.kernel(module="unique", enable_backward=False)
+    def measure_branches(
+        robot: Robot, qpos: wp.array2d(dtype=float), rest: wp.array2d(dtype=float), out: wp.array(dtype=Branch),
+        coms: wp.array2d(dtype=wp.vec3),
+    ):  # fmt: skip
+        """Write a branch at rest without its armatures, and its bodies' centres of mass from the trunk's origin."""
+        index = wp.tid()
+        positions = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
+        rotations = wp.zeros(shape=wp.static(depth + 1), dtype=wp.mat33)
+        velocities = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
+        trunk = make_trunk(robot, 0, qpos, rest)
+        branch = make_branch(robot, 0, index, trunk, qpos, rest, rest, positions, rotations, velocities, velocities)
+        for j in range(wp.static(depth)):
+            joint = robot.branch_joint[index, j]
+            branch.mass[j, j] -= robot.dof_armature[0, joint + 5]
+            coms[index, j] = positions[j + 1] + rotations[j + 1] * robot.body_ipos[0, joint + 1]
+        out[index] = branch
 
-        It is what ``make_branch`` returns at rest, in loops that are not unrolled.
-        """
-        pos, quat = wp.vec3(0.0), 1.0 * trunk.quat
-        positions[0] = pos
-        rotations[0] = trunk.rot
-        out = Branch()
-        for j in range(joints):
-            joint = robot.branch_joint[branch, j]
-            pos += quat_to_matrix(quat) * robot.body_pos[row(world, robot.body_pos.shape[0]), joint + 1]
-            quat = quat_multiply(quat, robot.body_quat[row(world, robot.body_quat.shape[0]), joint + 1])
-            rot = quat_to_matrix(quat)
-            axis = rot * robot.jnt_axis[row(world, robot.jnt_axis.shape[0]), joint]
-            anchor = pos + rot * robot.jnt_pos[row(world, robot.jnt_pos.shape[0]), joint]
-            positions[j + 1] = pos
-            rotations[j + 1] = rot
-            out.axis = with_column(out.axis, j, axis)
-            out.lever = with_column(out.lever, j, wp.cross(anchor, axis))
-        still = wp.vec3(0.0)
-        for reverse in range(joints):
-            j = joints - 1 - reverse
-            joint = robot.branch_joint[branch, j]
-            body = body_dynamics(
-                robot, world, joint + 1, positions[j + 1], rotations[j + 1], still, still, still, still
-            )
-            out.total = add_bodies(out.total, body)
-            axis, lever = column(out.axis, j), column(out.lever, j)
-            torque = out.total.inertia * axis + wp.cross(out.total.moment, lever)
-            force = out.total.mass * lever + wp.cross(axis, out.total.moment)
-            for i in range(j + 1):
-                out.mass[i, j] = wp.dot(column(out.axis, i), torque) + wp.dot(column(out.lever, i), force)
-                out.mass[j, i] = out.mass[i, j]
-            out.mass[j, j] += robot.dof_armature[row(world, robot.dof_armature.shape[0]), joint + 5]
-            out.mass_lin = with_column(out.mass_lin, j, force)
-            out.mass_ang = with_column(out.mass_ang, j, wp.transpose(trunk.rot) * torque)
+    @wp.func
+    def leg_at_rest(robot: Robot, world: int, index: int, measured: wp.array(dtype=Branch)) -> Leg:
+        """Return a branch with its inertia matrix, armatures included, factorized."""
         leg = Leg()
-        leg.branch = out
+        leg.branch = measured[index]
+        for j in range(wp.static(depth)):
+            dof = robot.branch_joint[index, j] + 5
+            leg.branch.mass[j, j] += robot.dof_armature[row(world, robot.dof_armature.shape[0]), dof]
         return assemble_damping(leg, 0.0)
 
     @wp.func
-    def inverse_weights(
-        leg: Leg, trunk_factor: mat66, rot: wp.mat33, com: wp.vec3, body_depth: int, rows: int
-    ) -> wp.vec3:
-        """Return mean inverse weights: of a body's translation at its centre of mass, its rotation, and its own joint.
+    def inverse_weight(
+        leg: Leg, trunk_factor: mat66, rot: wp.mat33, com: wp.vec3, body_depth: int, kind: int, rows: int
+    ) -> float:
+        """Return a mean inverse weight of a body: 0 of the translation of its centre of mass, 1 of its rotation, 2 of
+        its own joint.
 
         A row j of a Jacobian is (trunk's translation in world axes, its rotation in its own axes, branch); its weight
         is j M^-1 j^T. The trunk (depth 0) has its own translations in the joint's place.
         """
         lever = -wp.skew(com) * rot
-        weights = wp.vec3()
-        for k in range(rows):
-            kind = k // 3
+        weight = float(0.0)
+        for r in range(rows):
             unit = wp.vec3()
-            unit[k - 3 * kind] = 1.0
+            unit[r] = 1.0
             jac_lin = wp.where(kind == 0 or (kind == 2 and body_depth == 0), unit, wp.vec3(0.0))
             jac_ang = wp.vec3(0.0)
             jac = vector()
@@ -179,29 +173,50 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
             lin = jac_lin - leg.branch.mass_lin * solved
             ang = jac_ang - leg.branch.mass_ang * solved
             u = forward_solve(trunk_factor, vec6(lin[0], lin[1], lin[2], ang[0], ang[1], ang[2]))
-            weights[kind] = weights[kind] + (wp.dot(jac, solved) + wp.dot(u, u)) / 3.0
-        return weights
+            weight += (wp.dot(jac, solved) + wp.dot(u, u)) / 3.0
+        return weight
+
+    @wp.func
+    def write_weight(
+        weight: float, kind: int, world: int, body: int, body_invweight0: wp.array2d(dtype=wp.vec2),
+        dof_invweight0: wp.array2d(dtype=float),
+    ):  # fmt: skip
+        """Write an inverse weight of a body to its places."""
+        if kind == 2 and body > 1:
+            dof_invweight0[world, body + 4] = weight
+        elif kind == 2:
+            for r in range(3):
+                dof_invweight0[world, r] = weight
+        else:
+            body_invweight0[world, body][kind] = weight
+            if kind == 1 and body == 1:
+                for r in range(3):
+                    dof_invweight0[world, r + 3] = weight  # the mean is the same about any three axes
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def derive_constants(
-        robot: Robot, mask: wp.array(dtype=wp.bool), qpos: wp.array2d(dtype=float), rest: wp.array2d(dtype=float),
-        joints: int, rows: int, body_invweight0: wp.array2d(dtype=wp.vec2), dof_invweight0: wp.array2d(dtype=float),
+        robot: Robot, mask: wp.array(dtype=wp.bool), rot: wp.mat33, measured: wp.array(dtype=Branch),
+        coms: wp.array2d(dtype=wp.vec3), rows: int, body_invweight0: wp.array2d(dtype=wp.vec2),
+        dof_invweight0: wp.array2d(dtype=float),
     ):  # fmt: skip
         world, thread = wp.tid()
         if not mask[world]:
             return
-        body_depth = thread // wp.static(lanes)
-        lane = thread - body_depth * wp.static(lanes)
-        positions = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
-        rotations = wp.zeros(shape=wp.static(depth + 1), dtype=wp.mat33)
-        trunk = make_trunk(robot, world, qpos, rest)
+        group = thread // wp.static(lanes)
+        lane = thread - group * wp.static(lanes)
+        body_depth = group // wp.static(KINDS)
+        kind = group - body_depth * wp.static(KINDS)
+        still = wp.vec3(0.0)
+        trunk = Trunk()
+        trunk.rot = rot
+        trunk.body = body_dynamics(robot, world, 1, still, rot, still, still, still, still)
         total = Body()
         system = TrunkSystem()
         leg = Leg()
         for i in range(wp.static(per_lane)):
             branch = lane + i * wp.static(lanes)
             if branch < wp.static(branches):
-                leg = leg_at_rest(robot, world, branch, joints, trunk, positions, rotations)
+                leg = leg_at_rest(robot, world, branch, measured)
                 system = eliminate(leg, system, TrunkSystem())
                 total = add_bodies(total, leg.branch.total)
         whole = whole_inertia(trunk, total, wp.static(lanes))
@@ -210,19 +225,13 @@ def make_kernel(branches: int, depth: int, lanes: int) -> wp.Kernel:
             branch = lane + i * wp.static(lanes)
             if branch < wp.static(branches):
                 if wp.static(per_lane > 1):  # a CPU's thread has several branches, of which it kept the last one
-                    leg = leg_at_rest(robot, world, branch, joints, trunk, positions, rotations)
+                    leg = leg_at_rest(robot, world, branch, measured)
                 body = int(1)
+                com = rot * robot.body_ipos[row(world, robot.body_ipos.shape[0]), 1]
                 if body_depth > 0:
                     body = robot.branch_joint[branch, body_depth - 1] + 1
-                ipos = robot.body_ipos[row(world, robot.body_ipos.shape[0]), body]
-                com = positions[body_depth] + rotations[body_depth] * ipos
-                weights = inverse_weights(leg, trunk_factor, trunk.rot, com, body_depth, rows)
-                body_invweight0[world, body] = wp.vec2(weights[0], weights[1])
-                if body_depth > 0:
-                    dof_invweight0[world, body + 4] = weights[2]
-                else:
-                    for r in range(3):
-                        dof_invweight0[world, r] = weights[2]
-                        dof_invweight0[world, r + 3] = weights[1]  # the mean is the same about any three axes
+                    com = coms[branch, body_depth - 1]
+                weight = inverse_weight(leg, trunk_factor, rot, com, body_depth, kind, rows)
+                write_weight(weight, kind, world, body, body_invweight0, dof_invweight0)
 
-    return derive_constants
+    return SimpleNamespace(Branch=Branch, measure_branches=measure_branches, derive_constants=derive_constants)
