@@ -107,6 +107,44 @@ def test_two_iterations_of_every_task(make_runner, tmp_path, name, capsys):
     assert "Steps per second" in output and "ETA" in output and "Tracking/error_xy" in output
 
 
+def test_logs_are_written_while_the_next_rollout_is_collected(make_runner, tmp_path, monkeypatch):
+    """The numbers are those of the iteration before; a checkpoint has all that came before it."""
+    runner, order = make_runner(log_root=tmp_path, **{"runner.save_interval": 2, "runner.logger": "none"}), []
+    collect, save = runner.collect_rollout, runner.save
+
+    def told_collect():
+        order.append("collect")
+        collect()
+
+    def told_save(path):
+        order.append(f"save {runner.logger.tot_timesteps}")
+        save(path)
+
+    def told_log(it, learning_rate, action_std, **_):
+        order.append(f"log {it}")
+        assert learning_rate == rates[it] and torch.equal(action_std, stds[it])
+        runner.logger.tot_timesteps += BATCH
+
+    rates, stds, update = [], [], runner.alg.update
+
+    def told_update():
+        losses = update()
+        rates.append(float(runner.alg.learning_rate))
+        stds.append(runner.alg.actor.output_std.clone())
+        return losses
+
+    for owner, name, told in (
+        (runner, "collect_rollout", told_collect),
+        (runner, "save", told_save),
+        (runner.logger, "log", told_log),
+        (runner.alg, "update", told_update),
+    ):
+        monkeypatch.setattr(owner, name, told)
+    runner.learn(3)
+    middle = ["collect", "log 0", "log 1", f"save {2 * BATCH}", "collect", "log 2", f"save {3 * BATCH}"]
+    assert order == ["collect", *middle]
+
+
 def test_two_trainings_with_one_seed_are_equal(make_runner):
     """A seed fixes every random number, so that on a CPU a training repeats bit by bit."""
     runners = [make_runner(seed=7), make_runner(seed=7), make_runner(seed=8)]

@@ -59,9 +59,11 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         if perturbation and perturbation not in env.cfg.perturbations():
             raise unknown_name("evaluation.perturbation", perturbation, env.cfg.perturbations())
         super().__init__(env, train_cfg, log_dir, device)
+        self.logger.device = "cpu"  # where numbers are averaged that are on the host anyway
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         self.log_dir = log_dir
         self._seconds_before = 0.0  # training time before this process
+        self._unwritten_log: dict | None = None
         env.num_processes = self.gpu_world_size
         env.step_graph.enabled = self.alg.update_graph.enabled = self.cfg["capture"]
         enabled = self.cfg["capture"] and self.cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS
@@ -94,17 +96,19 @@ class OnPolicyRunner(runners.OnPolicyRunner):
                     break
                 start = time.perf_counter()
                 self.collect_rollout()
+                self._write_log()  # of the last iteration, while the device is busy with this one
                 self._wait()
                 collected = time.perf_counter()
                 self.alg.learn_actor(self.current_learning_iteration >= warmup)
                 losses = self.alg.update()
                 measured = self._evaluate(losses, start)
                 learned = time.perf_counter()
-                self._log(start_it, total_it, collected - start, learned - collected, losses, measured)
+                times = {"collect_time": collected - start, "learn_time": learned - collected}
+                self._prepare_log(start_it, total_it, times, losses, measured)
                 self.current_learning_iteration += 1
                 if self.current_learning_iteration % self.cfg["save_interval"] == 0:
                     self._save_checkpoint()
-        self._save_checkpoint()
+        self._save_checkpoint()  # writes the last log too
         self.logger.stop_logging_writer()
 
     def claim_log_dir(self) -> None:
@@ -251,10 +255,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         logged = {f"Evaluation/{name}": value for name, value in metrics.items()}
         return {**logged, "Perf/evaluation_time": time.perf_counter() - start}
 
-    def _log(
-        self, start_it: int, total_it: int, collect_time: float, learn_time: float, losses: dict, measured: dict
-    ) -> None:
-        """Hand the numbers of one iteration to rsl_rl's logger, which prints and writes them."""
+    def _prepare_log(self, start_it: int, total_it: int, times: dict, losses: dict, measured: dict) -> None:
+        """Read the numbers of one iteration from the device, for :meth:`_write_log`."""
         numbers = self.env.log.read(self.env.max_episode_length * self.env.dt) | measured
         if self.logger.writer is None:
             return
@@ -265,20 +267,26 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         values = torch.stack(list(curricula.values())).tolist() if curricula else []
         numbers |= {f"Curriculum/{name}": value for name, value in zip(curricula, values, strict=True)}
         self.logger.ep_extras.append(numbers)
-        self.logger.log(
-            it=self.current_learning_iteration,
-            start_it=start_it,
-            total_it=total_it,
-            collect_time=collect_time,
-            learn_time=learn_time,
-            loss_dict=losses,
-            learning_rate=float(self.alg.learning_rate),
-            action_std=self.alg.get_policy().output_std,
-            rnd_weight=None,
-        )
+        self._unwritten_log = {
+            "it": self.current_learning_iteration,
+            "start_it": start_it,
+            "total_it": total_it,
+            **times,
+            "loss_dict": losses,
+            "learning_rate": float(self.alg.learning_rate),
+            "action_std": self.alg.get_policy().output_std.cpu(),
+            "rnd_weight": None,
+        }
+
+    def _write_log(self) -> None:
+        """Hand the numbers that were read last to rsl_rl's logger, which prints and writes them: milliseconds."""
+        if self._unwritten_log:
+            self.logger.log(**self._unwritten_log)
+            self._unwritten_log = None
 
     def _save_checkpoint(self) -> None:
-        """Save into the run's folder, and warn if the simulator had too little room."""
+        """Save into the run's folder with all that was logged, and warn if the simulator had too little room."""
+        self._write_log()
         if self.log_dir is not None:
             self.save(str(Path(self.log_dir) / f"model_{self.current_learning_iteration}.pt"))
         warning = self.env.sim.check_buffers()
