@@ -53,6 +53,14 @@ def edited_model(sim, world):
     return model
 
 
+def check_constants(sim):
+    """Compare the inverse weights of all worlds with those of mj_setConst."""
+    for world in range(sim.num_envs):
+        model = edited_model(sim, world)
+        np.testing.assert_allclose(sim.field("body_invweight0")[world, 1:], model.body_invweight0[1:], rtol=1e-5)
+        np.testing.assert_allclose(sim.field("dof_invweight0")[world], model.dof_invweight0, rtol=1e-5)
+
+
 def uniformity(values, low, high):
     """Kolmogorov's distance of a sample from a uniform distribution, in units of what 1 in 1000 samples exceeds."""
     sample = np.sort(np.asarray(values, dtype=np.float64).ravel())
@@ -102,10 +110,7 @@ def test_worlds_move_as_their_models(make_task, name):
 def test_derived_constants(make_task):
     """Inverse weights are those of mj_setConst, in the worlds that were drawn anew and only there."""
     task = make_task("a1_torque", 6, **ALWAYS)
-    for world in range(6):
-        model = edited_model(task.sim, world)
-        np.testing.assert_allclose(task.sim.field("body_invweight0")[world, 1:], model.body_invweight0[1:], rtol=1e-5)
-        np.testing.assert_allclose(task.sim.field("dof_invweight0")[world], model.dof_invweight0, rtol=1e-5)
+    check_constants(task.sim)
     before = {name: task.sim.field(name).clone() for name in (*FIELDS, "body_invweight0", "dof_invweight0")}
     mask = torch.tensor([True, False, True, False, False, False])
     task._randomize_parameters(mask)
@@ -315,12 +320,14 @@ class ThighMassRobot(LeggedRobot):
 
 
 def test_a_variant_draws_more():
-    """What a task adds is drawn, seen by the critic and mirrored; unless nobody knows its mirror image."""
+    """What a task adds is drawn, acts on what follows from it, is seen by the critic and mirrored; unless nobody knows
+    its mirror image."""
     cfg = get_cfgs("--set=env.num_envs=20", "--set=domain_rand.randomize_parameters=true")[0]
     task = ThighMassRobot(cfg)
     thighs = task.sim.field("body_mass")[:, [3, 6, 9, 12]]
     ratio = thighs / torch.tensor(task.sim.mj_model.body_mass[[3, 6, 9, 12]], dtype=torch.float32)
     assert (ratio == ratio[:, :1]).all() and ratio.min() > 0.5 and ratio.max() < 0.9 and ratio.std() > 0.05
+    check_constants(task.sim)
     scaled = (ratio[:, 0] - 0.7) / 0.2
     torch.testing.assert_close(task.get_observations()["critic"][:, -1], scaled, atol=1e-4, rtol=0)
     assert task.mirror("critic", task.get_observations()["critic"]).shape == (20, 138)

@@ -120,8 +120,12 @@ class Simulator:
         """
         return wp.to_torch(getattr(owner(self.model, name), name))
 
+    def vary_legs(self) -> None:
+        """Expect changes of legs as well; otherwise constants follow from the trunk's mass and from armatures only."""
+        self._constants.vary_branches()
+
     def update_constants(self, mask: Tensor) -> None:
-        """Recompute what MuJoCo derives from masses and armatures, after they have been changed.
+        """Recompute what MuJoCo derives from masses and armatures, after they have been changed, see :meth:`vary_legs`.
 
         Args:
             mask: In which worlds. Shape: (num_envs,), bool.

@@ -140,6 +140,13 @@ def control_parameters(task: LeggedRobot) -> list[Parameter]:
     ]  # fmt: skip
 
 
+def draws_legs(task: LeggedRobot, drawn: list[Parameter]) -> bool:
+    """Return whether masses or places of bodies other than the trunk are drawn."""
+    widths = {"body_mass": 1, "body_inertia": 3, "body_ipos": 3, "body_iquat": 4, "body_pos": 3, "body_quat": 4}
+    of_trunk = {view(task, name).data_ptr(): entries(width, [TRUNK]) for name, width in widths.items()}
+    return any(not set(p.columns) <= set(of_trunk.get(p.field.data_ptr(), p.columns)) for p in drawn)
+
+
 def view(task: LeggedRobot, field: str) -> Tensor:
     """Return a field of the model as one row of numbers per world."""
     return task.sim.field(field).flatten(1)

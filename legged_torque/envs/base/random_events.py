@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from legged_torque.envs.base.action_delay import ActionDelay
-from legged_torque.envs.base.domain_rand import initial_state, parameters
+from legged_torque.envs.base.domain_rand import draws_legs, initial_state, parameters
 from legged_torque.sim.randomization import Parameter, Randomization
 
 PUSH_ADDED = 0.5
@@ -49,7 +49,10 @@ class RandomEvents:
         self.action_delay = ActionDelay(self)
         self.init_angles = torch.zeros(self.num_envs, 3, device=self.device)
         self.initial_state = Randomization(initial_state(self), self.num_envs, self.device)
-        self.randomization = Randomization(self.random_parameters(), self.num_envs, self.device, rand.keep_probability)
+        drawn = self.random_parameters()
+        self.randomization = Randomization(drawn, self.num_envs, self.device, rand.keep_probability)
+        if rand.randomize_parameters and draws_legs(self, drawn):
+            self.sim.vary_legs()
 
     def random_parameters(self) -> list[Parameter]:
         """Return what ``domain_rand`` draws in each world; a variant may add to it."""

@@ -25,8 +25,8 @@ class DerivedConstants:
     """Keeps ``body_invweight0`` and ``dof_invweight0`` of every world in step with its other parameters.
 
     They scale the softness of contacts, limits and dry friction, and follow from masses, inertias and armatures in the
-    model's reference pose. Of these, worlds may differ in the trunk's mass, inertia and centre of mass and in
-    armatures. Branches without their armatures are the same in all worlds, and measured once.
+    model's reference pose. Branches without their armatures are taken to be the same in all worlds and measured once,
+    until :meth:`vary_branches` is called: worlds differ in their trunks and armatures.
     """
 
     def __init__(self, mj_model: mujoco.MjModel, model: mjw.Model, num_envs: int) -> None:
@@ -52,13 +52,17 @@ class DerivedConstants:
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, mj_model.qpos0[3:7])
         self._rotation = wp.mat33(rotation)
+        self._depth, self._num_branches, self._measure = depth, branches, kernels.measure_branches
+        self._branch_type, self._reference = kernels.Branch, mj_model.qpos0
+        self._branches_vary = False
         with wp.ScopedDevice(self._device):
             self._robot = make_robot(mj_model, model, tree)
-            self._branches = wp.zeros(branches, dtype=kernels.Branch)
-            self._coms = wp.zeros((branches, depth), dtype=wp.vec3)
-            rest = wp.zeros((1, model.nv), dtype=wp.float32)
-            inputs = [self._robot, wp.array(mj_model.qpos0[None], dtype=wp.float32), rest]
-            wp.launch(kernels.measure_branches, branches, inputs, [self._branches, self._coms])
+        self._measure_worlds(1)
+
+    def vary_branches(self) -> None:
+        """Expect that worlds differ in their branches as well, from the next :meth:`update` on."""
+        self._branches_vary = True
+        self._measure_worlds(self._dim[0])
 
     def update(self, mask: wp.array) -> None:
         """Recompute the constants.
@@ -66,11 +70,32 @@ class DerivedConstants:
         Args:
             mask: Which worlds. Shape: (num_envs,), bool.
         """
+        if self._branches_vary:
+            self._measure_branches(mask)
         wp.launch(
             self._kernel,
             dim=self._dim,
             inputs=[self._robot, mask, self._rotation, self._branches, self._coms, ROWS],
             outputs=[self._robot.body_invweight0, self._robot.dof_invweight0],
+            device=self._device,
+        )
+
+    def _measure_worlds(self, num_worlds: int) -> None:
+        """Allocate and measure the branches of all worlds, or of one for all."""
+        with wp.ScopedDevice(self._device):
+            self._branches = wp.zeros((num_worlds, self._num_branches), dtype=self._branch_type)
+            self._coms = wp.zeros((num_worlds, self._num_branches, self._depth), dtype=wp.vec3)
+            self._qpos = wp.array(np.tile(self._reference, (num_worlds, 1)), dtype=wp.float32)
+            self._rest = wp.zeros((num_worlds, len(self._reference) - 1), dtype=wp.float32)
+            self._measure_branches(wp.full(num_worlds, True, dtype=wp.bool))
+
+    def _measure_branches(self, mask: wp.array) -> None:
+        """Measure the branches of some worlds in the reference pose."""
+        wp.launch(
+            self._measure,
+            dim=self._branches.shape,
+            inputs=[self._robot, mask, self._qpos, self._rest],
+            outputs=[self._branches, self._coms],
             device=self._device,
         )
 
@@ -112,29 +137,32 @@ def make_kernels(branches: int, depth: int, lanes: int) -> SimpleNamespace:
         branch_newton(depth).Leg, branch_newton(depth).assemble_damping, branch_newton(depth).eliminate,
     )  # fmt: skip
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def measure_branches(
-        robot: Robot, qpos: wp.array2d(dtype=float), rest: wp.array2d(dtype=float), out: wp.array(dtype=Branch),
-        coms: wp.array2d(dtype=wp.vec3),
+        robot: Robot, mask: wp.array(dtype=wp.bool), qpos: wp.array2d(dtype=float), rest: wp.array2d(dtype=float),
+        measured: wp.array2d(dtype=Branch), coms: wp.array3d(dtype=wp.vec3),
     ):  # fmt: skip
         """Write a branch at rest without its armatures, and its bodies' centres of mass from the trunk's origin."""
-        index = wp.tid()
+        world, index = wp.tid()
+        if not mask[world]:
+            return
         positions = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
         rotations = wp.zeros(shape=wp.static(depth + 1), dtype=wp.mat33)
         velocities = wp.zeros(shape=wp.static(depth + 1), dtype=wp.vec3)
-        trunk = make_trunk(robot, 0, qpos, rest)
-        branch = make_branch(robot, 0, index, trunk, qpos, rest, rest, positions, rotations, velocities, velocities)
+        trunk = make_trunk(robot, world, qpos, rest)
+        branch = make_branch(robot, world, index, trunk, qpos, rest, rest, positions, rotations, velocities, velocities)
         for j in range(wp.static(depth)):
             joint = robot.branch_joint[index, j]
-            branch.mass[j, j] -= robot.dof_armature[0, joint + 5]
-            coms[index, j] = positions[j + 1] + rotations[j + 1] * robot.body_ipos[0, joint + 1]
-        out[index] = branch
+            branch.mass[j, j] -= robot.dof_armature[row(world, robot.dof_armature.shape[0]), joint + 5]
+            ipos = robot.body_ipos[row(world, robot.body_ipos.shape[0]), joint + 1]
+            coms[world, index, j] = positions[j + 1] + rotations[j + 1] * ipos
+        measured[world, index] = branch
 
     @wp.func
-    def leg_at_rest(robot: Robot, world: int, index: int, measured: wp.array(dtype=Branch)) -> Leg:
+    def leg_at_rest(robot: Robot, world: int, index: int, measured: wp.array2d(dtype=Branch)) -> Leg:
         """Return a branch with its inertia matrix, armatures included, factorized."""
         leg = Leg()
-        leg.branch = measured[index]
+        leg.branch = measured[row(world, measured.shape[0]), index]
         for j in range(wp.static(depth)):
             dof = robot.branch_joint[index, j] + 5
             leg.branch.mass[j, j] += robot.dof_armature[row(world, robot.dof_armature.shape[0]), dof]
@@ -195,8 +223,8 @@ def make_kernels(branches: int, depth: int, lanes: int) -> SimpleNamespace:
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def derive_constants(
-        robot: Robot, mask: wp.array(dtype=wp.bool), rot: wp.mat33, measured: wp.array(dtype=Branch),
-        coms: wp.array2d(dtype=wp.vec3), rows: int, body_invweight0: wp.array2d(dtype=wp.vec2),
+        robot: Robot, mask: wp.array(dtype=wp.bool), rot: wp.mat33, measured: wp.array2d(dtype=Branch),
+        coms: wp.array3d(dtype=wp.vec3), rows: int, body_invweight0: wp.array2d(dtype=wp.vec2),
         dof_invweight0: wp.array2d(dtype=float),
     ):  # fmt: skip
         world, thread = wp.tid()
@@ -230,7 +258,7 @@ def make_kernels(branches: int, depth: int, lanes: int) -> SimpleNamespace:
                 com = rot * robot.body_ipos[row(world, robot.body_ipos.shape[0]), 1]
                 if body_depth > 0:
                     body = robot.branch_joint[branch, body_depth - 1] + 1
-                    com = coms[branch, body_depth - 1]
+                    com = coms[row(world, coms.shape[0]), branch, body_depth - 1]
                 weight = inverse_weight(leg, trunk_factor, rot, com, body_depth, kind, rows)
                 write_weight(weight, kind, world, body, body_invweight0, dof_invweight0)
 
