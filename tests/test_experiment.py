@@ -180,6 +180,7 @@ def test_dry_run(name, tmp_path):
         ({"environments": {"lo": ["low"]}}, "unknown perturbation 'lo'; did you mean 'low'?"),
         ({"environments": {"low": ["hihg"]}}, "unknown perturbation 'hihg'; did you mean 'high'?"),
         ({"environments": {"low": "high"}}, "experiment key 'environments.low' must be a list"),
+        ({"ranges": "narow"}, "unknown ranges 'narow'; did you mean 'narrow'?"),
         ({"train": {"runner.total_step": 1}}, "config key 'runner.total_step'; did you mean 'runner.total_steps'?"),
         ({"train": {"runner.total_steps": "many"}}, "'runner.total_steps' takes a value like"),
         ({"train": {"env.num_envs": 0}}, "num_envs must be at least 1, not 0"),
@@ -205,7 +206,7 @@ def test_mistakes_in_the_file(change, message, tmp_path):
         (["{file}", "--device=cpu", "--jobs=0"], "--jobs must be at least 1, not 0"),
         (["{file}", "--device=cuda:99"], "there is no device 'cuda:99'"),
         (["{broken}"], "is not valid YAML"),
-        (["{text}"], "must hold the keys tasks, environments, seeds, train, evaluation"),
+        (["{text}"], "must hold the keys tasks, environments, seeds, ranges, train, evaluation"),
         (["{half}"], "lacks the key 'environments'"),
     ],
 )
@@ -277,14 +278,21 @@ def order(stage):
 
 def test_order_and_commands(stage, tmp_path):
     """A seed comes before the next one; the scripts get the options of the cell and of the file."""
-    values = SMALL | {"seeds": [3, 1], "environments": {"low": ["low", "high"], "high": ["high"]}}
+    values = SMALL | {"seeds": [3, 1], "environments": {"low": ["low", "high"], "high": ["high"]}, "ranges": "narrow"}
     file, out = write(tmp_path / "m.yaml", values), tmp_path / "out"
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert (status, error) == (0, "")
     cells = [f"{task}-{name}-s{seed}" for seed in (3, 1) for name in ("low", "high") for task in SMALL["tasks"]]
     assert order(stage) == cells and (out / "experiment.yaml").read_bytes() == file.read_bytes()
     log = (out / "a1_torque-high-s3" / "train.log").read_text()
-    for word in ("--task=a1_torque", "--seed=3", "--perturbation=high", "--set=runner.total_steps=128", "--device=cpu"):
+    for word in (
+        "--task=a1_torque",
+        "--seed=3",
+        "--perturbation=high",
+        "--set=runner.total_steps=128",
+        "--ranges=narrow",
+        "--device=cpu",
+    ):
         assert f" {word}" in log.splitlines()[0]
     result = json.loads((out / "a1_torque-low-s3" / "result_high.json").read_text())
     assert (result["perturbation"], result["num_envs"], result["steps"]) == ("high", "256", "2000")

@@ -302,9 +302,23 @@ def test_perturbations(name, velocity, probability):
     assert without.domain_rand.init_dof_vel == plain["domain_rand"]["init_dof_vel"] == [0.0, 0.0]
 
 
-def test_unknown_perturbation():
-    """It is told with those that there are."""
-    assert "did you mean 'high'" in error_of(get_cfgs, "--perturbation=hih")
+def test_ranges():
+    """Narrow ranges lie inside the wide ones, go with any perturbation, stay with a run, and can be taken back."""
+    wide, narrow = (get_cfgs("--perturbation=low", *more)[0].domain_rand for more in ((), ("--ranges=narrow",)))
+    changed = {name: value for name, value in to_dict(narrow).items() if value != getattr(wide, name)}
+    assert changed["ground_friction"] == [0.8, 1.2] and changed["motor_strength"] == [0.9, 1.1] and len(changed) == 11
+    for name, (low, high) in changed.items():
+        assert getattr(wide, name)[0] < low <= high < getattr(wide, name)[1], name
+    run_config = {"env": to_dict(get_cfgs("--ranges=narrow")[0]), "train": {}}
+    assert get_cfgs("--perturbation=high", run_config=run_config)[0].domain_rand.ground_friction == [0.8, 1.2]
+    back = get_cfgs("--perturbation=low", "--ranges=wide", run_config=run_config)[0]
+    assert to_dict(back.domain_rand) == to_dict(wide)
+
+
+@pytest.mark.parametrize("option", ["--perturbation=hih", "--ranges=wid"])
+def test_unknown_names(option):
+    """They are told with those that there are."""
+    assert "did you mean" in error_of(get_cfgs, option)
 
 
 class ThighMassRobot(LeggedRobot):

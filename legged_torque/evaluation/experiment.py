@@ -54,6 +54,7 @@ class Matrix:
         tasks: Names of tasks.
         environments: For each perturbation of a training those in which its end result is evaluated.
         seeds: Random seeds.
+        ranges: How far random parameters go, as ``--ranges`` takes it; empty: as the tasks have it.
         train: Changed settings of the trainings, by dotted path.
         evaluation: "num_envs" worlds and "num_steps" control steps of an evaluation.
     """
@@ -61,6 +62,7 @@ class Matrix:
     tasks: list[str]
     environments: dict[str, list[str]]
     seeds: list[int]
+    ranges: str = ""
     train: dict[str, Any] = field(default_factory=dict)
     evaluation: dict[str, int] = field(default_factory=dict)
 
@@ -195,6 +197,7 @@ def new_run_words(matrix: Matrix, cell: Cell) -> list[str]:
         key: value if isinstance(value, str) else json.dumps(value, default=str) for key, value in matrix.train.items()
     }
     settings = [f"--set={key}={text}" for key, text in texts.items()]
+    settings += [f"--ranges={matrix.ranges}"] if matrix.ranges else []
     return [f"--seed={cell.seed}", f"--perturbation={cell.environment}", *settings]
 
 

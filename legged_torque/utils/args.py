@@ -52,6 +52,9 @@ def add_settings_args(parser: argparse.ArgumentParser) -> None:
         "a loaded run has",
     )
     parser.add_argument(
+        "--ranges", help="how far random parameters go: wide or narrow; default: wide, or what a loaded run has"
+    )
+    parser.add_argument(
         "--device",
         default="auto",
         help="auto, cpu or cuda:N; auto takes the GPU if there is one, with torchrun one for each process",
@@ -98,7 +101,7 @@ def apply_args(env_cfg: Any, train_cfg: Any, args: argparse.Namespace) -> None:
     """Change settings as the command line asks; what is more explicit wins.
 
     In this order: the preset, the number of worlds that suits the device, the settings of a resumed run
-    (``args.run_config``, if present), the perturbation, single options, ``--set``.
+    (``args.run_config``, if present), the perturbation, the ranges, single options, ``--set``.
 
     Raises:
         UserError: If an argument makes no sense.
@@ -112,6 +115,8 @@ def apply_args(env_cfg: Any, train_cfg: Any, args: argparse.Namespace) -> None:
         update_from_dict(train_cfg, run_config["train"])
     if getattr(args, "perturbation", None):
         apply_perturbation(env_cfg, args.perturbation)
+    if getattr(args, "ranges", None):
+        apply_named("ranges", env_cfg.parameter_ranges(), env_cfg, args.ranges)
     given = {
         "env.num_envs": args.num_envs,
         "seed": args.seed,
@@ -150,10 +155,18 @@ def apply_perturbation(env_cfg: Any, name: str) -> None:
     Raises:
         UserError: If there is no such set.
     """
-    perturbations = env_cfg.perturbations()
-    if name not in perturbations:
-        raise unknown_name("perturbation", name, perturbations)
-    update_from_dict(env_cfg, perturbations[name])
+    apply_named("perturbation", env_cfg.perturbations(), env_cfg, name)
+
+
+def apply_named(kind: str, choices: dict[str, dict], env_cfg: Any, name: str) -> None:
+    """Apply one of several named sets of changes to the task's settings.
+
+    Raises:
+        UserError: If there is no such set.
+    """
+    if name not in choices:
+        raise unknown_name(kind, name, choices)
+    update_from_dict(env_cfg, choices[name])
 
 
 def set_entry_of_either(env_cfg: Any, train_cfg: Any, path: str, value: Any) -> None:

@@ -40,7 +40,7 @@ class LeggedRobotCfg(BaseConfig):
         default_joint_angles: dict[str, float] = {}  # [rad] q_nominal, by joint name
 
     class domain_rand:
-        """What is drawn at random: uniform ranges [lowest, highest]. See ``perturbations``."""
+        """What is drawn at random: uniform ranges [lowest, highest]. See ``perturbations`` and ``parameter_ranges``."""
 
         # initial state, at every reset
         init_roll = [-0.19635, 0.19635]  # [rad] +-pi/16
@@ -191,6 +191,24 @@ class LeggedRobotCfg(BaseConfig):
             "high_frequency": environment(True, 1.0, 0.006),
             "doubled": environment(True, 1.0, 0.012),
         }
+
+    def parameter_ranges(self) -> dict[str, dict]:
+        """Return the named changes that ``--ranges`` chooses from: those of this class, and narrower ones."""
+        narrow = {
+            "ground_friction": [0.8, 1.2],
+            "contact_stiffness": [900.0, 1100.0],
+            "contact_damping": [72.0, 88.0],
+            "gravity": [9.51, 10.11],
+            "motor_strength": [0.9, 1.1],
+            "joint_offset": [-0.01, 0.01],
+            "action_scale_offset": [0.0, 0.0],
+            "stiffness_offset": [0.0, 0.0],
+            "stiffness_scale": [0.9, 1.1],
+            "damping_offset": [0.0, 0.0],
+            "damping_scale": [0.9, 1.1],
+        }
+        wide = {name: list(getattr(type(self).domain_rand, name)) for name in narrow}
+        return {"wide": {"domain_rand": wide}, "narrow": {"domain_rand": narrow}}
 
 
 class LeggedRobotCfgPPO(BaseConfig):
