@@ -195,9 +195,11 @@ def test_steps_that_do_not_sense(make_task, engine):
     Between, the sensors keep what the last step that sensed has written; MuJoCo Warp's own step sets them to zero.
     """
     generator = torch.Generator().manual_seed(5)
-    sims = [make_task("a1_torque", 2, **{"sim.engine": engine}).sim for _ in range(2)]
-    for sim in sims:
-        sim.qpos[:, 2] = 0.25
+    tasks = [make_task("a1_torque", 2, **{"sim.engine": engine}) for _ in range(2)]
+    sims = [task.sim for task in tasks]
+    for task in tasks:
+        task.sim.qpos[:, 2] = 0.25
+        task.dof_pos.copy_(task.default_dof_pos.expand(2, -1))  # touches the ground, whatever was drawn
     for sense in (True, False, False, True):
         kept = [sims[1].contact_found.clone(), sims[1].contact_force.clone()]
         torque = 8.0 * torch.randn(2, 12, generator=generator)

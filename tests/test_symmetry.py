@@ -91,6 +91,7 @@ def make_symmetric(make_task, tmp_path_factory):
         sim = task.sim
         qpos, qvel = sim.qpos[:num].clone(), torch.randn(num, 18, generator=generator)
         qpos[:, 2] = torch.linspace(0.1, 0.4, num)
+        qpos[:, 3:7], qpos[:, 7:] = torch.tensor([1.0, 0.0, 0.0, 0.0]), task.default_dof_pos  # not what was drawn
         qpos[:, 3:7] += 0.2 * torch.randn(num, 4, generator=generator)
         qpos[:, 3:7] /= qpos[:, 3:7].norm(dim=1, keepdim=True)
         qpos[:, 7:] += 0.3 * torch.randn(num, 12, generator=generator)
