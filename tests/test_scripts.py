@@ -285,6 +285,14 @@ def test_list_of_tasks(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_nobody_reads_on():
+    """Output that goes into ``| head`` ends a script without a traceback."""
+    process = start("train.py", "--list")
+    process.stdout.close()
+    assert (process.stderr.read(), process.wait()) == ("", 1)
+    process.stderr.close()
+
+
 def test_late_mistake_in_a_process_of_its_own(experiment):
     """A mistake that shows only when the simulator is there is one line too, and leaves no folder."""
     result = finish(start("train.py", *SMALL, f"--experiment_name={experiment}", "--logger=tensorbord"))

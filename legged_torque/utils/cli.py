@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 from collections.abc import Callable
 
@@ -10,7 +11,8 @@ from legged_torque.utils.errors import UserError
 
 
 def run_script(main: Callable[[], None]) -> None:
-    """Run a script's main function; a user's mistake ends it with one line and exit status 2, Ctrl-C with 130."""
+    """Run a script's main function; a user's mistake ends it with one line and exit status 2, Ctrl-C with 130,
+    an output that nobody reads any more (``| head``) with 1."""
     gc.freeze()  # what has been imported stays: searching it for garbage at the end would take a second or two
     try:
         main()
@@ -20,3 +22,6 @@ def run_script(main: Callable[[], None]) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes what is left when it ends
+        sys.exit(1)
