@@ -14,6 +14,7 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.evaluation.benchmark import TRACED, MemoryMeter, Plan, measure
 from legged_torque.utils.args import Parser, add_settings_args, device_name, resolve_device, run_script
+from legged_torque.utils.cli import prepare_file
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import package_versions
 
@@ -49,7 +50,7 @@ def main() -> None:
     device = resolve_device(args.device)
     settings = [size_settings(args, num_envs) for num_envs in args.num_envs or [None]]
     for file in filter(None, (args.json, args.profile)):
-        file.parent.mkdir(parents=True, exist_ok=True)
+        prepare_file(file)
     print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")
     print(LEGEND.format(memory=MEMORY[device.split(":")[0]]))
     print(" | ".join(f"{title:>{width(title)}}" for title, _ in COLUMNS.values()), flush=True)

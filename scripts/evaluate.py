@@ -16,6 +16,7 @@ from legged_torque.envs import task_registry
 from legged_torque.evaluation.evaluator import evaluation_cfg
 from legged_torque.evaluation.metrics import COMMANDS, CommandBreakdown, WalkingMetrics, measure
 from legged_torque.utils.args import Parser, add_task_args, device_name, run_script
+from legged_torque.utils.cli import prepare_file
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import find_checkpoint, package_versions
 from legged_torque.utils.task_registry import load_run, set_seed
@@ -40,10 +41,10 @@ def main() -> None:
         raise UserError(f"--steps must be at least 1, not {args.steps}")
     if args.command and not all(map(math.isfinite, args.command)):
         raise UserError(f"--command must be finite, not {args.command}")
-    if args.json and args.json.is_dir():
-        raise UserError(f"--json must be a file, '{args.json}' is a folder")
     run_dir, env_cfg, train_cfg = load_run(args)
     checkpoint = find_checkpoint(run_dir, args.checkpoint)
+    if args.json:
+        prepare_file(args.json)
     env_cfg = evaluation_cfg(env_cfg, env_cfg.env.num_envs)
     for name, value in zip(COMMANDS, args.command or (), strict=False):
         setattr(env_cfg.commands.ranges, name, [value, value])
@@ -73,7 +74,6 @@ def main() -> None:
     if args.json:
         result["metrics"] = {name: asdict(estimate) for name, estimate in metrics.estimates().items()}
         result["by_command"] = breakdown.table()
-        args.json.parent.mkdir(parents=True, exist_ok=True)
         args.json.write_text(json.dumps(without_nan(result), indent=1) + "\n", encoding="utf-8")
 
 

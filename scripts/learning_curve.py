@@ -10,6 +10,7 @@ from pathlib import Path
 from legged_torque.envs import task_registry
 from legged_torque.evaluation.metrics import measure
 from legged_torque.utils.args import Parser, add_task_args, device_name, run_script
+from legged_torque.utils.cli import prepare_file
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
@@ -34,6 +35,8 @@ def main() -> None:
     run_dir, env_cfg, train_cfg = load_run(args)
     env, _ = task_registry.make_env(args.task, args, env_cfg)
     runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
+    file = args.json or run_dir / "curve.json"
+    prepare_file(file)
     points = []
     for number in checkpoint_numbers(run_dir):
         infos = runner.load(str(find_checkpoint(run_dir, number)))
@@ -53,7 +56,7 @@ def main() -> None:
         "versions": package_versions(),
         "points": points,
     }
-    (args.json or run_dir / "curve.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,9 @@
 """Draw learning curves (Figure 3): ``python scripts/plot_curves.py docs/learning/*.json --out curves.png``."""
 
-import json
 from pathlib import Path
 
 from legged_torque.utils.args import Parser, run_script
-from legged_torque.utils.errors import UserError
-from legged_torque.utils.plotting import load_pyplot, save_figure
+from legged_torque.utils.plotting import load_pyplot, read_data, save_figure
 
 PANELS = {
     "track_percentage": "tracking (1 is perfect)",
@@ -31,7 +29,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="picture to write (png, svg, pdf)")
     args = parser.parse_args()
     pyplot = load_pyplot()
-    runs = [read(file) for file in args.files]
+    runs = [read_data(file, {"task", "seed", "points"}, "learning_curve.py") for file in args.files]
     tasks = sorted({run["task"] for run in runs})
     figure, axes = pyplot.subplots(1, len(PANELS), figsize=(15, 4.5), layout="constrained")
     for axis, (metric, title) in zip(axes, PANELS.items(), strict=True):
@@ -48,21 +46,6 @@ def main() -> None:
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize="small")
     save_figure(figure, args.out)
-
-
-def read(file: Path) -> dict:
-    """Return a run's curve.
-
-    Raises:
-        UserError: If the file is not one.
-    """
-    try:
-        run = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read '{file}': {error}") from None
-    if not isinstance(run, dict) or not {"task", "seed", "points"} <= run.keys():
-        raise UserError(f"'{file}' is not a file that learning_curve.py has written")
-    return run
 
 
 if __name__ == "__main__":

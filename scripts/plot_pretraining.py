@@ -1,12 +1,11 @@
 """Draw what gravity pre-training was like: ``python scripts/plot_pretraining.py report.json --out pretraining.png``."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from legged_torque.utils.args import Parser, run_script
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.plotting import load_pyplot, save_figure
+from legged_torque.utils.plotting import load_pyplot, read_data, save_figure
 
 BLUE, ORANGE = "#0072B2", "#D55E00"  # told apart by colour-blind eyes
 PARTS = {"histograms", "settings", "rms_error", "standing"}
@@ -19,7 +18,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="picture to write (png, svg, pdf)")
     args = parser.parse_args()
     pyplot = load_pyplot()
-    report = read(args.file)
+    report = read_data(args.file, PARTS, "pretrain_gravity.py")
     figure, axes = pyplot.subplots(1, 4, figsize=(17, 4), layout="constrained")
     try:
         draw(axes, report)
@@ -56,21 +55,6 @@ def draw_errors(axis: Any, errors: dict[str, list[float]]) -> None:
         axis.plot(range(1, len(values) + 1), values, line, color=color, label=name.replace("_", " "))
     axis.set(title="learned torques", xlabel="epoch", ylabel="root mean square error [N m]", ylim=(0, None))
     axis.legend()
-
-
-def read(file: Path) -> dict[str, Any]:
-    """Return a report.
-
-    Raises:
-        UserError: If the file is not one.
-    """
-    try:
-        report = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read '{file}': {error}") from None
-    if not isinstance(report, dict) or not PARTS <= report.keys():
-        raise UserError(f"'{file}' is not a report of pretrain_gravity.py")
-    return report
 
 
 if __name__ == "__main__":

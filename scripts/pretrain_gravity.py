@@ -12,6 +12,7 @@ os.environ["MUJOCO_GL"] = "disable"  # nothing is drawn, and MuJoCo must not loo
 from legged_torque.envs import task_registry
 from legged_torque.learning.pretrained import make_pretrained, pretrained_file
 from legged_torque.utils.args import Parser, add_build_args, device_name, resolve_device, run_script
+from legged_torque.utils.cli import prepare_file
 from legged_torque.utils.progress import CompileProgress
 
 
@@ -31,7 +32,7 @@ def main() -> None:
     env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
     file = pretrained_file(args, train_cfg)
     if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)  # minutes before it is written
+        prepare_file(args.json)
     print(f"Pre-training {args.task} on {device_name(resolve_device(args.device))}.", flush=True)
     with CompileProgress():
         report = make_pretrained(file, args, env_cfg, train_cfg)

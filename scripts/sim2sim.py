@@ -27,7 +27,7 @@ from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import Robot
 from legged_torque.deploy.simulation import Events, Simulation
 from legged_torque.deploy.video import Recorder
-from legged_torque.utils.cli import run_script
+from legged_torque.utils.cli import prepare_file, run_script
 from legged_torque.utils.errors import UserError
 
 
@@ -87,6 +87,8 @@ def main() -> None:
     xml = args.xml or ROOT_DIR / policy.description["robot"]["file"]
     robot = Robot(xml, policy.description)
     events = Events(args.command, args.push_velocity, args.push_probability)
+    if args.json:
+        prepare_file(args.json)
     simulation = Simulation(policy, robot, events)
     recorder = Recorder(simulation) if args.video else None
     sums = []
@@ -123,7 +125,6 @@ def write_json(args: argparse.Namespace, policy: Policy, robot: Robot, metrics: 
         name: {key: number if math.isfinite(number) else None for key, number in value.items()}
         for name, value in metrics.items()
     }
-    args.json.parent.mkdir(parents=True, exist_ok=True)
     args.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 

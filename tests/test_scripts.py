@@ -216,6 +216,8 @@ def test_mistakes_when_training(root, words, message):
         ("play.py", "--set=control.stifness=1", "did you mean 'control.stiffness'?"),
         ("learning_curve.py", "--steps=0", "--steps must be at least 1, not 0"),
         ("learning_curve.py", "--load_run=2026", "unknown run '2026'"),
+        ("learning_curve.py", "--num_envs=2 --json=/dev/null/a", "cannot write '/dev/null/a': Not a directory"),
+        ("evaluate.py", "--json=/dev", "cannot write '/dev': it is a folder"),
     ],
 )
 def test_mistakes_after_training(root, script, words, message):
@@ -271,10 +273,11 @@ def test_resume_in_a_folder_by_its_path(root, tmp_path):
 
 def test_learning_curve(root, tmp_path):
     """Every checkpoint is measured, at the number of steps after which it was saved."""
-    words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--steps=3", f"--json={tmp_path / 'curve.json'}"]
+    file = tmp_path / "new" / "curve.json"
+    words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--steps=3", f"--json={file}"]
     status, output, error = run_here("learning_curve.py", *words, root=root)
     assert (status, error) == (0, "") and len(output.splitlines()) == 2
-    curve = json.loads((tmp_path / "curve.json").read_text())
+    curve = json.loads(file.read_text())
     assert [point["steps"] for point in curve["points"]] == [8, 16]
     assert all(math.isfinite(value) for point in curve["points"] for value in point.values())
 

@@ -92,11 +92,7 @@ def place_on_ground(
         missing &= ~take
         if not missing.any():
             break
-    task.sim.qpos.copy_(qpos)
-    task.sim.qvel.copy_(qvel)
-    task._update_state()
-    task.compute_observations()
-    task._keep_last()
+    task.set_state(qpos, qvel)
 
 
 def is_standing(task: LeggedRobot) -> Tensor:

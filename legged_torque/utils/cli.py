@@ -6,6 +6,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 from legged_torque.utils.errors import UserError
 
@@ -25,3 +26,17 @@ def run_script(main: Callable[[], None]) -> None:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes what is left when it ends
         sys.exit(1)
+
+
+def prepare_file(file: Path) -> None:
+    """Make the folder of a file that will be written when the work is done.
+
+    Raises:
+        UserError: If that is not possible, or the file is a folder.
+    """
+    if file.is_dir():
+        raise UserError(f"cannot write '{file}': it is a folder")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot write '{file}': {error.strerror}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -23,6 +24,26 @@ def load_pyplot() -> ModuleType:
     except ImportError:
         raise UserError("plots need the extra: pip install -e .[plots]") from None
     return pyplot
+
+
+def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
+    """Return what a script has written as JSON.
+
+    Args:
+        file: The file.
+        keys: What it must have.
+        script: Name of the script, for the message.
+
+    Raises:
+        UserError: If the file is not such a one.
+    """
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read '{file}': {error}") from None
+    if not isinstance(data, dict) or not keys <= data.keys():
+        raise UserError(f"'{file}' is not a file that {script} has written")
+    return data
 
 
 def save_figure(figure: Any, file: Path) -> None:

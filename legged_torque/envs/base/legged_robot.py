@@ -242,6 +242,19 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         """Count the time of each foot since it left the ground."""
         self.feet_air_time.copy_((self.feet_air_time + self.dt) * (1.0 - self.feet_contact))
 
+    def set_state(self, qpos: Tensor, qvel: Tensor) -> None:
+        """Put all worlds into given states, with the observations that follow; episodes go on.
+
+        Args:
+            qpos: As ``sim.qpos``. Shape: (num_envs, nq).
+            qvel: As ``sim.qvel``. Shape: (num_envs, nv).
+        """
+        self.sim.qpos.copy_(qpos)
+        self.sim.qvel.copy_(qvel)
+        self._update_state()
+        self.compute_observations()
+        self._keep_last()
+
     # ---- construction ------------------------------------------------------------------------------------------------
 
     def _create_sim(self) -> None:
