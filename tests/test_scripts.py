@@ -216,7 +216,7 @@ def test_mistakes_when_training(root, words, message):
         ("play.py", "--set=control.stifness=1", "did you mean 'control.stiffness'?"),
         ("learning_curve.py", "--steps=0", "--steps must be at least 1, not 0"),
         ("learning_curve.py", "--load_run=2026", "unknown run '2026'"),
-        ("learning_curve.py", "--num_envs=2 --json=/dev/null/a", "cannot write '/dev/null/a': Not a directory"),
+        ("learning_curve.py", "--num_envs=2 --json=/dev/null/a", "cannot make the folder '/dev/null': File exists"),
         ("evaluate.py", "--json=/dev", "cannot write '/dev': it is a folder"),
     ],
 )

@@ -39,4 +39,4 @@ def prepare_file(file: Path) -> None:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"cannot write '{file}': {error.strerror}") from None
+        raise UserError(f"cannot make the folder '{file.parent}': {error.strerror}") from None
