@@ -1,0 +1,189 @@
+"""Commands, episodes and initial states of the tasks."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from test_control import HIGH, IN_THE_AIR, LOW, NOMINAL
+
+
+def euler_by_hand(quat):
+    """Roll, pitch and yaw (about fixed x, y, z, in this order) from MuJoCo's rotation matrix of a quaternion."""
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, np.asarray(quat, dtype=float))
+    r = matrix.reshape(3, 3)
+    return math.atan2(r[2, 1], r[2, 2]), -math.asin(r[2, 0]), math.atan2(r[1, 0], r[0, 0])
+
+
+# --------------------------------------------------------------------------------------------------- commands
+
+RANGES = {"lin_vel_x": [-1.0, 0.5], "lin_vel_y": [0.6, 0.75], "ang_vel_yaw": [-2.0, -1.5]}
+
+
+@pytest.mark.parametrize("ranges", [{}, RANGES])
+def test_commands_fill_their_ranges(make_task, ranges):
+    """Drawn at a reset, commands are uniform over their ranges, by default +-1 m/s and +-1 rad/s, one per world."""
+    task = make_task("a1_torque", 1024, **{f"commands.ranges.{key}": value for key, value in ranges.items()})
+    for column, key in enumerate(RANGES):
+        low, high = ranges.get(key, (-1.0, 1.0))
+        drawn = np.sort((task.commands[:, column].numpy() - low) / (high - low))
+        assert drawn[0] >= -1e-6 and drawn[-1] <= 1 + 1e-6 and len(np.unique(drawn)) > 1000
+        assert np.abs(drawn - np.linspace(0, 1, 1024)).max() < 0.0611  # Kolmogorov-Smirnov at 0.1%
+    correlation = np.corrcoef(task.commands.numpy().T)
+    assert np.abs(correlation - np.eye(3)).max() < 0.12
+
+
+@pytest.mark.parametrize("probability", [0.0, 0.002, 0.25, 1.0])
+def test_resampling_probability(make_task, probability):
+    """Commands are drawn anew with the set probability per world and step, and otherwise stay bitwise."""
+    task = make_task("a1_torque", 2048, **{"commands.resampling_probability": probability})
+    task.reset_buf.fill_(False)
+    draws, changed = 20 * 2048, 0
+    for _ in range(20):
+        before = task.commands.clone()
+        task._reset_worlds()
+        changed += (task.commands != before).all(dim=1).sum().item()
+        assert ((task.commands != before).all(dim=1) | (task.commands == before).all(dim=1)).all()
+    assert abs(changed - draws * probability) <= 4 * math.sqrt(draws * probability * (1 - probability))
+
+
+def test_default_resampling_probability(make_task):
+    """By default commands change with probability 0.002 per step, about every 10 s."""
+    assert make_task("a1_torque", 1).cfg.commands.resampling_probability == 0.002
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0])
+def test_resampling_within_step(make_task, probability):
+    """A step keeps all commands at probability 0 and draws all anew at 1, without ending an episode."""
+    task = make_task("a1_torque", 3, **IN_THE_AIR, **{"commands.resampling_probability": probability})
+    before = task.commands.clone()
+    task.step(torch.zeros(3, 12))
+    assert ((task.commands != before) == bool(probability)).all()
+    assert task.episode_length_buf.tolist() == [1, 1, 1]
+
+
+# --------------------------------------------------------------------------------------------------- episodes
+
+
+def test_time_out(make_task):
+    """An episode ends after its length as a time-out, and counting starts anew."""
+    task = make_task("a1_torque", 3, **IN_THE_AIR, **{"env.episode_length_s": 0.1})
+    task.episode_length_buf = torch.tensor([0, 2, 0])
+    for step in range(1, 9):
+        _, _, dones, extras = task.step(torch.zeros(3, 12))
+        expected = [step == 5, step in (3, 8), step == 5]
+        assert dones.tolist() == expected and extras["time_outs"].tolist() == expected
+        assert task.episode_length_buf.tolist() == [step % 5, (step + 2) % 5, step % 5]
+        assert ((task.base_pos[:, 2] == 2.0) == torch.tensor(expected)).all()
+
+
+def test_termination(make_task):
+    """A trunk on the ground ends its episode, which is no time-out, even in the very last step; others go on."""
+    task = make_task("a1_torque", 4, **IN_THE_AIR, **{"env.episode_length_s": 0.1})
+    task.episode_length_buf = torch.tensor([1, 1, 4, 4])
+    low = torch.tensor([False, True, False, True])
+    task.base_quat.copy_(torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4, 4))
+    task.dof_pos.copy_(torch.tensor([0.0, 2.6, -0.95] * 4).expand(4, 12))  # legs up
+    task.base_pos[low, 2] = 0.05
+    _, _, dones, extras = task.step(torch.zeros(4, 12))
+    assert dones.tolist() == [False, True, True, True]
+    assert extras["time_outs"].tolist() == [False, False, True, False]
+    assert task.episode_length_buf.tolist() == [2, 0, 0, 0]
+    np.testing.assert_array_equal(task.base_pos[1:], [[0.0, 0.0, 2.0]] * 3)
+
+
+@pytest.mark.parametrize("part", ["feet", "knees"])
+def test_no_termination_by_legs(make_task, part):
+    """Feet, calves and thighs on the ground end no episode."""
+    task = make_task("a1_torque", 1)
+    height, calf = {"feet": (0.333, -0.95), "knees": (0.207, -2.6)}[part]
+    task.sim.qpos[0] = torch.tensor([0, 0, height, 1, 0, 0, 0, *[0.0, 0.0, calf] * 4])
+    _, _, dones, _ = task.step(torch.zeros(1, 12))
+    assert task.contacts.sum() >= 4 and not dones.any()
+
+
+def test_reset_clears_what_belongs_to_the_episode(make_task):
+    """After its end an episode leaves no action, air time, sum, speed or contact behind; the other world keeps all."""
+    task = make_task("a1_torque", 2, **{"env.episode_length_s": 0.1, "rewards.only_positive_rewards": False})
+    task.base_pos[:, 2] = 0.2
+    task.episode_length_buf = torch.tensor([2, 0])
+    for _ in range(3):
+        task.feet_air_time.fill_(0.3)
+        task.base_quat.copy_(torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2))
+        task.base_pos[:, 2] = 0.25
+        obs, *_ = task.step(torch.full((2, 12), 0.5))
+    assert task.reset_buf.tolist() == [True, False]
+    for buffer in (task.actions, task.last_actions, task.episode_sums.T, task.episode_return, task.last_dof_vel):
+        assert (buffer[0] == 0).all() and (buffer[1] != 0).any()
+    for buffer in (task.feet_air_time, task.sim.qvel, task.sim.qacc_warmstart, task.contacts, task.base_lin_vel):
+        assert (buffer[0] == 0).all()
+    assert (task.contacts[1] != 0).any() and (task.sim.qvel[1] != 0).any()
+    assert (obs["policy"][0, 21:] == 0).all() and (obs["critic"][0, -88:-84] == 0).all()
+
+
+def test_reset_of_all_worlds(make_task):
+    """reset() starts every world anew, so that the first step's action rate and acceleration count from rest."""
+    task = make_task("a1_torque", 2, **IN_THE_AIR)
+    for _ in range(3):
+        task.step(torch.ones(2, 12))
+    obs = task.reset()
+    np.testing.assert_allclose(task.base_pos, [[0.0, 0.0, 2.0]] * 2)
+    assert (task.sim.qvel == 0).all() and (obs["policy"][:, 21:] == 0).all()
+    assert (task.episode_length_buf == 0).all() and (task.episode_sums == 0).all() and (task.episode_return == 0).all()
+    task.step(torch.zeros(2, 12))
+    sums = dict(zip(task.reward_names, task.episode_sums, strict=True))
+    assert (sums["action_rate"] == 0).all()
+    change = (task.sim.qvel[:, 6:] / 0.02).square().sum(dim=1)
+    np.testing.assert_allclose(sums["dof_acc"], -2.5e-7 * 0.02 * change, rtol=1e-3, atol=1e-9)
+
+
+# --------------------------------------------------------------------------------------------------- initial states
+
+
+@pytest.mark.parametrize(
+    "ranges",
+    [
+        {
+            "init_roll": [-math.pi / 16, math.pi / 16],
+            "init_pitch": [-math.pi / 16, math.pi / 16],
+            "init_yaw": [-math.pi, math.pi],
+            "init_dof_pos_scale": [0.5, 1.5],
+        },
+        {"init_roll": [0.1, 0.2], "init_pitch": [-0.4, -0.3], "init_yaw": [1.0, 3.0], "init_dof_pos_scale": [1.0, 1.1]},
+    ],
+)
+def test_initial_states(make_task, ranges):
+    """Initial angles fill their ranges, by default those of the design; the trunk is at rest at its place.
+
+    Joints are at q_nominal times a number of their own, kept inside their limits.
+    """
+    default = ranges["init_roll"][0] < 0
+    task = make_task("a1_torque", 512, **({} if default else {f"domain_rand.{k}": v for k, v in ranges.items()}))
+    np.testing.assert_allclose(task.base_pos, np.tile([0.0, 0.0, 0.4], (512, 1)), atol=1e-6)
+    assert (task.sim.qvel == 0).all()
+    angles = np.array([euler_by_hand(quat) for quat in task.base_quat.numpy()])
+    for column, key in enumerate(("init_roll", "init_pitch", "init_yaw")):
+        low, high = ranges[key]
+        drawn = (angles[:, column] - low) / (high - low)
+        assert -1e-4 < drawn.min() < 0.03 and 0.97 < drawn.max() < 1 + 1e-4, key
+        assert abs(drawn.mean() - 0.5) < 0.05 and len(np.unique(drawn)) > 500, key
+    q = task.dof_pos.numpy()
+    low, high = ranges["init_dof_pos_scale"]
+    assert (q >= LOW - 1e-6).all() and (q <= HIGH + 1e-6).all()
+    ends = np.sort([np.clip(NOMINAL * low, LOW, HIGH), np.clip(NOMINAL * high, LOW, HIGH)], axis=0)
+    assert (q >= ends[0] - 1e-6).all() and (q <= ends[1] + 1e-6).all()
+    inside = (q > LOW + 1e-4) & (q < HIGH - 1e-4)
+    scale = (np.where(inside, q / NOMINAL, np.nan) - low) / (high - low)
+    assert (np.nanmax(scale, axis=0) > 0.97).all() and (np.nanmin(scale[:, :2], axis=0) < 0.03).all()
+    front = scale[:, [0, 1, 3, 4, 6, 7]]  # hips and thighs are never clipped
+    assert np.abs(np.corrcoef(front.T) - np.eye(6)).max() < 0.2  # one draw per joint, not one per world
+
+
+def test_draws_differ_and_repeat_with_the_seed(make_task):
+    """No two worlds start alike; the same seed gives the same start, another seed another one."""
+    first, same, other = (make_task("a1_torque", 16, seed=seed) for seed in (5, 5, 6))
+    assert len(torch.unique(first.sim.qpos, dim=0)) == 16 and len(torch.unique(first.commands, dim=0)) == 16
+    assert torch.equal(first.sim.qpos, same.sim.qpos) and torch.equal(first.commands, same.commands)
+    assert not (first.sim.qpos[:, 3:] == other.sim.qpos[:, 3:]).all(dim=1).any()

@@ -1,0 +1,314 @@
+"""How an experiment goes through its cells, with stand-ins for the scripts."""
+
+import contextlib
+import fcntl
+import io
+import json
+import os
+import signal
+import threading
+import time
+
+import pytest
+import torch
+from settings import error_of
+from test_experiment import SMALL, experiment_here, wait_for, write
+from test_scripts import assert_told_in_one_line, contents
+
+from legged_torque.evaluation import experiment, experiment_run
+from legged_torque.evaluation.experiment import read_matrix
+from legged_torque.evaluation.experiment_job import find_workers
+from legged_torque.evaluation.experiment_run import ExperimentRun, duration_text, time_left
+
+STAND_IN_TRAIN = """
+import os, signal, sys, time
+from pathlib import Path
+options = dict(word.lstrip("-").partition("=")[::2] for word in sys.argv[1:])
+cell = Path(options["log_root"]) / options["experiment_name"]
+behaviour = Path(__file__).with_name("behaviour").read_text()
+with open(Path(__file__).with_name("order"), "a") as order:
+    order.write(f"{cell.name}{' resumed' if 'resume' in options else ''}\\n")
+if behaviour == f"fail {cell.name}":
+    sys.exit("first\\nsomething broke")
+runs = sorted(cell.glob("run_*"))
+done = max((int(file.stem[6:]) for file in runs[-1].glob("model_*")), default=0) if runs else 0
+run = cell / f"run_{len(runs)}"
+run.mkdir()
+(run / "config.yaml").write_text("{task: t, env: {}, train: {}, max_iterations: 4}")
+stopped = []
+signal.signal(signal.SIGTERM, lambda *_: stopped.append(1))
+while done < 4 and not stopped and not (behaviour == "early" and done == 2):
+    print(f"Learning iteration {done}/4", flush=True)
+    done += 1
+    while behaviour == "slow" and done == 3 and not stopped:
+        time.sleep(0.02)
+(run / f"model_{done}.pt").touch()
+"""
+
+STAND_IN_EVALUATE = """
+import json, sys
+from pathlib import Path
+options = dict(word.lstrip("-").partition("=")[::2] for word in sys.argv[1:])
+broken = Path(__file__).with_name("behaviour").read_text() == "broken"
+Path(options["json"]).write_text('{"half' if broken else json.dumps(options))
+"""
+
+
+@pytest.fixture
+def stage(tmp_path, monkeypatch):
+    """A folder with stand-ins for the scripts, whose file ``behaviour`` says how they behave."""
+    stage = tmp_path / "stage"
+    stage.mkdir()
+    for name, text in {
+        "train.py": STAND_IN_TRAIN,
+        "evaluate.py": STAND_IN_EVALUATE,
+        "behaviour": "",
+        "order": "",
+    }.items():
+        (stage / name).write_text(text)
+    monkeypatch.setattr(experiment, "SCRIPTS", stage)
+    monkeypatch.setattr(experiment_run, "POLL", 0.01)
+    return stage
+
+
+def order(stage):
+    """The cells that were trained, in their order."""
+    return (stage / "order").read_text().splitlines()
+
+
+def test_order_and_commands(stage, tmp_path):
+    """A seed comes before the next one; the scripts get the options of the cell and of the file."""
+    values = SMALL | {"seeds": [3, 1], "environments": {"low": ["low", "high"], "high": ["high"]}, "ranges": "narrow"}
+    file, out = write(tmp_path / "m.yaml", values), tmp_path / "out"
+    status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
+    assert (status, error) == (0, "")
+    cells = [f"{task}-{name}-s{seed}" for seed in (3, 1) for name in ("low", "high") for task in SMALL["tasks"]]
+    assert order(stage) == cells and (out / "experiment.yaml").read_bytes() == file.read_bytes()
+    log = (out / "a1_torque-high-s3" / "train.log").read_text()
+    for word in (
+        "--task=a1_torque",
+        "--seed=3",
+        "--perturbation=high",
+        "--set=runner.total_steps=128",
+        "--ranges=narrow",
+        "--device=cpu",
+    ):
+        assert f" {word}" in log.splitlines()[0]
+    result = json.loads((out / "a1_torque-low-s3" / "result_high.json").read_text())
+    assert (result["perturbation"], result["num_envs"], result["steps"]) == ("high", "256", "2000")
+    assert output.count("training on cpu took") == 8 and output.count("evaluation in") == 12
+    assert "8 of 8 cells done, " in output and "time left unknown yet" in output and " left\n" in output
+
+
+def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
+    """The exit status is 1, the last lines of its log are shown, and the next call tries it again, and only it."""
+    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
+    (stage / "behaviour").write_text("fail a1_position-low-s1")
+    status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
+    assert status == 1 and "1 of 2 cells are done." in output
+    assert error.startswith("a1_position-low-s1: training has failed with exit status 1\n")
+    assert str(out / "a1_position-low-s1" / "train.log") in error and error.endswith("    something broke\n")
+    (stage / "behaviour").write_text("")
+    status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
+    assert (status, error) == (0, "") and "2 of 2 cells are done." in output
+    assert order(stage) == ["a1_position-low-s1", "a1_torque-low-s1", "a1_position-low-s1"]
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "message"),
+    [
+        ("early", "training has ended after 2 of 4 iterations"),
+        ("broken", "evaluation in low has left no readable"),
+    ],
+)
+def test_steps_that_only_seem_to_succeed(stage, tmp_path, behaviour, message):
+    """Exit status 0 is not enough; what is incomplete does not become a result."""
+    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
+    (stage / "behaviour").write_text(behaviour)
+    status, _, error = experiment_here(file, f"--out={out}", "--device=cpu", "--jobs=2", tmp_path=tmp_path)
+    assert status == 1 and error.count(message) == 2 and not list(out.glob("*/result_*.json"))
+    (stage / "behaviour").write_text("")
+    assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
+    assert len(list(out.glob("*/result_*.json"))) == 4
+    assert any("resumed" in line for line in order(stage)) == (behaviour == "early")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stop(stage, tmp_path, number):
+    """Trainings save before this process ends with status 130, and go on the next time."""
+    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
+    (stage / "behaviour").write_text("slow")
+
+    def stop():
+        """Send the signal when the training is under way."""
+        wait_for(lambda: any("iteration 2/4" in log.read_text() for log in out.glob("*/train.log")))
+        os.kill(os.getpid(), number)
+
+    thread = threading.Thread(target=stop)
+    thread.start()
+    status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
+    thread.join()
+    assert (status, error) == (130, "interrupted\n") and "Stopping: " in output and "0 of 2 cells are done." in output
+    assert [path.name for path in out.glob("*/*/model_*")] == ["model_3.pt"]
+    (stage / "behaviour").write_text("")
+    words = [file, f"--out={out}", "--device=cpu"]
+    listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1].splitlines()
+    assert listed[0] == "a1_position-low-s1: resume after 3 of 4 iterations, evaluate in low, high"
+    assert experiment_here(*words, tmp_path=tmp_path)[0] == 0
+    assert order(stage) == ["a1_position-low-s1", "a1_position-low-s1 resumed", "a1_torque-low-s1"]
+
+
+def test_a_cell_that_another_process_works_on(stage, tmp_path):
+    """It is left for later, told once, and begun when the other process lets it go."""
+    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
+    (out / "a1_position-low-s1").mkdir(parents=True)
+    lock = open(out / "a1_position-low-s1" / "lock", "a")
+    fcntl.flock(lock, fcntl.LOCK_EX)
+
+    def release():
+        """Let go when the other cell is done."""
+        wait_for((out / "a1_torque-low-s1" / "result_high.json").is_file)
+        time.sleep(0.1)
+        assert order(stage) == ["a1_torque-low-s1"]
+        lock.close()
+
+    thread = threading.Thread(target=release)
+    thread.start()
+    status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
+    thread.join()
+    assert (status, error) == (0, "")
+    assert output.count("a1_position-low-s1: another process works on it; left for later\n") == 1
+    assert order(stage) == ["a1_torque-low-s1", "a1_position-low-s1"]
+
+
+def test_two_experiments_share_a_folder(stage, tmp_path):
+    """Each cell is trained once, and both end when all is done."""
+    file, out = write(tmp_path / "m.yaml", SMALL | {"seeds": [1, 2, 3]}), tmp_path / "out"
+    matrix, statuses = read_matrix(file), []
+    runs = [ExperimentRun(matrix, out, find_workers("cpu", 1)) for _ in range(2)]
+    threads = [threading.Thread(target=lambda run=run: statuses.append(run.run())) for run in runs]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert statuses == [0, 0]
+    assert sorted(order(stage)) == sorted(cell.name for cell in matrix.cells())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"train": {"runner.total_steps": 64}}, "train.runner.total_steps is 64, was 128; give another --out"),
+        ({"train": {}}, "train.runner.total_steps is not set, was 128"),
+        ({"train": SMALL["train"] | {"env.num_envs": 2}}, "train.env.num_envs is 2, was not set"),
+        ({"evaluation": {"num_steps": 100}}, "evaluation.num_steps is 100, was 2000"),
+        ({"tasks": ["a1_torque", "a1_multihead"]}, "tasks had a1_position as well"),
+        ({"environments": {"low": ["low"]}}, "environments.low had high as well"),
+        ({"environments": {"high": ["low", "high"]}}, "environments had low as well"),
+        ({"seeds": [2]}, "seeds had 1 as well"),
+    ],
+)
+@pytest.mark.parametrize("words", [[], ["--dry-run"]], ids=["run", "dry run"])
+def test_changed_settings_are_refused(change, message, words, tmp_path):
+    """A folder holds results of the same settings only."""
+    out = tmp_path / "out"
+    out.mkdir()
+    write(out / "experiment.yaml", SMALL)
+    file, before = write(tmp_path / "m.yaml", SMALL | change), contents(out)
+    result = experiment_here(file, f"--out={out}", "--device=cpu", *words, tmp_path=tmp_path)
+    assert_told_in_one_line(result, message)
+    assert contents(out) == before
+
+
+def test_more_cells_are_added(stage, tmp_path):
+    """More tasks, environments and seeds may come into a folder; what is there already stays."""
+    file, out = write(tmp_path / "m.yaml", SMALL | {"tasks": ["a1_torque"]}), tmp_path / "out"
+    assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
+    write(file, SMALL | {"environments": {"high": ["high"], "low": ["doubled", "low", "high"]}, "seeds": [2, 1]})
+    assert experiment_here(file, f"--out={out}", "--device=cpu", "--jobs=3", tmp_path=tmp_path)[0] == 0
+    assert len(order(stage)) == len(set(order(stage))) == 8
+    assert (out / "a1_torque-low-s1" / "result_doubled.json").is_file()
+    assert read_matrix(out / "experiment.yaml").seeds == [2, 1]
+
+
+def test_lost_and_broken_results_are_made_again(stage, tmp_path):
+    """They come from another evaluation, not from another training; nothing else is touched."""
+    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
+    words = [file, f"--out={out}", "--device=cpu"]
+    assert experiment_here(*words, tmp_path=tmp_path)[0] == 0
+    before = contents(out)
+    lost, broken = out / "a1_position-low-s1" / "result_high.json", out / "a1_torque-low-s1" / "result_low.json"
+    lost.unlink()
+    broken.write_text('{"half": ')
+    listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1].splitlines()
+    assert listed == ["a1_position-low-s1: evaluate in high", "a1_torque-low-s1: evaluate in low"]
+    status, output, error = experiment_here(*words, tmp_path=tmp_path)
+    assert (status, error) == (0, "") and output.count(" took ") == 2 and len(order(stage)) == 2
+    assert json.loads(lost.read_text())["perturbation"] == "high"
+    assert json.loads(broken.read_text())["perturbation"] == "low"
+    changed = {path.name for path, state in contents(out).items() if before.get(path) != state}
+    cells = {lost.parent.name, broken.parent.name}
+    assert changed == {"result_high.json", "result_low.json", "evaluate.log", "lock", *cells}
+
+
+def test_results_of_another_training_are_not_kept(stage, tmp_path):
+    """If the runs are gone and a result is missing, all results come from the new training."""
+    file, out = write(tmp_path / "m.yaml", SMALL | {"tasks": ["a1_torque"]}), tmp_path / "out"
+    (out / "a1_torque-low-s1").mkdir(parents=True)
+    (out / "a1_torque-low-s1" / "result_low.json").write_text("{}")
+    assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
+    assert json.loads((out / "a1_torque-low-s1" / "result_low.json").read_text())["perturbation"] == "low"
+
+
+def test_live_line(stage, tmp_path):
+    """In a terminal a line is rewritten that says which cell is trained and how far it is."""
+    (stage / "behaviour").write_text("slow")
+    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
+    stream = io.StringIO()
+    stream.isatty = lambda: True
+    run = ExperimentRun(read_matrix(file), out, find_workers("cpu", 1))
+    run._shown = -experiment_run.SHOW_EVERY
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(stream):
+        patch.setattr(experiment_run, "SHOW_EVERY", 0.05)
+        patch.setenv("COLUMNS", "120")
+        thread = threading.Thread(target=run.run)
+        thread.start()
+        wait_for(lambda: "75%" in stream.getvalue())
+        (stage / "behaviour").write_text("")
+        os.kill(int((out / "a1_position-low-s1" / "lock").read_text()), signal.SIGTERM)
+        thread.join()
+    live = [line for line in stream.getvalue().split("\r") if "75%" in line][0]
+    assert live.startswith("0 of 2 cells done, ") and live.strip().endswith(" | a1_position-low-s1 75%")
+    assert len(live) == 119
+
+
+def test_workers(monkeypatch):
+    """Every visible GPU gets one worker, which sees only that GPU; on the CPU there are as many as wanted."""
+    assert [worker.device for worker in find_workers("auto", 3)] == ["cpu"] * 3
+    assert len(find_workers("cpu", None)) == 1
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    for visible, names in {None: ["0", "1"], "3,5": ["3", "5"]}.items():
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+        if visible:
+            monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+        workers = find_workers("auto", None)
+        assert [worker.variables for worker in workers] == [{"CUDA_VISIBLE_DEVICES": name} for name in names]
+        assert [(worker.name, worker.device) for worker in workers] == [("cuda:0", "cuda:0"), ("cuda:1", "cuda:0")]
+        assert [worker.variables for worker in find_workers("cuda:1", None)] == [{"CUDA_VISIBLE_DEVICES": names[1]}]
+    assert "--jobs is for the CPU" in error_of(find_workers, "auto", 2)
+    assert len(find_workers("cpu", 2)) == 2
+
+
+def test_time_left():
+    """It is the mean duration of a finished cell, times the cells that are left, over those worked on at a time."""
+    assert time_left([], 5, 1) is None
+    assert time_left([10.0, 20.0], 4, 2) == 30.0
+    assert time_left([10.0], 1.5, 4) == 10.0 and time_left([10.0], 0.5, 4) == 5.0
+    assert time_left([10.0], 0, 4) == 0.0
+    assert [duration_text(seconds) for seconds in (0.4, 59, 61, 3600, 7265)] == [
+        "0 s",
+        "59 s",
+        "1 min 01 s",
+        "1 h 00 min",
+        "2 h 01 min",
+    ]

@@ -1,0 +1,65 @@
+"""Steps in real time."""
+
+import pytest
+
+from legged_torque.viewer.pacing import MAX_LAG, Pacer
+
+
+class Clock:
+    """A clock that only moves when someone sleeps, or by hand."""
+
+    def __init__(self):
+        self.now, self.slept = 100.0, []
+
+    def __call__(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.slept.append(seconds)
+        self.now += seconds
+
+
+def test_pacer_real_time():
+    """Steps come in time, however long they take, as long as that is shorter than a step."""
+    clock = Clock()
+    pacer = Pacer(0.02, clock, clock.sleep)
+    begun = []
+    for work in [0.005, 0.015, 0.0, 0.019] * 10:
+        pacer.wait()
+        begun.append(clock.now)
+        clock.now += work
+    assert begun == pytest.approx([100.0 + 0.02 * i for i in range(40)])
+    assert pacer.achieved() == pytest.approx(1.0)
+
+
+def test_pacer_speed():
+    """At a tenth of real time steps come every tenth part as often."""
+    clock = Clock()
+    pacer = Pacer(0.02, clock, clock.sleep)
+    pacer.speed = 0.1
+    for _ in range(11):
+        pacer.wait()
+    assert clock.now == pytest.approx(100.0 + 10 * 0.2) and pacer.achieved() == pytest.approx(0.1)
+
+
+def test_pacer_behind():
+    """A short delay is caught up, a long one forgotten; a machine that is too slow never sleeps and says how slow."""
+    clock = Clock()
+    pacer = Pacer(0.02, clock, clock.sleep)
+    pacer.wait()
+    clock.now += 0.05
+    for _ in range(3):
+        pacer.wait()
+    assert clock.now == pytest.approx(100.06)
+    clock.now += 2 * MAX_LAG
+    slept = len(clock.slept)
+    pacer.wait()
+    assert len(clock.slept) == slept
+    pacer.wait()
+    assert len(clock.slept) == slept + 1  # no rush of steps
+    pacer.restart()
+    clock.slept.clear()
+    for _ in range(60):
+        pacer.wait()
+        clock.now += 0.04
+    assert not clock.slept and pacer.achieved() == pytest.approx(0.5)

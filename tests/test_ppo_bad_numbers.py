@@ -1,0 +1,125 @@
+"""Updates that must not happen: numbers that are not finite."""
+
+import math
+
+import pytest
+import torch
+from rsl_rl.algorithms import PPO
+from test_ppo import (
+    NUM_ACTIONS,
+    SAMPLES,
+    SETTINGS,
+    SIZES,
+    WORLDS,
+    assert_same_state,
+    copy_rollout,
+    make_ppo,
+    parameters,
+    record_rollout,
+    state_of,
+    steps_taken,
+)
+
+
+def poison(storage, field, value, step=5, world=2):
+    """Spoil one sample of a stored rollout; return its number in the flattened rollout."""
+    tensor = storage.observations[field] if field in SIZES else getattr(storage, field)
+    tensor[step, world, 0] = value
+    return step * WORLDS + world
+
+
+POISONS = [
+    ("advantages", math.nan),
+    ("advantages", math.inf),
+    ("returns", math.nan),
+    ("returns", 1e30),  # all gradients are finite, their norm is not
+    ("actions", math.nan),
+    ("policy", math.nan),
+    ("critic", math.nan),
+    ("critic", -math.inf),
+]
+
+
+@pytest.mark.parametrize(("field", "value"), POISONS)
+def test_only_the_spoiled_minibatch_is_skipped(field, value):
+    """The result equals that of rsl_rl learning from the other minibatches only, moments and counters included."""
+    ours = make_ppo()
+    record_rollout(ours)
+    spoiled = poison(ours.storage, field, value)
+    size = SAMPLES // 4
+    torch.manual_seed(3)
+    minibatches = torch.randperm(SAMPLES).split(size)
+    expected = make_ppo(PPO, steps=size, worlds=1, num_mini_batches=1)
+    expected.actor.load_state_dict(ours.actor.state_dict())
+    expected.critic.load_state_dict(ours.critic.state_dict())
+    for samples in minibatches:
+        if spoiled not in samples:
+            copy_rollout(ours.storage, expected.storage, samples)
+            expected.update()
+    torch.manual_seed(3)
+    report = ours.update()
+    assert report["skipped_updates"] == 1
+    assert all(math.isfinite(number) for number in report.values())
+    entropy = NUM_ACTIONS * 0.5 * (1.0 + math.log(2.0 * math.pi))  # of deviations around 1, whose mean it reports
+    assert report["entropy"] == pytest.approx(entropy, abs=0.1)
+    assert steps_taken(ours) == 3
+    assert_same_state(state_of(ours), state_of(expected))
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "adamw"])
+@pytest.mark.parametrize("reloaded", [False, True])
+def test_skipped_updates_change_nothing_and_later_ones_learn(optimizer, reloaded):
+    """With every minibatch spoiled, nothing moves by a single bit; the next rollout is learned from as if unspoiled."""
+    alg, twin = make_ppo(optimizer=optimizer), make_ppo(optimizer=optimizer)
+    for each in (alg, twin):
+        record_rollout(each, seed=1)
+        torch.manual_seed(4)
+        each.update()
+    if reloaded:
+        state, alg = alg.save(), make_ppo(optimizer=optimizer, seed=9)
+        alg.load(state, None, True)
+    before = state_of(alg)
+    record_rollout(alg, seed=2)
+    alg.storage.returns[::2] = math.nan
+    alg.num_learning_epochs = 2
+    report = alg.update()
+    assert report["skipped_updates"] == 2 * 4
+    assert all(math.isfinite(number) for number in report.values())
+    assert_same_state(state_of(alg), before, rtol=0.0, atol=0.0)
+    alg.num_learning_epochs = 1
+    for each in (alg, twin):
+        record_rollout(each, seed=3)
+        torch.manual_seed(5)
+        assert each.update()["skipped_updates"] == 0
+    assert_same_state(state_of(alg), state_of(twin), rtol=0.0, atol=0.0)
+    assert steps_taken(alg) == 8
+    assert all(not torch.equal(before[name], value) for name, value in parameters(alg).items())
+
+
+@pytest.mark.parametrize("per_mini_batch", [False, True])
+def test_reward_that_is_not_a_number(per_mini_batch):
+    """It spoils the earlier returns of its own world; only if advantages share one normalization, all minibatches."""
+    alg = make_ppo(normalize_advantage_per_mini_batch=per_mini_batch)
+    record_rollout(alg, poison=(2, 1))
+    spoiled = torch.isnan(alg.storage.returns.squeeze(-1))
+    assert spoiled[2, 1] and not spoiled[3:].any() and not spoiled[:, [0, 2, 3]].any()
+    before = state_of(alg)
+    torch.manual_seed(0)
+    minibatches = torch.randperm(SAMPLES).split(SAMPLES // 4)
+    skipped = sum(bool(spoiled.flatten()[samples].any()) for samples in minibatches) if per_mini_batch else 4
+    torch.manual_seed(0)
+    report = alg.update()
+    assert report["skipped_updates"] == skipped and (skipped == 4) != per_mini_batch
+    assert all(math.isfinite(number) for number in report.values())
+    for name, value in parameters(alg).items():
+        assert torch.isfinite(value).all()
+        assert torch.equal(before[name], value) != per_mini_batch
+
+
+def test_learning_rate_ignores_an_undefined_divergence():
+    """A minibatch with observations that are not numbers has no KL and leaves the adaptive learning rate alone."""
+    alg = make_ppo(num_mini_batches=1, schedule="adaptive")
+    record_rollout(alg)
+    poison(alg.storage, "policy", math.nan)
+    assert alg.update()["skipped_updates"] == 1
+    assert float(alg.learning_rate) == pytest.approx(SETTINGS["learning_rate"], rel=1e-6)

@@ -1,0 +1,110 @@
+"""What the task keeps from step to step, and its log."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from test_rewards import TABLE_III
+
+
+def random_rotation(rng):
+    """A random unit quaternion (w, x, y, z) and the rotation matrix that takes body into world vectors."""
+    w, x, y, z = quat = (lambda q: q / np.linalg.norm(q))(rng.normal(size=4))
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return quat, np.eye(3) + 2 * w * skew + 2 * skew @ skew
+
+
+def test_velocities_and_gravity_in_the_trunk_frame(make_task):
+    """Turned at random, velocity and gravity are the world's, turned back by the rotation matrix."""
+    task, rng = make_task("a1_torque", 8), np.random.default_rng(0)
+    rotations = [random_rotation(rng) for _ in range(8)]
+    velocity, rate = rng.normal(size=(8, 3)), rng.normal(size=(8, 3))
+    task.base_quat.copy_(torch.tensor(np.array([quat for quat, _ in rotations])))
+    task.sim.qvel[:, :3] = torch.tensor(velocity)
+    task.sim.qvel[:, 3:6] = torch.tensor(rate)
+    task._update_state()
+    for world, (quat, matrix) in enumerate(rotations):
+        np.testing.assert_allclose(task.base_lin_vel[world], matrix.T @ velocity[world], atol=2e-6)
+        np.testing.assert_allclose(task.projected_gravity[world], matrix.T @ (0, 0, -1), atol=1e-6)
+        model, local = task.sim.mj_model, np.zeros(6)
+        data = mujoco.MjData(model)
+        data.qpos[3:7], data.qvel[:3], data.qvel[3:6] = quat, velocity[world], rate[world]
+        mujoco.mj_forward(model, data)
+        trunk = model.body("trunk").id
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, trunk, local, 1)
+        np.testing.assert_allclose(task.base_ang_vel[world], local[:3], atol=2e-6)
+        np.testing.assert_allclose(task.base_lin_vel[world], local[3:], atol=2e-6)
+
+
+def test_air_time_grows_in_flight(make_task):
+    """In free flight every foot's air time is the number of control steps since the reset times Delta t."""
+    task = make_task("a1_torque", 2, **{"init_state.pos": [0.0, 0.0, 2.0]})
+    for step in range(1, 6):
+        task.step(torch.zeros(2, 12))
+        np.testing.assert_allclose(task.feet_air_time, 0.02 * step, rtol=1e-5)
+    assert not task.feet_contact.any()
+
+
+def test_air_time_ends_with_a_touch(make_task):
+    """The touching step is rewarded for the swing that it ends; then the count starts anew."""
+    task = make_task("a1_torque", 1)
+    task.feet_air_time.zero_()
+    seen = []
+    for touches in (0.0, 0.0, 0.0, 1.0, 1.0, 0.0):
+        task.feet_contact.fill_(touches)
+        seen.append(task._reward_feet_air_time().item())
+        task._update_feet_air_time()
+    np.testing.assert_allclose(seen, [0.0, 0.0, 0.0, 4 * (0.06 - 0.5), 4 * -0.5, 0.0], rtol=1e-5)
+    np.testing.assert_allclose(task.feet_air_time, 0.02, rtol=1e-5)
+
+
+def test_actions_and_joint_speeds_of_the_last_step(make_task):
+    """Action rate and joint acceleration compare with the step before, with zero at the start of an episode."""
+    task = make_task("a1_torque", 2, **{"init_state.pos": [0.0, 0.0, 2.0]})
+    last_action, last_speed = torch.zeros(2, 12), torch.zeros(2, 12)
+    rate, acceleration = (task.reward_names.index(term) for term in ("action_rate", "dof_acc"))
+    for _ in range(3):
+        before = task.episode_sums.clone()
+        action = torch.randn(2, 12)
+        task.step(action)
+        gained = task.episode_sums - before
+        np.testing.assert_allclose(gained[rate], -1e-6 * 0.02 * (action - last_action).square().sum(dim=1), rtol=2e-3)
+        speed = task.sim.qvel[:, 6:].clone()
+        change = ((speed - last_speed) / 0.02).square().sum(dim=1)
+        np.testing.assert_allclose(gained[acceleration], -2.5e-7 * 0.02 * change, rtol=1e-3)
+        last_action, last_speed = action, speed
+
+
+def test_log(make_task):
+    """The log gives mean tracking errors per step, and return, length and terms per ended episode, and starts anew."""
+    task = make_task(
+        "a1_torque",
+        3,
+        **{"env.episode_length_s": 0.1, "init_state.pos": [0.0, 0.0, 2.0], "rewards.only_positive_rewards": False},
+    )
+    task.episode_length_buf = torch.tensor([1, 0, 0])  # the first world's episode ends a step earlier
+    returns, errors = torch.zeros(3), []
+    for step in range(1, 6):
+        commands, running = task.commands.clone(), task.episode_length_buf > 0
+        task.step(torch.randn(3, 12))
+        returns += task.rew_buf * (running | (step == 1))
+        if step <= 3:
+            velocity = torch.cat([task.base_lin_vel[:, :2], task.base_ang_vel[:, 2:]], dim=1)
+            errors.append((velocity - commands).square())
+        if step == 3:
+            means = torch.cat(errors).mean(dim=0).tolist()
+            assert task.log.read(0.1) == pytest.approx(
+                {
+                    "Tracking/error_xy": means[0] + means[1],
+                    "Tracking/error_yaw": means[2],
+                    "Health/diverged_worlds": 0.0,
+                },
+                rel=1e-4,
+            )
+    log = task.log.read(0.1)
+    assert log["length"] == 5.0
+    assert log["return"] == pytest.approx(returns.mean().item(), rel=1e-4)
+    terms = {name: value for name, value in log.items() if name.startswith("Episode_Reward/")}
+    assert set(terms) == {f"Episode_Reward/{term}" for term in TABLE_III}
+    assert 0.1 * sum(terms.values()) == pytest.approx(log["return"], rel=1e-4)
+    assert task.log.read(0.1) == {"Health/diverged_worlds": 0.0}
