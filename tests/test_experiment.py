@@ -1,6 +1,6 @@
 """Experiments with the real scripts, in processes of their own: what is missing is run, what is done is skipped.
 
-Order, failures, locks and signals are those of test_experiment_run.py, which puts small stand-ins in the scripts' place.
+Order, failures, locks and signals are those of test_experiment_run.py, with small stand-ins in the place of scripts.
 """
 
 import json
