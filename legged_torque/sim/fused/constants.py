@@ -25,8 +25,8 @@ class DerivedConstants:
     """Keeps ``body_invweight0`` and ``dof_invweight0`` of every world in step with its other parameters.
 
     They scale the softness of contacts, limits and dry friction, and follow from masses, inertias and armatures in the
-    model's reference pose. Branches without their armatures are taken to be the same in all worlds and measured once,
-    until :meth:`vary_branches` is called: worlds differ in their trunks and armatures.
+    model's reference pose. Worlds are expected to differ in their trunks and armatures only: branches without armatures
+    are measured once, for all worlds, unless :meth:`vary_branches` is called.
     """
 
     def __init__(self, mj_model: mujoco.MjModel, model: mjw.Model, num_envs: int) -> None:
@@ -176,7 +176,8 @@ def make_kernels(branches: int, depth: int, lanes: int) -> SimpleNamespace:
         its own joint.
 
         A row j of a Jacobian is (trunk's translation in world axes, its rotation in its own axes, branch); its weight
-        is j M^-1 j^T. The trunk (depth 0) has its own translations in the joint's place.
+        is j M^-1 j^T. The trunk (depth 0) has its own translations in the joint's place. The number of rows is an
+        argument so that their loop is not unrolled.
         """
         lever = -wp.skew(com) * rot
         weight = float(0.0)
