@@ -18,6 +18,7 @@ from torch.nn.functional import elu, linear
 from legged_torque.deploy.metrics import UNITS
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.evaluation import evaluator
 from legged_torque.evaluation.evaluator import TrainingEvaluator
 from legged_torque.evaluation.metrics import WalkingMetrics
 from legged_torque.utils.config import set_by_path
@@ -32,7 +33,11 @@ SMALL += ["--set=evaluation.interval=8", "--set=evaluation.num_samples=6"]
 
 @pytest.fixture
 def noted(monkeypatch):
-    """Every control step of every task: which task, what held before, what it was told, and what came of it."""
+    """Every control step of every task: which task, what held before, what it was told, and what came of it.
+
+    Worlds of evaluations do not settle before the first one.
+    """
+    monkeypatch.setattr(evaluator, "SETTLING_TIME", 0.0)
     steps, step = [], LeggedRobot.step
 
     def noted_step(task, actions):
@@ -141,6 +146,18 @@ def test_training_does_not_notice(make_runner):
     assert all(torch.equal(results[1][name], value) for name, value in results[0].items())
 
 
+def test_worlds_settle_before_the_first_evaluation(make_runner, noted, monkeypatch):
+    """For as long as it is said, in runs of whole evaluations; what happens then does not count."""
+    monkeypatch.setattr(evaluator, "SETTLING_TIME", 0.1)  # 5 steps, of an evaluation's 3
+    runner = make_runner(**{"evaluation.num_samples": 9, "evaluation.num_envs": 3, "evaluation.interval": 16})
+    runner.learn(2)
+    evaluations, rows = by_evaluation(noted, runner.env), rows_of(runner)
+    assert [len(notes) for notes in evaluations] == [9, 3]
+    for notes, row in zip(evaluations, rows, strict=True):
+        kept = ~torch.stack([note.reset for note in notes[-3:]])
+        assert row["height"] == pytest.approx(float(torch.stack([n.height for n in notes[-3:]])[kept].mean()), rel=1e-5)
+
+
 def test_curricula_are_those_of_the_training(make_runner, noted):
     """Evaluations act with the weights of eq. 1 at the training's steps: 16, 32, 48, and weights of 0, 24, 48."""
     env = {"control.mixing.update_interval": 24, "control.mixing.pd.t_end": 100}
@@ -159,8 +176,8 @@ def test_random_numbers_of_its_own(make_runner, noted):
     settings = {"num_envs": 4, "num_samples": 8, "perturbation": ""}
     for outside, seed in ((1, 7), (2, 7), (2, 8)):
         torch.manual_seed(outside)
-        evaluator = TrainingEvaluator(task, lambda obs: torch.zeros(len(obs), 12), settings, seed)
-        numbers = [evaluator.evaluate() for _ in range(2)]
+        evaluating = TrainingEvaluator(task, lambda obs: torch.zeros(len(obs), 12), settings, seed)
+        numbers = [evaluating.evaluate() for _ in range(2)]
         assert numbers[0] != numbers[1]
         drawn = torch.rand(3)
         torch.manual_seed(outside)

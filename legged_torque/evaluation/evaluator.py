@@ -22,6 +22,8 @@ from legged_torque.utils.random_state import own_random_numbers, seeded_state
 
 EVALUATIONS_FILE = "evaluations.csv"
 """In a run's folder: a row per evaluation."""
+SETTLING_TIME = 2.0
+"""Simulated time before the first evaluation [s]; all robots start from random states at once, in a resumed run too."""
 
 
 class TrainingEvaluator:
@@ -53,14 +55,18 @@ class TrainingEvaluator:
         self._num_steps = math.ceil(settings["num_samples"] / self._env.num_envs)
         enabled = task.step_graph.enabled
         self._env.step_graph.enabled = enabled
+        self._settling_runs = math.ceil(SETTLING_TIME / self._env.dt / self._num_steps)
         self._graph = CudaGraph(self._run, task.device, enabled and self._num_steps <= MAX_CAPTURED_STEPS)
 
     def evaluate(self) -> dict[str, float]:
         """Return the metrics of :class:`WalkingMetrics` at this moment of training."""
         self._env.total_steps.copy_(self._task.total_steps)
         self._env.update_curriculum()
-        self._metrics.clear()
         with own_random_numbers(self._task.device, self._random_state):
+            for _ in range(self._settling_runs):
+                self._graph()
+            self._settling_runs = 0
+            self._metrics.clear()
             self._graph()
         return self._metrics.means()
 
