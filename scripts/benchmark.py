@@ -61,6 +61,7 @@ def main() -> None:
         "versions": package_versions(),
         "preset": args.preset or "parallel",
         "perturbation": args.perturbation or "none",
+        "ranges": args.ranges or "wide",
         "set": args.set,
         "rounds": args.rounds,
         "rows": [],

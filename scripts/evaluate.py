@@ -61,6 +61,7 @@ def main() -> None:
         "checkpoint": checkpoint.name,
         "steps": infos["total_timesteps"],
         "perturbation": args.perturbation or "as in training",
+        "ranges": args.ranges or "as in training",
         "command": args.command,
         "num_envs": env.num_envs,
         "num_steps": args.steps,

@@ -33,10 +33,10 @@ def main() -> None:
     if args.steps < 1:
         raise UserError(f"--steps must be at least 1, not {args.steps}")
     run_dir, env_cfg, train_cfg = load_run(args)
-    env, _ = task_registry.make_env(args.task, args, env_cfg)
-    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
     file = args.json or run_dir / "curve.json"
     prepare_file(file)
+    env, _ = task_registry.make_env(args.task, args, env_cfg)
+    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
     points = []
     for number in checkpoint_numbers(run_dir):
         infos = runner.load(str(find_checkpoint(run_dir, number)))

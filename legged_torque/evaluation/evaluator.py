@@ -23,7 +23,7 @@ from legged_torque.utils.random_state import own_random_numbers, seeded_state
 EVALUATIONS_FILE = "evaluations.csv"
 """In a run's folder: a row per evaluation."""
 SETTLING_TIME = 2.0
-"""Simulated time before the first evaluation [s]; all robots start from random states at once, in a resumed run too."""
+"""Least simulated time before the first evaluation [s], in whole evaluations: all robots start from random states."""
 
 
 class TrainingEvaluator:

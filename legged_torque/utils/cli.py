@@ -12,8 +12,11 @@ from legged_torque.utils.errors import UserError
 
 
 def run_script(main: Callable[[], None]) -> None:
-    """Run a script's main function; a user's mistake ends it with one line and exit status 2, Ctrl-C with 130,
-    an output that nobody reads any more (``| head``) with 1."""
+    """Run a script's main function; what is no bug of ours ends it without a traceback.
+
+    A user's mistake ends it with one line and exit status 2, Ctrl-C with 130, an output that nobody reads any more
+    (``| head``) with 1.
+    """
     gc.freeze()  # what has been imported stays: searching it for garbage at the end would take a second or two
     try:
         main()

@@ -44,16 +44,14 @@ class DerivedConstants:
         self._device = model.qpos0.device
         for name in ("body_invweight0", "dof_invweight0"):
             expand(model, name, num_envs)
-        branches, depth = tree.joints.shape
+        self._branches_and_depth = branches, depth = tree.joints.shape
         lanes = lanes_per_world(branches, self._device.is_cuda)
+        self._kernels = make_kernels(branches, depth, lanes)
         self._dim = (num_envs, (depth + 1) * KINDS * lanes)
-        kernels = make_kernels(branches, depth, lanes)
-        self._kernel = kernels.derive_constants
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, mj_model.qpos0[3:7])
         self._rotation = wp.mat33(rotation)
-        self._depth, self._num_branches, self._measure = depth, branches, kernels.measure_branches
-        self._branch_type, self._reference = kernels.Branch, mj_model.qpos0
+        self._reference_pose = mj_model.qpos0
         self._branches_vary = False
         with wp.ScopedDevice(self._device):
             self._robot = make_robot(mj_model, model, tree)
@@ -73,7 +71,7 @@ class DerivedConstants:
         if self._branches_vary:
             self._measure_branches(mask)
         wp.launch(
-            self._kernel,
+            self._kernels.derive_constants,
             dim=self._dim,
             inputs=[self._robot, mask, self._rotation, self._branches, self._coms, ROWS],
             outputs=[self._robot.body_invweight0, self._robot.dof_invweight0],
@@ -83,34 +81,21 @@ class DerivedConstants:
     def _measure_worlds(self, num_worlds: int) -> None:
         """Allocate and measure the branches of all worlds, or of one for all."""
         with wp.ScopedDevice(self._device):
-            self._branches = wp.zeros((num_worlds, self._num_branches), dtype=self._branch_type)
-            self._coms = wp.zeros((num_worlds, self._num_branches, self._depth), dtype=wp.vec3)
-            self._qpos = wp.array(np.tile(self._reference, (num_worlds, 1)), dtype=wp.float32)
-            self._rest = wp.zeros((num_worlds, len(self._reference) - 1), dtype=wp.float32)
+            self._branches = wp.zeros((num_worlds, self._branches_and_depth[0]), dtype=self._kernels.Branch)
+            self._coms = wp.zeros((num_worlds, *self._branches_and_depth), dtype=wp.vec3)
+            self._qpos = wp.array(np.tile(self._reference_pose, (num_worlds, 1)), dtype=wp.float32)
+            self._rest = wp.zeros((num_worlds, len(self._reference_pose) - 1), dtype=wp.float32)
             self._measure_branches(wp.full(num_worlds, True, dtype=wp.bool))
 
     def _measure_branches(self, mask: wp.array) -> None:
         """Measure the branches of some worlds in the reference pose."""
         wp.launch(
-            self._measure,
+            self._kernels.measure_branches,
             dim=self._branches.shape,
             inputs=[self._robot, mask, self._qpos, self._rest],
             outputs=[self._branches, self._coms],
             device=self._device,
         )
-
-
-@wp.func
-def forward_solve(lower: mat66, b: vec6) -> vec6:
-    """Return L^-1 b, where L has the inverse of its diagonal in the diagonal's place."""
-    x = vec6()
-    for i in range(6):
-        rest = b[i]
-        for k in range(6):
-            if k < i:
-                rest -= lower[i, k] * x[k]
-        x[i] = rest * lower[i, i]
-    return x
 
 
 @functools.cache
@@ -132,7 +117,9 @@ def make_kernels(branches: int, depth: int, lanes: int) -> SimpleNamespace:
     per_lane = -(-branches // lanes)
     dynamics, algebra = branch_dynamics(depth), linear_algebra(depth)
     vector, column, Branch, make_branch = dynamics.vector, dynamics.column, dynamics.Branch, dynamics.make_branch
-    cholesky_solve = algebra.cholesky_solve
+    cholesky_solve, cholesky6, forward_solve6 = (
+        algebra.cholesky_solve, linear_algebra(6).cholesky, linear_algebra(6).forward_solve,
+    )  # fmt: skip
     Leg, assemble_damping, eliminate = (
         branch_newton(depth).Leg, branch_newton(depth).assemble_damping, branch_newton(depth).eliminate,
     )  # fmt: skip
@@ -172,12 +159,12 @@ def make_kernels(branches: int, depth: int, lanes: int) -> SimpleNamespace:
     def inverse_weight(
         leg: Leg, trunk_factor: mat66, rot: wp.mat33, com: wp.vec3, body_depth: int, kind: int, rows: int
     ) -> float:
-        """Return a mean inverse weight of a body: 0 of the translation of its centre of mass, 1 of its rotation, 2 of
-        its own joint.
+        """Return a mean inverse weight of a body.
 
-        A row j of a Jacobian is (trunk's translation in world axes, its rotation in its own axes, branch); its weight
-        is j M^-1 j^T. The trunk (depth 0) has its own translations in the joint's place. The number of rows is an
-        argument so that their loop is not unrolled.
+        Its kind is 0 for the translation of its centre of mass, 1 for its rotation, 2 for its own joint. A row j of a
+        Jacobian is (trunk's translation in world axes, its rotation in its own axes, branch); its weight is j M^-1 j^T.
+        The trunk (depth 0) has its own translations in the joint's place. The number of rows is an argument so that
+        their loop is not unrolled.
         """
         lever = -wp.skew(com) * rot
         weight = float(0.0)
@@ -201,7 +188,7 @@ def make_kernels(branches: int, depth: int, lanes: int) -> SimpleNamespace:
             solved = cholesky_solve(leg.factor, jac)
             lin = jac_lin - leg.branch.mass_lin * solved
             ang = jac_ang - leg.branch.mass_ang * solved
-            u = forward_solve(trunk_factor, vec6(lin[0], lin[1], lin[2], ang[0], ang[1], ang[2]))
+            u = forward_solve6(trunk_factor, vec6(lin[0], lin[1], lin[2], ang[0], ang[1], ang[2]))
             weight += (wp.dot(jac, solved) + wp.dot(u, u)) / 3.0
         return weight
 
@@ -249,7 +236,7 @@ def make_kernels(branches: int, depth: int, lanes: int) -> SimpleNamespace:
                 system = eliminate(leg, system, TrunkSystem())
                 total = add_bodies(total, leg.branch.total)
         whole = whole_inertia(trunk, total, wp.static(lanes))
-        trunk_factor = wp.static(linear_algebra(6).cholesky)(trunk_matrix(whole, system, wp.static(lanes)))
+        trunk_factor = cholesky6(trunk_matrix(whole, system, wp.static(lanes)))
         for i in range(wp.static(per_lane)):
             branch = lane + i * wp.static(lanes)
             if branch < wp.static(branches):

@@ -97,7 +97,7 @@ def linear_algebra(n: int) -> SimpleNamespace:
         n: Number of rows.
 
     Returns:
-        The types ``matrix`` and ``vector``, and ``cholesky(a)`` and ``cholesky_solve(cholesky(a), b)``.
+        The types ``matrix`` and ``vector``; ``cholesky(a)``; ``forward_solve`` and ``cholesky_solve`` with its result.
     """
     matrix = wp.types.matrix(shape=(n, n), dtype=wp.float32)
     vector = wp.types.vector(length=n, dtype=wp.float32)
@@ -123,8 +123,8 @@ def linear_algebra(n: int) -> SimpleNamespace:
         return lower
 
     @wp.func
-    def cholesky_solve(lower: matrix, b: vector) -> vector:
-        """Return the solution of a x = b from the factor of a."""
+    def forward_solve(lower: matrix, b: vector) -> vector:
+        """Return the solution of lower x = b, of a factor as ``cholesky`` returns it."""
         x = vector()
         for i in range(wp.static(n)):
             rest = b[i]
@@ -132,6 +132,12 @@ def linear_algebra(n: int) -> SimpleNamespace:
                 if k < i:
                     rest -= lower[i, k] * x[k]
             x[i] = rest * lower[i, i]
+        return x
+
+    @wp.func
+    def cholesky_solve(lower: matrix, b: vector) -> vector:
+        """Return the solution of a x = b from the factor of a."""
+        x = forward_solve(lower, b)
         for reverse in range(wp.static(n)):
             i = wp.static(n - 1) - reverse
             rest = x[i]
@@ -141,4 +147,6 @@ def linear_algebra(n: int) -> SimpleNamespace:
             x[i] = rest * lower[i, i]
         return x
 
-    return SimpleNamespace(matrix=matrix, vector=vector, cholesky=cholesky, cholesky_solve=cholesky_solve)
+    return SimpleNamespace(
+        matrix=matrix, vector=vector, cholesky=cholesky, cholesky_solve=cholesky_solve, forward_solve=forward_solve
+    )
