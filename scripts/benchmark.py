@@ -10,9 +10,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+from legged_torque.checks.benchmark import TRACED, MemoryMeter, Plan, measure
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.evaluation.benchmark import TRACED, MemoryMeter, Plan, measure
 from legged_torque.utils.args import Parser, add_settings_args, device_name, resolve_device, run_script
 from legged_torque.utils.cli import prepare_file
 from legged_torque.utils.errors import UserError

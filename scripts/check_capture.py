@@ -7,8 +7,8 @@ os.environ["MUJOCO_GL"] = "disable"
 import argparse
 import sys
 
+from legged_torque.checks.capture import compare_capture, warm_up
 from legged_torque.envs import task_registry
-from legged_torque.learning.capture_check import compare_capture, warm_up
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.args import Parser, add_build_args, device_name, resolve_device, run_script
 from legged_torque.utils.errors import UserError

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import torch
 
-from legged_torque.deploy.metrics import UNITS
 from legged_torque.envs import task_registry
-from legged_torque.evaluation.evaluator import evaluation_cfg
-from legged_torque.evaluation.metrics import COMMANDS, CommandBreakdown, WalkingMetrics, measure
+from legged_torque.envs.base.metrics import COMMANDS, CommandBreakdown, WalkingMetrics, measure
+from legged_torque.learning.evaluator import evaluation_cfg
 from legged_torque.utils.args import Parser, add_task_args, device_name, run_script
 from legged_torque.utils.cli import prepare_file
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.runs import find_checkpoint, package_versions
 from legged_torque.utils.task_registry import load_run, set_seed
 

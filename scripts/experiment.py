@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 
 from legged_torque import ROOT_DIR
-from legged_torque.evaluation.experiment import cell_state, check_same, read_matrix
-from legged_torque.evaluation.experiment_job import find_workers
-from legged_torque.evaluation.experiment_run import ExperimentRun, claim_folder
+from legged_torque.experiments.job import find_workers
+from legged_torque.experiments.matrix import cell_state, check_same, read_matrix
+from legged_torque.experiments.run import ExperimentRun, claim_folder
 from legged_torque.utils.args import Parser, run_script
 
 

@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 
 from legged_torque.envs import task_registry
-from legged_torque.evaluation.metrics import measure
+from legged_torque.envs.base.metrics import measure
 from legged_torque.utils.args import Parser, add_task_args, device_name, run_script
 from legged_torque.utils.cli import prepare_file
 from legged_torque.utils.config import to_dict

@@ -6,8 +6,8 @@ os.environ["MUJOCO_GL"] = "disable"
 
 import torch
 
+from legged_torque.checks.accuracy import copy_state, reference_velocities, velocity_errors
 from legged_torque.envs import task_registry
-from legged_torque.evaluation.accuracy import copy_state, reference_velocities, velocity_errors
 from legged_torque.sim.simulator import Simulator
 from legged_torque.utils.args import Parser, add_task_args, run_script
 from legged_torque.utils.runs import find_checkpoint

@@ -10,16 +10,16 @@ import math
 from pathlib import Path
 
 from legged_torque import ROOT_DIR
-from legged_torque.deploy.metrics import UNITS
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.evaluation.metrics import measure
-from legged_torque.evaluation.video import Recorder
+from legged_torque.envs.base.metrics import measure
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.args import Parser, add_task_args, run_script
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.runs import find_checkpoint
 from legged_torque.utils.task_registry import load_run, set_seed
+from legged_torque.viewer.task_recorder import Recorder
 
 NUM_ENVS = {"none": 16, "web": 4, "native": 1}
 """Default number of worlds, by viewer."""

@@ -22,13 +22,13 @@ import mujoco
 import numpy as np
 
 from legged_torque import ROOT_DIR
-from legged_torque.deploy.metrics import UNITS, estimates
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import Robot
 from legged_torque.deploy.simulation import Events, Simulation
-from legged_torque.deploy.video import Recorder
 from legged_torque.utils.cli import prepare_file, run_script
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.metrics import UNITS, estimates
+from legged_torque.viewer.video import Recorder
 
 
 class Parser(argparse.ArgumentParser):

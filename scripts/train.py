@@ -10,8 +10,8 @@ os.environ["MUJOCO_GL"] = "disable"  # training draws nothing, and MuJoCo must n
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
-from legged_torque.learning import distributed
 from legged_torque.learning.pretrained import find_pretrained, start_from
+from legged_torque.utils import distributed
 from legged_torque.utils.args import Parser, add_task_args, add_train_args, device_name, run_script
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError

@@ -11,9 +11,9 @@ import pytest
 import torch
 from test_scripts import assert_told_in_one_line, run_here
 
+from legged_torque.checks import benchmark
+from legged_torque.checks.benchmark import MemoryMeter, Times, is_out_of_memory, most_expensive, summarize
 from legged_torque.envs import LeggedRobot, task_registry
-from legged_torque.evaluation import benchmark
-from legged_torque.evaluation.benchmark import MemoryMeter, Times, is_out_of_memory, most_expensive, summarize
 from legged_torque.utils.config import set_by_path
 
 SETTINGS = {"runner.num_steps_per_env": 3, "algorithm.num_learning_epochs": 1, "algorithm.num_mini_batches": 1}

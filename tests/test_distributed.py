@@ -19,7 +19,7 @@ from test_ppo import make_ppo, record_rollout, state_of
 from test_random_stream import upcoming
 
 from legged_torque.envs import task_registry
-from legged_torque.learning import distributed
+from legged_torque.utils import distributed
 from legged_torque.utils.args import resolve_device
 from legged_torque.utils.task_registry import num_iterations, set_seed
 

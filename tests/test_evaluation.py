@@ -15,13 +15,13 @@ from test_ppo import make_ppo, record_rollout
 from test_scripts import assert_told_in_one_line, contents, run_here
 from torch.nn.functional import elu, linear
 
-from legged_torque.deploy.metrics import UNITS
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.evaluation import evaluator
-from legged_torque.evaluation.evaluator import TrainingEvaluator
-from legged_torque.evaluation.metrics import WalkingMetrics
+from legged_torque.envs.base.metrics import WalkingMetrics
+from legged_torque.learning import evaluator
+from legged_torque.learning.evaluator import TrainingEvaluator
 from legged_torque.utils.config import set_by_path
+from legged_torque.utils.metrics import UNITS
 
 COLUMNS = "steps,iteration,seconds,track_percentage,track_xy,track_angular,collision_force,cost_of_transport,height,"
 COLUMNS += "speed,falls_per_minute,critic_gradient_norm"

@@ -57,8 +57,8 @@ def device_check():
     """A process that reads a matrix, chooses workers, and prints what that has started; others run meanwhile."""
     code = (
         "from pathlib import Path; import torch, warp; from warp._src import context\n"
-        "from legged_torque.evaluation.experiment import read_matrix\n"
-        "from legged_torque.evaluation.experiment_job import find_workers\n"
+        "from legged_torque.experiments.matrix import read_matrix\n"
+        "from legged_torque.experiments.job import find_workers\n"
         f"read_matrix(Path({str(ROOT / 'experiments' / 'low.yaml')!r})); find_workers('auto', None)\n"
         "print(torch.cuda.is_initialized(), context.runtime)"
     )

@@ -8,8 +8,8 @@ import pytest
 import torch
 from test_simulator import CONVERGED, WEIGHT, contacts_by_hand
 
-from legged_torque.deploy.metrics import UNITS
-from legged_torque.evaluation.metrics import CommandBreakdown, WalkingMetrics, estimate, measure
+from legged_torque.envs.base.metrics import CommandBreakdown, WalkingMetrics, estimate, measure
+from legged_torque.utils.metrics import UNITS
 
 RANGES = {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-2.0, 0.0], "ang_vel_yaw": [0.5, 2.5]}
 STILL = {f"domain_rand.init_{angle}": [0.0, 0.0] for angle in ("roll", "pitch", "yaw")}

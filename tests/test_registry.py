@@ -9,8 +9,8 @@ import torch
 from settings import TASKS, error_of, flatten, parse
 
 from legged_torque.envs import task_registry
-from legged_torque.envs.a1.a1_config import A1Cfg, A1CfgPPO
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.utils.config import BaseConfig, section_keys, to_dict, update_from_dict
 from legged_torque.utils.errors import unknown_name
 from legged_torque.utils.task_registry import TaskRegistry

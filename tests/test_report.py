@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from legged_torque.evaluation import figures
-from legged_torque.evaluation.paper_values import ENVIRONMENTS, METRICS, TABLE_I, paper_value
-from legged_torque.evaluation.report import (
+from legged_torque.experiments import figures
+from legged_torque.experiments.paper_values import ENVIRONMENTS, METRICS, TABLE_I, paper_value
+from legged_torque.experiments.report import (
     ALL_METRICS,
     Run,
     compare,
@@ -22,7 +22,7 @@ from legged_torque.evaluation.report import (
     summarize,
     welch,
 )
-from legged_torque.evaluation.report_text import run_problems
+from legged_torque.experiments.report_text import run_problems
 from legged_torque.utils.errors import UserError
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "report.py"

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from legged_torque.evaluation.report import (
+from legged_torque.experiments.report import (
     holm,
     incomplete_beta,
     welch,

@@ -10,9 +10,9 @@ import pytest
 
 pytest.importorskip("PIL", reason="Pillow is not installed: pip install -e .[video]")
 
-from legged_torque.deploy import video
-from legged_torque.deploy.video import Moment, add_overlay, write_video
-from legged_torque.evaluation.video import Recorder
+from legged_torque.viewer import video
+from legged_torque.viewer.task_recorder import Recorder
+from legged_torque.viewer.video import Moment, add_overlay, write_video
 
 XML = Path(__file__).resolve().parents[1] / "resources" / "robots" / "a1" / "a1.xml"
 
@@ -24,7 +24,7 @@ reason = choose_offscreen_renderer()
 if reason:
     sys.exit("no renderer: " + reason)
 import mujoco, numpy as np
-from legged_torque.deploy.video import Moment, write_video
+from legged_torque.viewer.video import Moment, write_video
 from legged_torque.utils.errors import UserError
 model = mujoco.MjModel.from_xml_path(sys.argv[1])
 qpos = model.key_qpos[0] if model.nkey else model.qpos0
@@ -102,7 +102,7 @@ def test_numbers():
 def test_recorded_worlds(make_task, monkeypatch):
     """One world is the fastest one, more are the first ones; what is kept is the task's state."""
     saved = []
-    monkeypatch.setattr("legged_torque.evaluation.video.write_video", lambda *args: saved.append(args))
+    monkeypatch.setattr("legged_torque.viewer.task_recorder.write_video", lambda *args: saved.append(args))
     task = make_task("a1_torque", num_envs=5)
     task.reset()
     task.commands[:] = 0.1

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from legged_torque.control.dynamics import RobotDynamics
-from legged_torque.envs.a1.torque import TorqueRobot
+from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.utils.args import apply_perturbation

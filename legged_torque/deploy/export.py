@@ -26,8 +26,8 @@ from legged_torque.deploy.description import (
     to_yaml,
 )
 from legged_torque.deploy.policy import Policy, State
-from legged_torque.envs.a1.multi_head import MultiHeadRobot
-from legged_torque.envs.a1.torque import TorqueRobot
+from legged_torque.envs.approaches.multi_head import MultiHeadRobot
+from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import package_versions

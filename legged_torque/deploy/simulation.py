@@ -10,9 +10,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from legged_torque.deploy.metrics import step_sums
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import Robot
+from legged_torque.utils.metrics import step_sums
 
 PUSH_ADDED = 0.5
 """Share of pushes that add a velocity; the others set one."""
@@ -68,7 +68,7 @@ class Simulation:
             on_step: Called after every control step, e.g. to record it.
 
         Returns:
-            Sums of the metrics, see :func:`~legged_torque.deploy.metrics.step_sums`. Shape: (10,).
+            Sums of the metrics, see :func:`~legged_torque.utils.metrics.step_sums`. Shape: (10,).
         """
         self._rng = np.random.default_rng(seed)
         self._new_episode()

@@ -11,8 +11,8 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from legged_torque.learning import distributed
 from legged_torque.sim.graph import CudaGraph
+from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
 
 MIN_LEARNING_RATE = 1e-5

@@ -11,10 +11,10 @@ from rsl_rl import runners
 
 import legged_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.evaluation.evaluator import EVALUATIONS_FILE, TrainingEvaluator, append_row
-from legged_torque.learning import distributed
+from legged_torque.learning.evaluator import EVALUATIONS_FILE, TrainingEvaluator, append_row
 from legged_torque.learning.ppo import OnDevicePPO
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
+from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.random_state import random_state, restore_random_state

@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 import torch
 
-from legged_torque.learning import distributed
+from legged_torque.utils import distributed
 from legged_torque.utils.cli import run_script as run_script
 from legged_torque.utils.config import section_keys, set_by_path, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name

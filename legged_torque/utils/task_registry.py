@@ -17,7 +17,7 @@ from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils import resolve_callable
 
 from legged_torque import ROOT_DIR
-from legged_torque.learning import distributed
+from legged_torque.utils import distributed
 from legged_torque.utils.args import apply_args, resolve_device
 from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.errors import UserError, unknown_name

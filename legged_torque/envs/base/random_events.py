@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from legged_torque.envs.base.action_delay import ActionDelay
 from legged_torque.envs.base.domain_rand import draws_legs, initial_state, parameters
+from legged_torque.motors.action_delay import ActionDelay
 from legged_torque.sim.randomization import Parameter, Randomization
 
 PUSH_ADDED = 0.5

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from legged_torque.envs.base.action_delay import UNITS
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.motors.action_delay import UNITS
 from legged_torque.utils.config import section_keys
 from legged_torque.utils.errors import UserError, unknown_name
 

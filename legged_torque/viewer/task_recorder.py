@@ -8,8 +8,8 @@ import mujoco
 import torch
 
 from legged_torque import ROOT_DIR
-from legged_torque.deploy.video import Moment, write_video
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.viewer.video import Moment, write_video
 
 
 class Recorder:
@@ -39,6 +39,6 @@ class Recorder:
         self._steps.append([Moment(*moment) for moment in zip(*parts, strict=True)])
 
     def save(self, file: Path) -> None:
-        """Draw what was recorded, see :func:`~legged_torque.deploy.video.write_video`."""
+        """Draw what was recorded, see :func:`~legged_torque.viewer.video.write_video`."""
         model = mujoco.MjModel.from_xml_path(str(ROOT_DIR / self._task.cfg.asset.file))
         write_video(file, model, 1, self._steps, self._task.dt)

@@ -19,7 +19,7 @@ from typing import BinaryIO
 
 import torch
 
-from legged_torque.evaluation.experiment import Cell, State
+from legged_torque.experiments.matrix import Cell, State
 from legged_torque.utils.args import resolve_device
 from legged_torque.utils.errors import UserError
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from legged_torque.envs.a1.a1_config import A1Cfg, A1CfgPPO
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 
 
 class TorqueRobot(LeggedRobot):

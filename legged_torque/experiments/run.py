@@ -13,7 +13,8 @@ from pathlib import Path
 from types import FrameType
 from typing import BinaryIO
 
-from legged_torque.evaluation.experiment import (
+from legged_torque.experiments.job import Job, Worker, start_job, try_lock
+from legged_torque.experiments.matrix import (
     SETTINGS_FILE,
     Cell,
     Matrix,
@@ -24,7 +25,6 @@ from legged_torque.evaluation.experiment import (
     result_file,
     step_command,
 )
-from legged_torque.evaluation.experiment_job import Job, Worker, start_job, try_lock
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
 

@@ -7,9 +7,9 @@ from itertools import combinations
 from pathlib import Path
 from statistics import fmean
 
-from legged_torque.evaluation.figures import BARS, CURVES
-from legged_torque.evaluation.paper_values import METRICS, MODELS, paper_value
-from legged_torque.evaluation.report import LAST_SHARE, Experiment, Run, Table, compare
+from legged_torque.experiments.figures import BARS, CURVES
+from legged_torque.experiments.paper_values import METRICS, MODELS, paper_value
+from legged_torque.experiments.report import LAST_SHARE, Experiment, Run, Table, compare
 
 SIGNIFICANT = 0.05
 BASELINES = ("a1_position", "a1_torque")

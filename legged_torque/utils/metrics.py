@@ -1,4 +1,4 @@
-"""The metrics of :mod:`legged_torque.evaluation.metrics` in numpy, for robots that run one after another."""
+"""The metrics of :mod:`legged_torque.envs.base.metrics` in numpy, for robots that run one after another."""
 
 from __future__ import annotations
 

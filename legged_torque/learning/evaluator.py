@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.evaluation.metrics import WalkingMetrics
+from legged_torque.envs.base.metrics import WalkingMetrics
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils.args import apply_perturbation
 from legged_torque.utils.config import section_keys

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from legged_torque.envs.a1.torque import A1TorqueCfg, A1TorqueCfgPPO
+from legged_torque.envs.approaches.torque import A1TorqueCfg, A1TorqueCfgPPO
 
 
 class A1TorqueGravityCfg(A1TorqueCfg):

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from legged_torque.evaluation.paper_values import ENVIRONMENTS, METRICS, MODELS, paper_value
-from legged_torque.evaluation.report import Experiment, Run, Summary, Table
+from legged_torque.experiments.paper_values import ENVIRONMENTS, METRICS, MODELS, paper_value
+from legged_torque.experiments.report import Experiment, Run, Summary, Table
 from legged_torque.utils.plotting import load_pyplot
 
 STYLES = {  # colours of Okabe and Ito, which colour-blind eyes tell apart; near those of the paper

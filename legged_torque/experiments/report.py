@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import fmean, stdev, variance
 from typing import Any
 
-from legged_torque.evaluation.paper_values import ENVIRONMENTS, METRICS, paper_value
+from legged_torque.experiments.paper_values import ENVIRONMENTS, METRICS, paper_value
 from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import CONFIG_FILE, load_config

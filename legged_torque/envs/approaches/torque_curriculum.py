@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from legged_torque.envs.a1.torque import A1TorqueCfg, A1TorqueCfgPPO, TorqueRobot
+from legged_torque.envs.approaches.torque import A1TorqueCfg, A1TorqueCfgPPO, TorqueRobot
 
 
 class TorqueCurriculumRobot(TorqueRobot):

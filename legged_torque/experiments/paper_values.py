@@ -5,7 +5,7 @@ caption). The table prints no standard errors or deviations, so that there are n
 torque control (``a1_torque``) or gravity pre-training. Values that the authors mark in bold as significantly superior
 cannot be told from others in the text that we have; the test behind the marks is not named.
 
-Units are ours (:mod:`legged_torque.evaluation.metrics`): "Track %" is printed as a share (0.76, not 76), "Track xy"
+Units are ours (:mod:`legged_torque.envs.base.metrics`): "Track %" is printed as a share (0.76, not 76), "Track xy"
 and "Track angular" are squared deviations (section IV-F), cost of transport has no unit. The paper names no units;
 collision forces fit N, as a standing A1 presses on the ground with 122 N.
 """

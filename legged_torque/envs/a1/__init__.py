@@ -1,1 +1,0 @@
-"""The Unitree A1 and one module per approach."""

@@ -1,0 +1,1 @@
+"""The paper's approaches: task classes and settings that name no robot."""

@@ -1,0 +1,1 @@
+"""The settings of each robot, one module each; they name no approach."""

@@ -1,1 +1,0 @@
-"""Measuring policies and speed."""
