@@ -9,3 +9,8 @@ ROOT_DIR = Path(__file__).resolve().parent.parent
 
 RESOURCES_DIR = ROOT_DIR / "resources"
 """Folder of the robot models."""
+
+
+def resource_path(file: str) -> Path:
+    """Return where a file of the settings is: absolute paths as they are, others below the repository."""
+    return Path(file) if Path(file).is_absolute() else ROOT_DIR / file

@@ -6,6 +6,7 @@ os.environ["MUJOCO_GL"] = "disable"
 os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # torch's profiler otherwise tells on standard error when it starts
 
 import argparse
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,9 @@ from typing import Any
 from legged_torque.checks.benchmark import TRACED, MemoryMeter, Plan, measure
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.args import Parser, add_settings_args, device_name, resolve_device, run_script
-from legged_torque.utils.cli import prepare_file
+from legged_torque.utils.args import Parser, add_settings_args, options_of
+from legged_torque.utils.cli import prepare_file, run_script
+from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import package_versions
 
@@ -112,7 +114,7 @@ def size_settings(args: argparse.Namespace, num_envs: int | None) -> tuple[Any, 
         UserError: If an argument makes no sense.
     """
     changes = {"num_envs": num_envs, "set": ["evaluation.interval=0", *args.set]}  # so that iterations are alike
-    env_cfg, train_cfg = task_registry.get_cfgs(args.task, argparse.Namespace(**{**vars(args), **changes}))
+    env_cfg, train_cfg = task_registry.get_cfgs(args.task, dataclasses.replace(options_of(args), **changes))
     check_env_cfg(env_cfg)  # a mistake in the last size is told before the first one is measured
     return env_cfg, train_cfg
 

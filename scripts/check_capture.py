@@ -1,17 +1,19 @@
 """Check that training does the same with and without CUDA graphs: ``python scripts/check_capture.py``."""
 
-import os
+from legged_torque.utils.rendering import without_renderer
 
-os.environ["MUJOCO_GL"] = "disable"
+without_renderer()  # before anything imports mujoco
 
-import argparse
 import sys
 
 from legged_torque.checks.capture import compare_capture, warm_up
 from legged_torque.envs import task_registry
 from legged_torque.learning.runner import OnPolicyRunner
-from legged_torque.utils.args import Parser, add_build_args, device_name, resolve_device, run_script
+from legged_torque.utils.args import Parser, add_build_args, options_of
+from legged_torque.utils.cli import run_script
+from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import set_seed
 
 
@@ -36,7 +38,7 @@ def main() -> None:
     print(f"{args.task} on {device_name(device)}: with CUDA graphs against without")
     if device == "cpu":
         print("a CPU has no graphs: this compares two runs that are the same")
-    plain, captured = (build_runner(args, capture) for capture in (False, True))
+    plain, captured = (build_runner(options_of(args), capture) for capture in (False, True))
     too_far = []
     for iteration in range(args.iterations):
         print(f"{f'iteration {iteration}':<24} largest |  relative |       rms | rms of two without")
@@ -51,13 +53,13 @@ def main() -> None:
     print(f"all within the tolerance of {args.tolerance:g}")
 
 
-def build_runner(args: argparse.Namespace, capture: bool) -> OnPolicyRunner:
+def build_runner(options: Options, capture: bool) -> OnPolicyRunner:
     """Build the task and its runner from the seed of the settings, and let everything that can be captured be so."""
-    env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
+    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     train_cfg.runner.capture = capture
     set_seed(train_cfg.seed)
-    env, _ = task_registry.make_env(args.task, args, env_cfg)
-    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
+    env, _ = task_registry.make_env(options.task, options, env_cfg)
+    runner, _ = task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=None)
     warm_up(runner)
     return runner
 

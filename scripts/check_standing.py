@@ -4,11 +4,12 @@ Robots start from random states with the lowest foot just above the ground (``le
 """
 
 import copy
-import os
 from collections.abc import Callable
 from typing import Any
 
-os.environ["MUJOCO_GL"] = "disable"  # nothing is drawn, and MuJoCo must not look for a renderer
+from legged_torque.utils.rendering import without_renderer
+
+without_renderer()  # before anything imports mujoco
 
 from torch import Tensor
 
@@ -18,7 +19,10 @@ from legged_torque.control.standing import StandingResult, measure_standing, pla
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning.pretrained import check_spaces, pretrained_file, start_from
-from legged_torque.utils.args import Parser, add_build_args, run_script
+from legged_torque.utils.args import Parser, add_build_args, options_of
+from legged_torque.utils.cli import run_script
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.options import Options
 from legged_torque.utils.progress import CompileProgress
 from legged_torque.utils.task_registry import set_seed
 
@@ -28,10 +32,13 @@ def main() -> None:
     parser = Parser(__doc__)
     add_build_args(parser)
     parser.set_defaults(task="a1_torque_gravity", seed=2)
-    parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in this repository")
+    parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in the current directory")
     args = parser.parse_args()
-    env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
-    file = pretrained_file(args, train_cfg)
+    options = options_of(args)
+    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+    file = pretrained_file(options.task, train_cfg, options.log_root)
+    if not file.exists():
+        raise UserError(f"there is no pre-trained policy '{file}'; run scripts/pretrain_gravity.py first")
     check_spaces(file, env_cfg, train_cfg)
 
     def learned(task: LeggedRobot) -> Callable[[LeggedRobot], Tensor]:
@@ -50,18 +57,18 @@ def main() -> None:
             ("controller", controlled, decimation, 5.0),
             ("policy", learned, decimation, 5.0),
         ):
-            result = trial(args, env_cfg, actor, steps, seconds)
+            result = trial(options, env_cfg, actor, steps, seconds)
             frequency = 1.0 / (env_cfg.sim.dt * steps)
             row = f"{name:12} {frequency:6.0f} Hz {seconds:4.0f} s {result.share:9.1%}"
             print(f"{row} {result.mean_torque:8.2f} N m", flush=True)
 
 
-def trial(args: Any, env_cfg: Any, make_actor: Callable, decimation: int, seconds: float) -> StandingResult:
+def trial(options: Options, env_cfg: Any, make_actor: Callable, decimation: int, seconds: float) -> StandingResult:
     """Let something act in a new task that starts from random states."""
     cfg = copy.deepcopy(env_cfg)
     use_standing_trials(cfg, decimation)
-    set_seed(args.seed)
-    task, _ = task_registry.make_env(args.task, args, cfg)
+    set_seed(options.seed or 0)
+    task, _ = task_registry.make_env(options.task, options, cfg)
     act = make_actor(task)
     place_on_ground(task, RobotDynamics(task.sim.mj_model, task.num_envs, task.device, task.foot_names))
     return measure_standing(task, act, seconds)

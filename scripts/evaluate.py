@@ -1,8 +1,8 @@
 """Measure a checkpoint: ``python scripts/evaluate.py --task=a1_position --perturbation=high``."""
 
-import os
+from legged_torque.utils.rendering import without_renderer
 
-os.environ["MUJOCO_GL"] = "disable"
+without_renderer()  # before anything imports mujoco
 
 import json
 import math
@@ -14,12 +14,13 @@ import torch
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.metrics import COMMANDS, CommandBreakdown, WalkingMetrics, measure
 from legged_torque.learning.evaluator import evaluation_cfg
-from legged_torque.utils.args import Parser, add_task_args, device_name, run_script
-from legged_torque.utils.cli import prepare_file
+from legged_torque.utils.args import Parser, add_task_args, options_of
+from legged_torque.utils.cli import prepare_file, run_script
+from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
-from legged_torque.utils.runs import find_checkpoint, package_versions
-from legged_torque.utils.task_registry import load_run, set_seed
+from legged_torque.utils.runs import package_versions
+from legged_torque.utils.task_registry import set_seed
 
 
 def main() -> None:
@@ -41,25 +42,23 @@ def main() -> None:
         raise UserError(f"--steps must be at least 1, not {args.steps}")
     if args.command and not all(map(math.isfinite, args.command)):
         raise UserError(f"--command must be finite, not {args.command}")
-    run_dir, env_cfg, train_cfg = load_run(args)
-    checkpoint = find_checkpoint(run_dir, args.checkpoint)
+    options = options_of(args)
+    run = task_registry.load_run(options)
     if args.json:
         prepare_file(args.json)
-    env_cfg = evaluation_cfg(env_cfg, env_cfg.env.num_envs)
+    env_cfg = evaluation_cfg(run.env_cfg, run.env_cfg.env.num_envs)
     for name, value in zip(COMMANDS, args.command or (), strict=False):
         setattr(env_cfg.commands.ranges, name, [value, value])
     set_seed(args.seed)
-    env, _ = task_registry.make_env(args.task, args, env_cfg)
-    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
-    infos = runner.load(str(checkpoint))
+    env, runner = task_registry.make_loaded(run, options, env_cfg)
     breakdown = CommandBreakdown(env)
     torch.manual_seed(args.seed)  # building and loading have drawn numbers too
     metrics = measure(env, runner.get_inference_policy(env.device), args.steps, breakdown.add_step)
     result = {
         "task": args.task,
-        "run": str(run_dir),
-        "checkpoint": checkpoint.name,
-        "steps": infos["total_timesteps"],
+        "run": str(run.folder),
+        "checkpoint": run.checkpoint.name,
+        "steps": runner.logger.tot_timesteps,
         "perturbation": args.perturbation or "as in training",
         "ranges": args.ranges or "as in training",
         "command": args.command,
@@ -69,7 +68,7 @@ def main() -> None:
         "device": device_name(env.device),
         "versions": package_versions(),
     }
-    print(f"{checkpoint}, after {result['steps']:,} steps of training, {env.num_envs} worlds x {args.steps} steps:")
+    print(f"{run.checkpoint}, after {result['steps']:,} steps of training, {env.num_envs} worlds x {args.steps} steps:")
     print_metrics(metrics)
     print_breakdown(breakdown)
     if args.json:

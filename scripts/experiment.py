@@ -14,7 +14,8 @@ from legged_torque import ROOT_DIR
 from legged_torque.experiments.job import find_workers
 from legged_torque.experiments.matrix import cell_state, check_same, read_matrix
 from legged_torque.experiments.run import ExperimentRun, claim_folder
-from legged_torque.utils.args import Parser, run_script
+from legged_torque.utils.args import Parser
+from legged_torque.utils.cli import run_script
 
 
 def main() -> None:

@@ -1,16 +1,15 @@
 """Export a checkpoint for a robot: ``python scripts/export.py --task=a1_torque_multihead``."""
 
-import os
+from legged_torque.utils.rendering import without_renderer
 
-os.environ["MUJOCO_GL"] = "disable"
+without_renderer()  # before anything imports mujoco
 
 from pathlib import Path
 
 from legged_torque.deploy.export import export_policy, nominal_cfg
 from legged_torque.envs import task_registry
-from legged_torque.utils.args import Parser, add_task_args, run_script
-from legged_torque.utils.runs import find_checkpoint
-from legged_torque.utils.task_registry import load_run
+from legged_torque.utils.args import Parser, add_task_args, options_of
+from legged_torque.utils.cli import run_script
 
 
 def main() -> None:
@@ -19,21 +18,19 @@ def main() -> None:
     add_task_args(parser)
     parser.add_argument("--out", type=Path, help="folder to write; default: exported_<checkpoint> in the run's folder")
     args = parser.parse_args()
-    run_dir, env_cfg, train_cfg = load_run(args)
-    checkpoint = find_checkpoint(run_dir, args.checkpoint)
-    env, _ = task_registry.make_env(args.task, args, nominal_cfg(env_cfg))
-    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
-    runner.load(str(checkpoint))
+    options = options_of(args)
+    run = task_registry.load_run(options)
+    env, runner = task_registry.make_loaded(run, options, nominal_cfg(run.env_cfg))
     iterations = runner.current_learning_iteration
-    out = args.out or run_dir / f"exported_{iterations}"
+    out = args.out or run.folder / f"exported_{iterations}"
     training = {
-        "run": run_dir.name,
-        "checkpoint": checkpoint.name,
+        "run": run.folder.name,
+        "checkpoint": run.checkpoint.name,
         "iterations": iterations,
         "total_steps": int(env.total_steps),
     }
     difference = export_policy(env, runner.alg.get_policy(), out, args.task, training)
-    print(f"{checkpoint}, after {training['total_steps']:,} steps of training:")
+    print(f"{run.checkpoint}, after {training['total_steps']:,} steps of training:")
     print(f"  exported to {out}: policy.onnx, policy.pt, policy.yaml")
     print(f"  largest difference to the checkpoint's network: {difference:.2g}")
 

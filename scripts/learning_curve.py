@@ -9,12 +9,13 @@ from pathlib import Path
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.metrics import measure
-from legged_torque.utils.args import Parser, add_task_args, device_name, run_script
-from legged_torque.utils.cli import prepare_file
+from legged_torque.utils.args import Parser, add_task_args, options_of
+from legged_torque.utils.cli import prepare_file, run_script
 from legged_torque.utils.config import to_dict
+from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
-from legged_torque.utils.task_registry import load_run, set_seed
+from legged_torque.utils.task_registry import set_seed
 
 
 def main() -> None:
@@ -32,10 +33,12 @@ def main() -> None:
     args = parser.parse_args()
     if args.steps < 1:
         raise UserError(f"--steps must be at least 1, not {args.steps}")
-    run_dir, env_cfg, train_cfg = load_run(args)
+    options = options_of(args)
+    run = task_registry.load_run(options)
+    run_dir, env_cfg, train_cfg = run.folder, run.env_cfg, run.train_cfg
     file = args.json or run_dir / "curve.json"
     prepare_file(file)
-    env, _ = task_registry.make_env(args.task, args, env_cfg)
+    env, _ = task_registry.make_env(args.task, options, env_cfg)
     runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
     points = []
     for number in checkpoint_numbers(run_dir):
@@ -49,8 +52,8 @@ def main() -> None:
     result = {
         "task": args.task,
         "seed": train_cfg.seed,
-        "trained_with": args.run_config["train"],
-        "trained_env": args.run_config["env"],
+        "trained_with": run.config["train"],
+        "trained_env": run.config["env"],
         "device": device_name(env.device),
         "evaluation": {"num_envs": env.num_envs, "num_steps": args.steps, "actions": "mean", "env": to_dict(env_cfg)},
         "versions": package_versions(),

@@ -1,17 +1,17 @@
 """Compare solver settings with converged mj_step on a walking robot: ``python scripts/physics_accuracy.py``."""
 
-import os
+from legged_torque.utils.rendering import without_renderer
 
-os.environ["MUJOCO_GL"] = "disable"
+without_renderer()  # before anything imports mujoco
 
 import torch
 
 from legged_torque.checks.accuracy import copy_state, reference_velocities, velocity_errors
 from legged_torque.envs import task_registry
 from legged_torque.sim.simulator import Simulator
-from legged_torque.utils.args import Parser, add_task_args, run_script
-from legged_torque.utils.runs import find_checkpoint
-from legged_torque.utils.task_registry import load_run, set_seed
+from legged_torque.utils.args import Parser, add_task_args, options_of
+from legged_torque.utils.cli import run_script
+from legged_torque.utils.task_registry import set_seed
 
 SETTINGS = (
     ("fused", 10, 20),
@@ -32,11 +32,10 @@ def main() -> None:
         "--steps", type=int, default=100, help="control steps to walk; one physics step of each is compared"
     )
     args = parser.parse_args()
-    run_dir, env_cfg, train_cfg = load_run(args)
+    options = options_of(args)
+    run = task_registry.load_run(options)
     set_seed(args.seed)
-    env, _ = task_registry.make_env(args.task, args, env_cfg)
-    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
-    runner.load(str(find_checkpoint(run_dir, args.checkpoint)))
+    env, runner = task_registry.make_loaded(run, options)
     policy = runner.get_inference_policy(env.device)
     states = []
     obs = env.get_observations()

@@ -9,16 +9,16 @@ import functools
 import math
 from pathlib import Path
 
-from legged_torque import ROOT_DIR
+from legged_torque import resource_path
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import measure
 from legged_torque.learning.runner import OnPolicyRunner
-from legged_torque.utils.args import Parser, add_task_args, run_script
+from legged_torque.utils.args import Parser, add_task_args, options_of
+from legged_torque.utils.cli import run_script
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
-from legged_torque.utils.runs import find_checkpoint
-from legged_torque.utils.task_registry import load_run, set_seed
+from legged_torque.utils.task_registry import set_seed
 from legged_torque.viewer.task_recorder import Recorder
 
 NUM_ENVS = {"none": 16, "web": 4, "native": 1}
@@ -54,21 +54,19 @@ def main() -> None:
     if not 1 <= args.port <= 65535:
         raise UserError(f"--port must be from 1 to 65535, not {args.port}")
     choose_worlds(args)
-    run_dir, env_cfg, train_cfg = load_run(args)
-    checkpoint = find_checkpoint(run_dir, args.checkpoint)
+    options = options_of(args)
+    run = task_registry.load_run(options)
     watch = import_viewer(args.viewer)
     set_seed(args.seed)
-    env, _ = task_registry.make_env(args.task, args, env_cfg)
-    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
+    env, runner = task_registry.make_loaded(run, options)
     if watch is None:
-        roll_out(args, env, runner, checkpoint)
+        roll_out(args, env, runner, run.checkpoint)
         return
     from legged_torque.viewer.session import Session
 
     make_task = functools.partial(type(env), device=env.device)
-    number = int(checkpoint.stem.removeprefix("model_"))
-    session = Session(make_task, env_cfg, runner, run_dir, number)
-    robot = ROOT_DIR / env_cfg.asset.file
+    session = Session(make_task, run.env_cfg, runner, run.folder, run.iterations)
+    robot = resource_path(run.env_cfg.asset.file)
     if args.viewer == "web":
         watch(session, robot, args.task, args.host, args.port)
     else:
@@ -114,7 +112,6 @@ def import_viewer(name: str):
 
 def roll_out(args: argparse.Namespace, env: LeggedRobot, runner: OnPolicyRunner, checkpoint: Path) -> None:
     """Roll out mean actions, print how it walks, save a video."""
-    runner.load(str(checkpoint))
     recorder = Recorder(env, args.grid)
     policy = runner.get_inference_policy(env.device)
     metrics = measure(env, policy, args.steps, lambda commands: recorder.add_step())

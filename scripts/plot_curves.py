@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from legged_torque.utils.args import Parser, run_script
+from legged_torque.utils.args import Parser
+from legged_torque.utils.cli import run_script
 from legged_torque.utils.plotting import load_pyplot, read_data, save_figure
 
 PANELS = {

@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from legged_torque.utils.args import Parser, run_script
+from legged_torque.utils.args import Parser
+from legged_torque.utils.cli import run_script
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.plotting import load_pyplot, read_data, save_figure
 

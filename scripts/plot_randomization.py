@@ -4,12 +4,13 @@ Builds 2000 worlds of a1_position with --perturbation low, unless told otherwise
 and controller read them.
 """
 
-import os
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-os.environ["MUJOCO_GL"] = "disable"  # nothing is rendered
+from legged_torque.utils.rendering import without_renderer
+
+without_renderer()  # before anything imports mujoco
 
 import numpy as np
 import torch
@@ -17,7 +18,8 @@ import torch
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.domain_rand import TRUNK
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.utils.args import Parser, add_build_args, run_script
+from legged_torque.utils.args import Parser, add_build_args, options_of
+from legged_torque.utils.cli import run_script
 from legged_torque.utils.plotting import load_pyplot, save_figure
 from legged_torque.utils.task_registry import set_seed
 
@@ -67,9 +69,10 @@ def main() -> None:
     parser.set_defaults(task="a1_position", perturbation="low", num_envs=2000)
     parser.add_argument("--out", type=Path, required=True, help="picture to write (png, svg, pdf)")
     args = parser.parse_args()
-    env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
+    options = options_of(args)
+    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     set_seed(train_cfg.seed)
-    task, _ = task_registry.make_env(args.task, args, env_cfg)
+    task, _ = task_registry.make_env(options.task, options, env_cfg)
     panels = [panel for read in (initial_state, robot, ground, controller, sensors, events) for panel in read(task)]
     draw(sorted(panels, key=lambda panel: GROUPS.index(panel.group)), args.out)  # events were read last
 

@@ -4,15 +4,17 @@ The policy is kept where ``train.py`` looks for it, which also makes it itself i
 """
 
 import json
-import os
 from pathlib import Path
 
-os.environ["MUJOCO_GL"] = "disable"  # nothing is drawn, and MuJoCo must not look for a renderer
+from legged_torque.utils.rendering import without_renderer
+
+without_renderer()  # before anything imports mujoco
 
 from legged_torque.envs import task_registry
 from legged_torque.learning.pretrained import make_pretrained, pretrained_file
-from legged_torque.utils.args import Parser, add_build_args, device_name, resolve_device, run_script
-from legged_torque.utils.cli import prepare_file
+from legged_torque.utils.args import Parser, add_build_args, options_of
+from legged_torque.utils.cli import prepare_file, run_script
+from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.progress import CompileProgress
 
 
@@ -21,7 +23,7 @@ def main() -> None:
     parser = Parser(__doc__)
     add_build_args(parser)
     parser.set_defaults(task="a1_torque_gravity")
-    parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in this repository")
+    parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in the current directory")
     parser.add_argument("--num_configurations", type=int, help="random initial states; default: that of the task")
     parser.add_argument("--num_steps", type=int, help="control steps for which each is followed; default: likewise")
     parser.add_argument("--json", type=Path, help="write the report with its histograms to this file as well")
@@ -29,13 +31,14 @@ def main() -> None:
     for name in ("num_configurations", "num_steps", "seed"):
         if getattr(args, name) is not None:
             args.set.append(f"pretraining.{name}={getattr(args, name)}")
-    env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
-    file = pretrained_file(args, train_cfg)
+    options = options_of(args)
+    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+    file, device = pretrained_file(options.task, train_cfg, options.log_root), resolve_device(options.device)
     if args.json:
         prepare_file(args.json)
-    print(f"Pre-training {args.task} on {device_name(resolve_device(args.device))}.", flush=True)
+    print(f"Pre-training {args.task} on {device_name(device)}.", flush=True)
     with CompileProgress():
-        report = make_pretrained(file, args, env_cfg, train_cfg)
+        report = make_pretrained(file, args.task, env_cfg, train_cfg, device)
     if args.json:
         args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     print(f"The policy is in {file}")

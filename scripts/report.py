@@ -9,7 +9,8 @@ from pathlib import Path
 from legged_torque.experiments.figures import draw_all
 from legged_torque.experiments.report import read_experiment, summarize, write_tables
 from legged_torque.experiments.report_text import missing_lines, report
-from legged_torque.utils.args import Parser, run_script
+from legged_torque.utils.args import Parser
+from legged_torque.utils.cli import run_script
 from legged_torque.utils.errors import UserError
 
 

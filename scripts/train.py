@@ -3,21 +3,25 @@
 On several GPUs of a machine: ``torchrun --standalone --nproc_per_node=2 scripts/train.py --task=a1_torque_multihead``.
 """
 
-import argparse
-import os
+from legged_torque.utils.rendering import without_renderer
 
-os.environ["MUJOCO_GL"] = "disable"  # training draws nothing, and MuJoCo must not look for a renderer
+without_renderer()  # before anything imports mujoco
+
+from typing import Any
 
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
-from legged_torque.learning.pretrained import find_pretrained, start_from
+from legged_torque.learning.pretrained import find_pretrained, pretrained_file, start_from
+from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils import distributed
-from legged_torque.utils.args import Parser, add_task_args, add_train_args, device_name, run_script
+from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of
+from legged_torque.utils.cli import run_script
 from legged_torque.utils.config import to_dict
+from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.options import DEFAULT_PRESET, Options
 from legged_torque.utils.progress import CompileProgress
-from legged_torque.utils.runs import find_checkpoint, save_config
-from legged_torque.utils.task_registry import load_run, num_iterations, set_seed
+from legged_torque.utils.runs import save_config
+from legged_torque.utils.task_registry import num_iterations, set_seed
 
 
 def main() -> None:
@@ -30,50 +34,60 @@ def main() -> None:
     if args.list:
         print("\n".join(task_registry.names()))
         return
-    if args.resume:
-        if args.preset:
+    options = options_of(args)
+    if options.resume:
+        if options.preset:
             raise UserError("--preset cannot be given with --resume, which keeps the settings of the run")
-        run_dir, env_cfg, train_cfg = load_run(args)
-        args.load_run, args.preset = str(run_dir), args.run_config.get("preset")
-        args.max_iterations = args.max_iterations or args.run_config.get("max_iterations")
-        find_checkpoint(run_dir, args.checkpoint)  # a mistake is told before anything is built
-    elif args.load_run or args.checkpoint is not None:
+        run = task_registry.load_run(options)
+        env_cfg, train_cfg = run.env_cfg, run.train_cfg
+        options.load_run, options.preset = str(run.folder), run.config.get("preset")
+        options.max_iterations = options.max_iterations or run.config.get("max_iterations")
+    elif options.load_run or options.checkpoint is not None:
         raise UserError("--load_run and --checkpoint need --resume")
     else:
-        env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
+        env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     set_seed(train_cfg.seed)
     with CompileProgress():
-        train(args, env_cfg, train_cfg)
+        train(options, env_cfg, train_cfg)
 
 
-def train(args: argparse.Namespace, env_cfg: LeggedRobotCfg, train_cfg: LeggedRobotCfgPPO) -> None:
+def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
     """Build the task and train it, from a pre-trained policy if the task has one."""
-    starts_pretrained = train_cfg.pretraining.function and not args.resume and distributed.rank() == 0
-    pretrained = find_pretrained(args, env_cfg, train_cfg) if starts_pretrained else None
-    env, _ = task_registry.make_env(args.task, args, env_cfg)
-    runner, _ = task_registry.make_alg_runner(env, args.task, args, train_cfg)
-    if pretrained:
+    is_first = distributed.rank() == 0
+    pretrained = pretrained_file(options.task, train_cfg, options.log_root)
+    starts_pretrained = bool(train_cfg.pretraining.function) and not options.resume and is_first
+    if starts_pretrained:
+        find_pretrained(pretrained, options.task, env_cfg, train_cfg, resolve_device(options.device))
+    env, _ = task_registry.make_env(options.task, options, env_cfg)
+    runner, _ = task_registry.make_alg_runner(env, options.task, options, train_cfg)
+    if starts_pretrained:
         start_from(runner, pretrained)  # the other processes get the networks of the first one
-    total = args.max_iterations or num_iterations(env, train_cfg)
+    total = options.max_iterations or num_iterations(env, train_cfg)
     remaining = total - runner.current_learning_iteration
     if remaining < 1:
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
-    if distributed.rank() == 0:
-        runner.claim_log_dir()
-        num_processes = distributed.world_size()
-        settings = {"task": args.task, "preset": args.preset or "parallel", "device": env.device}
-        settings |= {"processes": num_processes, "max_iterations": total}
-        place = f"{num_processes} x " * (num_processes > 1) + device_name(env.device)
-        print(f"Training {args.task} on {place}: {num_processes * env.num_envs} worlds, {total} iterations.")
-        print(f"Curves: tensorboard --logdir {runner.log_dir}")
-        print(f"See it learn: python scripts/play.py {run_words(args.task, runner.log_dir)} --viewer web", flush=True)
-        save_config(runner.log_dir, settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
+    if is_first:
+        announce(runner, options, env_cfg, train_cfg, total)
     runner.learn(remaining, init_at_random_ep_len=True)
-    if distributed.rank() == 0:
+    if is_first:
         print(f"The run is in {runner.log_dir}")
         for what, script in {"See it walk": "play", "Measure it": "evaluate", "Take it elsewhere": "export"}.items():
-            print(f"{what}: python scripts/{script}.py {run_words(args.task, runner.log_dir)}")
+            print(f"{what}: python scripts/{script}.py {run_words(options.task, runner.log_dir)}")
     runner.close()
+
+
+def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: Any, total: int) -> None:
+    """Create the run's folder with its settings, and print where it is and how to watch it."""
+    runner.claim_log_dir()
+    device, num_processes = runner.env.device, distributed.world_size()
+    place = device_name(device) if num_processes == 1 else f"{num_processes} x {device_name(device)}"
+    print(f"Training {options.task} on {place}: {num_processes * runner.env.num_envs} worlds, {total} iterations.")
+    print(f"Curves: tensorboard --logdir {runner.log_dir}")
+    words = run_words(options.task, runner.log_dir)
+    print(f"See it learn: python scripts/play.py {words} --viewer web", flush=True)
+    settings = {"task": options.task, "preset": options.preset or DEFAULT_PRESET, "device": device}
+    settings |= {"processes": num_processes, "max_iterations": total}
+    save_config(runner.log_dir, settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
 
 
 def run_words(task: str, run_dir: str) -> str:

@@ -1,6 +1,5 @@
 """What all tests share: tasks on the CPU, small and seeded."""
 
-import argparse
 import os
 
 os.environ["MUJOCO_GL"] = "disable"  # before anything imports mujoco: no test renders
@@ -10,6 +9,7 @@ import torch
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import set_by_path
+from legged_torque.utils.options import Options
 
 
 @pytest.fixture(scope="session")
@@ -22,6 +22,6 @@ def make_task():
         for path, value in {"env.num_envs": num_envs, **overrides}.items():
             set_by_path(env_cfg, path, value)
         torch.manual_seed(seed)
-        return task_registry.make_env(name, argparse.Namespace(device="cpu"), env_cfg)[0]
+        return task_registry.make_env(name, Options(device="cpu"), env_cfg)[0]
 
     return make

@@ -3,26 +3,23 @@
 import pytest
 
 from legged_torque.envs import task_registry
-from legged_torque.utils.args import Parser, add_task_args, add_train_args
+from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of
 from legged_torque.utils.errors import UserError
 
 TASKS = ["a1_position", "a1_torque", "a1_torque_gravity", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
 
 
 def parse(*words):
-    """The namespace that train.py makes of a command line, on the CPU."""
+    """The options that train.py makes of a command line, on the CPU."""
     parser = Parser("test")
     add_task_args(parser)
     add_train_args(parser)
-    return parser.parse_args(["--device=cpu", *words])
+    return options_of(parser.parse_args(["--device=cpu", *words]))
 
 
 def get_cfgs(*words, task="a1_position", run_config=None):
     """A task's settings, changed by a command line."""
-    args = parse(*words)
-    if run_config is not None:
-        args.run_config = run_config
-    return task_registry.get_cfgs(task, args)
+    return task_registry.get_cfgs(task, parse(*words), run_config)
 
 
 def error_of(function, *args, **kwargs):

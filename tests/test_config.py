@@ -7,8 +7,9 @@ import torch
 from settings import TASKS, error_of, flatten, get, get_cfgs, parse
 
 from legged_torque.envs import task_registry
-from legged_torque.utils.args import resolve_device, run_script
+from legged_torque.utils.cli import run_script
 from legged_torque.utils.config import section_keys, set_by_path, to_dict
+from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import num_iterations
 

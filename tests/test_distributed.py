@@ -20,7 +20,7 @@ from test_random_stream import upcoming
 
 from legged_torque.envs import task_registry
 from legged_torque.utils import distributed
-from legged_torque.utils.args import resolve_device
+from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.task_registry import num_iterations, set_seed
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -11,12 +11,12 @@ import time
 
 import pytest
 import torch
-from legged_torque.experiments import matrix as experiment
-from legged_torque.experiments import run as experiment_run
 from settings import error_of
 from test_experiment import SMALL, experiment_here, wait_for, write
 from test_scripts import assert_told_in_one_line, contents
 
+from legged_torque.experiments import matrix as experiment
+from legged_torque.experiments import run as experiment_run
 from legged_torque.experiments.job import find_workers
 from legged_torque.experiments.matrix import read_matrix
 from legged_torque.experiments.run import ExperimentRun, duration_text, time_left

@@ -15,7 +15,7 @@ from legged_torque.control.gravity_pretraining import (
     Followed,
     Pairs,
     act_by_controller,
-    exchange_last_actions,
+    exchange,
     follow,
     histogram,
     imitation_loss,
@@ -228,7 +228,7 @@ def test_gains_of_the_imitated_controller(monkeypatch):
     changes = {"num_configurations": 12, "num_steps": 1, "num_rounds": 1, "num_epochs": 1, "held_out": 0.5}
     words = [*SMALL, f"--task={TASK}", *words_of(**changes), "--set=domain_rand.init_dof_pos_scale=[1, 1]"]
     words.append("--set=pretraining.controller.joint_damping=0")
-    _, report = pretrain(parse(*words), *get_cfgs(*words, task=TASK))
+    _, report = pretrain(TASK, *get_cfgs(*words, task=TASK), "cpu")
     assert report["histograms"]["mean_torque"]["counts"] == [12.0, *[0.0] * 49]
     assert report["pairs"] == 12 and report["settings"]["controller"]["joint_damping"] == 0.0
 
@@ -318,7 +318,8 @@ def test_last_actions_are_exchanged(history):
     """They are those of other samples, of which each is used once; all else stays."""
     observations = torch.arange(50.0 * 20 * history).view(50, 20 * history)
     torch.manual_seed(0)
-    exchanged = exchange_last_actions(observations, 3, history)
+    columns = [20 * step + column for step in range(history) for column in (17, 18, 19)]
+    exchanged = exchange(observations, columns)
     before, after = observations.view(50, history, 20), exchanged.view(50, history, 20)
     assert torch.equal(after[..., :17], before[..., :17])
     assert (after[..., 17:] != before[..., 17:]).float().mean() > 0.8

@@ -1,6 +1,5 @@
 """The registry of tasks, and settings that inherit."""
 
-import argparse
 import copy
 import inspect
 
@@ -13,6 +12,7 @@ from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.utils.config import BaseConfig, section_keys, to_dict, update_from_dict
 from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import TaskRegistry
 
 
@@ -99,7 +99,7 @@ def test_variant_is_built(make_task):
     registry = TaskRegistry()
     registry.register("variant", LeggedRobot, VariantCfg(), A1CfgPPO())
     env_cfg, _ = registry.get_cfgs("variant", parse("--num_envs=2"))
-    task, cfg = registry.make_env("variant", argparse.Namespace(device="cpu"), env_cfg)
+    task, cfg = registry.make_env("variant", Options(device="cpu"), env_cfg)
     assert task.cfg is cfg is env_cfg and task.num_envs == 2
     assert "action_rate" not in task.reward_names
     reference = make_task("a1_position", 2)

@@ -12,9 +12,9 @@ from settings import get_cfgs
 
 from legged_torque.envs import task_registry
 from legged_torque.utils import rendering, runs
-from legged_torque.utils.args import Parser, add_task_args, apply_args
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.math import quat_rotate_inverse
+from legged_torque.utils.options import Options, apply_options
 
 
 def quaternion_matrices(quat):
@@ -75,11 +75,9 @@ def test_yaml_needs_no_tags(tmp_path):
     assert "!!" not in text and yaml.safe_load(text)["train"]["runner"]["run_name"] == "x"
 
 
-def test_apply_args_needs_only_what_a_script_offers():
+def test_options_that_are_not_given_change_nothing():
     """Scripts without training options, such as play.py, leave training settings alone."""
     env_cfg, train_cfg = task_registry.get_cfgs("a1_position")
     before = to_dict(train_cfg)
-    parser = Parser("test")
-    add_task_args(parser)
-    apply_args(env_cfg, train_cfg, parser.parse_args(["--device=cpu", "--num_envs=3"]))
+    apply_options(env_cfg, train_cfg, Options(device="cpu", num_envs=3))
     assert env_cfg.env.num_envs == 3 and to_dict(train_cfg) == before

@@ -1,6 +1,5 @@
 """The whole-body controller: its torques against MuJoCo's dynamics, and whether robots under it stand."""
 
-import argparse
 import copy
 import dataclasses
 
@@ -14,6 +13,7 @@ from legged_torque.control.standing import is_standing, measure_standing, place_
 from legged_torque.control.whole_body import WholeBodyController, WholeBodySettings
 from legged_torque.envs import task_registry
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.options import Options
 
 TORQUE_LIMIT = 33.5
 WEIGHT = 12.453 * 9.81
@@ -31,7 +31,7 @@ def make_trial(num_envs, name="a1_torque", **env):
     for key, value in {"num_envs": num_envs, **env}.items():
         setattr(cfg.env, key, value)
     torch.manual_seed(1)
-    return task_registry.make_env(name, argparse.Namespace(device="cpu"), cfg)[0]
+    return task_registry.make_env(name, Options(device="cpu"), cfg)[0]
 
 
 def make_controller(task, num_states, settings=None):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import copy
 import dataclasses
 import math
@@ -20,8 +19,8 @@ from legged_torque.control.dynamics import RobotDynamics
 from legged_torque.control.standing import measure_standing, place_on_ground, use_standing_trials
 from legged_torque.control.whole_body import WholeBodyController, WholeBodySettings, WholeBodyTorques
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.utils.args import device_name, resolve_device
 from legged_torque.utils.config import to_dict
+from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.random_state import own_random_numbers, seeded_state
 from legged_torque.utils.task_registry import task_registry
@@ -75,15 +74,16 @@ class Collection:
     residuals: Tensor
 
 
-def pretrain(args: argparse.Namespace, env_cfg: Any, train_cfg: Any) -> tuple[MLPModel, dict[str, Any]]:
+def pretrain(name: str, env_cfg: Any, train_cfg: Any, device: str) -> tuple[MLPModel, dict[str, Any]]:
     """Make a policy that stands: the ``pretraining.function`` of ``a1_torque_gravity``.
 
     Its random numbers are its own, so that a training is the same whether it had to make its policy or found one.
 
     Args:
-        args: Parsed command line; says which task on which device.
+        name: Name of the task.
         env_cfg: Settings of the task.
         train_cfg: Settings of its training; those of this function are ``pretraining``.
+        device: "cpu" or "cuda:N".
 
     Returns:
         The actor, and a report of plain values.
@@ -91,9 +91,8 @@ def pretrain(args: argparse.Namespace, env_cfg: Any, train_cfg: Any) -> tuple[ML
     cfg, settings = copy.deepcopy(env_cfg), train_cfg.pretraining
     check_settings(settings)
     use_standing_trials(cfg, env_cfg.control.decimation)
-    device = resolve_device(args.device)
     with own_random_numbers(device, seeded_state(device, settings.seed)):
-        task, _ = task_registry.make_env(args.task, args, cfg)
+        task = task_registry.get_task_class(name)(cfg, device)
         actor = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=None)[0].alg.actor
         controller = make_controller(task, WholeBodySettings(**to_dict(settings.controller)))
         start = time.perf_counter()
@@ -102,7 +101,7 @@ def pretrain(args: argparse.Namespace, env_cfg: Any, train_cfg: Any) -> tuple[ML
         standing = standing_shares(task, controller, actor)
     print(f"Standing after 5 s: {' and '.join(f'the {who} {share:.1%}' for who, share in standing.items())}.")
     report = {
-        "task": args.task,
+        "task": name,
         "device": device_name(task.device),
         "settings": to_dict(settings),
         "pairs": len(collection.training.actions) + len(collection.held_out.actions),
@@ -260,8 +259,7 @@ def residual_share(controller: WholeBodyController, decided: WholeBodyTorques) -
 def supervise(task: LeggedRobot, actor: MLPModel, collection: Collection, settings: Any) -> dict[str, list[float]]:
     """Train the actor's mean on the pairs and on their mirror images by their mean square error.
 
-    The last action, which the policy sees too, is that of another pair: it would tell the next one so well that the
-    policy would learn to copy it, and could not correct its own mistakes.
+    Last actions are shuffled; otherwise the policy would copy them and could not correct its own mistakes.
 
     Args:
         task: The task, which knows mirror images.
@@ -296,29 +294,25 @@ def supervise(task: LeggedRobot, actor: MLPModel, collection: Collection, settin
 
 def imitation_loss(task: LeggedRobot, actor: MLPModel, pairs: Pairs) -> Tensor:
     """Return the mean square error of the actor's mean actions on pairs and their mirror images. Scalar."""
-    observations = exchange_last_actions(pairs.observations, task.num_actions, task.cfg.env.history_length)
+    observations = exchange(pairs.observations, task.observations.policy_columns("last_action"))
     observations = torch.cat([observations, task.mirror("policy", observations)])
     actions = torch.cat([pairs.actions, task.mirror("actions", pairs.actions)])
     predicted = actor(TensorDict({"policy": observations}, [len(observations)]))
     return (predicted - actions).square().mean()
 
 
-def exchange_last_actions(observations: Tensor, num_actions: int, history_length: int) -> Tensor:
-    """Return observations whose last actions are those of other samples, drawn at random.
-
-    Args:
-        observations: What the policy sees; each of its steps ends with the last action. Shape: (samples, size).
-        num_actions: Number of actions.
-        history_length: Number of steps.
-    """
-    steps = observations.unflatten(1, (history_length, -1))
-    others = steps[torch.randperm(len(steps), device=steps.device)]
-    return torch.cat([steps[..., :-num_actions], others[..., -num_actions:]], dim=2).flatten(1)
+def exchange(observations: Tensor, columns: list[int]) -> Tensor:
+    """Return observations with some columns of other samples, drawn at random. Shapes: (samples, size)."""
+    others = observations[torch.randperm(len(observations), device=observations.device)]
+    result = observations.clone()
+    result[:, columns] = others[:, columns]
+    return result
 
 
 def make_controller(task: LeggedRobot, settings: WholeBodySettings | None = None) -> WholeBodyController:
     """Return the whole-body controller for the worlds of a task; without settings, with its own defaults."""
     dynamics = RobotDynamics(task.sim.mj_model, task.num_envs, task.device, task.foot_names)
+    settings = dataclasses.replace(settings or WholeBodySettings(), height=task.cfg.rewards.base_height_target)
     return WholeBodyController(dynamics, task.default_dof_pos.tolist(), settings)
 
 

@@ -13,9 +13,9 @@ from legged_torque.control.dynamics import RobotDynamics
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.utils.args import apply_perturbation
 from legged_torque.utils.config import update_from_dict
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.options import apply_perturbation
 
 START_CLEARANCE = (0.0, 0.02)
 """Lowest and highest clearance of the lowest foot at the start [m]."""
@@ -104,7 +104,7 @@ def is_standing(task: LeggedRobot) -> Tensor:
     Returns:
         Shape: (num_envs,), bool.
     """
-    upright = (task.base_pos[:, 2] > LOWEST_HEIGHT) & (task.projected_gravity[:, 2] < HIGHEST_GRAVITY_Z)
+    upright = (task.base_height > LOWEST_HEIGHT) & (task.projected_gravity[:, 2] < HIGHEST_GRAVITY_Z)
     only_feet = task.contacts.sum(dim=1) == task.feet_contact.sum(dim=1)
     slow = torch.linalg.vector_norm(task.base_lin_vel, dim=1) < HIGHEST_SPEED
     return upright & only_feet & slow

@@ -8,6 +8,7 @@ import os
 import shutil
 import tempfile
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,6 @@ from legged_torque.deploy.description import (
     to_yaml,
 )
 from legged_torque.deploy.policy import Policy, State
-from legged_torque.envs.approaches.multi_head import MultiHeadRobot
-from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import package_versions
@@ -166,40 +165,33 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
 
 def _observation_terms(task: LeggedRobot) -> list[dict[str, Any]]:
     """Return the terms of the policy's observations in their order."""
-    scales, joints = task.cfg.normalization.obs_scales, task.num_dof
-    clip = _both_ways(task.cfg.normalization.clip_observations)
-    command_scale = [scales.lin_vel, scales.lin_vel, scales.ang_vel]
-    rows = [
-        ("projected_gravity", 3, 1.0, "trunk", "", "unit vector of gravity, (0, 0, -1) when upright"),
-        ("angular_velocity", 3, scales.ang_vel, "trunk", "rad/s", "of the trunk"),
-        ("command", 3, command_scale, "trunk", "m/s, m/s, rad/s", "commanded v_x, v_y and yaw rate"),
-        ("joint_position", joints, scales.dof_pos, "joint", "rad", "q - nominal_pose"),
-        ("joint_velocity", joints, scales.dof_vel, "joint", "rad/s", "qd"),
-        ("last_action", task.num_actions, 1.0, "none", "", "clipped actions of the step before, 0 at the start"),
+    clip, sizes = _both_ways(task.cfg.normalization.clip_observations), task.observations.sizes
+    return [
+        {
+            "name": term.name,
+            "size": sizes[term.name],
+            "scale": list(term.scale) if isinstance(term.scale, Sequence) else term.scale,
+            "frame": term.frame,
+            "unit": term.unit,
+            "meaning": term.meaning,
+            "clip": list(clip),
+        }
+        for term in task.observations.policy_terms()
     ]
-    keys = ("name", "size", "scale", "frame", "unit", "meaning")
-    return [dict(zip(keys, row, strict=True)) | {"clip": list(clip)} for row in rows]
 
 
 def _action_terms(task: LeggedRobot) -> list[dict[str, Any]]:
     """Return what actions mean, in their order, mixed as at the task's counters; :func:`check_task` checks it."""
-    scales = {"position_residual": task.action_scale, "torque": task.torque_scale}
-    texts = {"position_residual": ("rad", "joint position relative to nominal_pose, for PD control")}
-    texts["torque"] = ("N m", "joint torque")
-    if isinstance(task, MultiHeadRobot):
-        weights = dict(zip(scales, _plain(task.mixing), strict=True))
-    else:
-        weights = {"torque" if isinstance(task, TorqueRobot) else "position_residual": 1.0}
     return [
         {
-            "name": name,
+            "name": term.name,
             "size": task.num_dof,
-            "scale": _plain(scales[name][0, 0]),
-            "unit": texts[name][0],
-            "mixing_weight": weight,
-            "meaning": texts[name][1],
+            "scale": _plain(term.scale[0, 0]),
+            "unit": term.unit,
+            "mixing_weight": 1.0 if term.weight is None else _plain(term.weight),
+            "meaning": term.meaning,
         }
-        for name, weight in weights.items()
+        for term in task.action_terms()
     ]
 
 
@@ -239,8 +231,8 @@ def check_task(task: LeggedRobot, policy: Policy) -> None:
     task.reset_buf.fill_(True)  # the history starts with copies
     task._update_state()
     task.compute_observations()
-    torques = task.motor_strength * task._compute_torques(task.actions)
-    expected = torques.clamp(task.torque_limits[0], task.torque_limits[1])
+    task.motors.apply(task._compute_torques(task.actions), task.dof_vel, out=task.torques)
+    expected = task.torques
     for world in range(task.num_envs):
         parts = (task.base_ang_vel, task.dof_pos, task.dof_vel, task.projected_gravity)
         state = State(*(part[world].cpu().numpy() for part in parts))

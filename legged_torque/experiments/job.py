@@ -20,7 +20,7 @@ from typing import BinaryIO
 import torch
 
 from legged_torque.experiments.matrix import Cell, State
-from legged_torque.utils.args import resolve_device
+from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 
 LAST_LINES = 10

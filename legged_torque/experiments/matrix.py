@@ -11,7 +11,7 @@ from typing import Any
 from legged_torque import ROOT_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.args import Parser, add_task_args, add_train_args
+from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of
 from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.runs import checkpoint_numbers, load_config
@@ -184,7 +184,7 @@ def check_settings(matrix: Matrix) -> None:
     add_train_args(parser)
     for cell in matrix.cells():
         words = ["--device=cpu", f"--task={cell.task}", *new_run_words(matrix, cell)]
-        env_cfg, _ = task_registry.get_cfgs(cell.task, parser.parse_args(words))
+        env_cfg, _ = task_registry.get_cfgs(cell.task, options_of(parser.parse_args(words)))
         check_env_cfg(env_cfg)
         for name in cell.evaluated_in:
             if name not in env_cfg.perturbations():

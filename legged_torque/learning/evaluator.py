@@ -16,8 +16,8 @@ from torch import Tensor
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import WalkingMetrics
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
-from legged_torque.utils.args import apply_perturbation
 from legged_torque.utils.config import section_keys
+from legged_torque.utils.options import apply_perturbation
 from legged_torque.utils.random_state import own_random_numbers, seeded_state
 
 EVALUATIONS_FILE = "evaluations.csv"
@@ -31,8 +31,7 @@ class TrainingEvaluator:
 
     Its worlds have their own random numbers, no rewards, and go on where the last evaluation left them: an evaluation
     has as many steps of robots as the paper's 16 worlds x 2000 steps, but in many worlds at once. Training is the same
-    with and without it. A robot that an early policy has left sitting may stay there for the rest of its episode,
-    through some hundred evaluations: as long as a task is not learned, its numbers lag behind.
+    with and without it. Robots stuck under an early policy stay stuck until time-out, so early metrics lag.
     """
 
     def __init__(self, task: LeggedRobot, policy: Callable[[TensorDict], Tensor], settings: dict, seed: int) -> None:

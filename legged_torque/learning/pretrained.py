@@ -6,15 +6,13 @@ again wherever these are the same, and refused where they are not.
 
 from __future__ import annotations
 
-import argparse
-import os
 from pathlib import Path
 from typing import Any
 
-import torch
 from rsl_rl.utils import resolve_callable
 
-from legged_torque.learning.runner import OnPolicyRunner, last_line
+from legged_torque.learning import checkpoint
+from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import all_experiments_dir
@@ -28,56 +26,44 @@ STANDARD_DEVIATION = "distribution."
 """Start of the names of parameters that are not taken over: how much a training explores is its own setting."""
 
 
-def pretrained_file(args: argparse.Namespace, train_cfg: Any) -> Path:
+def pretrained_file(task: str, train_cfg: Any, log_root: str | None = None) -> Path:
     """Return where a task's pre-trained policy is kept: ``pretraining.file``, or in the folder of all experiments."""
     if train_cfg.pretraining.file:
         return Path(train_cfg.pretraining.file)
-    return all_experiments_dir(args) / "pretrained" / f"{args.task}.pt"
+    return all_experiments_dir(log_root) / "pretrained" / f"{task}.pt"
 
 
-def find_pretrained(args: argparse.Namespace, env_cfg: Any, train_cfg: Any) -> Path:
-    """Return the file of a task's pre-trained policy, after making it if it is missing.
+def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> None:
+    """See that there is a pre-trained policy that fits a task, and make it if it is missing.
 
     Args:
-        args: Parsed command line.
+        file: Where it is kept.
+        task: Name of the task.
         env_cfg: Settings of the task.
         train_cfg: Settings of its training.
+        device: Where to make it.
 
     Raises:
         UserError: If there is one, but its inputs or outputs mean something else.
     """
-    file = pretrained_file(args, train_cfg)
     if not file.exists():
         print(f"There is no pre-trained policy '{file}' yet; making it.", flush=True)
-        make_pretrained(file, args, env_cfg, train_cfg)
+        make_pretrained(file, task, env_cfg, train_cfg, device)
     check_spaces(file, env_cfg, train_cfg)
     print(f"Starting from the pre-trained policy '{file}'.")
-    return file
 
 
-def make_pretrained(file: Path, args: argparse.Namespace, env_cfg: Any, train_cfg: Any) -> dict[str, Any]:
-    """Make a task's pre-trained policy, and return what its making reports.
-
-    Args:
-        file: Where to keep it; it is either complete or absent.
-        args: Parsed command line.
-        env_cfg: Settings of the task.
-        train_cfg: Settings of the training; ``pretraining.function`` makes the policy.
+def make_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> dict[str, Any]:
+    """Make a task's pre-trained policy, and return what its making reports; arguments as for :func:`find_pretrained`.
 
     Raises:
         UserError: If the task has no pre-training.
     """
     if not train_cfg.pretraining.function:
-        raise UserError(f"task '{args.task}' has no pre-training: its pretraining.function is empty")
-    actor, report = resolve_callable(train_cfg.pretraining.function)(args, env_cfg, train_cfg)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f"{file.name}.{os.getpid()}.part")
-    try:
-        content = {"actor_state_dict": actor.state_dict(), "spaces": spaces(env_cfg, train_cfg), "report": report}
-        torch.save(content, part)
-        part.replace(file)
-    finally:
-        part.unlink(missing_ok=True)
+        raise UserError(f"task '{task}' has no pre-training: its pretraining.function is empty")
+    actor, report = resolve_callable(train_cfg.pretraining.function)(task, env_cfg, train_cfg, device)
+    content = {"actor_state_dict": actor.state_dict(), "spaces": spaces(env_cfg, train_cfg), "report": report}
+    checkpoint.write(file, content)
     return report
 
 
@@ -111,10 +97,7 @@ def read_pretrained(file: Path) -> dict[str, Any]:
     Raises:
         UserError: If it is not one.
     """
-    try:
-        content = torch.load(file, weights_only=True, map_location="cpu")
-    except Exception as error:  # torch raises about anything for a file that is not its own
-        raise UserError(f"'{file}' is not a readable pre-trained policy: {last_line(error)}") from None
+    content = checkpoint.read(file, "pre-trained policy", "cpu")
     if not isinstance(content, dict) or not {"actor_state_dict", "spaces", "report"} <= content.keys():
         raise UserError(f"'{file}' is not a pre-trained policy")
     return content

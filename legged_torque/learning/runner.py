@@ -1,8 +1,7 @@
-"""rsl_rl's on-policy runner, with rollouts that never wait for the host and training that is never lost."""
+"""rsl_rl's on-policy runner, with rollouts that never wait for the host and crash-safe checkpoints."""
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from rsl_rl import runners
 
 import legged_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.learning import checkpoint
 from legged_torque.learning.evaluator import EVALUATIONS_FILE, TrainingEvaluator, append_row
 from legged_torque.learning.ppo import OnDevicePPO
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
@@ -18,7 +18,7 @@ from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.random_state import random_state, restore_random_state
-from legged_torque.utils.runs import claim_run_dir
+from legged_torque.utils.runs import checkpoint_file, claim_run_dir
 
 EVALUATION_SEED = 10_000
 """Added to the seed of a training for that of its evaluations."""
@@ -140,12 +140,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         }
         if self.gpu_global_rank > 0:
             return
-        part = f"{path}.part"
-        try:
-            torch.save(state, part)
-            os.replace(part, path)
-        finally:
-            Path(part).unlink(missing_ok=True)
+        checkpoint.write(Path(path), state)
         self.logger.save_model(path, self.current_learning_iteration)
 
     def load(
@@ -165,10 +160,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         Raises:
             UserError: If the file is not a checkpoint or belongs to another kind of policy.
         """
-        try:
-            state = torch.load(path, weights_only=True, map_location=map_location or self.device)
-        except Exception as error:  # torch raises about anything for a file that is not its own
-            raise UserError(f"'{path}' is not a readable checkpoint: {last_line(error)}") from None
+        state = checkpoint.read(Path(path), "checkpoint", map_location or self.device)
         try:
             load_iteration = self.alg.load(state, load_cfg, strict)
             if load_iteration:
@@ -177,8 +169,16 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             self.logger.tot_timesteps = state["infos"]["total_timesteps"]
             self._seconds_before = state["infos"]["seconds"]
         except (RuntimeError, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-            raise UserError(f"checkpoint '{path}' does not fit this task: {last_line(error)}") from None
+            raise UserError(f"checkpoint '{path}' does not fit this task: {checkpoint.last_line(error)}") from None
         return state["infos"]
+
+    def resume(self, path: str) -> None:
+        """Continue the training of a checkpoint, random numbers included.
+
+        Raises:
+            UserError: If the file is not a checkpoint of such a training.
+        """
+        self.continue_random_numbers(self.load(path))
 
     def continue_random_numbers(self, infos: dict) -> None:
         """Go on with the random numbers of the run that a checkpoint is from, instead of repeating them.
@@ -194,7 +194,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             if self.gpu_global_rank < len(states):
                 restore_random_state(self.device, states[self.gpu_global_rank])
         except (KeyError, TypeError, RuntimeError, AttributeError) as error:
-            raise UserError(f"the checkpoint has no usable 'random_states': {last_line(error)}") from None
+            raise UserError(f"the checkpoint has no usable 'random_states': {checkpoint.last_line(error)}") from None
 
     def collect_rollout(self) -> None:
         """Let curricula that hold for a rollout move on, and fill the storage with one rollout and its returns."""
@@ -279,7 +279,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         }
 
     def _write_log(self) -> None:
-        """Hand the numbers that were read last to rsl_rl's logger, which prints and writes them: milliseconds."""
+        """Log the previous iteration; takes milliseconds."""
         if self._unwritten_log:
             self.logger.log(**self._unwritten_log)
             self._unwritten_log = None
@@ -288,12 +288,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         """Save into the run's folder with all that was logged, and warn if the simulator had too little room."""
         self._write_log()
         if self.log_dir is not None:
-            self.save(str(Path(self.log_dir) / f"model_{self.current_learning_iteration}.pt"))
+            self.save(str(checkpoint_file(Path(self.log_dir), self.current_learning_iteration)))
         warning = self.env.sim.check_buffers()
         if warning:
             print(f"Warning: {warning}.")
-
-
-def last_line(error: Exception) -> str:
-    """Return the line of an error's message that says most."""
-    return str(error).strip().splitlines()[-1].strip() if str(error).strip() else type(error).__name__

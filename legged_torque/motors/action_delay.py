@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from legged_torque.envs.base.legged_robot import LeggedRobot
 
 UNITS = ("physics_steps", "control_steps")
 """What ``domain_rand.action_delay`` may count."""
@@ -22,19 +18,22 @@ class ActionDelay:
         drawn: Delay in the unit of the settings; its whole part counts. Shape: (num_envs, 1).
     """
 
-    def __init__(self, task: LeggedRobot) -> None:
+    def __init__(self, newest: Tensor, longest: int, unit: str, decimation: int) -> None:
         """Prepare; there is no delay until one is drawn.
 
         Args:
-            task: The task, whose ``actions`` are the newest ones.
+            newest: The buffer of the newest actions, which :meth:`keep` and :meth:`actions` read.
+                Shape: (num_envs, num_actions).
+            longest: Longest delay, in the unit.
+            unit: One of :data:`UNITS`.
+            decimation: Physics steps per control step.
         """
-        rand = task.cfg.domain_rand
-        self._decimation = task.cfg.control.decimation
-        self._physics_steps = self._decimation if rand.action_delay_unit == "control_steps" else 1
-        self._newest = task.actions
-        depth = math.ceil(rand.action_delay[1] * self._physics_steps / self._decimation)
-        self._before = task.actions.new_zeros(depth, *task.actions.shape)
-        self.drawn = task.actions.new_zeros(task.num_envs, 1)
+        self._decimation = decimation
+        self._physics_steps = decimation if unit == "control_steps" else 1
+        self._newest = newest
+        depth = math.ceil(longest * self._physics_steps / decimation)
+        self._before = newest.new_zeros(depth, *newest.shape)
+        self.drawn = newest.new_zeros(len(newest), 1)
 
     def keep(self) -> None:
         """Keep the newest actions, before they are overwritten."""

@@ -10,6 +10,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from legged_torque.utils.mirroring import Mirroring
+
 Range = tuple[float, float]
 """Lowest and highest value."""
 
@@ -30,6 +32,8 @@ class Parameter:
         same_draw_as: Name of an earlier parameter whose draws it takes.
         may_keep: Whether it keeps its value at the start in a share of the draws.
         limits: Lowest and highest values, per column, into which draws are clipped.
+        mirror: Left-right mirror image of the numbers that are drawn; None: that of one number is itself, that of
+            several is not known.
     """
 
     name: str
@@ -43,6 +47,7 @@ class Parameter:
     same_draw_as: str | None = None
     may_keep: bool = False
     limits: tuple[Sequence[float], Sequence[float]] | None = None
+    mirror: Mirroring | None = None
 
 
 class Randomization:

@@ -10,30 +10,88 @@ import yaml
 
 from legged_torque.utils.errors import UserError, unknown_name
 
+_OF_EVERY_CLASS = ("__dict__", "__weakref__")
+"""What Python adds to each class by itself."""
 
-class BaseConfig:
-    """A configuration whose sections are nested classes.
 
-    A subclass overrides what it wants to change and inherits the rest. Creating one turns every nested class into an
-    object of its own and copies lists and dictionaries, so that changing a configuration never changes its class.
+class Section:
+    """A part of a configuration: its settings are class attributes, its sections are nested classes.
+
+    Nested classes inherit by themselves. ``class control: stiffness = 30.0`` in a subclass takes all other settings of
+    ``control`` from the sections of that name in the base classes, in Python's method resolution order. Naming a base,
+    as in ``class control(A1Cfg.control):``, is allowed; it matters only if it is a section of another configuration.
+
+    A name that no base class has is refused when the class is made, unless the class declares it new: a setting by an
+    annotation (``ramp_time: float = 2.0``), a section by its base (``class ramp(Section):``).
+
+    An instance has instances in place of all nested classes, and copies of lists and dictionaries, so that changing it
+    never changes its class.
     """
 
+    def __init_subclass__(cls) -> None:
+        """Check the names of a new class and let its nested classes inherit.
+
+        Raises:
+            UserError: If a name is neither known nor declared new, or is a setting here and a section there.
+        """
+        super().__init_subclass__()
+        _check_names(cls)
+        names = [name for owner in reversed(cls.__mro__) for name in vars(owner)]
+        for name in dict.fromkeys(names):
+            if inspect.isclass(getattr(cls, name)) and not name.startswith("_"):
+                setattr(cls, name, _merge(cls, name))
+
     def __init__(self) -> None:
-        """Instantiate all nested sections."""
-        instantiate_sections(self)
+        """Instantiate the nested sections, all the way down."""
+        for key in section_keys(self):
+            value = getattr(self, key)
+            if inspect.isclass(value):
+                value = value()
+            elif isinstance(value, (list, tuple, dict)):
+                value = copy.deepcopy(list(value) if isinstance(value, tuple) else value)  # YAML knows no tuples
+            setattr(self, key, value)
 
 
-def instantiate_sections(section: Any) -> None:
-    """Replace the nested classes of ``section`` by instances of them, all the way down."""
-    for key in section_keys(section):
-        value = getattr(section, key)
-        if inspect.isclass(value):
-            value = value()
-            if not isinstance(value, BaseConfig):
-                instantiate_sections(value)
-        elif isinstance(value, (list, tuple, dict)):
-            value = copy.deepcopy(list(value) if isinstance(value, tuple) else value)  # YAML knows no tuples
-        setattr(section, key, value)
+def _check_names(cls: type[Section]) -> None:
+    """Refuse names of a class that no base class has and that it does not declare new."""
+    known = [name for base in cls.__bases__ for name in dir(base) if not name.startswith("_")]
+    annotated = inspect.get_annotations(cls)
+    where = cls.__qualname__.rpartition("<locals>.")[2]
+    for name, value in vars(cls).items():
+        if name.startswith("_") or inspect.isroutine(value):
+            continue
+        declared_new = name in annotated or (inspect.isclass(value) and issubclass(value, Section))
+        if known and name not in known and not declared_new:
+            raise UserError(
+                f"{unknown_name(f'setting or section of {where}', name, known)}; to declare it new, annotate a setting "
+                f"({name}: float = ...), derive a section from Section"
+            )
+        for base in cls.__bases__:
+            if inspect.isclass(getattr(base, name, value)) != inspect.isclass(value):
+                kinds = ("a setting", "a section") if inspect.isclass(value) else ("a section", "a setting")
+                raise UserError(f"{where}.{name} is {kinds[1]}, but in {base.__qualname__} it is {kinds[0]}")
+
+
+def _merge(cls: type[Section], name: str) -> type[Section]:
+    """Return the nested class ``name`` of ``cls`` with the sections of that name in all bases of ``cls`` as its bases.
+
+    What it names as bases itself comes first, unless it is among theirs anyway.
+    """
+    own = vars(cls).get(name)
+    inherited = [getattr(base, name) for base in cls.__bases__ if hasattr(base, name)]
+    named = [] if own is None else [base for base in own.__bases__ if base not in (object, Section)]
+    foreign = [base for base in named if not any(issubclass(section, base) for section in inherited)]
+    bases = list(dict.fromkeys([*foreign, *inherited])) or [Section]
+    bases = [base for base in bases if not any(other is not base and issubclass(other, base) for other in bases)]
+    if own is None and len(bases) == 1:
+        return bases[0]
+    members = {} if own is None else {key: value for key, value in vars(own).items() if key not in _OF_EVERY_CLASS}
+    members["__qualname__"] = f"{cls.__qualname__}.{name}"
+    return type(name, tuple(bases), members)
+
+
+class BaseConfig(Section):
+    """A whole configuration: settings in sections, and nothing but sections on top."""
 
 
 def section_keys(section: Any) -> list[str]:
@@ -44,17 +102,12 @@ def section_keys(section: Any) -> list[str]:
     return [key for key in keys if not key.startswith("_") and not inspect.isroutine(getattr(section, key))]
 
 
-def is_section(value: Any) -> bool:
-    """Return whether a configuration entry holds entries of its own."""
-    return hasattr(value, "__dict__") and not inspect.isroutine(value)
-
-
 def to_dict(section: Any) -> dict[str, Any]:
     """Return a configuration as nested dictionaries of plain values."""
     result = {}
     for key in section_keys(section):
         value = getattr(section, key)
-        result[key] = to_dict(value) if is_section(value) else value
+        result[key] = to_dict(value) if isinstance(value, Section) else value
     return result
 
 
@@ -94,10 +147,10 @@ def set_entry(section: Any, keys: list[str], value: Any, path: str) -> None:
         raise unknown_name("config key", dotted, [f"{path}.{name}" if path else name for name in allowed])
     old = section[key] if is_dict else getattr(section, key)
     if rest:
-        if not is_section(old) and not isinstance(old, dict):
+        if not isinstance(old, (Section, dict)):
             raise UserError(f"config key '{dotted}' is a value, it has no entry '{'.'.join(rest)}'")
         set_entry(old, rest, value, dotted)
-    elif is_section(old):
+    elif isinstance(old, Section):
         update_from_dict(old, value, dotted)
     else:
         new = convert(value, old, dotted)

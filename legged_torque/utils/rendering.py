@@ -10,6 +10,11 @@ INSTALL_HINT = "on Debian: apt-get install libosmesa6, then MUJOCO_GL=osmesa"
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 
 
+def without_renderer() -> None:
+    """Tell MuJoCo to import without a renderer, which scripts that draw nothing must not depend on."""
+    os.environ["MUJOCO_GL"] = "disable"
+
+
 def choose_offscreen_renderer() -> str | None:
     """Set ``MUJOCO_GL`` to a renderer that needs no screen and whose library is installed.
 

@@ -14,6 +14,7 @@ from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 
 CONFIG_FILE = "config.yaml"
+_CHECKPOINT = "model_"
 _PACKAGES = ("legged_torque", "torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib", "numpy")
 
 
@@ -47,7 +48,7 @@ def find_run(log_root: Path, load_run: str | None) -> Path:
     """
     if load_run and Path(load_run).is_dir():
         return Path(load_run)
-    runs = sorted(path.name for path in log_root.glob("*") if list(path.glob("model_*.pt")))
+    runs = sorted(path.name for path in log_root.glob("*") if list(path.glob(f"{_CHECKPOINT}*.pt")))
     if not runs:
         raise UserError(f"there is no run with a checkpoint in '{log_root}'; train first")
     if load_run and load_run not in runs:
@@ -70,13 +71,23 @@ def find_checkpoint(run_dir: Path, checkpoint: int | None) -> Path:
         raise UserError(f"there is no checkpoint in '{run_dir}'")
     if checkpoint is not None and checkpoint not in numbers:
         raise unknown_name("checkpoint", str(checkpoint), map(str, numbers))
-    return run_dir / f"model_{numbers[-1] if checkpoint is None else checkpoint}.pt"
+    return checkpoint_file(run_dir, numbers[-1] if checkpoint is None else checkpoint)
+
+
+def checkpoint_file(run_dir: Path, iterations: int) -> Path:
+    """Return the file of the checkpoint after a number of iterations."""
+    return run_dir / f"{_CHECKPOINT}{iterations}.pt"
+
+
+def checkpoint_number(file: Path) -> int:
+    """Return the number of iterations after which a checkpoint was saved."""
+    return int(file.stem.removeprefix(_CHECKPOINT))
 
 
 def checkpoint_numbers(run_dir: Path) -> list[int]:
     """Return the iterations after which a run has saved checkpoints, in rising order."""
-    stems = (path.stem.removeprefix("model_") for path in run_dir.glob("model_*.pt"))
-    return sorted(int(stem) for stem in stems if stem.isdecimal())
+    files = run_dir.glob(f"{_CHECKPOINT}*.pt")
+    return sorted(checkpoint_number(file) for file in files if file.stem.removeprefix(_CHECKPOINT).isdecimal())
 
 
 def save_config(run_dir: str | Path, config: dict[str, Any]) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import copy
 import importlib.util
 import io
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,37 @@ from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils import resolve_callable
 
-from legged_torque import ROOT_DIR
 from legged_torque.utils import distributed
-from legged_torque.utils.args import apply_args, resolve_device
 from legged_torque.utils.config import BaseConfig, to_dict
+from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.runs import find_checkpoint, find_run, load_config, new_run_dir
-from legged_torque.utils.validation import check_train_cfg
+from legged_torque.utils.options import Options, apply_options
+from legged_torque.utils.runs import checkpoint_number, find_checkpoint, find_run, load_config, new_run_dir
+from legged_torque.utils.train_validation import check_train_cfg
+
+
+@dataclass
+class LoadedRun:
+    """A run of an earlier training.
+
+    Attributes:
+        folder: Its folder.
+        config: Contents of its ``config.yaml``.
+        env_cfg: Settings of its task, changed by the options.
+        train_cfg: Settings of its training, changed by the options.
+        checkpoint: The checkpoint that the options name.
+    """
+
+    folder: Path
+    config: dict[str, Any]
+    env_cfg: Any
+    train_cfg: Any
+    checkpoint: Path
+
+    @property
+    def iterations(self) -> int:
+        """Iterations after which the checkpoint was saved."""
+        return checkpoint_number(self.checkpoint)
 
 
 class TaskRegistry:
@@ -55,27 +79,35 @@ class TaskRegistry:
         """
         return self._get(name)[0]
 
-    def get_cfgs(self, name: str, args: argparse.Namespace | None = None) -> tuple[Any, Any]:
-        """Return copies of the settings of a task and of its training, changed by the command line.
+    def get_cfgs(
+        self, name: str, args: Options | None = None, run_config: dict[str, Any] | None = None
+    ) -> tuple[Any, Any]:
+        """Return copies of the settings of a task and of its training.
+
+        Args:
+            name: Name of the task.
+            args: Changes that a user asks for.
+            run_config: Settings of a loaded run, which ``args`` change.
 
         Raises:
-            UserError: If there is no such task or an argument makes no sense.
+            UserError: If there is no such task or an option makes no sense.
         """
         env_cfg, train_cfg = copy.deepcopy(self._get(name)[1:])
+        train_cfg.runner.experiment_name = train_cfg.runner.experiment_name or name
         if args is not None:
-            apply_args(env_cfg, train_cfg, args)
+            apply_options(env_cfg, train_cfg, args, run_config)
             check_train_cfg(train_cfg)
             to_rsl_rl(train_cfg)  # refuses an unknown logger
         return env_cfg, train_cfg
 
     def make_env(
-        self, name: str, args: argparse.Namespace | None = None, env_cfg: Any | None = None
+        self, name: str, args: Options | None = None, env_cfg: Any | None = None
     ) -> tuple[VecEnv, Any]:
         """Create a task.
 
         Args:
             name: Name of the task.
-            args: Parsed command line; gives the device, and settings if ``env_cfg`` is not given.
+            args: Gives the device, and changes of the settings if ``env_cfg`` is not given.
             env_cfg: Settings to use as they are; None takes the registered ones with ``args`` applied.
 
         Returns:
@@ -84,13 +116,13 @@ class TaskRegistry:
         task_class = self.get_task_class(name)
         if env_cfg is None:
             env_cfg, _ = self.get_cfgs(name, args)
-        return task_class(env_cfg, resolve_device(getattr(args, "device", None))), env_cfg
+        return task_class(env_cfg, resolve_device(args.device if args else None)), env_cfg
 
     def make_alg_runner(
         self,
         env: VecEnv,
         name: str | None = None,
-        args: argparse.Namespace | None = None,
+        args: Options | None = None,
         train_cfg: Any | None = None,
         log_root: str | Path | None = "default",
     ) -> tuple[OnPolicyRunner, Any]:
@@ -99,9 +131,10 @@ class TaskRegistry:
         Args:
             env: The task.
             name: Name of the task; may be left out if ``train_cfg`` is given.
-            args: Parsed command line; its ``resume``, ``load_run`` and ``checkpoint`` say what to load.
+            args: With ``resume``, the checkpoint that ``load_run`` and ``checkpoint`` name is loaded.
             train_cfg: Settings to use as they are; None takes the registered ones with ``args`` applied.
-            log_root: Folder of the experiment's runs; "default" is ``logs/<experiment name>``, None keeps nothing.
+            log_root: Folder of the experiment's runs; "default" is ``logs/<experiment name>`` in the current directory,
+                None keeps nothing.
 
         Returns:
             The runner and its settings. Nothing is written before training starts.
@@ -110,18 +143,48 @@ class TaskRegistry:
             if name is None:
                 raise ValueError("make_alg_runner needs a task's name or its train_cfg")
             _, train_cfg = self.get_cfgs(name, args)
-        root = experiment_dir(train_cfg, args) if log_root == "default" else log_root and Path(log_root)
+        default = experiment_dir(train_cfg, args.log_root if args else None)
+        root = default if log_root == "default" else log_root and Path(log_root)
         if root and train_cfg.runner.logger == "wandb" and importlib.util.find_spec("wandb") is None:
             raise UserError("--logger wandb needs the extra: pip install -e .[wandb]")
         log_dir = str(new_run_dir(root, train_cfg.runner.run_name)) if root else None
         runner_class = resolve_callable(train_cfg.runner.class_name)
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints its networks at length
             runner = runner_class(env, to_rsl_rl(train_cfg), log_dir, env.device)
-        if args is not None and getattr(args, "resume", False):
-            run_dir = find_run(root or experiment_dir(train_cfg, args), args.load_run)
-            infos = runner.load(str(find_checkpoint(run_dir, args.checkpoint)))
-            runner.continue_random_numbers(infos)
+        if args is not None and args.resume:
+            runner.resume(str(find_checkpoint(find_run(root or default, args.load_run), args.checkpoint)))
         return runner, train_cfg
+
+    def load_run(self, options: Options) -> LoadedRun:
+        """Return the run that the options name.
+
+        Raises:
+            UserError: If there is no such run or checkpoint, it is of another task, or its settings cannot be read.
+        """
+        _, train_cfg = self.get_cfgs(options.task)
+        train_cfg.runner.experiment_name = options.experiment_name or train_cfg.runner.experiment_name
+        folder = find_run(experiment_dir(train_cfg, options.log_root), options.load_run)
+        config = load_config(folder)
+        if config["task"] != options.task:
+            raise UserError(f"the run '{folder}' is of task '{config['task']}', not '{options.task}'")
+        cfgs = self.get_cfgs(options.task, options, config)
+        return LoadedRun(folder, config, *cfgs, find_checkpoint(folder, options.checkpoint))
+
+    def make_loaded(self, run: LoadedRun, options: Options, env_cfg: Any = None) -> tuple[VecEnv, OnPolicyRunner]:
+        """Create the task of a run, and a runner that holds the policy of its checkpoint and keeps nothing.
+
+        Args:
+            run: The run.
+            options: Give the device.
+            env_cfg: Settings of the task in place of the run's.
+
+        Raises:
+            UserError: If the checkpoint cannot be read or is of another kind of policy.
+        """
+        env, _ = self.make_env(options.task, options, env_cfg or run.env_cfg)
+        runner, _ = self.make_alg_runner(env, train_cfg=run.train_cfg, log_root=None)
+        runner.load(str(run.checkpoint))
+        return env, runner
 
     def _get(self, name: str) -> tuple[type[VecEnv], BaseConfig, BaseConfig]:
         """Return what was registered under a name."""
@@ -130,31 +193,14 @@ class TaskRegistry:
         return self._tasks[name]
 
 
-def load_run(args: argparse.Namespace) -> tuple[Path, Any, Any]:
-    """Return the folder of the run that the command line names, and its settings changed by the command line.
-
-    Raises:
-        UserError: If there is no such run, it is of another task, or its settings cannot be read.
-    """
-    _, train_cfg = task_registry.get_cfgs(args.task)
-    train_cfg.runner.experiment_name = args.experiment_name or train_cfg.runner.experiment_name
-    run_dir = find_run(experiment_dir(train_cfg, args), args.load_run)
-    config = load_config(run_dir)
-    if config["task"] != args.task:
-        raise UserError(f"the run '{run_dir}' is of task '{config['task']}', not '{args.task}'")
-    args.run_config = config
-    return run_dir, *task_registry.get_cfgs(args.task, args)
-
-
-def experiment_dir(train_cfg: Any, args: argparse.Namespace | None = None) -> Path:
+def experiment_dir(train_cfg: Any, log_root: str | None = None) -> Path:
     """Return the folder that holds the runs of an experiment."""
-    return all_experiments_dir(args) / train_cfg.runner.experiment_name
+    return all_experiments_dir(log_root) / train_cfg.runner.experiment_name
 
 
-def all_experiments_dir(args: argparse.Namespace | None = None) -> Path:
-    """Return the folder that holds all experiments: ``--log_root``, or ``logs/`` in the repository."""
-    root = getattr(args, "log_root", None)
-    return Path(root) if root else ROOT_DIR / "logs"
+def all_experiments_dir(log_root: str | None = None) -> Path:
+    """Return the folder that holds all experiments: ``log_root``, or ``logs/`` in the current directory."""
+    return Path(log_root or "logs")
 
 
 def num_iterations(env: VecEnv, train_cfg: Any) -> int:

@@ -64,7 +64,7 @@ class TorqueParts:
             pd = task.mixing[0] * task._pd_torques(actions[:, : task.num_dof])
         else:
             pd = total if self._is_position else torch.zeros_like(total)
-        self.parts.copy_(torch.stack([pd, total - pd]) * task.motor_strength)
+        self.parts.copy_(torch.stack([pd, total - pd]) * task.motors.strength)
         return total
 
 

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from legged_torque.learning.runner import OnPolicyRunner
-from legged_torque.utils.args import apply_perturbation
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.options import apply_perturbation
 from legged_torque.utils.runs import checkpoint_numbers
 from legged_torque.viewer.pacing import Pacer
 from legged_torque.viewer.recording import History, Recorder
@@ -142,7 +142,6 @@ class Session(Requests):
     def _adopt(self, task: Any) -> None:
         """Go on with a task: the runner's first one, or one that was built with other perturbations."""
         self.task = self._runner.env = task
-        self._given_commands = task._command_low.clone(), task._command_span.clone()
         self._recorder = Recorder(task)
         self._rewards, self._falls = np.zeros(len(task.reward_names)), 0
         self.history.clear()
@@ -157,13 +156,8 @@ class Session(Requests):
     def _set_command(self, command: tuple[float, float, float] | None) -> None:
         """Let the task draw commands from a range of one command, or from its own ranges."""
         task = self.task
-        low, span = self._given_commands
-        if command is not None:
-            low = torch.tensor(command, dtype=torch.float32, device=task.device)
-            span = torch.zeros_like(low)
-        task._command_low.copy_(low)
-        task._command_span.copy_(span)
-        task._resample_commands(torch.ones_like(task.reset_buf))
+        task.command_generator.hold(command)
+        task.command_generator.resample(torch.ones_like(task.reset_buf))
         self._show(command=command)
 
     def _push(self, angle: float, speed: float) -> None:

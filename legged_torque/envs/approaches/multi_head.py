@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from legged_torque.envs.base.actions import ActionTerm
 from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO, LinearChange
+from legged_torque.utils.config import Section
 
 
 class MultiHeadRobot(LeggedRobot):
@@ -16,8 +18,6 @@ class MultiHeadRobot(LeggedRobot):
         mixing: theta_pd and theta_torque of eq. 7. Shape: (2,).
     """
 
-    actions_per_dof = 2
-
     def _init_buffers(self) -> None:
         """Allocate the mixing weights as well."""
         super()._init_buffers()
@@ -25,6 +25,10 @@ class MultiHeadRobot(LeggedRobot):
         self._mixing_curriculum = LinearCurriculum([settings.pd, settings.torque], self.device)
         self.mixing = self._tensor([0.0, 0.0])
         self.update_curriculum()
+
+    def action_terms(self) -> list[ActionTerm]:
+        """Return a position residual and a torque per joint, mixed by their weights."""
+        return [self.position_actions(self.mixing[0]), self.torque_actions(self.mixing[1])]
 
     def update_curriculum(self) -> None:
         """Set the mixing weights by eq. 1, at the last multiple of the update interval."""
@@ -42,52 +46,39 @@ class MultiHeadRobot(LeggedRobot):
         return super().curriculum_values() | {"mixing_pd": self.mixing[0], "mixing_torque": self.mixing[1]}
 
 
-class A1TorqueMultiHeadCfg(A1Cfg):
-    """Settings of ``a1_torque_multihead``: the weight of the PD part ends at 0."""
+class TorqueMultiHeadCfg(LeggedRobotCfg):
+    """Settings of multi-head control whose PD part fades to 0."""
 
-    class env(A1Cfg.env):
-        num_actions = 24
-
-    class control(A1Cfg.control):
-        class mixing:
+    class control:
+        class mixing(Section):
             update_interval = 64_000  # [total steps]; weights change between rollouts only
 
-            class pd:
+            class pd(LinearChange):
                 start = 1.0
                 end = 0.0
                 t_start = 0
                 t_end = 50_000_000
 
-            class torque:
+            class torque(LinearChange):
                 start = 1.0
                 end = 1.0
                 t_start = 0
                 t_end = 50_000_000
 
 
-class A1MultiHeadCfg(A1TorqueMultiHeadCfg):
-    """Settings of ``a1_multihead``: the weight of the PD part ends at 0.1."""
+class MultiHeadCfg(TorqueMultiHeadCfg):
+    """Settings of multi-head control whose PD part fades to 0.1."""
 
-    class control(A1TorqueMultiHeadCfg.control):
-        class mixing(A1TorqueMultiHeadCfg.control.mixing):
-            class pd(A1TorqueMultiHeadCfg.control.mixing.pd):
+    class control:
+        class mixing:
+            class pd:
                 end = 0.1
 
 
-class A1TorqueMultiHeadCfgPPO(A1CfgPPO):
-    """Training of ``a1_torque_multihead``."""
+class MultiHeadCfgPPO(LeggedRobotCfgPPO):
+    """Training of multi-head control."""
 
-    class runner(A1CfgPPO.runner):
-        experiment_name = "a1_torque_multihead"
-
-    class actor(A1CfgPPO.actor):
+    class actor:
         class_name = "legged_torque.learning.multi_head:MultiHeadModel"
         hidden_dims = [512, 256]  # shared by both heads
-        head_hidden_dims = [128]
-
-
-class A1MultiHeadCfgPPO(A1TorqueMultiHeadCfgPPO):
-    """Training of ``a1_multihead``."""
-
-    class runner(A1TorqueMultiHeadCfgPPO.runner):
-        experiment_name = "a1_multihead"
+        head_hidden_dims: list[int] = [128]

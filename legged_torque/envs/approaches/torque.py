@@ -4,27 +4,29 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from legged_torque.envs.base.actions import ActionTerm
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 
 
 class TorqueRobot(LeggedRobot):
     """A robot whose actions are torques."""
+
+    def action_terms(self) -> list[ActionTerm]:
+        """Return one torque per joint."""
+        return [self.torque_actions()]
 
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """tau = torque_scale a [N m]. Shapes: (num_envs, num_dof)."""
         return self.torque_scale * actions
 
 
-class A1TorqueCfg(A1Cfg):
-    """Settings of ``a1_torque``: those of the A1."""
+class TorqueCfg(LeggedRobotCfg):
+    """Settings of torque control: those of the robot."""
 
 
-class A1TorqueCfgPPO(A1CfgPPO):
-    """Training of ``a1_torque``."""
+class TorqueCfgPPO(LeggedRobotCfgPPO):
+    """Training of torque control."""
 
-    class runner(A1CfgPPO.runner):
-        experiment_name = "a1_torque"
-
-    class algorithm(A1CfgPPO.algorithm):
-        max_learning_rate = 2e-3  # as long as nothing is rewarded, it rises until the critic diverges
+    class algorithm:
+        max_learning_rate = 2e-3  # with near-zero rewards the adaptive rate climbs until the critic diverges

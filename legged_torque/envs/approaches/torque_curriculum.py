@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from legged_torque.envs.approaches.torque import A1TorqueCfg, A1TorqueCfgPPO, TorqueRobot
+from legged_torque.envs.approaches.torque import TorqueCfg, TorqueCfgPPO, TorqueRobot
+from legged_torque.envs.base.legged_robot_config import LinearChange
 
 
 class TorqueCurriculumRobot(TorqueRobot):
@@ -17,33 +18,30 @@ class TorqueCurriculumRobot(TorqueRobot):
         return torch.exp(-self.cfg.rewards.nominal_position_temperature * error)
 
 
-class A1TorqueCurriculumCfg(A1TorqueCfg):
-    """Settings of ``a1_torque_curriculum``."""
+class TorqueCurriculumCfg(TorqueCfg):
+    """Settings of the torque curriculum: the reward for the pose fades, then tracking takes over."""
 
-    class rewards(A1TorqueCfg.rewards):
-        nominal_position_temperature = 0.5
+    class rewards:
+        nominal_position_temperature: float = 0.5  # gamma of the term
 
-        class scales(A1TorqueCfg.rewards.scales):
-            nominal_position = 1.0
+        class scales:
+            nominal_position: float = 1.0
 
-        class curriculum(A1TorqueCfg.rewards.curriculum):
-            class nominal_position:
+        class curriculum:
+            class nominal_position(LinearChange):
                 start = 20.0
                 end = 1.0
                 t_start = 0
                 t_end = 5_000_000
 
-            class tracking_lin_vel(A1TorqueCfg.rewards.curriculum.tracking_lin_vel):
+            class tracking_lin_vel:
                 t_start = 3_000_000
                 t_end = 13_000_000
 
-            class tracking_ang_vel(A1TorqueCfg.rewards.curriculum.tracking_ang_vel):
+            class tracking_ang_vel:
                 t_start = 3_000_000
                 t_end = 13_000_000
 
 
-class A1TorqueCurriculumCfgPPO(A1TorqueCfgPPO):
-    """Training of ``a1_torque_curriculum``."""
-
-    class runner(A1TorqueCfgPPO.runner):
-        experiment_name = "a1_torque_curriculum"
+class TorqueCurriculumCfgPPO(TorqueCfgPPO):
+    """Training of the torque curriculum: that of torque control."""

@@ -2,34 +2,28 @@
 
 from __future__ import annotations
 
-from legged_torque.envs.approaches.torque import A1TorqueCfg, A1TorqueCfgPPO
+from legged_torque.envs.approaches.torque import TorqueCfgPPO
+from legged_torque.utils.config import Section
 
 
-class A1TorqueGravityCfg(A1TorqueCfg):
-    """Settings of ``a1_torque_gravity``: those of default torque control."""
+class TorqueGravityCfgPPO(TorqueCfgPPO):
+    """Training of torque control from a pre-trained policy; the task is that of default torque control."""
 
-
-class A1TorqueGravityCfgPPO(A1TorqueCfgPPO):
-    """Training of ``a1_torque_gravity``."""
-
-    class runner(A1TorqueCfgPPO.runner):
-        experiment_name = "a1_torque_gravity"
-
-    class pretraining(A1TorqueCfgPPO.pretraining):
+    class pretraining:
         function = "legged_torque.control.gravity_pretraining:pretrain"
         critic_warmup_iterations = 10
-        seed = 1
-        num_configurations = 20_000  # random initial states, each followed for
-        num_steps = 50  # control steps,
-        num_rounds = 4  # first under the controller, in the other rounds under the policy as it is by then
-        max_mean_torque = 30.0  # [N m] pairs with a larger mean absolute torque are dropped, as in the paper
-        max_residual = 3.0  # likewise: what the contacts cannot give of the wanted wrench, as a share of the weight
-        held_out = 0.1  # share of the configurations that only measure the learned policy
-        num_epochs = 4  # per round, through all pairs so far
-        batch_size = 4096
-        learning_rate = 1e-3
+        seed: int = 1
+        num_configurations: int = 20_000  # random initial states, each followed for
+        num_steps: int = 50  # control steps,
+        num_rounds: int = 4  # round 1: the controller acts; later rounds: the current policy (DAgger)
+        max_mean_torque: float = 30.0  # [N m] pairs with a larger mean absolute torque are dropped, as in the paper
+        max_residual: float = 3.0  # likewise: what contacts cannot give of the wanted wrench, as a share of the weight
+        held_out: float = 0.1  # share of the configurations that only measure the learned policy
+        num_epochs: int = 4  # per round, through all pairs so far
+        batch_size: int = 4096
+        learning_rate: float = 1e-3
 
-        class controller:
+        class controller(Section):
             """Where the imitated controller differs from the one that stands most often: it is softer."""
 
             joint_damping = 0.5

@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
-
-class CurriculumCfg(Protocol):
-    """Settings of one value that changes linearly with the total number of environment steps."""
-
-    start: float
-    end: float
-    t_start: int
-    t_end: int
+from legged_torque.envs.base.legged_robot_config import LinearChange
 
 
 class LinearCurriculum:
@@ -24,7 +16,7 @@ class LinearCurriculum:
     A value is a function of the step count alone, so that a resumed training continues exactly where it was.
     """
 
-    def __init__(self, settings: Sequence[CurriculumCfg | None], device: str) -> None:
+    def __init__(self, settings: Sequence[LinearChange | None], device: str) -> None:
         """Create the curricula.
 
         Args:

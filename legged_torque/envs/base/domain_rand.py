@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from legged_torque.sim.randomization import Parameter
+from legged_torque.utils.mirroring import SCALAR, VECTOR, Mirroring
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -41,22 +42,19 @@ def initial_state(task: LeggedRobot) -> list[Parameter]:
     def velocity(name: str, columns: Any) -> Parameter:
         return Parameter(name, qvel, list(columns), base=0.0, offset=tuple(getattr(rand, name)))
 
+    delay = {"base": 0.0, "offset": (shortest, longest + 1), "limits": ([shortest], [longest + 0.5])}
+    dof_pos = {"base": pose, "scale": tuple(rand.init_dof_pos_scale), "limits": limits}
     return [
         Parameter("base_pos", qpos, range(3), base=task.cfg.init_state.pos, shared=True),
         Parameter("roll", task.init_angles, [0], base=0.0, offset=tuple(rand.init_roll)),
         Parameter("pitch", task.init_angles, [1], base=0.0, offset=tuple(rand.init_pitch)),
         Parameter("yaw", task.init_angles, [2], base=0.0, offset=tuple(rand.init_yaw)),
-        Parameter(
-            "dof_pos", qpos, [7 + dof for dof in dofs], base=pose, scale=tuple(rand.init_dof_pos_scale), limits=limits
-        ),
+        Parameter("dof_pos", qpos, [7 + dof for dof in dofs], **dof_pos),
         velocity("init_lin_vel", range(3)),
         velocity("init_ang_vel", range(3, 6)),
         velocity("init_dof_vel", [6 + dof for dof in dofs]),
-        Parameter(
-            "action_delay", task.action_delay.drawn, [0], base=0.0, offset=(shortest, longest + 1),
-            limits=([shortest], [longest + 0.5]),
-        ),
-    ]  # fmt: skip
+        Parameter("action_delay", task.action_delay.drawn, [0], **delay),
+    ]
 
 
 def parameters(task: LeggedRobot) -> list[Parameter]:
@@ -66,32 +64,33 @@ def parameters(task: LeggedRobot) -> list[Parameter]:
 
 def robot_parameters(task: LeggedRobot) -> list[Parameter]:
     """Return what is drawn of the robot; its joints may keep their own values, all at once."""
-    cfg, model = task.cfg.domain_rand, task.sim.mj_model
+    cfg, model, symmetry = task.cfg.domain_rand, task.sim.mj_model, task.symmetry
     dofs, joints = range(6, model.nv), range(1, model.njnt)
     feet = [model.geom(name).id for name in task.foot_names]
     trunk = offset(cfg, "trunk_mass_offset") | scale(cfg, "trunk_mass_scale")
     inertia_per_mass = list(model.body_inertia[TRUNK] / model.body_mass[TRUNK])
+    joint_values = symmetry.joints and symmetry.joints.unsigned()
+    foot_vectors = symmetry.feet and symmetry.feet.of_vectors(VECTOR)
 
     def drawn(name: str, field: str, columns: Any, **settings: Any) -> Parameter:
         return Parameter(name, view(task, field), list(columns), **settings)
 
     def of_joints(name: str, field: str, columns: Any) -> Parameter:
-        return drawn(name, field, columns, may_keep=True, **absolute(cfg, name))
+        return drawn(name, field, columns, may_keep=True, mirror=joint_values, **absolute(cfg, name))
 
+    trunk_com, foot_offset = offset(cfg, "trunk_com_offset"), offset(cfg, "foot_offset")
+    inertia = {**trunk, "weight": inertia_per_mass, "shared": True, "same_draw_as": "trunk_mass"}
     return [
         drawn("trunk_mass", "body_mass", [TRUNK], **trunk),
-        drawn(
-            "trunk_inertia", "body_inertia", entries(3, [TRUNK]), shared=True, same_draw_as="trunk_mass",
-            **trunk | {"weight": inertia_per_mass},
-        ),
-        drawn("trunk_com", "body_ipos", entries(3, [TRUNK]), **offset(cfg, "trunk_com_offset")),
+        drawn("trunk_inertia", "body_inertia", entries(3, [TRUNK]), **inertia),
+        drawn("trunk_com", "body_ipos", entries(3, [TRUNK]), mirror=VECTOR, **trunk_com),
         drawn("foot_radius", "geom_size", [3 * foot for foot in feet], shared=True, **absolute(cfg, "foot_radius")),
-        drawn("foot_offset", "geom_pos", entries(3, feet), **offset(cfg, "foot_offset")),
+        drawn("foot_offset", "geom_pos", entries(3, feet), mirror=foot_vectors, **foot_offset),
         of_joints("dof_damping", "dof_damping", dofs),
         of_joints("dof_armature", "dof_armature", dofs),
         of_joints("dof_stiffness", "jnt_stiffness", joints),
         of_joints("dof_frictionloss", "dof_frictionloss", dofs),
-    ]  # fmt: skip
+    ]
 
 
 def ground_parameters(task: LeggedRobot) -> list[Parameter]:
@@ -99,45 +98,50 @@ def ground_parameters(task: LeggedRobot) -> list[Parameter]:
     cfg, model = task.cfg.domain_rand, task.sim.mj_model
     geoms = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
     kinds = list((model.geom_friction[geoms] / model.geom_friction[geoms, :1]).ravel())
+    friction, solref = view(task, "geom_friction"), view(task, "geom_solref")
+    stiffness = absolute(cfg, "contact_stiffness", -1.0)
+    damping = absolute(cfg, "contact_damping", -1.0) | {"same_draw_as": "contact_stiffness"}
     return [
         Parameter(
-            "ground_friction", view(task, "geom_friction"), entries(3, geoms), shared=True,
-            **absolute(cfg, "ground_friction", kinds),
+            "ground_friction", friction, entries(3, geoms), shared=True, **absolute(cfg, "ground_friction", kinds)
         ),
-        Parameter(
-            "contact_stiffness", view(task, "geom_solref"), [2 * geom for geom in geoms], shared=True,
-            **absolute(cfg, "contact_stiffness", -1.0),
-        ),
-        Parameter(
-            "contact_damping", view(task, "geom_solref"), [2 * geom + 1 for geom in geoms], shared=True,
-            same_draw_as="contact_stiffness", **absolute(cfg, "contact_damping", -1.0),
-        ),
+        Parameter("contact_stiffness", solref, [2 * geom for geom in geoms], shared=True, **stiffness),
+        Parameter("contact_damping", solref, [2 * geom + 1 for geom in geoms], shared=True, **damping),
         Parameter("gravity", view(task, "gravity"), [2], **absolute(cfg, "gravity", -1.0)),
-    ]  # fmt: skip
+    ]
 
 
 def control_parameters(task: LeggedRobot) -> list[Parameter]:
     """Return what is drawn of the controller: one number for all joints, but each joint has an offset of its own."""
     cfg, control = task.cfg.domain_rand, task.cfg.control
-    joints = range(task.num_dof)
-    torque_per_position = control.torque_scale / control.action_scale
+    joints, mirror = range(task.num_dof), task.symmetry.joints
+    action_scale = offset(cfg, "action_scale_offset")
+    torque_scale = action_scale | {"weight": control.torque_scale / control.action_scale}
+    stiffness = offset(cfg, "stiffness_offset") | scale(cfg, "stiffness_scale")
+    damping = offset(cfg, "damping_offset") | scale(cfg, "damping_scale")
     return [
-        Parameter("motor_strength", task.motor_strength, joints, shared=True, **scale(cfg, "motor_strength")),
-        Parameter("joint_offset", task.joint_offset, joints, **offset(cfg, "joint_offset")),
-        Parameter("action_scale", task.action_scale, [0], **offset(cfg, "action_scale_offset")),
-        Parameter(
-            "torque_scale", task.torque_scale, [0], same_draw_as="action_scale",
-            **offset(cfg, "action_scale_offset") | {"weight": torque_per_position},
-        ),
-        Parameter(
-            "p_gains", task.p_gains, joints, shared=True,
-            **offset(cfg, "stiffness_offset") | scale(cfg, "stiffness_scale"),
-        ),
-        Parameter(
-            "d_gains", task.d_gains, joints, shared=True,
-            **offset(cfg, "damping_offset") | scale(cfg, "damping_scale"),
-        ),
-    ]  # fmt: skip
+        Parameter("motor_strength", task.motors.strength, joints, shared=True, **scale(cfg, "motor_strength")),
+        Parameter("joint_offset", task.joint_offset, joints, mirror=mirror, **offset(cfg, "joint_offset")),
+        Parameter("action_scale", task.action_scale, [0], **action_scale),
+        Parameter("torque_scale", task.torque_scale, [0], same_draw_as="action_scale", **torque_scale),
+        Parameter("p_gains", task.p_gains, joints, shared=True, **stiffness),
+        Parameter("d_gains", task.d_gains, joints, shared=True, **damping),
+    ]
+
+
+def mirrors(drawn: list[Parameter], sizes: dict[str, int]) -> Mirroring | None:
+    """Return the mirror image of the numbers of :attr:`Randomization.values`; None if that of one is not known.
+
+    Args:
+        drawn: The parameters.
+        sizes: How many numbers of its own each has.
+    """
+    parts = [
+        parameter.mirror or (SCALAR if sizes[parameter.name] == 1 else None)
+        for parameter in drawn
+        if parameter.name in sizes
+    ]
+    return None if None in parts else Mirroring.joined([part for part in parts if part])
 
 
 def draws_legs(task: LeggedRobot, drawn: list[Parameter]) -> bool:
@@ -157,17 +161,23 @@ def entries(width: int, rows: list[int]) -> list[int]:
     return [row * width + part for row in rows for part in range(width)]
 
 
+def is_drawn(cfg: Any, name: str) -> bool:
+    """Return whether a parameter has a range and is not kept fixed."""
+    return getattr(cfg, name) is not None and name not in cfg.keep_fixed
+
+
 def offset(cfg: Any, name: str) -> dict[str, Any]:
     """Return settings for a value that is changed by an offset, unless it is kept fixed."""
-    return {} if name in cfg.keep_fixed else {"offset": tuple(getattr(cfg, name))}
+    return {"offset": tuple(getattr(cfg, name))} if is_drawn(cfg, name) else {}
 
 
 def scale(cfg: Any, name: str) -> dict[str, Any]:
     """Return settings for a value that is multiplied, unless it is kept fixed."""
-    return {} if name in cfg.keep_fixed else {"scale": tuple(getattr(cfg, name))}
+    return {"scale": tuple(getattr(cfg, name))} if is_drawn(cfg, name) else {}
 
 
 def absolute(cfg: Any, name: str, weight: list[float] | float = 1.0) -> dict[str, Any]:
     """Return settings for a value that is replaced, times a weight, unless it is kept fixed."""
-    limits = tuple(getattr(cfg, name))
-    return {} if name in cfg.keep_fixed else {"base": 0.0, "offset": limits, "weight": weight}
+    if not is_drawn(cfg, name):
+        return {}
+    return {"base": 0.0, "offset": tuple(getattr(cfg, name)), "weight": weight}

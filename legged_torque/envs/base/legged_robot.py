@@ -4,38 +4,39 @@ from __future__ import annotations
 
 import functools
 import math
-from pathlib import Path
 
 import torch
-from rsl_rl.env import VecEnv
-from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque import ROOT_DIR
-from legged_torque.envs.base.curriculum import LinearCurriculum
-from legged_torque.envs.base.domain_rand import MODEL_FIELDS
+from legged_torque.envs.base.actions import ActionTerm
+from legged_torque.envs.base.asset import by_joint, load_asset, nominal_pose
+from legged_torque.envs.base.base_task import BaseTask
+from legged_torque.envs.base.commands import UniformCommands
+from legged_torque.envs.base.domain_rand import MODEL_FIELDS, draws_legs, initial_state, mirrors, parameters
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.envs.base.observations import Observations
+from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
 from legged_torque.envs.base.random_events import RandomEvents
-from legged_torque.envs.base.rewards import RewardTerms
-from legged_torque.envs.base.symmetry import Mirror
+from legged_torque.envs.base.rewards import Rewards
+from legged_torque.envs.base.symmetry import Mirror, RobotSymmetry
 from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.sim.graph import CudaGraph
-from legged_torque.sim.model import build_model, collision_geoms, indices_matching, read_spec
+from legged_torque.motors import make_motors
+from legged_torque.motors.action_delay import ActionDelay
+from legged_torque.sim.randomization import Parameter
 from legged_torque.sim.simulator import Simulator
+from legged_torque.terrain import make_terrain
 from legged_torque.utils.config import section_keys, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.math import quat_rotate_inverse
+from legged_torque.utils.mirroring import Mirroring
 
 
-class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
+class LeggedRobot(BaseTask):
     """A batch of robots with position control, and what all approaches share.
 
-    An approach overrides :meth:`_compute_torques`, adds ``_reward_<term>`` methods, or overrides the curriculum hook
-    :meth:`update_curriculum`. A control step is replayed as one CUDA graph on a GPU, hence the rules for everything
-    that runs inside :meth:`_step`: fixed shapes, masks instead of lists of ids, nothing read back to the host, and
-    what is kept from step to step is written in place (``copy_``, ``masked_fill_``), never bound to a new tensor.
+    An approach overrides :meth:`_compute_torques` and :meth:`action_terms`, adds ``_reward_<term>`` methods or
+    :meth:`observation_terms`, or overrides the curriculum hook :meth:`update_curriculum`. What runs inside a step obeys
+    the rules of :class:`BaseTask`.
 
     Attributes:
         base_pos: Trunk position in the world [m]. Shape: (num_envs, 3).
@@ -51,92 +52,35 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         commands: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
         contacts: 1 for each collision geom that touches the ground, else 0. Shape: (num_envs, geoms).
         feet_contact: The same for the feet. Shape: (num_envs, feet).
-        total_steps: Environment steps so far over all worlds of all processes: t of eq. 1. Scalar, int64.
     """
 
     cfg: LeggedRobotCfg
-    actions_per_dof = 1
-    """Actions that :meth:`_compute_torques` takes per joint."""
-    num_processes = 1
-    """Processes that train together, each with as many worlds; the runner sets it."""
 
     def __init__(self, cfg: LeggedRobotCfg, device: str = "cpu") -> None:
         """Create the worlds and put each into a random initial state.
 
         Args:
-            cfg: Settings of the task.
+            cfg: Settings of the task; ``env.num_actions`` is filled in.
             device: "cpu" or "cuda:N".
 
         Raises:
             UserError: If a setting makes no sense or names something that does not exist.
         """
         check_env_cfg(cfg)
+        super().__init__(cfg.env.num_envs, device)
         self.cfg = cfg
-        self.device = device
-        self.num_envs = cfg.env.num_envs
-        self.num_actions = cfg.env.num_actions
         self.dt = cfg.sim.dt * cfg.control.decimation
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
         self._create_sim()
         self._init_buffers()
+        self._init_actions()
         self._prepare_reward_functions()
         self._init_random_events()
-        self._init_observations()
-        self.step_graph = CudaGraph(self._step, device)
+        history, clip = cfg.env.history_length, cfg.normalization.clip_observations
+        terms = self.observation_terms()
+        self.observations = Observations(terms, history, clip, cfg.noise.add_noise, self.num_envs)
+        self.obs_buf = self.observations.buffers
         self.reset()
-
-    # ---- what rsl_rl calls -------------------------------------------------------------------------------------------
-
-    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
-        """Apply actions for one control step.
-
-        Args:
-            actions: Shape: (num_envs, num_actions). Worlds with an action that is not finite are reset.
-
-        Returns:
-            Observations (a copy); rewards (num_envs,); dones (num_envs,), bool; extras with "time_outs" (num_envs,),
-            bool. Rewards, dones and extras are buffers that the next step overwrites.
-        """
-        self._given_actions.copy_(actions)
-        self.step_graph()
-        return self.get_observations(), self.rew_buf, self.reset_buf, self.extras
-
-    def get_observations(self) -> TensorDict:
-        """Return a copy of the current observations: groups "policy" and "critic", each (num_envs, size)."""
-        return self.obs_buf.clone()
-
-    def reset(self) -> TensorDict:
-        """Start a new episode in every world and return the observations."""
-        self.reset_buf.fill_(True)
-        self._reset_worlds()
-        self.compute_observations()
-        self._keep_last()
-        return self.get_observations()
-
-    @functools.cached_property
-    def mirror(self) -> Mirror:
-        """Reflects observations and actions of this robot left to right."""
-        return Mirror(self)
-
-    @property
-    def episode_length_buf(self) -> Tensor:
-        """Control steps since the start of each world's episode. Shape: (num_envs,), int64."""
-        return self._episode_length_buf
-
-    @episode_length_buf.setter
-    def episode_length_buf(self, value: Tensor) -> None:
-        """Write the counters in place: rsl_rl sets them to random values when training starts."""
-        self._episode_length_buf.copy_(value)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return what a checkpoint must keep of the task: its counters, on which all curricula depend."""
-        return {"total_steps": self.total_steps.clone(), "num_diverged": self.num_diverged.clone()}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from the counters of a checkpoint."""
-        self.total_steps.copy_(state["total_steps"])
-        self.num_diverged.copy_(state["num_diverged"])
-        self.update_curriculum()
 
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
 
@@ -147,7 +91,7 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
             actions: Shape: (num_envs, num_actions).
 
         Returns:
-            Torques before clipping to the limits [N m]. Shape: (num_envs, num_dof).
+            Torques that the motors are asked for [N m]. Shape: (num_envs, num_dof).
         """
         return self._pd_torques(actions)
 
@@ -156,8 +100,26 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         target = self.default_dof_pos + self.joint_offset + self.action_scale * actions
         return self.p_gains * (target - self.dof_pos) - self.d_gains * self.dof_vel
 
-    def update_curriculum(self) -> None:
-        """Curriculum hook for what may only change between rollouts; the runner calls it before each of them."""
+    def action_terms(self) -> list[ActionTerm]:
+        """Return what the actions of :meth:`_compute_torques` are, one term per action of a joint."""
+        return [self.position_actions()]
+
+    def position_actions(self, weight: Tensor | None = None) -> ActionTerm:
+        """Return the term of PD targets; for ``weight`` see :class:`ActionTerm`."""
+        meaning = "joint position relative to nominal_pose, for PD control"
+        return ActionTerm("position_residual", self.action_scale, "rad", meaning, weight)
+
+    def torque_actions(self, weight: Tensor | None = None) -> ActionTerm:
+        """Return the term of joint torques; for ``weight`` see :class:`ActionTerm`."""
+        return ActionTerm("torque", self.torque_scale, "N m", "joint torque", weight)
+
+    def observation_terms(self) -> list[ObservationTerm]:
+        """Return what policy and critic see."""
+        return standard_terms(self)
+
+    def random_parameters(self) -> list[Parameter]:
+        """Return what ``domain_rand`` draws in each world."""
+        return parameters(self)
 
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the scalars that curricula set, for logging: here the weights of reward terms that have one."""
@@ -178,8 +140,8 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         decimation = self.cfg.control.decimation
         for i in range(decimation):
             if i == 0 or self.cfg.control.refresh_torques:
-                torques = self.motor_strength * self._compute_torques(self.action_delay.actions(i))
-                torch.clamp(torques, self.torque_limits[0], self.torque_limits[1], out=self.torques)
+                wanted = self._compute_torques(self.action_delay.actions(i))
+                self.motors.apply(wanted, self.dof_vel, out=self.torques)
             self.sim.step(sense=i == decimation - 1)
         self.sim.flag_diverged()
         self.post_physics_step()
@@ -192,10 +154,9 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         self.check_termination()
         self.compute_reward()
         self.log.add_step(self)
-        self._update_feet_air_time()
+        self.feet_air_time.copy_((self.feet_air_time + self.dt) * (1.0 - self.feet_contact))
         self._reset_worlds()
-        self.compute_observations()
-        self._keep_last()
+        self._finish_step()
 
     def _update_state(self) -> None:
         """Compute what follows from the simulator's state."""
@@ -205,6 +166,11 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         self.projected_gravity.copy_(gravity)
         self.contacts.copy_(self.sim.contact_found > 0)
         self.feet_contact.copy_(self.contacts[:, self.feet_indices])
+
+    @property
+    def base_height(self) -> Tensor:
+        """Height of the trunk's origin above the ground under it [m]. Shape: (num_envs,)."""
+        return self.terrain.height_above(self.base_pos)
 
     def check_termination(self) -> None:
         """End episodes whose trunk touches the ground, whose state diverged, or whose time is over."""
@@ -217,30 +183,37 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
 
     def compute_reward(self) -> None:
         """Compute the sum of all terms (Table III); 0 for worlds that diverged, or without terms."""
-        if not self.reward_names:
-            return
-        terms = torch.stack([function() for function in self._reward_functions])
-        terms = torch.where(self.sim.diverged, 0.0, terms)
-        terms *= self.reward_weights().unsqueeze(1)
-        self.episode_sums += terms
-        reward = terms.sum(dim=0)
-        if self.cfg.rewards.only_positive_rewards:
-            reward = reward.clamp(min=0.0)
-        self.rew_buf.copy_(reward)
-        self.episode_return += reward
+        if self.reward_names:
+            self.rew_buf.copy_(self.rewards.compute(self.total_steps, self.sim.diverged))
+            self.episode_return += self.rew_buf
 
     def reward_weights(self) -> Tensor:
         """Return the weights of the terms at this moment of training, Delta t included. Shape: (terms,)."""
-        return self._reward_scales * self._reward_curriculum(self.total_steps)
+        return self.rewards.weights(self.total_steps)
 
-    def _keep_last(self) -> None:
-        """Keep what the next step's rewards compare with."""
+    def _reset_worlds(self) -> None:
+        """Start a new episode in the worlds of ``reset_buf``; elsewhere draw anew what is due."""
+        mask = self.reset_buf
+        self.events.reset_state(mask)
+        self.terrain.move_to_origin(mask, self.base_pos)
+        for buffer in (self.actions, self.feet_air_time):
+            buffer.masked_fill_(mask.unsqueeze(1), 0.0)
+        self.action_delay.reset(mask)
+        self._episode_length_buf.masked_fill_(mask, 0)
+        self.episode_sums.masked_fill_(mask, 0.0)
+        self.episode_return.masked_fill_(mask, 0.0)
+        self.events.happen(mask)
+        self._update_state()
+
+    def compute_observations(self) -> None:
+        """Write the observations of this moment."""
+        self.observations.compute(self.reset_buf)
+
+    def _finish_step(self) -> None:
+        """Compute the observations, and keep what the next step's rewards compare with."""
+        self.compute_observations()
         self.last_actions.copy_(self.actions)
         self.last_dof_vel.copy_(self.dof_vel)
-
-    def _update_feet_air_time(self) -> None:
-        """Count the time of each foot since it left the ground."""
-        self.feet_air_time.copy_((self.feet_air_time + self.dt) * (1.0 - self.feet_contact))
 
     def set_state(self, qpos: Tensor, qvel: Tensor) -> None:
         """Put all worlds into given states, with the observations that follow; episodes go on.
@@ -252,99 +225,178 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
         self.sim.qpos.copy_(qpos)
         self.sim.qvel.copy_(qvel)
         self._update_state()
-        self.compute_observations()
-        self._keep_last()
+        self._finish_step()
 
     # ---- construction ------------------------------------------------------------------------------------------------
 
     def _create_sim(self) -> None:
-        """Load the robot and build the simulator and its views."""
-        asset = self.cfg.asset
-        file = Path(asset.file) if Path(asset.file).is_absolute() else ROOT_DIR / asset.file
-        spec = read_spec(file)
-        geoms = collision_geoms(spec)
-        feet = indices_matching(geoms, [asset.foot_name])
-        penalized = indices_matching(geoms, asset.penalize_contacts_on)
-        terminating = indices_matching(geoms, asset.terminate_after_contacts_on)
-        model = build_model(spec, geoms)
-        model.opt.timestep = self.cfg.sim.dt
-        sim = self.cfg.sim
-        per_world = MODEL_FIELDS if self.cfg.domain_rand.randomize_parameters else ()
+        """Load robot, ground and motors, and build the simulator and its views."""
+        cfg, sim = self.cfg, self.cfg.sim
+        self.asset = load_asset(cfg.asset, sim.dt)
+        model = self.asset.mj_model
+        per_world = MODEL_FIELDS if cfg.domain_rand.randomize_parameters else ()
         self.sim = Simulator(
             model, self.num_envs, self.device, sim.engine, sim.solver_iterations, sim.ls_iterations, per_world
         )
-        self.foot_names = [geoms[i] for i in feet]
-        self.dof_names = [model.joint(i).name for i in range(1, model.njnt)]
+        self.dof_names, self.foot_names = self.asset.dof_names, self.asset.foot_names
         self.num_dof = len(self.dof_names)
-        if self.num_actions != self.actions_per_dof * self.num_dof:
-            expected = self.actions_per_dof * self.num_dof
-            raise UserError(f"env.num_actions must be {expected} for {type(self).__name__}, not {self.num_actions}")
+        self.symmetry = RobotSymmetry(
+            cfg.asset.mirrored_legs, self.dof_names, self.asset.dof_axes().tolist(), self.foot_names
+        )
+        self.terrain = make_terrain(cfg.terrain.mesh_type)
+        self.motors = make_motors(cfg.motors.model, self.num_envs, self._tensor(model.actuator_forcerange.T))
+        self.torque_limits = self.motors.limits
         self.base_pos, self.base_quat = self.sim.qpos[:, :3], self.sim.qpos[:, 3:7]
         self.dof_pos, self.dof_vel = self.sim.qpos[:, 7:], self.sim.qvel[:, 6:]
         self.base_ang_vel = self.sim.qvel[:, 3:6]
         self.torques = self.sim.ctrl
-        self.torque_limits = self._tensor(model.actuator_forcerange.T)
         limits = self._tensor(model.jnt_range[1:])
         middle = limits.mean(dim=1, keepdim=True)
-        self.dof_pos_limits = middle + self.cfg.rewards.soft_dof_pos_limit * (limits - middle)
+        self.dof_pos_limits = middle + cfg.rewards.soft_dof_pos_limit * (limits - middle)
+        places = (self.asset.feet, self.asset.penalized, self.asset.terminating)
         self.feet_indices, self.penalized_contact_indices, self.termination_contact_indices = (
-            torch.tensor(chosen, dtype=torch.long, device=self.device) for chosen in (feet, penalized, terminating)
+            torch.tensor(chosen, dtype=torch.long, device=self.device) for chosen in places
         )
 
     def _init_buffers(self) -> None:
-        """Allocate everything that is written in place, and constants."""
-        n, cfg = self.num_envs, self.cfg
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(*shape, dtype=dtype, device=self.device)
-
-        self._given_actions, self.actions, self.last_actions = (zeros(n, self.num_actions) for _ in range(3))
-        self.base_lin_vel, self.projected_gravity, self.commands = (zeros(n, 3) for _ in range(3))
-        self.last_dof_vel = zeros(n, self.num_dof)
-        control = cfg.control
-        self.p_gains, self.d_gains = (
-            zeros(n, self.num_dof) + control.stiffness,
-            zeros(n, self.num_dof) + control.damping,
-        )
-        self.motor_strength, self.joint_offset = zeros(n, self.num_dof) + 1.0, zeros(n, self.num_dof)
-        self.action_scale, self.torque_scale = zeros(n, 1) + control.action_scale, zeros(n, 1) + control.torque_scale
-        self.contacts = zeros(*self.sim.contact_found.shape)
-        self.feet_contact, self.feet_air_time = (zeros(n, len(self.feet_indices)) for _ in range(2))
-        self.rew_buf, self.episode_return = zeros(n), zeros(n)
-        self.reset_buf, self.time_out_buf = zeros(n, dtype=torch.bool), zeros(n, dtype=torch.bool)
-        self._episode_length_buf = zeros(n, dtype=torch.long)
-        self.total_steps, self.num_diverged = zeros((), dtype=torch.long), zeros((), dtype=torch.long)
-        self.extras = {"time_outs": self.time_out_buf}
-        angles = cfg.init_state.default_joint_angles
-        for name in angles:
-            if name not in self.dof_names:
-                raise unknown_name("joint in init_state.default_joint_angles", name, self.dof_names)
-        for name in self.dof_names:
-            if name not in angles:
-                raise UserError(f"init_state.default_joint_angles lacks the joint '{name}'")
-        self.default_dof_pos = self._tensor([angles[name] for name in self.dof_names])
+        """Allocate what the state, the controller and the episodes keep, and constants."""
+        n, control, dof_names = self.num_envs, self.cfg.control, self.dof_names
+        zeros = functools.partial(torch.zeros, device=self.device)
+        self.base_lin_vel, self.projected_gravity = zeros(n, 3), zeros(n, 3)
         self._gravity = self._tensor([0.0, 0.0, -1.0]).expand(n, 3)
-        ranges = cfg.commands.ranges
-        limits = self._tensor([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw])
-        self._command_low, self._command_span = limits[:, 0], limits[:, 1] - limits[:, 0]
+        self.contacts = zeros(self.sim.contact_found.shape)
+        self.feet_contact, self.feet_air_time = zeros(n, len(self.feet_indices)), zeros(n, len(self.feet_indices))
+        self.last_dof_vel, self.joint_offset = zeros(n, self.num_dof), zeros(n, self.num_dof)
+        self.default_dof_pos = self._tensor(nominal_pose(self.cfg.init_state.default_joint_angles, dof_names))
+        self.p_gains = zeros(n, 1) + self._tensor(by_joint("control.stiffness", control.stiffness, dof_names))
+        self.d_gains = zeros(n, 1) + self._tensor(by_joint("control.damping", control.damping, dof_names))
+        self.action_scale, self.torque_scale = zeros(n, 1) + control.action_scale, zeros(n, 1) + control.torque_scale
+
+    def _init_actions(self) -> None:
+        """Allocate the actions, as many as their terms have."""
+        rand, control, env = self.cfg.domain_rand, self.cfg.control, self.cfg.env
+        self.num_actions = len(self.action_terms()) * self.num_dof
+        if env.num_actions not in (None, self.num_actions):
+            name = type(self).__name__
+            raise UserError(f"env.num_actions must be {self.num_actions} for {name}, not {env.num_actions}")
+        env.num_actions = self.num_actions
+        self._given_actions, self.actions, self.last_actions = torch.zeros(
+            3, self.num_envs, self.num_actions, device=self.device
+        ).unbind()
+        self.action_delay = ActionDelay(self.actions, rand.action_delay[1], rand.action_delay_unit, control.decimation)
 
     def _prepare_reward_functions(self) -> None:
         """Collect the functions of all terms with a scale that is not zero, and their weights."""
         scales = {name: scale for name, scale in to_dict(self.cfg.rewards.scales).items() if scale != 0.0}
-        known = [name.removeprefix("_reward_") for name in dir(self) if name.startswith("_reward_")]
-        curricula = self.cfg.rewards.curriculum
-        for name in [*scales, *section_keys(curricula)]:
-            if not hasattr(self, f"_reward_{name}"):
+        known = [name.removeprefix("_reward_") for name in dir(type(self)) if name.startswith("_reward_")]
+        curricula = {
+            name: getattr(self.cfg.rewards.curriculum, name) for name in section_keys(self.cfg.rewards.curriculum)
+        }
+        for name in [*scales, *curricula]:
+            if name not in known:
                 raise unknown_name("reward term", name, known)
-        self.reward_names = list(scales)
-        self._reward_functions = [getattr(self, f"_reward_{name}") for name in self.reward_names]
-        self._reward_scales = self._tensor(list(scales.values())) * self.dt
-        self._reward_curriculum = LinearCurriculum(
-            [getattr(curricula, name, None) for name in self.reward_names], self.device
-        )
-        self.episode_sums = torch.zeros(len(self.reward_names), self.num_envs, device=self.device)
+        functions = {name: getattr(self, f"_reward_{name}") for name in scales}
+        only_positive = self.cfg.rewards.only_positive_rewards
+        self.rewards = Rewards(functions, scales, curricula, only_positive, self.dt, self.num_envs, self.device)
+        self.reward_names, self.episode_sums = self.rewards.names, self.rewards.episode_sums
         self.log = TaskLog(self.reward_names, self.device)
+
+    def _init_random_events(self) -> None:
+        """Prepare commands, initial states, random parameters and pushes."""
+        cfg = self.cfg
+        self.command_generator = UniformCommands(cfg.commands.ranges, self.num_envs, self.device)
+        self.commands = self.command_generator.values
+        self.init_angles = torch.zeros(self.num_envs, 3, device=self.device)
+        drawn = self.random_parameters()
+        self.events = RandomEvents(
+            cfg.domain_rand,
+            cfg.commands.resampling_probability,
+            self.sim,
+            self.command_generator,
+            self.init_angles,
+            initial_state(self),
+            drawn,
+        )
+        self.randomization = self.events.parameters
+        self.parameter_mirror = mirrors(drawn, self.randomization.sizes)
+        if cfg.domain_rand.randomize_parameters and draws_legs(self, drawn):
+            self.sim.vary_legs()
+
+    @functools.cached_property
+    def mirror(self) -> Mirror:
+        """Reflects observations and actions of this robot left to right."""
+        actions = [(term.name, self.symmetry.joints) for term in self.action_terms()]
+        return Mirror({**self.observations.mirrors(), "actions": actions}, self.symmetry.problem, self.device)
+
+    def action_mirror(self) -> Mirroring | None:
+        """Return the mirror image of all actions; None without symmetry."""
+        joints = self.symmetry.joints
+        return joints and Mirroring.joined([joints] * len(self.action_terms()))
 
     def _tensor(self, values) -> Tensor:
         """Return values as a float tensor on the task's device."""
         return torch.as_tensor(values, dtype=torch.float32, device=self.device).clone()
+
+    # ---- reward terms: one value per world without its weight, shape (num_envs,) -------------------------------------
+
+    def _reward_tracking_lin_vel(self) -> Tensor:
+        """exp(-gamma |v*_xy - v_xy|^2), velocities in the trunk's frame [m/s]."""
+        error = (self.commands[:, :2] - self.base_lin_vel[:, :2]).square().sum(dim=1)
+        return torch.exp(-self.cfg.rewards.tracking_temperature * error)
+
+    def _reward_tracking_ang_vel(self) -> Tensor:
+        """exp(-gamma (w*_z - w_z)^2), trunk frame [rad/s]."""
+        error = (self.commands[:, 2] - self.base_ang_vel[:, 2]).square()
+        return torch.exp(-self.cfg.rewards.tracking_temperature * error)
+
+    def _reward_lin_vel_z(self) -> Tensor:
+        """v_z^2, trunk frame [m^2/s^2]."""
+        return self.base_lin_vel[:, 2].square()
+
+    def _reward_ang_vel_xy(self) -> Tensor:
+        """|w_xy|^2, trunk frame [rad^2/s^2]."""
+        return self.base_ang_vel[:, :2].square().sum(dim=1)
+
+    def _reward_orientation(self) -> Tensor:
+        """|g_xy|^2 of the unit gravity vector in the trunk's frame."""
+        return self.projected_gravity[:, :2].square().sum(dim=1)
+
+    def _reward_dof_pos_limits(self) -> Tensor:
+        """Sum over joints of how far they are beyond their soft limits [rad]."""
+        below = (self.dof_pos_limits[:, 0] - self.dof_pos).clamp(min=0.0)
+        above = (self.dof_pos - self.dof_pos_limits[:, 1]).clamp(min=0.0)
+        return (below + above).sum(dim=1)
+
+    def _reward_dof_acc(self) -> Tensor:
+        """|(qd_last - qd) / Delta t|^2, from control step to control step [rad^2/s^4]."""
+        return ((self.last_dof_vel - self.dof_vel) / self.dt).square().sum(dim=1)
+
+    def _reward_torques(self) -> Tensor:
+        """|tau|^2 of the applied torques [N^2 m^2]."""
+        return self.torques.square().sum(dim=1)
+
+    def _reward_action_rate(self) -> Tensor:
+        """|a_last - a|^2."""
+        return (self.last_actions - self.actions).square().sum(dim=1)
+
+    def _reward_collision(self) -> Tensor:
+        """Number of calves, thighs and trunks that touch the ground."""
+        return self.contacts[:, self.penalized_contact_indices].sum(dim=1)
+
+    def _reward_base_height(self) -> Tensor:
+        """(z - z_nominal - z_terrain)^2 of the trunk [m^2]."""
+        return (self.base_height - self.cfg.rewards.base_height_target).square()
+
+    def _reward_feet_air_time(self) -> Tensor:
+        """Sum over the feet on the ground of (t_swing - target), t_swing being the swing that has just ended.
+
+        Table III has a weight of -0.1 and a caption by which positive weights encourage; the authors' environment has
+        +0.1, which rewards long swings and is used here. A foot that stays on the ground has t_swing = 0.
+        """
+        return ((self.feet_air_time - self.cfg.rewards.feet_air_time_target) * self.feet_contact).sum(dim=1)
+
+    def _reward_symmetry(self) -> Tensor:
+        """1 for each pair of left and right feet, front or rear, of which both are in the air."""
+        in_air = 1.0 - self.feet_contact
+        pairs = [in_air[:, right] * in_air[:, left] for right, left in self.symmetry.foot_pairs]
+        return sum(pairs[1:], pairs[0])

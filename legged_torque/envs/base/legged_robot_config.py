@@ -1,8 +1,20 @@
-"""The settings of a task and of its training, with legged_gym's names. A variant inherits and overrides."""
+"""The settings of a task and of its training, with legged_gym's names. A variant inherits and overrides.
+
+Values that belong to a robot are placeholders here, see :mod:`legged_torque.envs.robots`.
+"""
 
 from __future__ import annotations
 
-from legged_torque.utils.config import BaseConfig
+from legged_torque.utils.config import BaseConfig, Section
+
+
+class LinearChange(Section):
+    """A value that changes linearly with the total number of environment steps (paper, eq. 1)."""
+
+    start = 1.0
+    end = 1.0
+    t_start = 0  # [total steps]
+    t_end = 1  # [total steps]
 
 
 class LeggedRobotCfg(BaseConfig):
@@ -13,17 +25,19 @@ class LeggedRobotCfg(BaseConfig):
 
         num_envs = 4096
         num_envs_cpu = 64  # default on a CPU, where a world-step costs about a millisecond
-        num_actions = 12
+        num_actions: int | None = None  # None: those of the approach for each joint of the robot
         history_length = 1  # control steps whose observations the policy sees, the newest first
         episode_length_s = 20.0
 
     class asset:
         """The robot, and which of its geoms mean what."""
 
-        file = ""  # MJCF, relative to the repository's root or absolute
+        file = ""  # MJCF, absolute or below resources/
         foot_name = "foot"  # collision geoms whose name contains this are feet
         penalize_contacts_on: list[str] = []  # likewise: those of the collision term
         terminate_after_contacts_on: list[str] = []  # likewise: those that end an episode
+        mirrored_legs: list[list[str]] = []  # pairs [right, left] of names of legs, with which names of parts begin
+        max_dof_vel = 0.0  # [rad/s] highest speed of the joints
 
     class sim:
         """Physics."""
@@ -33,14 +47,27 @@ class LeggedRobotCfg(BaseConfig):
         solver_iterations = 10  # at most
         ls_iterations = 20  # line search, at most
 
+    class terrain:
+        """The ground."""
+
+        mesh_type = "plane"
+
+    class motors:
+        """What joints get of the torques that actions ask for."""
+
+        model = "ideal"  # any torque within the limits, at once
+
     class init_state:
         """Where episodes start, and the nominal pose."""
 
-        pos = [0.0, 0.0, 0.4]  # [m] of the trunk at a reset: high enough for stretched legs
-        default_joint_angles: dict[str, float] = {}  # [rad] q_nominal, by joint name
+        pos = [0.0, 0.0, 1.0]  # [m] of the trunk at a reset: high enough for stretched legs
+        default_joint_angles: dict[str, float] = {}  # [rad] q_nominal, by joint name, in the order of the MJCF
 
     class domain_rand:
-        """What is drawn at random: uniform ranges [lowest, highest]. See ``perturbations`` and ``parameter_ranges``."""
+        """What is drawn at random: uniform ranges [lowest, highest]. See ``perturbations`` and ``parameter_ranges``.
+
+        Of a parameter without a range, every world has the robot's own value.
+        """
 
         # initial state, at every reset
         init_roll = [-0.19635, 0.19635]  # [rad] +-pi/16
@@ -52,33 +79,33 @@ class LeggedRobotCfg(BaseConfig):
         init_ang_vel = [0.0, 0.0]  # [rad/s] of the trunk, per axis
 
         # time from the policy to the motors, at every reset
-        action_delay = [0, 0]  # whole numbers of
+        action_delay = [0, 0]  # [lowest, highest], whole numbers in action_delay_unit
         action_delay_unit = "physics_steps"  # or "control_steps"
 
-        # parameters, at every reset and now and then; one number per world unless said otherwise
+        # parameters, resampled at resets and at random; one value per world unless noted
         randomize_parameters = False
         keep_fixed: list[str] = []  # names of ranges below that are not drawn after all
         resampling_probability = 0.002  # per control step and world
-        trunk_mass_offset = [-0.8, 0.8]  # [kg], then
+        trunk_mass_offset = [0.0, 0.0]  # [kg], then
         trunk_mass_scale = [0.75, 1.25]  # times the mass; inertia in proportion
         trunk_com_offset = [-0.0025, 0.0025]  # [m] per axis
-        foot_radius = [0.0195, 0.0205]  # [m]
+        foot_radius: list[float] | None = None  # [m]
         foot_offset = [-0.0025, 0.0025]  # [m] per foot and axis
         keep_probability = 0.3  # share of draws in which the joints keep their own values of the next four
-        dof_damping = [0.0, 0.2]  # [N m s/rad] per joint
-        dof_armature = [0.009, 0.02]  # [kg m^2] per joint
-        dof_stiffness = [0.0, 0.5]  # [N m/rad] per joint, of a spring towards angle 0
-        dof_frictionloss = [0.0, 0.65]  # [N m] per joint
+        dof_damping: list[float] | None = None  # [N m s/rad] per joint
+        dof_armature: list[float] | None = None  # [kg m^2] per joint
+        dof_stiffness: list[float] | None = None  # [N m/rad] per joint, of a spring towards angle 0
+        dof_frictionloss: list[float] | None = None  # [N m] per joint
         ground_friction = [0.001, 2.0]  # tangential; torsional and rolling in proportion
         contact_stiffness = [500.0, 1500.0]  # of MuJoCo's direct solref
         contact_damping = [30.0, 130.0]  # low where the stiffness is low
         gravity = [8.81, 10.81]  # [m/s^2]
         motor_strength = [0.75, 1.25]  # times the torques
         joint_offset = [-0.05, 0.05]  # [rad] on the target angle, per joint
-        action_scale_offset = [-0.03, 0.03]  # [rad] per unit of a position action; torques in proportion
-        stiffness_offset = [-3.0, 3.0]  # [N m/rad] on Kp, then
+        action_scale_offset = [0.0, 0.0]  # [rad] per unit of a position action; torques in proportion
+        stiffness_offset = [0.0, 0.0]  # [N m/rad] on Kp, then
         stiffness_scale = [0.75, 1.25]  # times Kp
-        damping_offset = [-0.1, 0.1]  # [N m s/rad] on Kd, then
+        damping_offset = [0.0, 0.0]  # [N m s/rad] on Kd, then
         damping_scale = [0.75, 1.25]  # times Kd
 
         # pushes: half of them set the trunk's velocity, half are added to it
@@ -116,10 +143,10 @@ class LeggedRobotCfg(BaseConfig):
 
         decimation = 4  # physics steps per control step: 50 Hz
         refresh_torques = True  # whether torques are computed anew at every physics step
-        stiffness = 20.0  # [N m/rad] Kp
-        damping = 0.5  # [N m s/rad] Kd
+        stiffness: float | dict[str, float] = 0.0  # [N m/rad] Kp; of all joints, or by a part of their names
+        damping: float | dict[str, float] = 0.0  # [N m s/rad] Kd, likewise
         action_scale = 0.25  # [rad] per unit of a position action
-        torque_scale = 4.0  # [N m] per unit of a torque action
+        torque_scale = 1.0  # [N m] per unit of a torque action
 
     class rewards:
         """The terms of Table III; each is a method ``_reward_<term>``."""
@@ -127,10 +154,11 @@ class LeggedRobotCfg(BaseConfig):
         only_positive_rewards = True  # clip the sum at 0 from below
         tracking_temperature = 4.0  # gamma of both tracking terms
         soft_dof_pos_limit = 0.9  # share of a joint's range, beyond which dof_pos_limits acts
-        base_height_target = 0.303  # [m] above the ground
+        base_height_target = 0.0  # [m] of the trunk above the ground, in the nominal pose
+        feet_air_time_target = 0.5  # [s] swings are rewarded for what they last beyond this
 
         class scales:
-            """Weights of Table III; the task multiplies them by the control step."""
+            """Weights of Table III; each is multiplied by the control step and by its factor of ``curriculum``."""
 
             tracking_lin_vel = 1.0
             tracking_ang_vel = 1.0
@@ -149,13 +177,13 @@ class LeggedRobotCfg(BaseConfig):
         class curriculum:
             """Factors on the scales: linear from start to end between two total step counts (eq. 1)."""
 
-            class tracking_lin_vel:
+            class tracking_lin_vel(LinearChange):
                 start = 4.0
                 end = 2.0
                 t_start = 0
                 t_end = 10_000_000
 
-            class tracking_ang_vel:
+            class tracking_ang_vel(LinearChange):
                 start = 0.1
                 end = 1.0
                 t_start = 0
@@ -179,8 +207,8 @@ class LeggedRobotCfg(BaseConfig):
         """Return the named changes that ``--perturbation`` chooses from (paper, IV-A)."""
 
         def environment(on: bool, velocity: float = 0.0, probability: float = 0.0) -> dict:
-            speeds = {"init_dof_vel": 10.5, "init_lin_vel": 0.5, "init_ang_vel": 0.5}  # half of what joints can do
-            states = {name: [-on * speed, on * speed] for name, speed in speeds.items()}
+            speeds = {"init_dof_vel": 0.5 * self.asset.max_dof_vel, "init_lin_vel": 0.5, "init_ang_vel": 0.5}
+            states = {name: [-speed, speed] if on else [0.0, 0.0] for name, speed in speeds.items()}
             pushes = {"push_robots": on, "push_velocity": [-velocity, velocity], "push_probability": probability}
             return {"domain_rand": {"randomize_parameters": on, **states, **pushes}, "noise": {"add_noise": on}}
 
@@ -224,7 +252,7 @@ class LeggedRobotCfgPPO(BaseConfig):
         num_steps_per_env = 24
         total_steps = 110_000_000  # over all worlds of all processes; --max_iterations overrides it
         save_interval = 50  # iterations between checkpoints
-        experiment_name = "legged_robot"
+        experiment_name = ""  # folder of the runs; empty: the name of the task
         run_name = ""
         logger = "tensorboard"
         wandb_project = "legged_torque"

@@ -1,72 +1,205 @@
-"""What the policy and the critic see."""
+"""What policy and critic see: one list of terms, from which sizes, noise, history and mirror images follow."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.utils.mirroring import AXIAL_VECTOR, PLANAR_VELOCITY, SCALAR, VECTOR, Mirroring
+
+if TYPE_CHECKING:
+    from legged_torque.envs.base.legged_robot import LeggedRobot
+
+
+@dataclass
+class ObservationTerm:
+    """One part of the observations.
+
+    Attributes:
+        name: Its name, also in ``policy.yaml``.
+        value: Returns the unscaled values. Shape: (num_envs, size).
+        mirror: Their left-right mirror image; None if it is not known, then learning from mirror images is refused.
+        scale: Factor on all values, or on each.
+        noise: Largest error of the policy's sensor, uniform, before scaling.
+        privileged: Whether only the critic sees it.
+        unit: Unit of the values.
+        frame: In which they are given: "trunk", "joint" or "none".
+        meaning: What they are.
+    """
+
+    name: str
+    value: Callable[[], Tensor]
+    mirror: Mirroring | None
+    scale: float | Sequence[float] = 1.0
+    noise: float = 0.0
+    privileged: bool = False
+    unit: str = ""
+    frame: str = "none"
+    meaning: str = ""
+
+
+def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
+    """Return the terms of all tasks: what a real robot can measure (paper, App. I-B), then what only a simulator knows.
+
+    Scales are those of ``normalization.obs_scales``, errors those of ``noise.noise_scales``.
+    """
+    scales, noise, symmetry = task.cfg.normalization.obs_scales, task.cfg.noise.noise_scales, task.symmetry
+    command_scales = (scales.lin_vel, scales.lin_vel, scales.ang_vel)
+    joints, feet = symmetry.joints, symmetry.feet
+    return [
+        ObservationTerm(
+            "projected_gravity",
+            lambda: task.projected_gravity,
+            VECTOR,
+            noise=noise.gravity,
+            frame="trunk",
+            meaning="unit vector of gravity, (0, 0, -1) when upright",
+        ),
+        ObservationTerm(
+            "angular_velocity",
+            lambda: task.base_ang_vel,
+            AXIAL_VECTOR,
+            scales.ang_vel,
+            noise.ang_vel,
+            unit="rad/s",
+            frame="trunk",
+            meaning="of the trunk",
+        ),
+        ObservationTerm(
+            "command",
+            lambda: task.commands,
+            PLANAR_VELOCITY,
+            command_scales,
+            unit="m/s, m/s, rad/s",
+            frame="trunk",
+            meaning="commanded v_x, v_y and yaw rate",
+        ),
+        ObservationTerm(
+            "joint_position",
+            lambda: task.dof_pos - task.default_dof_pos,
+            joints,
+            scales.dof_pos,
+            noise.dof_pos,
+            unit="rad",
+            frame="joint",
+            meaning="q - nominal_pose",
+        ),
+        ObservationTerm(
+            "joint_velocity",
+            lambda: task.dof_vel,
+            joints,
+            scales.dof_vel,
+            noise.dof_vel,
+            unit="rad/s",
+            frame="joint",
+            meaning="qd",
+        ),
+        ObservationTerm(
+            "last_action",
+            lambda: task.actions,
+            task.action_mirror(),
+            meaning="clipped actions of the step before, 0 at the start",
+        ),
+        ObservationTerm("linear_velocity", lambda: task.base_lin_vel, VECTOR, scales.lin_vel, privileged=True),
+        ObservationTerm("height", lambda: task.base_height.unsqueeze(1), SCALAR, privileged=True),
+        ObservationTerm("feet_contact", lambda: task.feet_contact, feet, privileged=True),
+        ObservationTerm(
+            "random_parameters",
+            lambda: task.randomization.values,
+            task.parameter_mirror,
+            privileged=True,
+            meaning="drawn parameters as shares of their ranges, -1 to 1",
+        ),
+    ]
+
 
 class Observations:
-    """Observations of :class:`~legged_torque.envs.base.legged_robot.LeggedRobot`, of which this is a part."""
+    """Computes the observations of a list of terms.
 
-    def compute_observations(self) -> None:
-        """Compute what a real robot can measure for the policy, and what only a simulator knows for the critic."""
-        scales = self.cfg.normalization.obs_scales
-        policy = torch.cat(
-            [
-                self.projected_gravity,
-                self.base_ang_vel * scales.ang_vel,
-                self.commands * self._command_scales,
-                (self.dof_pos - self.default_dof_pos) * scales.dof_pos,
-                self.dof_vel * scales.dof_vel,
-                self.actions,
-            ],
-            dim=1,
-        )
-        critic = torch.cat(
-            [
-                policy,
-                self.base_lin_vel * scales.lin_vel,
-                self.base_pos[:, 2:],
-                self.feet_contact,
-                self.randomization.values,
-            ],
-            dim=1,
-        )
-        if self.cfg.noise.add_noise:
-            policy = torch.addcmul(policy, self._noise_scale_vec, self._uniform(policy, [-1.0, 1.0]))
-        clip = self.cfg.normalization.clip_observations
-        self.obs_buf["policy"].copy_(self._with_history(policy.clamp(-clip, clip)))
-        torch.clamp(critic, -clip, clip, out=self.obs_buf["critic"])
+    Attributes:
+        terms: The terms: those of the policy, then those of the critic alone.
+        sizes: Numbers of each term, by name.
+        buffers: Groups "policy", with noise and history, and "critic", without. Shapes: (num_envs, size).
+    """
 
-    def _with_history(self, policy: Tensor) -> Tensor:
-        """Return the policy's observations followed by those of the steps before; an episode starts with copies."""
-        length = self.cfg.env.history_length
-        if length == 1:
+    def __init__(
+        self, terms: Sequence[ObservationTerm], history_length: int, clip: float, add_noise: bool, num_envs: int
+    ) -> None:
+        """Allocate the buffers.
+
+        Args:
+            terms: What is seen.
+            history_length: Control steps that the policy sees.
+            clip: Largest absolute value of an observation.
+            add_noise: Whether the policy's sensors have errors.
+            num_envs: Number of worlds.
+        """
+        self.terms = sorted(terms, key=lambda term: term.privileged)
+        values = [term.value() for term in self.terms]
+        device = values[0].device
+        self.sizes = {term.name: value.shape[1] for term, value in zip(self.terms, values, strict=True)}
+        self._history_length, self._clip, self._add_noise = history_length, clip, add_noise
+        scales = [_per_value(term.scale, self.sizes[term.name]) for term in self.terms]
+        errors = [_scaled(term.noise, scale) for term, scale in zip(self.terms, scales, strict=True)]
+        self._scales = torch.tensor(sum(scales, []), dtype=torch.float32, device=device)
+        self._policy_size = sum(self.sizes[term.name] for term in self.policy_terms())
+        self._noise = torch.tensor(sum(errors, [])[: self._policy_size], dtype=torch.float32, device=device)
+        sizes = {"policy": self._policy_size * history_length, "critic": len(self._scales)}
+        groups = {name: torch.zeros(num_envs, size, device=device) for name, size in sizes.items()}
+        self.buffers = TensorDict(groups, batch_size=[num_envs], device=device)
+
+    def policy_terms(self) -> list[ObservationTerm]:
+        """Return the terms that the policy sees."""
+        return [term for term in self.terms if not term.privileged]
+
+    def policy_columns(self, name: str) -> list[int]:
+        """Return where a term stands in the policy's observations, in every step of the history."""
+        names = [term.name for term in self.policy_terms()]
+        start = sum(self.sizes[before] for before in names[: names.index(name)])
+        columns = range(start, start + self.sizes[name])
+        return [step * self._policy_size + column for step in range(self._history_length) for column in columns]
+
+    def compute(self, is_new: Tensor) -> None:
+        """Compute the observations of this moment.
+
+        Args:
+            is_new: Worlds whose episode has just started: their history starts with copies. Shape: (num_envs,), bool.
+        """
+        critic = torch.cat([term.value() for term in self.terms], dim=1) * self._scales
+        policy = critic[:, : self._policy_size]
+        if self._add_noise:
+            policy = torch.addcmul(policy, self._noise, torch.empty_like(policy).uniform_(-1.0, 1.0))
+        policy = policy.clamp(-self._clip, self._clip)
+        self.buffers["policy"].copy_(self._with_history(policy, is_new))
+        torch.clamp(critic, -self._clip, self._clip, out=self.buffers["critic"])
+
+    def _with_history(self, policy: Tensor, is_new: Tensor) -> Tensor:
+        """Return the policy's observations followed by those of the steps before."""
+        if self._history_length == 1:
             return policy
-        before = self.obs_buf["policy"][:, : -policy.shape[1]]
-        copies = policy.repeat(1, length - 1)
-        return torch.cat([policy, torch.where(self.reset_buf.unsqueeze(1), copies, before)], dim=1)
+        before = self.buffers["policy"][:, : -policy.shape[1]]
+        copies = policy.repeat(1, self._history_length - 1)
+        return torch.cat([policy, torch.where(is_new.unsqueeze(1), copies, before)], dim=1)
 
-    def _init_observations(self) -> None:
-        """Allocate the observations and their scales."""
-        n, scales = self.num_envs, self.cfg.normalization.obs_scales
-        now = 9 + 2 * self.num_dof + self.num_actions
-        policy = now * self.cfg.env.history_length
-        critic = now + 4 + len(self.feet_indices) + self.randomization.values.shape[1]
-        self.obs_buf = TensorDict(
-            {name: torch.zeros(n, size, device=self.device) for name, size in (("policy", policy), ("critic", critic))},
-            batch_size=[n],
-            device=self.device,
-        )
-        self._command_scales = self._tensor([scales.lin_vel, scales.lin_vel, scales.ang_vel])
-        self._noise_scale_vec = self._tensor(self._noise_scales())
+    def mirrors(self) -> dict[str, list[tuple[str, Mirroring | None]]]:
+        """Return the mirror images of the groups, term by term with their names."""
+        policy = [(term.name, term.mirror) for term in self.policy_terms()]
+        return {
+            "policy": policy * self._history_length,
+            "critic": [(term.name, term.mirror) for term in self.terms],
+        }
 
-    def _noise_scales(self) -> list[float]:
-        """Return the largest errors of the policy's observations, in their order and scaled as they are."""
-        noise, scales = self.cfg.noise.noise_scales, self.cfg.normalization.obs_scales
-        gravity, ang_vel, commands = [noise.gravity] * 3, [noise.ang_vel * scales.ang_vel] * 3, [0.0] * 3
-        dof_pos = [noise.dof_pos * scales.dof_pos] * self.num_dof
-        dof_vel = [noise.dof_vel * scales.dof_vel] * self.num_dof
-        return gravity + ang_vel + commands + dof_pos + dof_vel + [0.0] * self.num_actions
+
+def _per_value(value: float | Sequence[float], size: int) -> list[float]:
+    """Return one number per value of a term."""
+    return [value] * size if isinstance(value, (int, float)) else list(value)
+
+
+def _scaled(noise: float, scales: list[float]) -> list[float]:
+    """Return the largest errors of scaled values."""
+    return [noise * scale for scale in scales]

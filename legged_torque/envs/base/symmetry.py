@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -9,57 +10,103 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.mirroring import Mirroring
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
 
 
-class Mirror:
-    """Reflects observations and actions at the robot's sagittal plane: signed permutations of their entries.
+class RobotSymmetry:
+    """Which joints and feet of a robot are mirror images of each other.
 
-    Joints and feet change places with those of the same name on the other side: R and L swapped at the end of the
-    part before the first underscore, as in FR_hip and FL_hip. Joints that turn about the x axis change their sign.
+    Attributes:
+        joints: Mirroring of joint angles; those of joints that turn about the x axis change their sign. None without
+            symmetry.
+        feet: Mirroring of one number per foot. None without symmetry.
+        foot_pairs: Places of the right and left foot of each pair of legs.
+        problem: Why there is no symmetry, empty if there is one.
     """
 
-    def __init__(self, task: LeggedRobot) -> None:
+    def __init__(
+        self,
+        mirrored_legs: Sequence[Sequence[str]],
+        dof_names: Sequence[str],
+        dof_axes: Sequence[Sequence[float]],
+        foot_names: Sequence[str],
+    ) -> None:
+        """Match names.
+
+        Args:
+            mirrored_legs: ``asset.mirrored_legs``.
+            dof_names: Names of the joints in their order.
+            dof_axes: Their axes in the frames of their bodies. Shape: (num_dof, 3).
+            foot_names: Names of the feet in their order.
+        """
+        self.joints: Mirroring | None = None
+        self.feet: Mirroring | None = None
+        self.foot_pairs = [(_place(foot_names, right), _place(foot_names, left)) for right, left in mirrored_legs]
+        self.problem = ""
+        try:
+            signs = tuple(-1.0 if abs(axis[0]) > 0.5 else 1.0 for axis in dof_axes)
+            self.joints = Mirroring(counterparts(dof_names, mirrored_legs), signs)
+            self.feet = Mirroring(counterparts(foot_names, mirrored_legs), (1.0,) * len(foot_names))
+        except UserError as error:
+            self.problem = str(error)
+
+
+def _place(names: Sequence[str], leg: str) -> int:
+    """Return the place of the name that begins with that of a leg.
+
+    Raises:
+        UserError: If there is none.
+    """
+    for place, name in enumerate(names):
+        if name.startswith(leg):
+            return place
+    raise UserError(f"asset.mirrored_legs: no foot's name begins with '{leg}'; the feet are {', '.join(names)}")
+
+
+def counterparts(names: Sequence[str], mirrored_legs: Sequence[Sequence[str]]) -> tuple[int, ...]:
+    """Return where each part's counterpart on the other side stands: that of FR_hip is FL_hip.
+
+    Raises:
+        UserError: If one is missing.
+    """
+    other_leg = {leg: other for pair in mirrored_legs for leg, other in (pair, reversed(pair))}
+    result = []
+    for name in names:
+        leg = next((leg for leg in other_leg if name.startswith(leg)), None)
+        if leg is None:
+            raise UserError(f"'{name}' has no counterpart: asset.mirrored_legs, {mirrored_legs}, lacks its leg")
+        other = other_leg[leg] + name.removeprefix(leg)
+        if other not in names:
+            raise UserError(f"'{name}' has no counterpart '{other}' on the other side")
+        result.append(list(names).index(other))
+    return tuple(result)
+
+
+class Mirror:
+    """Reflects vectors at the robot's sagittal plane."""
+
+    def __init__(self, parts: Mapping[str, Sequence[tuple[str, Mirroring | None]]], problem: str, device: str) -> None:
         """Prepare the permutations.
 
         Args:
-            task: The task; its observations are those of ``Observations.compute_observations``.
+            parts: For each kind of vector its terms, by name, one behind the other.
+            problem: Why the robot is not symmetric, if it is not.
+            device: Name of the device.
 
         Raises:
-            UserError: If a joint or foot has no counterpart on the other side, or a drawn parameter has another number
-                of values than one or one per joint.
+            UserError: If the mirror image of a term is not known.
         """
-        names = task.dof_names
-        joints = counterparts(names)
-        rolls = [abs(task.sim.mj_model.joint(name).axis[0]) > 0.5 for name in names]
-        joint_signs = [-1.0 if roll else 1.0 for roll in rolls]
-        feet = counterparts(task.foot_names)
-        actions = [joints, joint_signs] if task.actions_per_dof == 1 else repeat(joints, joint_signs, 2)
-        vector, axial = ([0, 1, 2], [1.0, -1.0, 1.0]), ([0, 1, 2], [-1.0, 1.0, -1.0])
-        command = ([0, 1, 2], [1.0, -1.0, -1.0])
-        policy = [vector, axial, command, (joints, joint_signs), (joints, joint_signs), tuple(actions)]
-        signed = {
-            "trunk_com": vector,
-            "foot_offset": ([3 * foot + axis for foot in feet for axis in range(3)], vector[1] * len(feet)),
-            "joint_offset": (joints, joint_signs),
-        }
-        unsigned = {1: ([0], [1.0]), len(joints): (joints, [1.0] * len(joints))}
-        drawn = []
-        for name, size in task.randomization.sizes.items():
-            if name not in signed and size not in unsigned:
-                raise UserError(f"algorithm.symmetry_cfg: the mirror image of the {size} numbers '{name}' is not known")
-            drawn.append(signed.get(name) or unsigned[size])
-        critic = [*policy, vector, ([0], [1.0]), (feet, [1.0] * len(feet)), *drawn]
-        self._maps = {
-            name: self._concatenate(parts, task.device)
-            for name, parts in {
-                "policy": policy * task.cfg.env.history_length,
-                "critic": critic,
-                "actions": [tuple(actions)],
-            }.items()
-        }
+        self._maps = {}
+        for kind, terms in parts.items():
+            for name, mirroring in terms:
+                if mirroring is None:
+                    reason = problem or f"the mirror image of '{name}' in '{kind}' is not known"
+                    raise UserError(f"algorithm.symmetry_cfg: {reason}")
+            whole = Mirroring.joined([mirroring for _, mirroring in terms if mirroring])
+            self._maps[kind] = torch.tensor(whole.order, device=device), torch.tensor(whole.signs, device=device)
 
     def __call__(self, name: str, values: Tensor) -> Tensor:
         """Return the mirror image.
@@ -70,39 +117,6 @@ class Mirror:
         """
         order, signs = self._maps[name]
         return values[:, order] * signs
-
-    @staticmethod
-    def _concatenate(parts: list[tuple[list[int], list[float]]], device: str) -> tuple[Tensor, Tensor]:
-        """Return order and signs of all parts behind each other."""
-        order: list[int] = []
-        signs: list[float] = []
-        for indices, part_signs in parts:
-            start = len(order)
-            order += [start + index for index in indices]
-            signs += part_signs
-        return torch.tensor(order, device=device), torch.tensor(signs, device=device)
-
-
-def repeat(indices: list[int], signs: list[float], times: int) -> tuple[list[int], list[float]]:
-    """Return a signed permutation that acts alike on each of several blocks."""
-    size = len(indices)
-    return [block * size + index for block in range(times) for index in indices], signs * times
-
-
-def counterparts(names: list[str]) -> list[int]:
-    """Return where each part's counterpart on the other side stands: that of FR_hip is FL_hip.
-
-    Raises:
-        UserError: If one is missing.
-    """
-    result = []
-    for name in names:
-        leg, _, rest = name.partition("_")
-        other = f"{leg[:-1]}{leg[-1:].translate(str.maketrans('LR', 'RL'))}_{rest}"
-        if other not in names:
-            raise UserError(f"algorithm.symmetry_cfg: '{name}' has no counterpart '{other}' on the other side")
-        result.append(names.index(other))
-    return result
 
 
 def with_mirror_images(

@@ -1,4 +1,4 @@
-"""Settings that make no sense are refused before anything is built."""
+"""Validate the settings of a task before anything is built."""
 
 from __future__ import annotations
 
@@ -35,7 +35,6 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     """
     for key, value in {
         "env.num_envs": cfg.env.num_envs,
-        "env.num_actions": cfg.env.num_actions,
         "env.history_length": cfg.env.history_length,
         "control.decimation": cfg.control.decimation,
         "sim.solver_iterations": cfg.sim.solver_iterations,
@@ -48,6 +47,10 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
             raise UserError(f"{key} must be greater than 0, not {value}")
     if len(cfg.init_state.pos) != 3:
         raise UserError(f"init_state.pos must be [x, y, z], not {cfg.init_state.pos}")
+    if cfg.rewards.scales.symmetry and not cfg.asset.mirrored_legs:
+        raise UserError("rewards.scales.symmetry needs asset.mirrored_legs: which legs are the right and left of a pair")
+    if cfg.rewards.scales.base_height and not cfg.rewards.base_height_target > 0.0:
+        raise UserError(f"rewards.base_height_target must be greater than 0, not {cfg.rewards.base_height_target}")
     _check_probability("commands.resampling_probability", cfg.commands.resampling_probability)
     for key in section_keys(cfg.noise.noise_scales):
         if getattr(cfg.noise.noise_scales, key) < 0.0:
@@ -55,8 +58,9 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
                 f"noise.noise_scales.{key} must not be negative, it is {getattr(cfg.noise.noise_scales, key)}"
             )
     for key in POSITIVE:
-        if min(getattr(cfg.domain_rand, key)) < 0.0:
-            raise UserError(f"domain_rand.{key} must not be negative, it is {getattr(cfg.domain_rand, key)}")
+        limits = getattr(cfg.domain_rand, key)
+        if limits is not None and min(limits) < 0.0:
+            raise UserError(f"domain_rand.{key} must not be negative, it is {limits}")
     ranges = [key for key in section_keys(cfg.domain_rand) if isinstance(getattr(cfg.domain_rand, key), list)]
     ranges = [key for key in ranges if key not in NOT_PARAMETERS and not key.startswith("init_")]
     for name in cfg.domain_rand.keep_fixed:

@@ -1,4 +1,4 @@
-"""The Unitree A1: what all approaches on it share."""
+"""The Unitree A1: figures of its URDF and of the paper, the same for all approaches."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRo
 
 
 class A1Cfg(LeggedRobotCfg):
-    """A1 with position control, the paper's baseline: task ``a1_position``."""
+    """Settings of the A1; alone, of position control on a plane: task ``a1_position``."""
 
-    class asset(LeggedRobotCfg.asset):
+    class asset:
         file = "resources/robots/a1/a1.xml"
         foot_name = "foot"
         penalize_contacts_on = ["calf", "thigh", "trunk"]
         terminate_after_contacts_on = ["trunk"]
+        mirrored_legs = [["FR", "FL"], ["RR", "RL"]]
+        max_dof_vel = 21.0
 
-    class init_state(LeggedRobotCfg.init_state):
+    class init_state:
+        pos = [0.0, 0.0, 0.4]
         default_joint_angles = {
             "FR_hip_joint": -0.1,
             "FR_thigh_joint": 0.8,
@@ -30,13 +33,30 @@ class A1Cfg(LeggedRobotCfg):
             "RL_calf_joint": -1.5,
         }
 
+    class control:
+        stiffness = 20.0
+        damping = 0.5
+        action_scale = 0.25
+        torque_scale = 4.0
+
+    class domain_rand:
+        trunk_mass_offset = [-0.8, 0.8]
+        foot_radius = [0.0195, 0.0205]
+        dof_damping = [0.0, 0.2]
+        dof_armature = [0.009, 0.02]
+        dof_stiffness = [0.0, 0.5]
+        dof_frictionloss = [0.0, 0.65]
+        action_scale_offset = [-0.03, 0.03]
+        stiffness_offset = [-3.0, 3.0]
+        damping_offset = [-0.1, 0.1]
+
+    class rewards:
+        base_height_target = 0.303
+
 
 class A1CfgPPO(LeggedRobotCfgPPO):
-    """Training of ``a1_position``."""
+    """Training of an A1, which is the same left and right."""
 
-    class runner(LeggedRobotCfgPPO.runner):
-        experiment_name = "a1_position"
-
-    class algorithm(LeggedRobotCfgPPO.algorithm):
-        class symmetry_cfg(LeggedRobotCfgPPO.algorithm.symmetry_cfg):
+    class algorithm:
+        class symmetry_cfg:
             use_data_augmentation = True

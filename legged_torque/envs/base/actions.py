@@ -1,0 +1,28 @@
+"""What actions mean: one term per block of actions, one action of each term per joint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass
+class ActionTerm:
+    """One action per joint; mirrored as the joints are.
+
+    ``_compute_torques`` says what is done with it. Sizes, mirror images, ``policy.yaml`` and plots follow from here.
+
+    Attributes:
+        name: What ``policy.yaml`` calls it: "position_residual" or "torque".
+        scale: Factor on the action, one per world. Shape: (num_envs, 1).
+        unit: Unit of scale times action.
+        meaning: What scale times action is.
+        weight: Weight of its torques, a scalar on the device; None is 1.
+    """
+
+    name: str
+    scale: Tensor
+    unit: str
+    meaning: str
+    weight: Tensor | None = None

@@ -1,0 +1,127 @@
+"""From the settings of a robot to its model, its parts by name, and its numbers by joint."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from legged_torque import resource_path
+from legged_torque.sim.model import build_model, collision_geoms, indices_matching, read_spec
+from legged_torque.utils.errors import UserError, unknown_name
+
+if TYPE_CHECKING:
+    from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+
+
+@dataclass
+class Asset:
+    """A robot's model and which of its parts mean what.
+
+    Attributes:
+        mj_model: The model to simulate.
+        dof_names: Names of the joints, in the order of the MJCF.
+        geom_names: Names of the collision geoms; places below are places in this list.
+        feet: Places of the feet.
+        penalized: Places of the geoms of the collision term.
+        terminating: Places of the geoms that end an episode.
+    """
+
+    mj_model: mujoco.MjModel
+    dof_names: list[str]
+    geom_names: list[str]
+    feet: list[int]
+    penalized: list[int]
+    terminating: list[int]
+
+    @property
+    def foot_names(self) -> list[str]:
+        """Names of the geoms of the feet."""
+        return [self.geom_names[place] for place in self.feet]
+
+    def dof_axes(self) -> np.ndarray:
+        """Return the axes of the joints in the frames of their bodies. Shape: (num_dof, 3)."""
+        return self.mj_model.jnt_axis[1:]
+
+
+def load_asset(settings: LeggedRobotCfg.asset, timestep: float) -> Asset:
+    """Load a robot.
+
+    Args:
+        settings: ``asset`` of the settings.
+        timestep: Physics step [s].
+
+    Raises:
+        UserError: If the file cannot be read, a name in the settings matches nothing, or motors are in another order
+            than joints.
+    """
+    spec = read_spec(resource_path(settings.file))
+    geoms = collision_geoms(spec)
+    feet = indices_matching(geoms, [settings.foot_name])
+    penalized = indices_matching(geoms, settings.penalize_contacts_on)
+    terminating = indices_matching(geoms, settings.terminate_after_contacts_on)
+    model = build_model(spec, geoms)
+    model.opt.timestep = timestep
+    dof_names = [model.joint(i).name for i in range(1, model.njnt)]
+    _check_motors(model, dof_names, settings.file)
+    return Asset(model, dof_names, geoms, feet, penalized, terminating)
+
+
+def _check_motors(model: mujoco.MjModel, dof_names: list[str], file: str) -> None:
+    """Refuse motors in another order than joints, whose torques would go to other joints, and motors without limits."""
+    driven = [model.joint(joint).name for joint in model.actuator_trnid[:, 0]]
+    if driven != dof_names:
+        raise UserError(f"the motors of '{file}' must be in the order of its joints, {dof_names}, not {driven}")
+    for actuator, name in enumerate(driven):
+        if not model.actuator_forcelimited[actuator]:
+            raise UserError(f"the motor of the joint '{name}' in '{file}' has no forcerange: its torque limits")
+
+
+def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:
+    """Return a number for each joint.
+
+    Args:
+        setting: Name of the setting, for messages.
+        values: One number for all joints, or numbers by a part of the joints' names; the first one that matches counts.
+        dof_names: Names of the joints.
+
+    Raises:
+        UserError: If a joint has no number, or a name matches no joint.
+    """
+    if not isinstance(values, dict):
+        return [values] * len(dof_names)
+    for part in values:
+        if not any(part in name for name in dof_names):
+            raise unknown_name(f"joint (part of its name) in {setting}", part, dof_names)
+    result = []
+    for name in dof_names:
+        matching = [value for part, value in values.items() if part in name]
+        if not matching:
+            raise UserError(f"{setting} lacks the joint '{name}'; it has {', '.join(values) or 'no entries'}")
+        result.append(matching[0])
+    return result
+
+
+def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[float]:
+    """Return the nominal joint angles [rad] in the order of the joints.
+
+    Args:
+        angles: ``init_state.default_joint_angles``, in the same order.
+        dof_names: Names of the joints in the order of the MJCF.
+
+    Raises:
+        UserError: If a joint is missing or unknown, or the order is another one.
+    """
+    key = "init_state.default_joint_angles"
+    for name in angles:
+        if name not in dof_names:
+            raise unknown_name(f"joint in {key}", name, dof_names)
+    for name in dof_names:
+        if name not in angles:
+            raise UserError(f"{key} lacks the joint '{name}'")
+    if list(angles) != list(dof_names):
+        raise UserError(f"{key} must be in the order of the MJCF's joints: {', '.join(dof_names)}")
+    return list(angles.values())

@@ -1,0 +1,48 @@
+"""Commanded velocities."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+
+
+class UniformCommands:
+    """Draws commands uniformly.
+
+    Attributes:
+        values: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
+    """
+
+    def __init__(self, ranges: LeggedRobotCfg.commands.ranges, num_envs: int, device: str) -> None:
+        """Start with commands of 0.
+
+        Args:
+            ranges: ``commands.ranges`` of the settings.
+            num_envs: Number of worlds.
+            device: Name of the device.
+        """
+        self.values = torch.zeros(num_envs, 3, device=device)
+        limits = [ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw]
+        low, high = torch.tensor(limits, dtype=torch.float32, device=device).unbind(dim=1)
+        self._low, self._span = low.clone(), high - low
+        self._from_settings = self._low.clone(), self._span.clone()
+
+    def hold(self, command: tuple[float, float, float] | None) -> None:
+        """Draw nothing but one command from now on; None draws from the settings' ranges again."""
+        low, span = self._from_settings
+        self._low.copy_(low if command is None else torch.tensor(command))
+        self._span.copy_(span if command is None else torch.zeros(3))
+
+    def resample(self, mask: Tensor) -> None:
+        """Draw new commands.
+
+        Args:
+            mask: In which worlds. Shape: (num_envs,), bool.
+        """
+        drawn = torch.addcmul(self._low, self._span, torch.rand_like(self.values))
+        torch.where(mask.unsqueeze(1), drawn, self.values, out=self.values)

@@ -1,0 +1,39 @@
+"""What every ground can tell. All points are in the world frame [m]; nothing here waits for the host."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from torch import Tensor
+
+
+class Terrain(ABC):
+    """The ground under all worlds."""
+
+    @abstractmethod
+    def height(self, points: Tensor) -> Tensor:
+        """Return the height of the ground under points [m].
+
+        Args:
+            points: Shape: (..., 3); only x and y count.
+
+        Returns:
+            Shape: (...,).
+        """
+
+    @abstractmethod
+    def normal(self, points: Tensor) -> Tensor:
+        """Return the unit normal of the ground under points, upwards. Shapes: (..., 3)."""
+
+    @abstractmethod
+    def move_to_origin(self, mask: Tensor, base_pos: Tensor) -> None:
+        """Move trunks, placed as if the world's origin were 0, to where episodes of their worlds start.
+
+        Args:
+            mask: In which worlds. Shape: (num_envs,), bool.
+            base_pos: Positions of the trunks, changed in place. Shape: (num_envs, 3).
+        """
+
+    def height_above(self, points: Tensor) -> Tensor:
+        """Return how high points are above the ground under them [m]. Shapes: (..., 3), (...,)."""
+        return points[..., 2] - self.height(points)

@@ -1,0 +1,44 @@
+"""Which device a process works on."""
+
+from __future__ import annotations
+
+import re
+
+import torch
+
+from legged_torque.utils import distributed
+from legged_torque.utils.errors import UserError, unknown_name
+
+
+def resolve_device(device: str | None) -> str:
+    """Return the name of the device to use. Processes that train together take a GPU each.
+
+    Args:
+        device: "auto", "cpu", "cuda" or "cuda:N"; None is "auto".
+
+    Raises:
+        UserError: If there is no such device, or not one for each process.
+    """
+    num_gpus = torch.cuda.device_count()
+    available = ["cpu", *(f"cuda:{i}" for i in range(num_gpus))]
+    if device in (None, "auto"):
+        device = "cuda" if num_gpus else "cpu"
+    if device == "cuda":
+        num_processes = distributed.local_world_size()
+        if 0 < num_gpus < num_processes:
+            raise UserError(f"torchrun has started {num_processes} processes on a machine with {num_gpus} GPU(s)")
+        device = f"cuda:{distributed.local_rank()}"
+    elif device in available[1:] and distributed.world_size() > 1:
+        raise UserError(f"with torchrun each process takes a GPU of its own: leave out --device {device}")
+    if device not in available:
+        if re.fullmatch(r"cuda:\d+", device):
+            raise UserError(f"there is no device '{device}'; available: {', '.join(available)}")
+        raise unknown_name("device", device, ["auto", *available])
+    return device
+
+
+def device_name(device: str) -> str:
+    """Return what the machine calls the device."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"CPU, {torch.get_num_threads()} threads"

@@ -1,0 +1,53 @@
+"""Mirror images as signed permutations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Mirroring:
+    """The left-right mirror image of a vector: entry i becomes ``signs[i]`` times entry ``order[i]``.
+
+    Attributes:
+        order: Which entry comes to each place.
+        signs: 1 or -1 for each place.
+    """
+
+    order: tuple[int, ...]
+    signs: tuple[float, ...]
+
+    @classmethod
+    def of_signs(cls, *signs: float) -> Mirroring:
+        """Return the mirroring of entries that stay where they are."""
+        return cls(tuple(range(len(signs))), signs)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Mirroring]) -> Mirroring:
+        """Return the mirroring of several vectors behind each other."""
+        order: list[int] = []
+        for part in parts:
+            start = len(order)
+            order += [start + place for place in part.order]
+        return cls(tuple(order), tuple(sign for part in parts for sign in part.signs))
+
+    def unsigned(self) -> Mirroring:
+        """Return the same permutation of values that keep their signs, such as masses."""
+        return Mirroring(self.order, (1.0,) * len(self.order))
+
+    def of_vectors(self, each: Mirroring) -> Mirroring:
+        """Return the mirroring of one vector per entry, each of which is mirrored by ``each``."""
+        size = len(each.order)
+        order = [size * place + part for place in self.order for part in each.order]
+        return Mirroring(tuple(order), each.signs * len(self.order))
+
+
+SCALAR = Mirroring.of_signs(1.0)
+"""A number that is the same in the mirror."""
+VECTOR = Mirroring.of_signs(1.0, -1.0, 1.0)
+"""A vector (x, y, z) in the trunk's frame: a velocity, a force, a place."""
+AXIAL_VECTOR = Mirroring.of_signs(-1.0, 1.0, -1.0)
+"""An axial vector in the trunk's frame: an angular velocity, a moment."""
+PLANAR_VELOCITY = Mirroring.of_signs(1.0, -1.0, -1.0)
+"""v_x, v_y and yaw rate in the trunk's frame."""

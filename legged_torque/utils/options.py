@@ -1,0 +1,140 @@
+"""What a user asks for beyond a task's own settings, as plain values, and how it changes the settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from legged_torque.utils.config import BaseConfig, section_keys, set_by_path, update_from_dict
+from legged_torque.utils.devices import resolve_device
+from legged_torque.utils.errors import UserError, unknown_name
+
+DEFAULT_TASK = "a1_torque_multihead"
+DEFAULT_PRESET = "parallel"
+
+
+@dataclass
+class Options:
+    """The options that scripts share; None leaves a setting as it is.
+
+    Attributes:
+        task: Name of the task.
+        device: "auto", "cpu" or "cuda:N".
+        num_envs: Number of worlds of each process.
+        seed: Random seed.
+        preset: Named training settings, see ``presets`` of the training's settings.
+        perturbation: Named random events, see ``perturbations`` of the task's settings.
+        ranges: Named ranges of random parameters, see ``parameter_ranges`` of the task's settings.
+        set: Single settings, each as "key.by.dotted.path=value".
+        log_root: Folder of all experiments.
+        experiment_name: Folder of the runs below that.
+        run_name: Added to the name of the run's folder.
+        logger: "tensorboard", "wandb" or "none".
+        load_run: Run to load: name of its folder or a path; None is the last one.
+        checkpoint: Checkpoint to load; None is the last one.
+        resume: Whether training goes on from that.
+        max_iterations: Iterations of the training in all.
+    """
+
+    task: str = DEFAULT_TASK
+    device: str = "auto"
+    num_envs: int | None = None
+    seed: int | None = None
+    preset: str | None = None
+    perturbation: str | None = None
+    ranges: str | None = None
+    set: list[str] = field(default_factory=list)
+    log_root: str | None = None
+    experiment_name: str | None = None
+    run_name: str | None = None
+    logger: str | None = None
+    load_run: str | None = None
+    checkpoint: int | None = None
+    resume: bool = False
+    max_iterations: int | None = None
+
+
+def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: dict[str, Any] | None = None) -> None:
+    """Change settings as the options ask; what is more explicit wins.
+
+    In this order: the preset, the number of worlds that suits the device, the settings of a loaded run, the
+    perturbation, the ranges, single options, ``set``.
+
+    Args:
+        env_cfg: Settings of the task, changed in place.
+        train_cfg: Settings of its training, changed in place.
+        options: What is asked for.
+        run_config: "env" and "train" of a loaded run.
+
+    Raises:
+        UserError: If an option makes no sense.
+    """
+    apply_preset(env_cfg, train_cfg, options.preset or DEFAULT_PRESET)
+    if resolve_device(options.device) == "cpu":
+        env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
+    if run_config:
+        update_from_dict(env_cfg, run_config["env"])
+        update_from_dict(train_cfg, run_config["train"])
+    if options.perturbation:
+        apply_perturbation(env_cfg, options.perturbation)
+    if options.ranges:
+        _apply_named("ranges", env_cfg.parameter_ranges(), env_cfg, options.ranges)
+    given = {
+        "env.num_envs": options.num_envs,
+        "seed": options.seed,
+        "runner.experiment_name": options.experiment_name,
+        "runner.run_name": options.run_name,
+        "runner.logger": options.logger,
+    }
+    for path, value in given.items():
+        if value is not None:
+            set_entry_of_either(env_cfg, train_cfg, path, value)
+    for item in options.set:
+        path, separator, text = item.partition("=")
+        if not separator:
+            raise UserError(f"--set takes KEY=VALUE, not '{item}'")
+        set_entry_of_either(env_cfg, train_cfg, path, text)
+    if options.max_iterations is not None and options.max_iterations < 1:
+        raise UserError(f"--max_iterations must be at least 1, not {options.max_iterations}")
+
+
+def apply_preset(env_cfg: Any, train_cfg: Any, name: str) -> None:
+    """Apply the named changes that the training settings offer as their presets.
+
+    Raises:
+        UserError: If there is no such preset.
+    """
+    presets = train_cfg.presets()
+    if name not in presets:
+        raise unknown_name("preset", name, presets)
+    for section, values in presets[name].items():
+        update_from_dict(env_cfg if section in section_keys(env_cfg) else train_cfg, {section: values})
+
+
+def apply_perturbation(env_cfg: Any, name: str) -> None:
+    """Apply one of the named sets of random events that the task's settings offer.
+
+    Raises:
+        UserError: If there is no such set.
+    """
+    _apply_named("perturbation", env_cfg.perturbations(), env_cfg, name)
+
+
+def _apply_named(kind: str, choices: dict[str, dict], env_cfg: BaseConfig, name: str) -> None:
+    """Apply one of several named sets of changes to the task's settings."""
+    if name not in choices:
+        raise unknown_name(kind, name, choices)
+    update_from_dict(env_cfg, choices[name])
+
+
+def set_entry_of_either(env_cfg: Any, train_cfg: Any, path: str, value: Any) -> None:
+    """Set an entry by its dotted path in the task's or the training's settings, whose sections differ in name.
+
+    Raises:
+        UserError: If neither has such an entry.
+    """
+    section = path.split(".")[0]
+    sections = {key: cfg for cfg in (env_cfg, train_cfg) for key in section_keys(cfg)}
+    if section not in sections:
+        raise unknown_name("config section", section, sections)
+    set_by_path(sections[section], path, value)
