@@ -28,7 +28,7 @@ def main() -> None:
     parser = Parser(__doc__)
     add_build_args(parser)
     parser.set_defaults(task="a1_torque_gravity", seed=2)
-    parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in this repository")
+    parser.add_argument("--log_root", help="folder that keeps all experiments; default: ./logs")
     args = parser.parse_args()
     env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
     file = pretrained_file(args, train_cfg)

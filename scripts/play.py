@@ -9,7 +9,7 @@ import functools
 import math
 from pathlib import Path
 
-from legged_torque import ROOT_DIR
+from legged_torque import resource_path
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import measure
@@ -68,7 +68,7 @@ def main() -> None:
     make_task = functools.partial(type(env), device=env.device)
     number = int(checkpoint.stem.removeprefix("model_"))
     session = Session(make_task, env_cfg, runner, run_dir, number)
-    robot = ROOT_DIR / env_cfg.asset.file
+    robot = resource_path(env_cfg.asset.file)
     if args.viewer == "web":
         watch(session, robot, args.task, args.host, args.port)
     else:

@@ -21,7 +21,7 @@ def main() -> None:
     parser = Parser(__doc__)
     add_build_args(parser)
     parser.set_defaults(task="a1_torque_gravity")
-    parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in this repository")
+    parser.add_argument("--log_root", help="folder that keeps all experiments; default: ./logs")
     parser.add_argument("--num_configurations", type=int, help="random initial states; default: that of the task")
     parser.add_argument("--num_steps", type=int, help="control steps for which each is followed; default: likewise")
     parser.add_argument("--json", type=Path, help="write the report with its histograms to this file as well")

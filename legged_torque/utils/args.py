@@ -79,7 +79,7 @@ def add_build_args(parser: argparse.ArgumentParser) -> None:
 def add_task_args(parser: argparse.ArgumentParser) -> None:
     """Add what all scripts take that build a task and keep or load runs of it."""
     add_build_args(parser)
-    parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in this repository")
+    parser.add_argument("--log_root", help="folder that keeps all experiments; default: ./logs")
     parser.add_argument("--experiment_name", help="folder of the run below that; default: name of the task")
     parser.add_argument("--load_run", help="run to load: name of its folder or a path; default: the last one")
     parser.add_argument("--checkpoint", type=int, help="checkpoint to load; default: the last one")

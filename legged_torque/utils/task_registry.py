@@ -16,7 +16,6 @@ from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils import resolve_callable
 
-from legged_torque import ROOT_DIR
 from legged_torque.utils import distributed
 from legged_torque.utils.args import apply_args, resolve_device
 from legged_torque.utils.config import BaseConfig, to_dict
@@ -152,9 +151,9 @@ def experiment_dir(train_cfg: Any, args: argparse.Namespace | None = None) -> Pa
 
 
 def all_experiments_dir(args: argparse.Namespace | None = None) -> Path:
-    """Return the folder that holds all experiments: ``--log_root``, or ``logs/`` in the repository."""
+    """Return the folder that holds all experiments: ``--log_root``, or ``logs/`` in the current directory."""
     root = getattr(args, "log_root", None)
-    return Path(root) if root else ROOT_DIR / "logs"
+    return Path(root) if root else Path("logs")
 
 
 def num_iterations(env: VecEnv, train_cfg: Any) -> int:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import functools
 import math
-from pathlib import Path
 
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque import ROOT_DIR
+from legged_torque import resource_path
 from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.envs.base.domain_rand import MODEL_FIELDS
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
@@ -260,8 +259,7 @@ class LeggedRobot(Observations, RandomEvents, RewardTerms, VecEnv):
     def _create_sim(self) -> None:
         """Load the robot and build the simulator and its views."""
         asset = self.cfg.asset
-        file = Path(asset.file) if Path(asset.file).is_absolute() else ROOT_DIR / asset.file
-        spec = read_spec(file)
+        spec = read_spec(resource_path(asset.file))
         geoms = collision_geoms(spec)
         feet = indices_matching(geoms, [asset.foot_name])
         penalized = indices_matching(geoms, asset.penalize_contacts_on)
