@@ -20,7 +20,9 @@ def main() -> None:
     """Bring a matrix to its end, or list what is to be done."""
     parser = Parser(__doc__)
     parser.add_argument("file", type=Path, help="description of the matrix, see experiments/")
-    parser.add_argument("--out", type=Path, help="folder of all results; default: ./logs/experiments/<name of the file>")
+    parser.add_argument(
+        "--out", type=Path, help="folder of all results; default: ./logs/experiments/<name of the file>"
+    )
     parser.add_argument(
         "--device", default="auto", help="auto, cpu or cuda:N; auto takes all GPUs, one run on each, or the CPU"
     )

@@ -44,7 +44,7 @@ def run_here(script, *words, root):
 
 
 def start(script, *words, root):
-    """Start a script as a process of its own, in the folder ``root``, without what the tests have set for themselves."""
+    """Start a script in the folder ``root``, a process of its own without what the tests have set for themselves."""
     environment = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
     environment |= {"PYTHONUNBUFFERED": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(ROOT / "scripts" / script), *words]
