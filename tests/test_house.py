@@ -16,7 +16,7 @@ LEVELS = [
     ("control", "deploy"),
     ("viewer", "experiments", "checks"),
 ]
-"""Folders of the package from low to high; one imports those of lower levels and nothing else. Scripts are above all."""
+"""Folders of the package from low to high: one imports those of lower levels, no others. Scripts are above all."""
 LEVEL_OF = {f"legged_torque.{folder}": number for number, level in enumerate(LEVELS) for folder in level}
 MAX_LINES = 400
 

@@ -83,7 +83,7 @@ def test_contents(installed):
 
 
 def test_scripts_from_another_directory(installed, tmp_path):
-    """Train, play, export, let the exported policy walk, run an experiment: everything lands in the current directory."""
+    """Train, play, export, let the exported policy walk, run an experiment: all files land in the current directory."""
     (tmp_path / "tiny.yaml").write_text(EXPERIMENT)
     experiment = start(installed, tmp_path, "experiment", "tiny.yaml", "--device=cpu")
     task = ["--task=a1_torque_multihead", "--device=cpu"]
