@@ -1,4 +1,4 @@
-"""Metadata of the package."""
+"""Metadata of the package, and which folders of the repository are installed as parts of it."""
 
 import re
 from pathlib import Path
@@ -8,6 +8,8 @@ from setuptools import find_packages, setup
 ROOT = Path(__file__).parent
 VERSION = re.search(r'__version__ = "(.+?)"', (ROOT / "legged_torque" / "__init__.py").read_text("utf-8")).group(1)
 EXPORT = ["onnx>=1.16,<2", "onnxruntime>=1.18,<2", "jsonschema>=4.18,<5"]
+VIDEO = ["imageio", "imageio-ffmpeg", "pillow>=10.1"]
+TEST = ["pytest", "pytest-xdist>=3.6,<4", "setuptools>=77", "matplotlib", *VIDEO, *EXPORT]
 
 setup(
     name="legged_torque",
@@ -16,8 +18,18 @@ setup(
     long_description=(ROOT / "README.md").read_text("utf-8"),
     long_description_content_type="text/markdown",
     license="BSD-3-Clause",
-    packages=find_packages(include=["legged_torque", "legged_torque.*"]),
-    package_data={"legged_torque.deploy": ["policy.schema.json"]},
+    packages=[
+        *find_packages(include=["legged_torque", "legged_torque.*"]),
+        "legged_torque.resources",
+        "legged_torque.scripts",
+    ],
+    # At the top level one finds them; in an installed environment they are found by the package.
+    package_dir={"legged_torque.resources": "resources", "legged_torque.scripts": "scripts"},
+    package_data={
+        "legged_torque.deploy": ["policy.schema.json"],
+        "legged_torque.resources": ["robots/**"],
+    },
+    include_package_data=False,  # what a wheel holds stands here; MANIFEST.in is for the source archive
     python_requires=">=3.10",
     install_requires=[
         "torch>=2.6,<2.14",
@@ -30,11 +42,12 @@ setup(
         "pyyaml",
     ],
     extras_require={
-        "video": ["imageio", "imageio-ffmpeg", "pillow>=10.1"],
+        "video": VIDEO,
         "plots": ["matplotlib"],
         "viewer": ["viser>=1.1,<2", "trimesh>=4.8,<6", "pillow"],
         "wandb": ["wandb"],
         "export": EXPORT,
-        "test": ["pytest", "pytest-xdist>=3.6,<4", "matplotlib", "imageio", "imageio-ffmpeg", "pillow>=10.1", *EXPORT],
+        "test": TEST,
+        "dev": ["ruff>=0.17,<0.18", "mypy>=2.4,<2.5", "pre-commit>=4.2,<5", "types-PyYAML"],
     },
 )

@@ -4,13 +4,27 @@ from pathlib import Path
 
 __version__ = "0.1.0"
 
-ROOT_DIR = Path(__file__).resolve().parent.parent
-"""Folder that holds the package, ``resources/``, ``scripts/`` and, by default, ``logs/``."""
 
-RESOURCES_DIR = ROOT_DIR / "resources"
+def _find_dir(name: str) -> Path:
+    """Return a folder that a wheel holds inside the package and a checkout beside it."""
+    package = Path(__file__).resolve().parent
+    installed = package / name
+    return installed if installed.is_dir() else package.parent / name
+
+
+RESOURCES_DIR = _find_dir("resources")
 """Folder of the robot models."""
 
+SCRIPTS_DIR = _find_dir("scripts")
+"""Folder of the scripts."""
 
-def resource_path(file: str) -> Path:
-    """Return where a file of the settings is: absolute paths as they are, others below the repository."""
-    return Path(file) if Path(file).is_absolute() else ROOT_DIR / file
+
+def resource_path(file: str | Path) -> Path:
+    """Return where a file is that settings name, for instance ``asset.file``; whether it exists is not checked.
+
+    Args:
+        file: An absolute path, one below ``resources/``, which means :data:`RESOURCES_DIR`, or one that is relative to
+            the current directory.
+    """
+    path = Path(file)
+    return RESOURCES_DIR.parent / path if path.parts[:1] == ("resources",) else path

@@ -10,7 +10,6 @@ os.environ["MUJOCO_GL"] = "disable"
 import sys
 from pathlib import Path
 
-from legged_torque import ROOT_DIR
 from legged_torque.experiments.job import find_workers
 from legged_torque.experiments.matrix import cell_state, check_same, read_matrix
 from legged_torque.experiments.run import ExperimentRun, claim_folder
@@ -22,7 +21,9 @@ def main() -> None:
     """Bring a matrix to its end, or list what is to be done."""
     parser = Parser(__doc__)
     parser.add_argument("file", type=Path, help="description of the matrix, see experiments/")
-    parser.add_argument("--out", type=Path, help="folder of all results; default: logs/experiments/<name of the file>")
+    parser.add_argument(
+        "--out", type=Path, help="folder of all results; default: ./logs/experiments/<name of the file>"
+    )
     parser.add_argument(
         "--device", default="auto", help="auto, cpu or cuda:N; auto takes all GPUs, one run on each, or the CPU"
     )
@@ -30,7 +31,7 @@ def main() -> None:
     parser.add_argument("--dry-run", action="store_true", help="only list what is to be done")
     args = parser.parse_args()
     matrix = read_matrix(args.file)
-    out = (args.out or ROOT_DIR / "logs" / "experiments" / args.file.stem).resolve()
+    out = (args.out or Path("logs", "experiments", args.file.stem)).resolve()
     workers = find_workers(args.device, args.jobs)
     if args.dry_run:
         check_same(matrix, out)

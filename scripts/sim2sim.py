@@ -21,7 +21,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from legged_torque import ROOT_DIR
+from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import Robot
 from legged_torque.deploy.simulation import Events, Simulation
@@ -84,7 +84,7 @@ def main() -> None:
     """Load a policy and a robot, let it walk, print the metrics, write JSON and video if asked to."""
     args = parse_args()
     policy = Policy(args.policy)
-    xml = args.xml or ROOT_DIR / policy.description["robot"]["file"]
+    xml = args.xml or resource_path(policy.description["robot"]["file"])
     robot = Robot(xml, policy.description)
     events = Events(args.command, args.push_velocity, args.push_probability)
     if args.json:

@@ -12,6 +12,14 @@ from legged_torque.utils.config import set_by_path
 from legged_torque.utils.options import Options
 
 
+@pytest.fixture(scope="session", autouse=True)
+def current_dir(tmp_path_factory):
+    """Where tests run: a temporary folder, so that logs and MuJoCo's MUJOCO_LOG.TXT do not land in the repository."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("current_dir"))
+        yield
+
+
 @pytest.fixture(scope="session")
 def make_task():
     """Factory of tasks: ``make_task("a1_torque", num_envs=2, **{"control.decimation": 2})``."""

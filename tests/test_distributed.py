@@ -5,7 +5,6 @@ Started by torchrun (:func:`train_together`), this file is the process that trai
 
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -242,26 +241,22 @@ def test_bad_numbers_in_one_process_are_skipped_by_both(together):
         assert same(before, after)
 
 
-def test_train_script_in_two_processes():
+def test_train_script_in_two_processes(tmp_path):
     """One folder, one set of prints, and Ctrl-C saves the iteration that both have finished."""
-    name = f"test_distributed_{os.getpid()}"
-    words = ["--task=a1_position", "--device=cpu", f"--experiment_name={name}", "--logger=none", *SMALL]
-    try:
-        with torchrun(ROOT / "scripts" / "train.py", *words, "--max_iterations=100000") as process:
-            output = ""
-            for line in process.stdout:
-                output += line
-                if "Learning iteration 2/" in line:
-                    process.send_signal(signal.SIGINT)
-                    break
-            output += process.communicate(timeout=120)[0]
-        (run,) = (ROOT / "logs" / name).iterdir()
-        (checkpoint,) = run.glob("*.pt*")
-        count = int(checkpoint.stem.removeprefix("model_"))
-        state = torch.load(checkpoint, weights_only=True)
-        config = yaml.safe_load((run / "config.yaml").read_text())
-    finally:
-        shutil.rmtree(ROOT / "logs" / name, ignore_errors=True)
+    words = ["--task=a1_position", "--device=cpu", f"--log_root={tmp_path}", "--logger=none", *SMALL]
+    with torchrun(ROOT / "scripts" / "train.py", *words, "--max_iterations=100000") as process:
+        output = ""
+        for line in process.stdout:
+            output += line
+            if "Learning iteration 2/" in line:
+                process.send_signal(signal.SIGINT)
+                break
+        output += process.communicate(timeout=120)[0]
+    (run,) = (tmp_path / "a1_position").iterdir()
+    (checkpoint,) = run.glob("*.pt*")
+    count = int(checkpoint.stem.removeprefix("model_"))
+    state = torch.load(checkpoint, weights_only=True)
+    config = yaml.safe_load((run / "config.yaml").read_text())
     assert count >= 3 and state["infos"]["total_timesteps"] == count * ALL_STEPS
     assert config["processes"] == 2 and config["env"]["env"]["num_envs"] == WORLDS
     assert output.count("Training a1_position on 2 x CPU") == output.count("Learning iteration 1/") == 1

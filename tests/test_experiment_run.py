@@ -67,7 +67,7 @@ def stage(tmp_path, monkeypatch):
         "order": "",
     }.items():
         (stage / name).write_text(text)
-    monkeypatch.setattr(experiment, "SCRIPTS", stage)
+    monkeypatch.setattr(experiment, "SCRIPTS_DIR", stage)
     monkeypatch.setattr(experiment_run, "POLL", 0.01)
     return stage
 

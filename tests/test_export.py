@@ -316,7 +316,7 @@ def test_script(tmp_path):
     assert not list(run.glob("exported*"))
     status, output, error = run_here("export.py", *words, root=tmp_path)
     assert (status, error) == (0, "")
-    assert f"exported to {run / 'exported_2'}" in output
+    assert f"exported to logs/a1_position/{run.name}/exported_2" in output
     policy = Policy(run / "exported_2")
     assert policy.description["training"] == {
         "run": run.name,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from legged_torque import ROOT_DIR
+from legged_torque import RESOURCES_DIR
 from legged_torque.sim.model import build_model, read_spec
 from legged_torque.sim.simulator import Simulator
 
@@ -44,7 +44,7 @@ INSECT_LEG = """<body pos="{x} {y} 0" euler="0 0 {a}"><joint axis="0.2 -1 0" pos
 
 def make_a1(edit=None):
     """The specification of the A1, changed by a function."""
-    spec = read_spec(ROOT_DIR / "resources/robots/a1/a1.xml")
+    spec = read_spec(RESOURCES_DIR / "robots/a1/a1.xml")
     if edit is not None:
         edit(spec)
     return spec

@@ -122,7 +122,7 @@ def follow_noting(task, controller, act, num_configurations, num_steps):
 
 def test_report(made):
     """Every pair is kept or dropped for a reason, each configuration counts once, and errors fall."""
-    _, file, report, output = made
+    root, file, report, output = made
     kept, dropped = report["pairs"], report["dropped"]
     assert set(dropped) == {"after a fall", "mean torque over 30 N m", "wrench residual over 3"}
     assert kept + sum(dropped.values()) == 41 * 6 and kept > 200
@@ -142,7 +142,7 @@ def test_report(made):
         f"Kept {kept} of 246 pairs; dropped: ",
         f"Epoch 3 of 3: root mean square error training {training[5]:.2f} N m, held out ",
         f"Standing after 5 s: the controller {report['standing']['controller']:.1%} and the policy ",
-        f"The policy is in {file}",
+        f"The policy is in {file.relative_to(root)}",
     ):
         assert line in output
 

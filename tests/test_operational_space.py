@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from legged_torque import ROOT_DIR
+from legged_torque import RESOURCES_DIR
 from legged_torque.control import operational_space as osc
 from legged_torque.control.dynamics import RobotDynamics
 from legged_torque.sim.model import build_model, collision_geoms, read_spec
@@ -22,7 +22,7 @@ ENOUGH = MASKS[:2]
 @pytest.fixture(scope="module")
 def model():
     """The A1 of the tasks."""
-    spec = read_spec(ROOT_DIR / "resources/robots/a1/a1.xml")
+    spec = read_spec(RESOURCES_DIR / "robots/a1/a1.xml")
     return build_model(spec, collision_geoms(spec))
 
 

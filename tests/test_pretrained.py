@@ -57,11 +57,10 @@ def same(network, other):
 
 def test_a_policy_is_found_or_made(made, trained):
     """Training starts from the file if there is one and else makes it, with the same result whatever its own seed."""
-    _, file, _, _ = made
+    root, file, _, _ = made
     other, (found, _), (made_here, _) = trained
-    assert (
-        f"Starting from the pre-trained policy '{file}'." in found and "making it" not in found and "Round" not in found
-    )
+    assert f"Starting from the pre-trained policy '{file.relative_to(root)}'." in found
+    assert "making it" not in found and "Round" not in found
     assert f"There is no pre-trained policy '{other}' yet; making it." in made_here
     assert f"Starting from the pre-trained policy '{other}'." in made_here
     networks = [read_pretrained(path)["actor_state_dict"] for path in (file, other)]
@@ -121,7 +120,7 @@ def test_what_does_not_fit_is_refused(made):
     }.items():
         result = run_here("train.py", *words, f"--set={setting}", root=root)
         assert_told_in_one_line(result, told)
-        assert str(file) in result[2]
+        assert f"'{file.relative_to(root)}'" in result[2]
     assert contents(root) == before
     check_spaces(file, *get_cfgs(task="a1_torque"))  # another task with the same spaces may use it
 

@@ -19,21 +19,19 @@ import yaml
 from settings import TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from legged_torque.utils import task_registry
-
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--set=runner.num_steps_per_env=4", "--max_iterations=2"]
 
 
 def run_here(script, *words, root):
-    """Run a script in this process, with ``root`` in place of the repository for its logs.
+    """Run a script in this process, in the folder ``root``, whose ``logs/`` it writes.
 
     Returns:
         Exit status, standard output, standard error without what tells that kernels are being compiled.
     """
     output, error, status = io.StringIO(), io.StringIO(), 0
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(output), contextlib.redirect_stderr(error):
-        patch.setattr(task_registry, "ROOT_DIR", root)
+        patch.chdir(root)
         patch.setattr(sys, "argv", [script, *words])
         patch.setenv("MUJOCO_GL", "disable")  # given back afterwards: play.py chooses another one
         try:
@@ -45,13 +43,13 @@ def run_here(script, *words, root):
     return status, output.getvalue(), "".join(told)
 
 
-def start(script, *words):
-    """Start a script as a process of its own, without what the tests have set for themselves."""
+def start(script, *words, root):
+    """Start a script in the folder ``root``, a process of its own without what the tests have set for themselves."""
     environment = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
     environment |= {"PYTHONUNBUFFERED": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(ROOT / "scripts" / script), *words]
     return subprocess.Popen(
-        command, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        command, cwd=root, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
 
 
@@ -65,14 +63,6 @@ def finish(process):
 def contents(folder):
     """Every file and folder below a folder, with what would give away a change."""
     return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in folder.rglob("*")}
-
-
-@pytest.fixture
-def experiment():
-    """A name for an experiment in the repository's logs, which is deleted afterwards."""
-    name = f"test_scripts_{os.getpid()}"
-    yield name
-    shutil.rmtree(ROOT / "logs" / name, ignore_errors=True)
 
 
 @pytest.fixture(scope="module")
@@ -288,24 +278,24 @@ def test_list_of_tasks(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_nobody_reads_on():
+def test_nobody_reads_on(tmp_path):
     """Output that goes into ``| head`` ends a script without a traceback."""
-    process = start("train.py", "--list")
+    process = start("train.py", "--list", root=tmp_path)
     process.stdout.close()
     assert (process.stderr.read(), process.wait()) == ("", 1)
     process.stderr.close()
 
 
-def test_late_mistake_in_a_process_of_its_own(experiment):
+def test_late_mistake_in_a_process_of_its_own(tmp_path):
     """A mistake that shows only when the simulator is there is one line too, and leaves no folder."""
-    result = finish(start("train.py", *SMALL, f"--experiment_name={experiment}", "--logger=tensorbord"))
+    result = finish(start("train.py", *SMALL, "--logger=tensorbord", root=tmp_path))
     assert_told_in_one_line(result, "unknown logger 'tensorbord'; did you mean 'tensorboard'?")
-    assert not (ROOT / "logs" / experiment).exists()
+    assert not list(tmp_path.iterdir())
 
 
-def test_train_stop_resume_play(experiment):
+def test_train_stop_resume_play(tmp_path):
     """Ctrl-C saves and ends with status 0, resuming goes on with all counters, and playing prints how it walks."""
-    task = ["--task=a1_torque_multihead", f"--experiment_name={experiment}", "--device=cpu"]
+    task, logs = ["--task=a1_torque_multihead", "--device=cpu"], tmp_path / "logs" / "a1_torque_multihead"
     settings = {
         "runner.num_steps_per_env": 4,
         "env.episode_length_s": 0.06,  # three steps: there are rewards of whole episodes to print
@@ -313,14 +303,14 @@ def test_train_stop_resume_play(experiment):
         "control.mixing.pd.t_end": 400,
     }
     changes = [f"--set={key}={value}" for key, value in settings.items()]
-    process = start("train.py", *task, *changes, "--num_envs=2", "--max_iterations=100000")
+    process = start("train.py", *task, *changes, "--num_envs=2", "--max_iterations=100000", root=tmp_path)
     for line in process.stdout:
         if "Learning iteration 1/" in line:
             break
     process.send_signal(signal.SIGINT)
     status, output, error = finish(process)
     assert status == 0 and "Traceback" not in error and "Stopping" in output + error
-    (first,) = (ROOT / "logs" / experiment).iterdir()
+    (first,) = logs.iterdir()
     (checkpoint,) = first.glob("*.pt*")
     count = int(checkpoint.stem.removeprefix("model_"))
     state = torch.load(checkpoint, weights_only=True)
@@ -328,9 +318,9 @@ def test_train_stop_resume_play(experiment):
     events = EventAccumulator(str(first)).Reload()
     assert [event.step for event in events.Scalars("Loss/value")] == list(range(count))
 
-    status, output, error = run_here("train.py", *task, "--resume", f"--max_iterations={count + 2}", root=ROOT)
+    status, output, error = run_here("train.py", *task, "--resume", f"--max_iterations={count + 2}", root=tmp_path)
     assert (status, error) == (0, "")
-    (second,) = set((ROOT / "logs" / experiment).iterdir()) - {first}
+    (second,) = set(logs.iterdir()) - {first}
     state = torch.load(second / f"model_{count + 2}.pt", weights_only=True)
     assert state["iter"] == count + 2 and state["infos"]["total_timesteps"] == (count + 2) * 8
     assert int(state["infos"]["task"]["total_steps"]) == (count + 2) * 8
@@ -345,14 +335,14 @@ def test_train_stop_resume_play(experiment):
     assert configs[0]["env"] == configs[1]["env"] and configs[0]["train"] == configs[1]["train"]
     assert configs[1]["env"]["env"]["num_envs"] == 2 and torch.__version__.startswith(configs[1]["versions"]["torch"])
 
-    status, output, error = finish(start("play.py", *task, "--num_envs=2", "--steps=10"))
+    status, output, error = finish(start("play.py", *task, "--num_envs=2", "--steps=10", root=tmp_path))
     assert status == 0 and "Traceback" not in error
     assert f"model_{count + 2}.pt, after {(count + 2) * 8:,} steps of training:" in output
     for name in ("track_xy", "track_angular", "cost_of_transport", "falls_per_minute"):
         assert math.isfinite(float(re.search(rf"^\s*{name}\s+(\S+)", output, re.MULTILINE).group(1)))
     line = output.splitlines()[-1]
     if line.startswith("video: "):
-        assert Path(line.removeprefix("video: ")).read_bytes()[4:8] == b"ftyp"  # the mark of an mp4
+        assert (tmp_path / line.removeprefix("video: ")).read_bytes()[4:8] == b"ftyp"  # the mark of an mp4
     else:
         assert re.match(r"no video: .+", line)
 

@@ -8,7 +8,7 @@ from settings import get_cfgs
 from tensordict import TensorDict
 from torch import nn
 
-from legged_torque import ROOT_DIR
+from legged_torque import RESOURCES_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.symmetry import counterparts, with_mirror_images
 from legged_torque.utils.config import set_by_path
@@ -70,7 +70,7 @@ def make_symmetric(make_task, tmp_path_factory):
     Of its worlds, the second half is the mirror image of the first one, in states of all kinds.
     """
     file = tmp_path_factory.mktemp("symmetric") / "a1.xml"
-    text = (ROOT_DIR / "resources/robots/a1/a1.xml").read_text()
+    text = (RESOURCES_DIR / "robots/a1/a1.xml").read_text()
     for old, new in (
         ('pos="0 0.0041 -0.0005"', 'pos="0.003 0 -0.0005"'),
         ("-3.66e-05 -6.11e-05 -2.75e-05", "0 6e-4 0"),

@@ -12,7 +12,7 @@ import pytest
 import torch
 from test_pacer import Clock
 
-from legged_torque import ROOT_DIR
+from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.utils.errors import UserError
 from legged_torque.viewer import native
@@ -369,7 +369,7 @@ def test_missing_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     for name in ("web", "scene", "controls", "plots"):
         monkeypatch.delitem(sys.modules, f"legged_torque.viewer.{name}", raising=False)
-    play = runpy.run_path(str(ROOT_DIR / "scripts" / "play.py"))
+    play = runpy.run_path(str(SCRIPTS_DIR / "play.py"))
     with pytest.raises(UserError, match=r"pip install -e \.\[viewer\]"):
         play["import_viewer"]("web")
     assert play["import_viewer"]("none") is None

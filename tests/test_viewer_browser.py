@@ -18,7 +18,7 @@ from PIL import Image
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
-from legged_torque import ROOT_DIR
+from legged_torque import resource_path
 from legged_torque.envs import task_registry
 from legged_torque.utils.errors import UserError
 from legged_torque.viewer.session import Session
@@ -71,7 +71,7 @@ def session(make_task, tmp_path):
 @pytest.fixture
 def page(session):
     """The session's page."""
-    page = Page(session, ROOT_DIR / session.task.cfg.asset.file, "a1_torque_multihead", "127.0.0.1", 8480)
+    page = Page(session, resource_path(session.task.cfg.asset.file), "a1_torque_multihead", "127.0.0.1", 8480)
     yield page
     page.close()
 

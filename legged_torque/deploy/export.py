@@ -17,7 +17,7 @@ import torch
 from rsl_rl.models import MLPModel
 from torch import Tensor
 
-from legged_torque import ROOT_DIR, __version__
+from legged_torque import RESOURCES_DIR, __version__
 from legged_torque.deploy.description import (
     DESCRIPTION_FILE,
     FORMAT_VERSION,
@@ -110,8 +110,8 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
     """Return the contents of ``policy.yaml`` but for the network's checksum; arguments as of :func:`export_policy`."""
     cfg, model = task.cfg, task.sim.mj_model
     file = Path(cfg.asset.file)
-    if file.is_absolute() and file.is_relative_to(ROOT_DIR):
-        file = file.relative_to(ROOT_DIR)
+    if file.is_absolute() and file.is_relative_to(RESOURCES_DIR):
+        file = file.relative_to(RESOURCES_DIR.parent)
     rand, ranges = cfg.domain_rand, cfg.commands.ranges
     return {
         "format_version": FORMAT_VERSION,

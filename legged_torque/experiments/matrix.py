@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from legged_torque import ROOT_DIR
+from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of
@@ -16,8 +16,6 @@ from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.runs import checkpoint_numbers, load_config
 
-SCRIPTS = ROOT_DIR / "scripts"
-"""Folder of train.py and evaluate.py."""
 SETTINGS_FILE = "experiment.yaml"
 """Copy of the description that a folder of results was made with."""
 OF_A_CELL = {"seed": "seeds", "runner.experiment_name": "tasks, environments and seeds"}
@@ -215,9 +213,9 @@ def step_command(matrix: Matrix, out: Path, cell: Cell, state: State, device: st
     if state.step == "evaluate":
         name, numbers = state.missing[0], matrix.evaluation
         words += [f"--perturbation={name}", f"--num_envs={numbers['num_envs']}", f"--steps={numbers['num_steps']}"]
-        return [sys.executable, str(SCRIPTS / "evaluate.py"), *words, f"--json={part_file(out, cell, name)}"]
+        return [sys.executable, str(SCRIPTS_DIR / "evaluate.py"), *words, f"--json={part_file(out, cell, name)}"]
     words += ["--resume"] if state.step == "resume" else new_run_words(matrix, cell)
-    return [sys.executable, str(SCRIPTS / "train.py"), *words]
+    return [sys.executable, str(SCRIPTS_DIR / "train.py"), *words]
 
 
 def cell_state(out: Path, cell: Cell) -> State:

@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 import torch
 
-from legged_torque import ROOT_DIR
+from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.viewer.video import Moment, write_video
 
@@ -40,5 +40,5 @@ class Recorder:
 
     def save(self, file: Path) -> None:
         """Draw what was recorded, see :func:`~legged_torque.viewer.video.write_video`."""
-        model = mujoco.MjModel.from_xml_path(str(ROOT_DIR / self._task.cfg.asset.file))
+        model = mujoco.MjModel.from_xml_path(str(resource_path(self._task.cfg.asset.file)))
         write_video(file, model, 1, self._steps, self._task.dt)

@@ -1,0 +1,1 @@
+"""What a user runs: ``python scripts/train.py`` in a checkout, ``python -m legged_torque.scripts.train`` anywhere."""

@@ -1,0 +1,101 @@
+"""The package as it is installed: without the repository, and run from any directory."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = ("CHANGELOG.md", "LICENSE", "MANIFEST.in", "README.md", "setup.py")
+FOLDERS = ("experiments", "legged_torque", "resources", "scripts", "tests")
+SMALL = ["--num_envs=2", "--set=runner.num_steps_per_env=4", "--max_iterations=1", "--logger=none"]
+EXPERIMENT = """
+tasks: [a1_position]
+environments: {none: [none]}
+seeds: [1]
+train: {env.num_envs: 2, runner.num_steps_per_env: 4, runner.total_steps: 8, runner.logger: none}
+evaluation: {num_envs: 2, num_steps: 5}
+"""
+
+
+def build(kind, source):
+    """Build the "sdist" or the "wheel" of a folder of sources, without a network; return its file."""
+    code = f"from setuptools import build_meta; build_meta.build_{kind}('dist')"
+    result = subprocess.run([sys.executable, "-c", code], cwd=source, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    (file,) = (source / "dist").iterdir()
+    return file
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """A folder with the installed package, made from the source archive."""
+    source, unpacked, site = (tmp_path_factory.mktemp(name) for name in ("source", "unpacked", "site"))
+    for name in SOURCES:
+        shutil.copy(ROOT / name, source)
+    for name in FOLDERS:
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "*.pyc"))
+    with tarfile.open(build("sdist", source)) as archive:
+        archive.extractall(unpacked, filter="data")
+    (unpacked,) = unpacked.iterdir()
+    with zipfile.ZipFile(build("wheel", unpacked)) as wheel:  # nothing has to be compiled: this installs it
+        wheel.extractall(site)
+    return site
+
+
+def start(installed, folder, script, *words):
+    """Start an installed script in a folder."""
+    environment = os.environ | {"PYTHONPATH": str(installed), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-m", f"legged_torque.scripts.{script}", *map(str, words)]
+    return subprocess.Popen(
+        command, cwd=folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+
+
+def finish(process):
+    """Wait for a script that must end well; return what it has printed."""
+    with process:
+        output, _ = process.communicate(timeout=200)
+    assert process.returncode == 0, output
+    return output
+
+
+def files(folder):
+    """The names of all files below a folder."""
+    return {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+
+
+def test_contents(installed):
+    """The package holds its own files, the robots and the scripts, each once."""
+    expected = files(ROOT / "legged_torque")
+    expected |= {f"{folder}/{name}" for folder in ("resources", "scripts") for name in files(ROOT / folder)}
+    assert files(installed / "legged_torque") == expected
+    assert {path.name for path in installed.iterdir() if path.suffix != ".dist-info"} == {"legged_torque"}
+
+
+def test_scripts_from_another_directory(installed, tmp_path):
+    """Train, play, export, let the exported policy walk, run an experiment: all files land in the current directory."""
+    (tmp_path / "tiny.yaml").write_text(EXPERIMENT)
+    experiment = start(installed, tmp_path, "experiment", "tiny.yaml", "--device=cpu")
+    task = ["--task=a1_torque_multihead", "--device=cpu"]
+    finish(start(installed, tmp_path, "train", *task, *SMALL))
+    (run,) = (tmp_path / "logs" / "a1_torque_multihead").iterdir()
+    assert (run / "model_1.pt").is_file()
+    playing = start(installed, tmp_path, "play", *task, "--num_envs=2", "--steps=3", "--video=walk.mp4")
+    finish(start(installed, tmp_path, "export", *task))
+    walking = finish(start(installed, tmp_path, "sim2sim", run / "exported_1", "--robots=1", "--steps=3"))
+    assert str(installed / "legged_torque" / "resources" / "robots") in walking
+    assert "cost_of_transport" in finish(playing)
+    finish(experiment)
+    (result,) = (tmp_path / "logs" / "experiments" / "tiny").glob("*/*.json")
+    assert result.is_file()
+    assert {path.name for path in tmp_path.iterdir()} <= {"tiny.yaml", "logs", "walk.mp4"}
