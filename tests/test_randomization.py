@@ -335,7 +335,8 @@ class ThighMassRobot(LeggedRobot):
 
 def test_a_variant_draws_more():
     """What a task adds is drawn, acts on what follows from it, is seen by the critic and mirrored; unless nobody knows
-    its mirror image."""
+    its mirror image.
+    """
     cfg = get_cfgs("--set=env.num_envs=20", "--set=domain_rand.randomize_parameters=true")[0]
     task = ThighMassRobot(cfg)
     thighs = task.sim.field("body_mass")[:, [3, 6, 9, 12]]

@@ -42,7 +42,7 @@ SETTINGS = {
 
 def line(million, tracking, **others):
     """A line of evaluations.csv: all metrics are 10 times the tracking, if they are not given."""
-    values = {name: 10.0 * tracking for name in ALL_METRICS} | {"track_percentage": tracking} | others
+    values = dict.fromkeys(ALL_METRICS, 10.0 * tracking) | {"track_percentage": tracking} | others
     return f"{million * 1_000_000},{million},{million}.5," + ",".join(str(values[name]) for name in ALL_METRICS)
 
 
@@ -259,7 +259,7 @@ def test_compare(tmp_path):
 def test_table(report):
     """One row per task, column and metric, with the paper's value beside ours and nothing where there is nothing."""
     _, table, _ = report
-    assert list(table[0]) == "task environment metric mean standard_error seeds paper_mean paper_error".split()
+    assert list(table[0]) == ["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean", "paper_error"]
     rows = {(row["task"], row["environment"], row["metric"]): row for row in table}
     assert len(rows) == len(table) == 3 * 4 * len(ALL_METRICS)
     row = rows["a1_position", "low", "track_percentage"]

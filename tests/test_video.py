@@ -77,7 +77,7 @@ def test_overlay_is_readable(gray):
     result = add_overlay(image, rows)
     assert (image == gray).all() and result.shape == image.shape and result.dtype == np.uint8
     ys, xs = np.nonzero((result != gray).any(axis=2))
-    assert 0 < xs.min() and xs.max() < 0.5 * 480 and 0 < ys.min() and ys.max() < 0.4 * 270
+    assert xs.min() > 0 and xs.max() < 0.5 * 480 and ys.min() > 0 and ys.max() < 0.4 * 270
     box = result[ys.min() : ys.max(), xs.min() : xs.max()]
     assert np.median(box) < 90 and box.max() > 240
 

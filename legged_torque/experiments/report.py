@@ -272,7 +272,7 @@ def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
     """Write ``table.csv`` (summaries) and ``evaluations.csv`` (every evaluation during training)."""
     with (out / "table.csv").open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow("task environment metric mean standard_error seeds paper_mean paper_error".split())
+        writer.writerow(["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean", "paper_error"])
         for column, cells in table.items():
             for task, metric in ((task, metric) for task in cells for metric in ALL_METRICS):
                 summary = cells[task].get(metric)

@@ -100,9 +100,7 @@ class TaskRegistry:
             to_rsl_rl(train_cfg)  # refuses an unknown logger
         return env_cfg, train_cfg
 
-    def make_env(
-        self, name: str, args: Options | None = None, env_cfg: Any | None = None
-    ) -> tuple[VecEnv, Any]:
+    def make_env(self, name: str, args: Options | None = None, env_cfg: Any | None = None) -> tuple[VecEnv, Any]:
         """Create a task.
 
         Args:

@@ -48,7 +48,9 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     if len(cfg.init_state.pos) != 3:
         raise UserError(f"init_state.pos must be [x, y, z], not {cfg.init_state.pos}")
     if cfg.rewards.scales.symmetry and not cfg.asset.mirrored_legs:
-        raise UserError("rewards.scales.symmetry needs asset.mirrored_legs: which legs are the right and left of a pair")
+        raise UserError(
+            "rewards.scales.symmetry needs asset.mirrored_legs: which legs are the right and left of a pair"
+        )
     if cfg.rewards.scales.base_height and not cfg.rewards.base_height_target > 0.0:
         raise UserError(f"rewards.base_height_target must be greater than 0, not {cfg.rewards.base_height_target}")
     _check_probability("commands.resampling_probability", cfg.commands.resampling_probability)
