@@ -32,10 +32,10 @@ def files(tmp_path):
 
 def test_one_reader(files):
     """Every file has the task, the seed and the rows; a report's file has a curve per training."""
-    labels = [["seed 3"], ["seed 3"], ["low, seed 3", "high, seed 3"]]
-    for file, expected in zip(files, labels, strict=True):
+    names = [["a1_torque, seed 3"], ["a1_torque, seed 3"], ["a1_torque, low, seed 3", "a1_torque, high, seed 3"]]
+    for file, expected in zip(files, names, strict=True):
         curves = read_curves(file)
-        assert [curve.label for curve in curves] == expected
+        assert [str(curve) for curve in curves] == expected
         for curve in curves:
             assert (curve.task, curve.seed) == ("a1_torque", 3)
             assert [row["steps"] for row in curve.rows] == [1_000_000, 2_000_000]

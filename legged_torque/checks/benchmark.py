@@ -158,7 +158,7 @@ def _measure(
         row = summarize(times, physics, step, task.num_envs, train_cfg.runner.num_steps_per_env)
         row |= {**peak, **summarize_startup(marks), "compiled_modules": compilation.modules}
         if plan.endurance:
-            row["endurance"] = endure(runner, plan.endurance, memory)
+            row["endurance"] = measure_endurance(runner, plan.endurance, memory)
         if plan.trace:
             row["kernels"] = trace_iterations(runner, plan.trace)
     return row
@@ -292,8 +292,8 @@ def summarize_startup(marks: list[float]) -> dict[str, float]:
     return {**parts, "startup_s": marks[-1] - marks[0]}
 
 
-def endure(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -> dict[str, float]:
-    """Run many iterations in a row and compare the first tenth of them with the last.
+def measure_endurance(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -> dict[str, float]:
+    """Run many iterations in a row and compare the first tenth with the last.
 
     Returns:
         Mean milliseconds of an iteration in both tenths, and the memory at the end of both [MiB].

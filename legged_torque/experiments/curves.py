@@ -25,17 +25,16 @@ Row = dict[str, float]
 
 @dataclass
 class LearningCurve:
-    """The evaluations of one training.
-
-    Attributes:
-        label: Which training it is, besides the task: its seed, and its environment if the file names it.
-        rows: The evaluations, in the order of training.
-    """
+    """The evaluations of one training, in the order of training. Some files do not name its environment."""
 
     task: str
     seed: int
-    label: str
+    environment: str = ""
     rows: list[Row] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        """Name the training."""
+        return ", ".join(filter(None, [self.task, self.environment, f"seed {self.seed}"]))
 
 
 def read_curves(file: Path) -> list[LearningCurve]:
@@ -48,22 +47,22 @@ def read_curves(file: Path) -> list[LearningCurve]:
     Raises:
         UserError: If the file cannot be read or holds something else.
     """
+    training: dict[str, Any] = {}
     if file.suffix == ".json":
-        data = read_data(file, {"task", "seed", "points"}, "learning_curve.py")
-        entries = [{"task": data["task"], "seed": data["seed"], **point} for point in data["points"]]
+        training = read_data(file, {"task", "seed", "points"}, "learning_curve.py")
+        entries = training["points"]
     else:
         entries = read_csv(file)
         if entries and "task" not in entries[0]:
             config = load_config(file.parent)
-            entries = [{"task": config["task"], "seed": config["train"]["seed"], **entry} for entry in entries]
+            training = {"task": config["task"], "seed": config["train"]["seed"]}
     curves: dict[tuple, LearningCurve] = {}
     try:
         for entry in entries:
-            environment = [entry["environment"]] if "environment" in entry else []
-            label = ", ".join([*environment, f"seed {entry['seed']}"])
-            curve = LearningCurve(entry["task"], int(entry["seed"]), label)
-            curves.setdefault((curve.task, label), curve).rows.append(to_row(entry))
-    except (LookupError, ValueError, TypeError) as error:
+            names = training or entry
+            key = (names["task"], int(names["seed"]), names.get("environment", ""))
+            curves.setdefault(key, LearningCurve(*key)).rows.append(to_row(entry))
+    except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"'{file}' does not hold learning curves: {error!r}") from None
     return list(curves.values())
 

@@ -118,7 +118,7 @@ def draw_single_curves(runs: list[LearningCurve]) -> Figure:
             line = SEED_LINES[(run.seed - 1) % len(SEED_LINES)]
             curve = metric_curve(run.rows, name)
             if curve.steps.size:
-                draw_curve(axis, [curve], f"{run.task}, {run.label}", (color, line, hatch))
+                draw_curve(axis, [curve], str(run), (color, line, hatch))
         set_axis(axis, METRICS_BY_NAME[name].label)
         axis.set(xlim=(0, None), ylim=(0, None))
     axes[0].legend(fontsize="small")
@@ -129,7 +129,8 @@ def draw_curves(experiment: Experiment, title: str) -> Figure | None:
     """Draw a metric over the steps of training, a panel per environment; return None without data."""
     name, scale = CURVES[title]
     panels: dict[str, dict[str, list[Curve]]] = {}
-    for environment in sorted(experiment.environments, key=environment_order):
+    order = [*ENVIRONMENTS, *experiment.environments]  # those of Table I first
+    for environment in sorted(experiment.environments, key=order.index):
         curves = {task: task_curves(experiment, task, environment, name) for task in experiment.tasks}
         if any(curves.values()):
             panels[environment] = {task: seeds for task, seeds in curves.items() if seeds}
@@ -162,12 +163,6 @@ def set_axis(axis: Axes, title: str) -> None:
     """Set what all panels of learning curves share."""
     axis.set(title=title, xlabel="environment steps [millions]")
     axis.grid(alpha=0.3)
-
-
-def environment_order(environment: str) -> int:
-    """Return the place of an environment: those of Table I first, in its order."""
-    names = list(ENVIRONMENTS)
-    return names.index(environment) if environment in names else len(names)
 
 
 def task_curves(experiment: Experiment, task: str, environment: str, name: str) -> list[Curve]:

@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO
@@ -48,33 +48,59 @@ class Worker:
     job: Job | None = None
 
 
-@dataclass
 class Job:
     """A step of a cell in its own process.
 
     Attributes:
+        cell: The cell.
         state: The cell's progress when the step began.
         lock: The cell's open lock file; the process holds it too.
         cell_start: When the work on the cell began, by ``time.monotonic()`` [s].
-        log: File that the process writes to.
-        log_start: Size of the file when the step began [bytes].
         start: When the step began [s].
+        log: File that the process writes to.
+        process: The process.
     """
 
-    cell: Cell
-    state: CellState
-    lock: BinaryIO
-    cell_start: float
-    log: Path
-    log_start: int
-    process: subprocess.Popen
-    start: float = field(default_factory=time.monotonic)
+    def __init__(
+        self, cell: Cell, state: CellState, lock: BinaryIO, cell_start: float, command: list[str], worker: Worker
+    ) -> None:
+        """Start the process. It holds the cell's lock too, and gets SIGTERM if this process ends.
+
+        Args:
+            cell: The cell.
+            state: Its progress.
+            lock: Its open lock file, in the cell's folder; the process id is written to it.
+            cell_start: When the work on the cell began, by ``time.monotonic()`` [s].
+            command: Command line of the process.
+            worker: Where the process runs.
+        """
+        self.cell, self.state, self.lock, self.cell_start = cell, state, lock, cell_start
+        self.log = Path(lock.name).with_name("evaluate.log" if state.step == "evaluate" else "train.log")
+        with open(self.log, "ab") as file:
+            file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {shlex.join(command)}\n".encode())
+            file.flush()
+            self._log_start = file.tell()  # size of the file when the step began [bytes]
+            self.process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                env=os.environ | {"PYTHONUNBUFFERED": "1"} | worker.variables,
+                pass_fds=[lock.fileno()],
+                start_new_session=True,  # Ctrl-C reaches only this process, which passes it on
+                preexec_fn=end_with_parent if sys.platform == "linux" else None,
+            )
+        self.start = time.monotonic()
+        with contextlib.suppress(OSError):  # the id is only for people to read
+            lock.truncate(0)
+            lock.write(f"{self.process.pid}\n".encode())
+            lock.flush()
 
     def output(self) -> bytes:
         """Return the end of the log that the process has written so far."""
         with open(self.log, "rb") as file:
             size = file.seek(0, os.SEEK_END)
-            file.seek(max(self.log_start, size - _TAIL))
+            file.seek(max(self._log_start, size - _TAIL))
             return file.read()
 
     def fraction(self) -> float:
@@ -101,48 +127,6 @@ class Job:
         if self.state.step == "evaluate":
             return f"{self.cell.name} evaluation"
         return f"{self.cell.name} {100 * self.fraction():.0f}%"
-
-
-def start_job(
-    out: Path,
-    cell: Cell,
-    state: CellState,
-    command: list[str],
-    variables: dict[str, str],
-    lock: BinaryIO,
-    cell_start: float,
-) -> Job:
-    """Start a process for a step of a cell. It holds the cell's lock too, and gets SIGTERM if this process ends.
-
-    Args:
-        out: Folder of all results.
-        cell: The cell.
-        state: Its progress.
-        command: Command line of the process.
-        variables: Additional environment variables of the process.
-        lock: The cell's lock file; the process id is written to it.
-        cell_start: When the work on the cell began [s].
-    """
-    log = out / cell.name / ("evaluate.log" if state.step == "evaluate" else "train.log")
-    with open(log, "ab") as file:
-        file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {shlex.join(command)}\n".encode())
-        file.flush()
-        log_start = file.tell()
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            env=os.environ | {"PYTHONUNBUFFERED": "1"} | variables,
-            pass_fds=[lock.fileno()],
-            start_new_session=True,  # Ctrl-C reaches only this process, which passes it on
-            preexec_fn=end_with_parent if sys.platform == "linux" else None,
-        )
-    with contextlib.suppress(OSError):  # the id is only for people to read
-        lock.truncate(0)
-        lock.write(f"{process.pid}\n".encode())
-        lock.flush()
-    return Job(cell, state, lock, cell_start, log, log_start, process)
 
 
 def end_with_parent() -> None:

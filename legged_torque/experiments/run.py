@@ -14,7 +14,7 @@ from statistics import fmean
 from types import FrameType
 from typing import BinaryIO
 
-from legged_torque.experiments.job import Job, Worker, start_job, try_lock
+from legged_torque.experiments.job import Job, Worker, try_lock
 from legged_torque.experiments.matrix import (
     SETTINGS_FILE,
     Cell,
@@ -66,7 +66,7 @@ class ExperimentRun:
         self._num_cells = len(matrix.cells())
         self._num_done = self._num_cells - len(self.queue)
         self._failures: list[str] = []  # a message per failed cell
-        self._told: set[Cell] = set()  # cells reported to be held by another process
+        self._reported: set[Cell] = set()  # cells reported to be held by another process
         self._durations: list[float] = []  # of cells finished here [s]
         self._start = time.monotonic()
         self._shown = 0.0  # when the live line was last updated [s]
@@ -127,8 +127,8 @@ class ExperimentRun:
         for cell in list(self.queue):
             lock = try_lock(self.out / cell.name / "lock")
             if lock is None:
-                if cell not in self._told:
-                    self._told.add(cell)
+                if cell not in self._reported:
+                    self._reported.add(cell)
                     self._print(f"{cell.name}: another process works on it; left for later")
                 continue
             self.queue.remove(cell)
@@ -146,7 +146,7 @@ class ExperimentRun:
                 for name in cell.evaluated_in:
                     result_file(self.out, cell, name).unlink(missing_ok=True)
             command = step_command(self.matrix, self.out, cell, state, worker.device)
-            worker.job = start_job(self.out, cell, state, command, worker.variables, lock, cell_start)
+            worker.job = Job(cell, state, lock, cell_start, command, worker)
         except (OSError, subprocess.SubprocessError, UserError) as error:
             self._fail(cell, lock, str(error))
 

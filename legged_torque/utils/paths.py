@@ -15,9 +15,12 @@ def portable_path(path: str | Path) -> str:
 
 
 def without_machine(value: Any) -> Any:
-    """Return settings with every absolute path in them replaced by :func:`portable_path`."""
+    """Return settings with every absolute path, alone or as KEY=PATH, replaced by :func:`portable_path`."""
     if isinstance(value, dict):
         return {key: without_machine(entry) for key, entry in value.items()}
     if isinstance(value, list):
         return [without_machine(entry) for entry in value]
-    return portable_path(value) if isinstance(value, str) and Path(value).is_absolute() else value
+    if not isinstance(value, str):
+        return value
+    key, equals, path = value.rpartition("=")
+    return key + equals + portable_path(path) if Path(path).is_absolute() else value
