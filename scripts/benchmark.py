@@ -144,7 +144,7 @@ def print_row(row: dict[str, Any]) -> None:
 
 
 def print_kernels(kernels: list[dict[str, Any]], device: str, trace: Path) -> None:
-    """Print what took most time in a trace."""
+    """Print the most expensive entries of a trace."""
     kind = "torch operators (Warp's kernels show on a GPU only)" if device == "cpu" else "kernels"
     print(f"  most expensive {kind} of {TRACED} iterations, see {trace}:")
     print(f"  {'calls':>8}  {'total ms':>9}  name")

@@ -40,7 +40,7 @@ ACTION_SCALE = 0.5
 TOP_KERNELS = 10
 """Kernels listed from a trace."""
 OUT_OF_MEMORY = ("out of memory", "Failed to allocate", "can't allocate memory")
-"""What messages of CUDA, Warp and torch on the CPU say when memory has run out."""
+"""Parts of the messages of CUDA, Warp and torch on the CPU when memory has run out."""
 _MIB = 2**20
 _MS = 1e3
 
@@ -52,7 +52,7 @@ checkpoints that are due. "iteration": their sum, from the start of one iteratio
 
 @dataclass
 class Plan:
-    """What to measure.
+    """The measurements to take.
 
     Attributes:
         rounds: How many iterations are timed, and how often physics and step are.
@@ -118,7 +118,7 @@ def measure(
         task_name: Name of the task.
         env_cfg: Its settings.
         train_cfg: Settings of its training.
-        plan: What to measure.
+        plan: The measurements to take.
         memory: The meter of the device.
         device: "cpu" or "cuda:N".
 
@@ -136,7 +136,7 @@ def measure(
 def _measure(
     task_name: str, env_cfg: Any, train_cfg: Any, plan: Plan, memory: MemoryMeter, device: str
 ) -> dict[str, Any]:
-    """Do what :func:`measure` says for a size that fits."""
+    """Measure a size that fits in memory, as :func:`measure` describes."""
     marks, used = [time.perf_counter()], []
 
     def mark(number: int = 0) -> None:
@@ -339,7 +339,7 @@ def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]
 
 
 def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict[str, Any]]:
-    """Return what took most time in a trace: kernels and copies of a GPU, or torch's operators on the CPU.
+    """Return the most expensive entries of a trace: kernels and copies of a GPU, or torch's operators on the CPU.
 
     torch's profiler sees Warp's kernels on a GPU only.
 

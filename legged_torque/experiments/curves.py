@@ -15,9 +15,11 @@ from legged_torque.utils.metric_names import METRICS, Metric
 from legged_torque.utils.plotting import read_data
 from legged_torque.utils.runs import load_config
 
+MILLION = 1e6
+"""Steps in a million, the unit of axes and texts."""
 CRITIC_GRADIENT_NORM = Metric("critic_gradient_norm", "", "Gradient norm of the critic", None)
 CURVE_METRICS = (*METRICS, CRITIC_GRADIENT_NORM)
-"""What is measured during training."""
+"""The metrics of an evaluation during training."""
 
 Row = dict[str, float]
 """One evaluation: "steps" and all of :data:`CURVE_METRICS`; NaN where nothing was measured."""

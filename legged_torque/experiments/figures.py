@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from legged_torque.experiments.curves import CURVE_METRICS, LearningCurve, Row
+from legged_torque.experiments.curves import CURVE_METRICS, MILLION, LearningCurve, Row
 from legged_torque.experiments.paper_values import ENVIRONMENTS, MODELS, PAPER_METRICS, paper_value
 from legged_torque.experiments.results import Experiment, Summary, Table
 from legged_torque.utils.metric_names import Metric
@@ -49,7 +49,6 @@ FIGURES = (*CURVES, *BARS)
 SINGLE_CURVES = ("track_percentage", "track_xy", "cost_of_transport")
 """Metrics that are shown of single trainings."""
 METRICS_BY_NAME = {metric.name: metric for metric in CURVE_METRICS}
-MILLION = 1e6
 BAND_ALPHA = 0.2
 UNFINISHED_ALPHA = 0.45
 CUT_AT = 3.0
@@ -160,7 +159,7 @@ def draw_curves(experiment: Experiment, title: str) -> Figure | None:
 
 
 def set_axis(axis: Axes, title: str) -> None:
-    """Set what all panels of learning curves share."""
+    """Set title, label and grid of a panel of learning curves."""
     axis.set(title=title, xlabel="environment steps [millions]")
     axis.grid(alpha=0.3)
 
@@ -180,7 +179,7 @@ def metric_curve(rows: list[Row], name: str, is_finished: bool = True) -> Curve:
 
 
 def progress_note(seeds: list[Curve], num_planned: int) -> str:
-    """Return what the label of an incomplete task adds; nothing if the task is complete."""
+    """Return the addition to the label of an incomplete task; nothing if the task is complete."""
     if all(curve.is_finished for curve in seeds):
         return "" if len(seeds) == num_planned else f" ({len(seeds)} of {num_planned} seeds)"
     ends = sorted(curve.steps[-1] / MILLION for curve in seeds)

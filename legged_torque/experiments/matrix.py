@@ -50,7 +50,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Matrix:
-    """What is trained and evaluated.
+    """The trainings and evaluations of an experiment.
 
     Attributes:
         tasks: Names of tasks.
@@ -194,7 +194,7 @@ def task_settings(matrix: Matrix, cell: Cell) -> Any:
     Raises:
         UserError: If the task or one of its settings is unknown or not valid.
     """
-    choices = {"seed": cell.seed, "perturbation": cell.environment, "ranges": matrix.ranges}
+    choices = {"seed": cell.seed, "perturbation": cell.environment, "ranges": str(matrix.ranges or "")}
     options = argparse.Namespace(device="cpu", num_envs=None, set=set_words(matrix), **choices)
     return task_registry.get_cfgs(cell.task, options)[0]
 
@@ -208,7 +208,7 @@ def step_command(matrix: Matrix, out: Path, cell: Cell, state: CellState, device
     """Return the command line of a cell's next step.
 
     Args:
-        matrix: What is trained and evaluated.
+        matrix: The trainings and evaluations.
         out: Folder of all results.
         cell: The cell.
         state: Its progress.

@@ -6,6 +6,7 @@ import math
 from itertools import combinations
 from pathlib import Path
 
+from legged_torque.experiments.curves import MILLION
 from legged_torque.experiments.figures import FIGURES, file_name
 from legged_torque.experiments.paper_values import MODELS, PAPER_METRICS, paper_value
 from legged_torque.experiments.results import (
@@ -24,7 +25,6 @@ from legged_torque.utils.paths import portable_path
 
 SIGNIFICANT = 0.05
 BASELINES = ("a1_position", "a1_torque")
-MILLION = 1e6
 
 
 def report(
@@ -33,7 +33,7 @@ def report(
     """Return the report.
 
     Args:
-        experiment: What was run.
+        experiment: The experiment.
         table: Its summaries.
         from_step: Step from which evaluations count.
         figures: Titles of the figures that were drawn.
@@ -81,7 +81,7 @@ def missing_lines(experiment: Experiment, from_step: float) -> list[str]:
 
 
 def run_problems(run: CellResult, evaluated: list[str], from_step: float) -> list[str]:
-    """Return what is missing, unfinished or unreadable of a training."""
+    """Return the problems of a training: missing, unfinished or unreadable parts."""
     problems, total = list(run.notes), f"{run.total_steps / MILLION:.4g} million steps"
     if not run.rows:
         problems.append("no evaluation during training yet")

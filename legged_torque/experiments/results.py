@@ -177,7 +177,7 @@ def read_experiment(folder: Path) -> Experiment:
 
 
 def read_cell(folder: Path, cell: CellResult) -> CellResult:
-    """Fill in what a cell's folder holds. The rows of a run replace earlier runs' rows from its first one on."""
+    """Read the files of a cell's folder. A run's rows replace those of earlier runs from its first evaluation on."""
     for run_dir in sorted(path for path in folder.iterdir() if path.is_dir()):
         if (run_dir / CONFIG_FILE).is_file():
             try:

@@ -57,7 +57,7 @@ class ExperimentRun:
         """Find the cells that are not done; nothing is written or started yet.
 
         Args:
-            matrix: What is trained and evaluated.
+            matrix: The trainings and evaluations.
             out: Folder of all results, as an absolute path.
             workers: Where processes run.
         """
@@ -173,7 +173,7 @@ class ExperimentRun:
             self._start_step(worker, job.cell, job.lock, job.cell_start)
 
     def _problem(self, job: Job) -> str:
-        """Return what went wrong in an ended step, or nothing; a complete result gets its final name."""
+        """Return the failure of an ended step, or an empty text; a complete result gets its final name."""
         status = job.process.returncode
         if status:
             how = f"was ended by signal {-status}" if status < 0 else f"has failed with exit status {status}"
@@ -232,7 +232,7 @@ def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
     """Create the folder of the results, or check that its settings are the same, and copy the description into it.
 
     Args:
-        matrix: What the file describes.
+        matrix: The matrix that the file describes.
         file: The description.
         out: The folder.
 

@@ -41,5 +41,5 @@ METRICS = (
     Metric("speed", "m/s", "Speed", None),
     Metric("falls_per_minute", "1/min", "Falls per minute", True),
 )
-"""What an evaluation measures, the paper's five first. To add a metric, add its line here and its formula to
+"""The metrics of an evaluation, the five of the paper first. To add one, add its line here and its formula to
 :mod:`legged_torque.utils.metrics`."""
