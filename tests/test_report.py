@@ -284,6 +284,20 @@ def test_evaluations(report):
     )
 
 
+def test_same_bytes_again(report, folder, tmp_path):
+    """The same results give the same compressed file, so that a commit holds no change that is none."""
+    assert run_script(folder, "--out", tmp_path / "again") == 0
+    files = [tmp_path / name / "evaluations.csv.gz" for name in ("out", "again")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert files[0].read_bytes()[4:8] == bytes(4)  # no time
+
+
+def test_no_folder_of_this_machine(report, tmp_path):
+    """Commands and notes of the report hold no absolute path."""
+    text, _, _ = report
+    assert str(tmp_path) not in text and "python scripts/experiment.py paper/experiment.yaml --out paper_again" in text
+
+
 def test_what_is_missing(report):
     """Cells without data, unfinished runs and missing evaluations are told at the top."""
     text, _, _ = report
