@@ -98,13 +98,8 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--profile", type=Path, help=f"write a trace of {TRACED} iterations for ui.perfetto.dev, as .json or .json.gz"
     )
-    parser.add_argument(
-        "--endurance",
-        type=int,
-        default=0,
-        metavar="N",
-        help="also run N iterations and compare the first tenth with the last",
-    )
+    help_text = "also run N iterations and compare the first tenth with the last"
+    parser.add_argument("--endurance", type=int, default=0, metavar="N", help=help_text)
     args = parser.parse_args()
     if args.rounds < 1:
         raise UserError(f"--rounds must be at least 1, not {args.rounds}")

@@ -180,21 +180,19 @@ def time_iterations(
         KeyboardInterrupt: If Ctrl-C was pressed, which the runner takes as a request to stop early.
     """
     collect, update = runner.collect_rollout, runner.alg.update
-    started: list[float] = []
-    collected: list[float] = []
-    updated: list[float] = []
+    marks: list[float] = []  # of each iteration: start of the rollout, start and end of the update
 
     def timed_collect() -> None:
-        at_start(len(started))
-        started.append(time.perf_counter())
+        at_start(len(marks) // 3)
+        marks.append(time.perf_counter())
         with torch.profiler.record_function("rollout"):
             collect()
 
     def timed_update() -> dict[str, float]:
-        collected.append(time.perf_counter())
+        marks.append(time.perf_counter())
         with torch.profiler.record_function("update"):
             losses = update()
-        updated.append(time.perf_counter())
+        marks.append(time.perf_counter())
         return losses
 
     try:
@@ -208,12 +206,11 @@ def time_iterations(
     finally:
         if hasattr(runner.logger.writer, "close"):  # rsl_rl leaves tensorboard's open
             runner.logger.writer.close()
-    if len(started) <= count:
+    if len(marks) <= 3 * count:
         raise KeyboardInterrupt
-    marks = _MS * np.array([started[:count], collected[:count], updated[:count], started[1:]])
-    names = ("rollout", "update", "log")
-    parts = {name: values.tolist() for name, values in zip(names, np.diff(marks, axis=0), strict=True)}
-    return {**parts, "iteration": (marks[-1] - marks[0]).tolist()}
+    parts = _MS * np.diff(marks[: 3 * count + 1]).reshape(count, 3)
+    columns = {"rollout": parts[:, 0], "update": parts[:, 1], "log": parts[:, 2], "iteration": parts.sum(axis=1)}
+    return {name: values.tolist() for name, values in columns.items()}
 
 
 def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:

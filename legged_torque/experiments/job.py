@@ -66,13 +66,8 @@ class Job:
     ) -> None:
         """Start the process. It holds the cell's lock too, and gets SIGTERM if this process ends.
 
-        Args:
-            cell: The cell.
-            state: Its progress.
-            lock: Its open lock file, in the cell's folder; the process id is written to it.
-            cell_start: When the work on the cell began, by ``time.monotonic()`` [s].
-            command: Command line of the process.
-            worker: Where the process runs.
+        The arguments are those of the attributes, and the command line of the process and the worker that runs it. The
+        lock file lies in the cell's folder; the process id is written to it.
         """
         self.cell, self.state, self.lock, self.cell_start = cell, state, lock, cell_start
         self.log = Path(lock.name).with_name("evaluate.log" if state.step == "evaluate" else "train.log")

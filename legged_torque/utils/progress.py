@@ -8,7 +8,6 @@ import re
 import sys
 import threading
 import time
-from types import TracebackType
 from typing import TextIO
 
 import warp as wp
@@ -58,9 +57,7 @@ class CompileProgress:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         """Stop watching, and finish the line if there is one."""
         self._stop.set()
         self._thread.join()
