@@ -1,9 +1,11 @@
-"""Measure the speed and the memory of training: ``python scripts/benchmark.py --num_envs 1024 4096``."""
+"""Measure speed and memory of training: ``python scripts/benchmark.py --num_envs 1024 4096``."""
 
 import os
 
-os.environ["MUJOCO_GL"] = "disable"
-os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # torch's profiler otherwise tells on standard error when it starts
+from legged_torque.utils.rendering import without_renderer
+
+without_renderer()  # before anything imports mujoco
+os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or torch's profiler writes to standard error when it starts
 
 import argparse
 import dataclasses
@@ -18,6 +20,7 @@ from legged_torque.utils.args import Parser, add_settings_args, options_of
 from legged_torque.utils.cli import prepare_file, run_script
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.paths import without_machine
 from legged_torque.utils.runs import package_versions
 
 COLUMNS = {
@@ -36,21 +39,26 @@ COLUMNS = {
 """Heading of each column and its number of decimals."""
 
 LEGEND = """\
-  physics: the physics steps of one control step alone; step: env.step; iteration: a whole one of training, with logging
-  x floor: iteration / (physics x control steps of a rollout); steps/s: those of whole iterations
+  physics: only the physics steps of one control step; step: env.step; iteration: a whole iteration, with logging
+  x floor: iteration / (physics x control steps of a rollout); steps/s: over whole iterations
   peak: {memory}
-  start-up: from building the task to the end of the second iteration, when all is compiled and captured"""
+  start-up: from building the task to the end of the second iteration, when everything is compiled and captured"""
 MEMORY = {
     "cuda": "GPU memory of torch and Warp together, without the CUDA context",
-    "cpu": "resident memory of this process so far",
+    "cpu": "peak resident memory of this process",
 }
+MIN_WIDTH = 7
+"""Least width of a column."""
+MAX_NAME = 110
+"""Characters of a kernel's name that are printed."""
 
 
 def main() -> None:
-    """Measure every number of worlds and print a table."""
+    """Measure every size and print a table."""
     args = parse_args()
     device = resolve_device(args.device)
-    settings = [size_settings(args, num_envs) for num_envs in args.num_envs or [None]]
+    changes = ["evaluation.interval=0", *args.set]  # without evaluations iterations are alike
+    settings = [size_settings(args, num_envs, changes) for num_envs in args.num_envs or [None]]
     for file in filter(None, (args.json, args.profile)):
         prepare_file(file)
     print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")
@@ -64,7 +72,7 @@ def main() -> None:
         "preset": args.preset or "parallel",
         "perturbation": args.perturbation or "none",
         "ranges": args.ranges or "wide",
-        "set": args.set,
+        "set": without_machine(args.set),
         "rounds": args.rounds,
         "rows": [],
     }
@@ -80,23 +88,22 @@ def main() -> None:
 
 
 def parse_args() -> argparse.Namespace:
-    """Return the command line.
+    """Parse and check the command line.
 
     Raises:
-        UserError: If it makes no sense.
+        UserError: If an option is not valid.
     """
     parser = Parser(__doc__)
     add_settings_args(parser)
     parser.add_argument("--num_envs", type=int, nargs="+", help="numbers of worlds; default: that of the task")
     parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
-    parser.add_argument("--json", type=Path, help="file to write all numbers to")
+    parser.add_argument("--json", type=Path, help="file to write")
     parser.add_argument(
-        "--profile", type=Path, help=f"file for a trace of {TRACED} iterations, for ui.perfetto.dev; .json or .json.gz"
+        "--profile", type=Path, help=f"write a trace of {TRACED} iterations for ui.perfetto.dev, as .json or .json.gz"
     )
-    parser.add_argument(
-        "--endurance", type=int, default=0, metavar="N", help="also run N iterations and compare their first and last"
-    )
+    help_text = "also run N iterations and compare the first tenth with the last"
+    parser.add_argument("--endurance", type=int, default=0, metavar="N", help=help_text)
     args = parser.parse_args()
     if args.rounds < 1:
         raise UserError(f"--rounds must be at least 1, not {args.rounds}")
@@ -107,20 +114,20 @@ def parse_args() -> argparse.Namespace:
     return args
 
 
-def size_settings(args: argparse.Namespace, num_envs: int | None) -> tuple[Any, Any]:
-    """Return the settings of the task and of its training for a number of worlds, changed as train.py would.
+def size_settings(args: argparse.Namespace, num_envs: int | None, changes: list[str]) -> tuple[Any, Any]:
+    """Return the settings of the task and of its training, as train.py would have them, for a number of worlds.
 
     Raises:
-        UserError: If an argument makes no sense.
+        UserError: If a setting is not valid.
     """
-    changes = {"num_envs": num_envs, "set": ["evaluation.interval=0", *args.set]}  # so that iterations are alike
-    env_cfg, train_cfg = task_registry.get_cfgs(args.task, dataclasses.replace(options_of(args), **changes))
-    check_env_cfg(env_cfg)  # a mistake in the last size is told before the first one is measured
+    options = dataclasses.replace(options_of(args), num_envs=num_envs, set=changes)
+    env_cfg, train_cfg = task_registry.get_cfgs(args.task, options)
+    check_env_cfg(env_cfg)  # report mistakes in any size before the first one is measured
     return env_cfg, train_cfg
 
 
-def print_row(row: dict) -> None:
-    """Print what was measured of one number of worlds."""
+def print_row(row: dict[str, Any]) -> None:
+    """Print the numbers of one size."""
     if "error" in row:
         print(f"{row['num_envs']:>{width('worlds')},} | {row['error']}", flush=True)
         return
@@ -135,20 +142,20 @@ def print_row(row: dict) -> None:
         )
 
 
-def print_kernels(kernels: list[dict], device: str, trace: Path) -> None:
-    """Print what has taken most time in a trace."""
+def print_kernels(kernels: list[dict[str, Any]], device: str, trace: Path) -> None:
+    """Print the most expensive entries of a trace."""
     kind = "torch operators (Warp's kernels show on a GPU only)" if device == "cpu" else "kernels"
     print(f"  most expensive {kind} of {TRACED} iterations, see {trace}:")
     print(f"  {'calls':>8}  {'total ms':>9}  name")
     if not kernels:
-        print("  none was seen: torch's profiler needs CUPTI, and the permission to use it")
+        print("  none: torch's profiler needs CUPTI and the permission to use it")
     for kernel in kernels:
-        print(f"  {kernel['calls']:>8}  {kernel['total_ms']:>9.2f}  {kernel['name'][:110]}")
+        print(f"  {kernel['calls']:>8}  {kernel['total_ms']:>9.2f}  {kernel['name'][:MAX_NAME]}")
 
 
 def width(title: str) -> int:
-    """Return how wide a column is."""
-    return max(len(title), 7)
+    """Return the width of a column."""
+    return max(len(title), MIN_WIDTH)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""Train and evaluate approaches x environments x seeds: ``python scripts/experiment.py experiments/low.yaml``.
+"""Train and evaluate tasks x environments x seeds: ``python scripts/experiment.py experiments/low.yaml``.
 
-What is done already is skipped and what was interrupted goes on, so the same command is the way to continue.
+Finished cells are skipped and interrupted ones resumed: to continue an experiment, repeat the command.
 """
 
-import os
+from legged_torque.utils.rendering import without_renderer
 
-os.environ["MUJOCO_GL"] = "disable"
+without_renderer()  # before anything imports mujoco
 
 import sys
 from pathlib import Path
@@ -18,17 +18,15 @@ from legged_torque.utils.cli import run_script
 
 
 def main() -> None:
-    """Bring a matrix to its end, or list what is to be done."""
+    """Run all cells of a matrix, or list what is left to do."""
     parser = Parser(__doc__)
     parser.add_argument("file", type=Path, help="description of the matrix, see experiments/")
+    parser.add_argument("--out", type=Path, help="folder of the results; default: logs/experiments/<name of the file>")
     parser.add_argument(
-        "--out", type=Path, help="folder of all results; default: ./logs/experiments/<name of the file>"
-    )
-    parser.add_argument(
-        "--device", default="auto", help="auto, cpu or cuda:N; auto takes all GPUs, one run on each, or the CPU"
+        "--device", default="auto", help="auto, cpu or cuda:N; auto uses all GPUs with one run on each, or else the CPU"
     )
     parser.add_argument("--jobs", type=int, help="runs at a time on the CPU; default: 1")
-    parser.add_argument("--dry-run", action="store_true", help="only list what is to be done")
+    parser.add_argument("--dry-run", action="store_true", help="only list what is left to do")
     args = parser.parse_args()
     matrix = read_matrix(args.file)
     out = (args.out or Path("logs", "experiments", args.file.stem)).resolve()

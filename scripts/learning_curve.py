@@ -1,8 +1,8 @@
 """Measure every checkpoint of a run with mean actions: ``python scripts/learning_curve.py --task=a1_position``."""
 
-import os
+from legged_torque.utils.rendering import without_renderer
 
-os.environ["MUJOCO_GL"] = "disable"
+without_renderer()  # before anything imports mujoco
 
 import json
 from pathlib import Path
@@ -14,8 +14,12 @@ from legged_torque.utils.cli import prepare_file, run_script
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.paths import without_machine
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import set_seed
+
+SEED_OFFSET = 1000
+"""Added to the training's seed: worlds other than in training, but the same for every checkpoint."""
 
 
 def main() -> None:
@@ -24,10 +28,7 @@ def main() -> None:
     add_task_args(parser)
     parser.set_defaults(num_envs=256)
     parser.add_argument(
-        "--steps",
-        type=int,
-        default=1000,
-        help="control steps per checkpoint; 1000 are an episode; default: %(default)s",
+        "--steps", type=int, default=1000, help="control steps per checkpoint; default: %(default)s, an episode"
     )
     parser.add_argument("--json", type=Path, help="file to write; default: curve.json in the run's folder")
     args = parser.parse_args()
@@ -43,11 +44,11 @@ def main() -> None:
     points = []
     for number in checkpoint_numbers(run_dir):
         infos = runner.load(str(find_checkpoint(run_dir, number)))
-        set_seed(train_cfg.seed + 1000)  # the same worlds for every checkpoint, others than in training
-        numbers = measure(env, runner.get_inference_policy(env.device), args.steps).means()
-        points.append({"steps": infos["total_timesteps"], "seconds": infos["seconds"], **numbers})
+        set_seed(train_cfg.seed + SEED_OFFSET)
+        means = measure(env, runner.get_inference_policy(env.device), args.steps).means()
+        points.append({"steps": infos["total_timesteps"], "seconds": infos["seconds"], **means})
         print(
-            f"{points[-1]['steps']:>12,} steps", *(f"{name} {value:.4f}" for name, value in numbers.items()), sep="  "
+            f"{infos['total_timesteps']:>12,} steps", *(f"{name} {mean:.4f}" for name, mean in means.items()), sep="  "
         )
     result = {
         "task": args.task,
@@ -59,7 +60,7 @@ def main() -> None:
         "versions": package_versions(),
         "points": points,
     }
-    file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    file.write_text(json.dumps(without_machine(result), indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,26 +1,29 @@
-"""Sum up an experiment: ``python scripts/report.py logs/experiments/paper --out docs/results/paper``."""
+"""Report on an experiment: ``python scripts/report.py logs/experiments/paper --out docs/results/paper``."""
 
-import os
+from legged_torque.utils.rendering import without_renderer
 
-os.environ["MUJOCO_GL"] = "disable"
+without_renderer()  # before anything imports mujoco
 
 from pathlib import Path
 
 from legged_torque.experiments.figures import draw_all
-from legged_torque.experiments.report import read_experiment, summarize, write_tables
-from legged_torque.experiments.report_text import missing_lines, report
+from legged_torque.experiments.report import missing_lines, report
+from legged_torque.experiments.results import read_experiment, summarize, write_tables
 from legged_torque.utils.args import Parser
 from legged_torque.utils.cli import run_script
 from legged_torque.utils.errors import UserError
 
+FROM_STEP = 90e6
+"""Where the paper's Table I begins to average."""
+
 
 def main() -> None:
-    """Read, draw, write the tables and the report, say where they are."""
+    """Read the results, draw figures, write tables and the report."""
     parser = Parser(__doc__)
-    parser.add_argument("experiment", type=Path, help="folder that experiment.py has filled")
+    parser.add_argument("experiment", type=Path, help="folder of results that experiment.py has made")
     parser.add_argument("--out", type=Path, required=True, help="folder for the report, its tables and figures")
     parser.add_argument(
-        "--from_step", type=float, default=90e6, help="evaluations that count begin here; default: %(default).0f"
+        "--from_step", type=float, default=FROM_STEP, help="step from which evaluations count; default: %(default).0f"
     )
     args = parser.parse_args()
     if not args.from_step >= 0:

@@ -27,7 +27,7 @@ from legged_torque.deploy.robot import Robot
 from legged_torque.deploy.simulation import Events, Simulation
 from legged_torque.utils.cli import prepare_file, run_script
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.metrics import UNITS, estimates
+from legged_torque.utils.metrics import UNITS, Estimate, estimates, ratios
 from legged_torque.viewer.video import Recorder
 
 
@@ -98,10 +98,10 @@ def main() -> None:
             record = recorder.add_step if recorder and number == 0 else lambda: None
             sums.append(simulation.run(args.steps, [args.seed, number], lambda record=record: (record(), show())))
     control_step = 1.0 / policy.description["timing"]["control_frequency"]
-    metrics = estimates(np.array(sums), robot.weight, control_step)
+    metrics = estimates(ratios(np.array(sums).T, robot.weight, control_step))
     print(f"  {args.robots} robots x {args.steps} steps of {control_step:g} s")
     for name, value in metrics.items():
-        print(f"  {name:<18} {value['mean']:10.4f} +- {value['standard_error']:.4f} {UNITS[name]}")
+        print(f"  {name:<18} {value.mean:10.4f} +- {value.standard_error:.4f} {UNITS[name]}")
     if args.json:
         write_json(args, policy, robot, metrics)
     if recorder:
@@ -116,13 +116,13 @@ def print_heading(policy: Policy, robot: Robot, xml: Path) -> None:
         print(f"  note: {note}")
 
 
-def write_json(args: argparse.Namespace, policy: Policy, robot: Robot, metrics: dict[str, dict[str, float]]) -> None:
+def write_json(args: argparse.Namespace, policy: Policy, robot: Robot, metrics: dict[str, Estimate]) -> None:
     """Write what was run and what came out; null stands for what was not measured."""
     result = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
     result["task"], result["training"] = policy.description["task"], policy.description["training"]
     result["notes"], result["versions"] = robot.notes, {"mujoco": mujoco.__version__, "numpy": np.__version__}
     result["metrics"] = {
-        name: {key: number if math.isfinite(number) else None for key, number in value.items()}
+        name: {key: number if math.isfinite(number) else None for key, number in vars(value).items()}
         for name, value in metrics.items()
     }
     args.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

@@ -171,6 +171,7 @@ def test_dry_run(name, tmp_path):
         ({"environments": {"low": ["hihg"]}}, "unknown perturbation 'hihg'; did you mean 'high'?"),
         ({"environments": {"low": "high"}}, "experiment key 'environments.low' must be a list"),
         ({"ranges": "narow"}, "unknown ranges 'narow'; did you mean 'narrow'?"),
+        ({"ranges": 3}, "unknown ranges '3'"),
         ({"train": {"runner.total_step": 1}}, "config key 'runner.total_step'; did you mean 'runner.total_steps'?"),
         ({"train": {"runner.total_steps": "many"}}, "'runner.total_steps' takes a value like"),
         ({"train": {"env.num_envs": 0}}, "num_envs must be at least 1, not 0"),

@@ -8,8 +8,8 @@ import pytest
 import torch
 from test_simulator import CONVERGED, WEIGHT, contacts_by_hand
 
-from legged_torque.envs.base.metrics import CommandBreakdown, WalkingMetrics, estimate, measure
-from legged_torque.utils.metrics import UNITS
+from legged_torque.envs.base.metrics import CommandBreakdown, WalkingMetrics, measure
+from legged_torque.utils.metrics import UNITS, estimate, step_sums
 
 RANGES = {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-2.0, 0.0], "ang_vel_yaw": [0.5, 2.5]}
 STILL = {f"domain_rand.init_{angle}": [0.0, 0.0] for angle in ("roll", "pitch", "yaw")}
@@ -167,7 +167,7 @@ def test_falls_by_hand(task):
 )
 def test_standard_error_by_hand(numerator, denominator, mean, error):
     """A ratio of sums with its standard error; with one world nobody knows it."""
-    result = estimate(torch.tensor(numerator), torch.tensor(denominator))
+    result = estimate(np.array(numerator, float), np.array(denominator, float))
     assert (result.mean, result.standard_error) == pytest.approx((mean, error), rel=1e-12, nan_ok=True)
 
 
@@ -176,7 +176,7 @@ def test_standard_error_is_the_spread_of_repetitions():
     generator = torch.Generator().manual_seed(3)
     denominator = 5.0 + 4.0 * torch.rand(2000, 60, generator=generator)
     numerator = denominator * (1.0 + 0.4 * torch.randn(2000, 60, generator=generator)) + 0.3 * denominator**2
-    results = [estimate(*sums) for sums in zip(numerator, denominator, strict=True)]
+    results = [estimate(*sums) for sums in zip(numerator.numpy(), denominator.numpy(), strict=True)]
     spread = np.std([result.mean for result in results])
     claimed = math.sqrt(np.mean([result.standard_error**2 for result in results]))
     assert claimed == pytest.approx(spread, rel=0.06)
@@ -297,3 +297,17 @@ def test_measure_uses_the_commands_of_the_step(make_task):
     assert not torch.equal(held[0], held[1]) and task.episode_length_buf.tolist() == [6] * 3
     errors = [((a[:, :2] - b) ** 2).sum(dim=1).mean() for a, b in zip(held, velocity, strict=True)]
     assert means["track_xy"] == pytest.approx(float(torch.stack(errors).mean()), rel=1e-5)
+
+
+def test_arrays_and_tensors_give_the_same():
+    """One robot after another in numpy is counted as a batch of worlds in torch, commands of 0 and falls included."""
+    generator = torch.Generator().manual_seed(5)
+    commands, velocity = (torch.randn(50, 3, generator=generator, dtype=torch.float64) for _ in range(2))
+    commands[:10, 1], commands[10:20] = 0.0, 0.0
+    parts = [torch.rand(50, generator=generator, dtype=torch.float64) for _ in range(4)]
+    ended = torch.arange(50) % 7 == 0
+    fell = ended & (torch.arange(50) % 2 == 0)
+    batch = step_sums(torch, commands, velocity, *parts, fell, ended).numpy()
+    for world in range(50):
+        rows = (tensor[world : world + 1].numpy() for tensor in (commands, velocity, *parts, fell, ended))
+        np.testing.assert_allclose(step_sums(np, *rows)[:, 0], batch[:, world], rtol=1e-12)

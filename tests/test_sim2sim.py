@@ -25,8 +25,6 @@ from test_export import export_random
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import Robot
 from legged_torque.deploy.simulation import Events, Simulation, quaternion
-from legged_torque.envs.base.metrics import WalkingMetrics
-from legged_torque.utils.metrics import estimates, step_sums
 from legged_torque.viewer import video
 
 XML = Path(__file__).resolve().parents[1] / "resources" / "robots" / "a1" / "a1.xml"
@@ -206,30 +204,6 @@ def test_standing_robot(policy):
 
 
 # --------------------------------------------------------------------------------------------------- metrics, events
-
-
-def test_metrics_are_the_task_s(make_task):
-    """On the steps of a task, with falls and commands of 0, they are those of ``evaluation/metrics.py``."""
-    task = make_task("a1_torque", num_envs=3, **{"env.episode_length_s": 0.5, "commands.ranges.lin_vel_y": [0.0, 0.0]})
-    metrics = WalkingMetrics(task)
-    sums = np.zeros((3, 10))
-    for _ in range(60):
-        commands = task.commands.clone()
-        task.step(torch.randn(3, 12))
-        metrics.add_step(commands)
-        velocity = torch.cat([task.base_lin_vel[:, :2], task.base_ang_vel[:, 2:]], dim=1).double().numpy()
-        for i in range(3):
-            force = float(task.sim.contact_force[i].norm(dim=1).sum())
-            power = float((task.torques[i] * task.dof_vel[i]).abs().sum())
-            ended, timed_out = bool(task.reset_buf[i]), bool(task.time_out_buf[i])
-            height = float(task.base_pos[i, 2])
-            parts = (commands[i].double().numpy(), velocity[i], force, power, height, ended and not timed_out, ended)
-            sums[i] += step_sums(*parts)
-    ours = estimates(sums, metrics._weight, task.dt)
-    for name, estimate in metrics.estimates().items():
-        expected = {"mean": estimate.mean, "standard_error": estimate.standard_error}
-        assert ours[name] == pytest.approx(expected, rel=1e-4, nan_ok=True), name
-    assert ours["falls_per_minute"]["mean"] > 0
 
 
 def test_random_numbers(policy):

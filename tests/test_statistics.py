@@ -4,11 +4,7 @@ import math
 
 import pytest
 
-from legged_torque.experiments.report import (
-    holm,
-    incomplete_beta,
-    welch,
-)
+from legged_torque.experiments.significance import holm, incomplete_beta, welch
 
 
 @pytest.mark.parametrize(

@@ -1,1 +1,1 @@
-"""Whether it is fast, right and the same with CUDA graphs: what the scripts benchmark.py, physics_accuracy.py and check_*.py run."""
+"""Checks of speed, accuracy and CUDA graphs, run by benchmark.py, physics_accuracy.py and check_capture.py."""

@@ -1,4 +1,4 @@
-"""How far cheaper solver settings are from MuJoCo's own, converged physics."""
+"""The error of cheap solver settings, compared with MuJoCo's own, converged physics."""
 
 from __future__ import annotations
 
@@ -10,27 +10,32 @@ import torch
 
 from legged_torque.sim.simulator import Simulator
 
-State = dict[str, torch.Tensor]
+PhysicsState = dict[str, torch.Tensor]
 """A batch of states: "qpos", "qvel", "qacc_warmstart", "ctrl", each (num_envs, size)."""
 
+CONVERGED_ITERATIONS = 100
+CONVERGED_LS_ITERATIONS = 50
+CONVERGED_TOLERANCE = 1e-12
 
-def copy_state(sim: Simulator) -> State:
-    """Return a copy of what the next physics step depends on."""
+
+def copy_state(sim: Simulator) -> PhysicsState:
+    """Return a copy of the arrays that the next physics step depends on."""
     return {name: getattr(sim, name).clone() for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
 
 
-def reference_velocities(model: mujoco.MjModel, states: list[State]) -> np.ndarray:
+def reference_velocities(model: mujoco.MjModel, states: list[PhysicsState]) -> np.ndarray:
     """Return the velocities after one ``mj_step`` in float64, with a converged solver, from every state.
 
     Args:
-        model: The model of the simulator that the states are from.
+        model: The model of the simulator that the states come from.
         states: The states.
 
     Returns:
         Velocities in MuJoCo's layout. Shape: (len(states), num_envs, nv).
     """
     model = copy.copy(model)
-    model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
+    model.opt.iterations, model.opt.ls_iterations = CONVERGED_ITERATIONS, CONVERGED_LS_ITERATIONS
+    model.opt.tolerance = CONVERGED_TOLERANCE
     data = mujoco.MjData(model)
     result = np.zeros((len(states), len(states[0]["qpos"]), model.nv))
     for i, state in enumerate(states):
@@ -43,17 +48,17 @@ def reference_velocities(model: mujoco.MjModel, states: list[State]) -> np.ndarr
     return result
 
 
-def velocity_errors(sim: Simulator, states: list[State], reference: np.ndarray) -> dict[str, float]:
+def velocity_errors(sim: Simulator, states: list[PhysicsState], reference: np.ndarray) -> dict[str, float]:
     """Compare one step of a simulator with the reference.
 
     Args:
-        sim: The simulator; its settings are what is judged.
-        states: States with as many worlds as the simulator.
+        sim: The simulator whose settings are judged.
+        states: States with as many worlds as the simulator has.
         reference: From :func:`reference_velocities`.
 
     Returns:
         "rms", "p999" (the 99.9th percentile) and "max" of the absolute error of all velocities [m/s, rad/s], and
-        "change_rms": how much velocities change in a step, to compare with.
+        "change_rms": the change of velocities in a step, for comparison.
     """
     errors, changes = [], []
     for state, expected in zip(states, reference, strict=True):

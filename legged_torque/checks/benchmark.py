@@ -1,4 +1,4 @@
-"""Where the time and the memory of training go."""
+"""Speed and memory of training."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
+from unittest.mock import patch
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -26,24 +28,36 @@ from legged_torque.utils.progress import CompileProgress
 from legged_torque.utils.task_registry import set_seed
 
 WARM_UP = 2
-"""Iterations until all is ready: the first one runs as it is and compiles, the second one captures the rollout."""
+"""Iterations before timing begins: the first one compiles, the second one captures the rollout."""
 TRACED = 2
 """Iterations in a trace."""
 PHYSICS_STEPS = 5
-"""Control steps of physics that are timed in a row: the copies before them cost little, and no robot falls so soon."""
+"""Control steps of physics timed in a row: enough to hide the cost of the reset before them, and no robot falls yet."""
+GPU_CALLS = 20
+"""Calls per timing on a GPU, where a single one is short; on the CPU one call is timed."""
+ACTION_SCALE = 0.5
+"""Standard deviation of the random actions while ``env.step`` is timed."""
 TOP_KERNELS = 10
-"""Kernels that are told of a trace."""
+"""Kernels listed from a trace."""
+OUT_OF_MEMORY = ("out of memory", "Failed to allocate", "can't allocate memory")
+"""Parts of the messages of CUDA, Warp and torch on the CPU when memory has run out."""
 _MIB = 2**20
+_MS = 1e3
+
+Times = dict[str, list[float]]
+"""Milliseconds of iterations in a row, one entry each. "rollout": curriculum, and the rollout with its returns.
+"update": the update of the networks. "log": reading numbers of the task, printing and writing them, and saving
+checkpoints that are due. "iteration": their sum, from the start of one iteration to the start of the next."""
 
 
 @dataclass
 class Plan:
-    """What to measure.
+    """The measurements to take.
 
     Attributes:
         rounds: How many iterations are timed, and how often physics and step are.
-        endurance: Iterations in a row to look for slow-down and growth; 0 leaves that out.
-        trace: File for a trace of :data:`TRACED` iterations; None leaves that out.
+        endurance: Iterations in a row to look for slow-down and growth; 0 leaves this out.
+        trace: File for a trace of :data:`TRACED` iterations; None leaves this out.
     """
 
     rounds: int
@@ -51,37 +65,19 @@ class Plan:
     trace: Path | None = None
 
 
-@dataclass
-class Times:
-    """Milliseconds of iterations in a row, one entry each.
-
-    Attributes:
-        rollout: Curriculum, and the rollout with its returns.
-        update: The update.
-        log: Reading the task's numbers, printing and writing them, and saving checkpoints that are due.
-        iteration: The sum: from the start of one iteration to the start of the next one.
-    """
-
-    rollout: list[float] = field(default_factory=list)
-    update: list[float] = field(default_factory=list)
-    log: list[float] = field(default_factory=list)
-    iteration: list[float] = field(default_factory=list)
-
-
 class MemoryMeter:
-    """How much memory this process takes.
+    """Memory used by this process.
 
-    On a GPU: by how much the free memory of the device has shrunk since the meter was created. That counts all of
-    torch (what its allocator holds, graphs), of Warp (which has a pool of its own that torch does not see), and kernels
-    that were loaded; it does not count the CUDA context, which is there before. It also counts what other processes
-    have taken or given back in the meantime: measure on a GPU of your own. Allocators keep what they have taken, graphs
-    above all, so that the most that is seen between iterations is what training needs.
+    On a GPU: how much the free memory of the device has shrunk since the meter was created. This includes torch's
+    allocator and graphs, Warp's own pool, and loaded kernels, but not the CUDA context, which exists before. It also
+    includes other processes that allocate meanwhile, so measure on a GPU of your own. Allocators keep what they have
+    taken, so the largest value between iterations is what training needs.
 
     On the CPU: the peak resident set size of the process, which never shrinks.
     """
 
     def __init__(self, device: str) -> None:
-        """Take the memory that is free now as that of a device without our work."""
+        """Note the free memory before any work on the device."""
         self._device = torch.device(device)
         self._free = 0
         if self._device.type == "cuda":
@@ -96,7 +92,7 @@ class MemoryMeter:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / _MIB
 
     def shares(self) -> dict[str, float]:
-        """Return what torch's allocator holds at most, and what Warp's pool has in use; nothing on the CPU [MiB]."""
+        """Return the peak of torch's allocator and the present use of Warp's pool; nothing on the CPU [MiB]."""
         if self._device.type != "cuda":
             return {}
         result = {"torch_memory_mib": torch.cuda.max_memory_reserved(self._device) / _MIB}
@@ -105,7 +101,7 @@ class MemoryMeter:
         return result
 
     def clear(self) -> None:
-        """Give back what the last size has taken, as far as it is not in use any more."""
+        """Give back the memory that is not in use any more."""
         gc.collect()
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
@@ -113,14 +109,16 @@ class MemoryMeter:
             torch.cuda.reset_peak_memory_stats(self._device)
 
 
-def measure(task_name: str, env_cfg: Any, train_cfg: Any, plan: Plan, memory: MemoryMeter, device: str) -> dict:
-    """Measure one task of one size in all respects.
+def measure(
+    task_name: str, env_cfg: Any, train_cfg: Any, plan: Plan, memory: MemoryMeter, device: str
+) -> dict[str, Any]:
+    """Measure one task of one size.
 
     Args:
         task_name: Name of the task.
         env_cfg: Its settings.
         train_cfg: Settings of its training.
-        plan: What to measure.
+        plan: The measurements to take.
         memory: The meter of the device.
         device: "cpu" or "cuda:N".
 
@@ -135,15 +133,17 @@ def measure(task_name: str, env_cfg: Any, train_cfg: Any, plan: Plan, memory: Me
     return {"num_envs": env_cfg.env.num_envs, "error": "does not fit in memory"}
 
 
-def _measure(task_name: str, env_cfg: Any, train_cfg: Any, plan: Plan, memory: MemoryMeter, device: str) -> dict:
-    """Do what :func:`measure` says for a size that fits."""
+def _measure(
+    task_name: str, env_cfg: Any, train_cfg: Any, plan: Plan, memory: MemoryMeter, device: str
+) -> dict[str, Any]:
+    """Measure a size that fits in memory, as :func:`measure` describes."""
+    marks, used = [time.perf_counter()], []
+
+    def mark(number: int = 0) -> None:
+        marks.append(time.perf_counter())
+        used.append(memory.used())
+
     with tempfile.TemporaryDirectory() as folder:
-        marks, used = [time.perf_counter()], []
-
-        def mark(number: int = 0) -> None:
-            marks.append(time.perf_counter())
-            used.append(memory.used())
-
         with CompileProgress() as compilation:
             set_seed(train_cfg.seed)
             task = task_registry.get_task_class(task_name)(env_cfg, device)
@@ -158,7 +158,7 @@ def _measure(task_name: str, env_cfg: Any, train_cfg: Any, plan: Plan, memory: M
         row = summarize(times, physics, step, task.num_envs, train_cfg.runner.num_steps_per_env)
         row |= {**peak, **summarize_startup(marks), "compiled_modules": compilation.modules}
         if plan.endurance:
-            row["endurance"] = endure(runner, plan.endurance, memory)
+            row["endurance"] = measure_endurance(runner, plan.endurance, memory)
         if plan.trace:
             row["kernels"] = trace_iterations(runner, plan.trace)
     return row
@@ -167,9 +167,9 @@ def _measure(task_name: str, env_cfg: Any, train_cfg: Any, plan: Plan, memory: M
 def time_iterations(
     runner: OnPolicyRunner, count: int, at_start: Callable[[int], object] = lambda number: None
 ) -> Times:
-    """Train for whole iterations as ``train.py`` does, with everything that is logged, and time them.
+    """Train for whole iterations as ``train.py`` does, with all logging, and time them.
 
-    One more iteration is run than timed: it shows when the last one ended. What is printed goes nowhere.
+    One more iteration is run than timed, to show when the last timed one ended. Nothing is printed.
 
     Args:
         runner: The runner.
@@ -177,48 +177,47 @@ def time_iterations(
         at_start: Called at the start of each iteration with its number from 0 to ``count``.
 
     Raises:
-        KeyboardInterrupt: If Ctrl-C was pressed, which the runner takes for a wish to stop early.
+        KeyboardInterrupt: If Ctrl-C was pressed, which the runner takes as a request to stop early.
     """
     collect, update = runner.collect_rollout, runner.alg.update
-    started, collected, updated = [], [], []
+    marks: list[float] = []  # of each iteration: start of the rollout, start and end of the update
 
     def timed_collect() -> None:
-        at_start(len(started))
-        started.append(time.perf_counter())
+        at_start(len(marks) // 3)
+        marks.append(time.perf_counter())
         with torch.profiler.record_function("rollout"):
             collect()
 
     def timed_update() -> dict[str, float]:
-        collected.append(time.perf_counter())
+        marks.append(time.perf_counter())
         with torch.profiler.record_function("update"):
             losses = update()
-        updated.append(time.perf_counter())
+        marks.append(time.perf_counter())
         return losses
 
-    runner.collect_rollout, runner.alg.update = timed_collect, timed_update
     try:
-        with open(os.devnull, "w") as nothing, contextlib.redirect_stdout(nothing):
+        with (
+            patch.object(runner, "collect_rollout", timed_collect),
+            patch.object(runner.alg, "update", timed_update),
+            open(os.devnull, "w") as nothing,
+            contextlib.redirect_stdout(nothing),
+        ):
             runner.learn(count + 1)
     finally:
-        del runner.collect_rollout, runner.alg.update
         if hasattr(runner.logger.writer, "close"):  # rsl_rl leaves tensorboard's open
             runner.logger.writer.close()
-    if len(started) <= count:
+    if len(marks) <= 3 * count:
         raise KeyboardInterrupt
-    times = Times()
-    for i in range(count):
-        times.rollout.append(1e3 * (collected[i] - started[i]))
-        times.update.append(1e3 * (updated[i] - collected[i]))
-        times.log.append(1e3 * (started[i + 1] - updated[i]))
-        times.iteration.append(1e3 * (started[i + 1] - started[i]))
-    return times
+    parts = _MS * np.diff(marks[: 3 * count + 1]).reshape(count, 3)
+    columns = {"rollout": parts[:, 0], "update": parts[:, 1], "log": parts[:, 2], "iteration": parts.sum(axis=1)}
+    return {name: values.tolist() for name, values in columns.items()}
 
 
 def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
-    """Time one control step in turns: its physics steps alone, the floor under everything else, and ``env.step``.
+    """Time the physics steps of one control step alone, which bound the speed of everything else, and ``env.step``.
 
-    Physics starts anew from the state that training has left every :data:`PHYSICS_STEPS` control steps, since lying
-    robots, which nobody resets here, have more contacts.
+    Physics restarts from the state that training has left every :data:`PHYSICS_STEPS` control steps: nothing resets
+    fallen robots here, and they have more contacts.
 
     Args:
         task: The task.
@@ -227,7 +226,7 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
     Returns:
         Medians of the milliseconds of the physics steps and of ``env.step``.
     """
-    actions = 0.5 * torch.randn(task.num_envs, task.num_actions, device=task.device)
+    actions = ACTION_SCALE * torch.randn(task.num_envs, task.num_actions, device=task.device)
     state = (task.sim.qpos, task.sim.qvel, task.sim.qacc_warmstart)
     kept = [tensor.clone() for tensor in state]
 
@@ -239,44 +238,38 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
             task.sim.step(sense=(i + 1) % decimation == 0)
 
     graph = CudaGraph(physics, task.device)
-    repeats = 20 if torch.device(task.device).type == "cuda" else 1
-    for _ in range(2):  # compile and capture
+    for _ in range(WARM_UP):
         graph()
-    times: tuple[list[float], list[float]] = ([], [])
-    for _ in range(rounds):
-        times[0].append(_milliseconds(graph, repeats, task) / PHYSICS_STEPS)
-        times[1].append(_milliseconds(lambda: task.step(actions), repeats, task))
-    return median(times[0]), median(times[1])
+    times = [(_milliseconds(graph, task), _milliseconds(lambda: task.step(actions), task)) for _ in range(rounds)]
+    of_physics, of_step = zip(*times, strict=True)
+    return median(of_physics) / PHYSICS_STEPS, median(of_step)
 
 
-def summarize(times: Times, physics: float, step: float, num_envs: int, num_steps: int) -> dict:
-    """Return medians with what follows from them: steps per second, and ratios to physics alone.
+def summarize(times: Times, physics: float, step: float, num_envs: int, num_steps: int) -> dict[str, Any]:
+    """Return medians, and the steps per second and ratios to physics alone that follow from them.
 
     Args:
-        times: Those of whole iterations.
+        times: Of whole iterations.
         physics: Milliseconds of the physics steps of one control step.
         step: Milliseconds of ``env.step``.
         num_envs: Number of worlds.
         num_steps: Control steps of a rollout.
     """
-    rollout, iteration = median(times.rollout), median(times.iteration)
+    medians = {name: median(values) for name, values in times.items()}
     return {
         "num_envs": num_envs,
         "num_steps_per_env": num_steps,
         "physics_ms": physics,
         "step_ms": step,
-        "rollout_ms": rollout,
-        "update_ms": median(times.update),
-        "log_ms": median(times.log),
-        "iteration_ms": iteration,
-        "iteration_min_ms": min(times.iteration),
-        "iteration_max_ms": max(times.iteration),
+        **{f"{name}_ms": value for name, value in medians.items()},
+        "iteration_min_ms": min(times["iteration"]),
+        "iteration_max_ms": max(times["iteration"]),
         "step_over_physics": step / physics,
-        "iteration_over_physics": iteration / (physics * num_steps),
-        "physics_steps_per_s": 1e3 * num_envs / physics,
-        "step_steps_per_s": 1e3 * num_envs / step,
-        "rollout_steps_per_s": 1e3 * num_envs * num_steps / rollout,
-        "iteration_steps_per_s": 1e3 * num_envs * num_steps / iteration,
+        "iteration_over_physics": medians["iteration"] / (physics * num_steps),
+        "physics_steps_per_s": _MS * num_envs / physics,
+        "step_steps_per_s": _MS * num_envs / step,
+        "rollout_steps_per_s": _MS * num_envs * num_steps / medians["rollout"],
+        "iteration_steps_per_s": _MS * num_envs * num_steps / medians["iteration"],
     }
 
 
@@ -284,20 +277,20 @@ def summarize_startup(marks: list[float]) -> dict[str, float]:
     """Return the seconds that pass before training runs at full speed.
 
     Args:
-        marks: When building began, when it ended, and when each iteration began [s]. The first one loads kernels and
-            compiles what is not in the cache, which in a process that measures several sizes the first size pays.
+        marks: When building began, when it ended, and when each iteration began [s]. The first iteration loads and
+            compiles kernels; where a process measures several sizes, only the first size pays for this.
 
     Returns:
         "build_s": task and runner. "log_s": opening the log. "first_iteration_s", and "capture_s" of the second one.
         "startup_s": all together.
     """
     names = ("build_s", "log_s", "first_iteration_s", "capture_s")
-    parts = {name: end - begin for name, begin, end in zip(names, marks[:-1], marks[1:], strict=True)}
+    parts = dict(zip(names, np.diff(marks).tolist(), strict=True))
     return {**parts, "startup_s": marks[-1] - marks[0]}
 
 
-def endure(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -> dict[str, float]:
-    """Run many iterations in a row and compare the first tenth of them with the last one.
+def measure_endurance(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -> dict[str, float]:
+    """Run many iterations in a row and compare the first tenth with the last.
 
     Returns:
         Mean milliseconds of an iteration in both tenths, and the memory at the end of both [MiB].
@@ -309,7 +302,7 @@ def endure(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -> dict[str,
         if number in (tenth, count):
             used[number] = memory.used()
 
-    times = time_iterations(runner, count, look).iteration
+    times = time_iterations(runner, count, look)["iteration"]
     first, last = mean(times[:tenth]), mean(times[-tenth:])
     return {
         "iterations": count,
@@ -322,27 +315,28 @@ def endure(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -> dict[str,
     }
 
 
-def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict]:
-    """Write a trace of :data:`TRACED` whole iterations that Perfetto and Chrome open.
+def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]:
+    """Write a trace of :data:`TRACED` whole iterations for Perfetto or Chrome.
 
     Args:
         runner: The runner, warmed up.
         file: The file to write, compressed if its name ends in ".gz".
 
     Returns:
-        What :func:`most_expensive` tells.
+        The list of :func:`most_expensive`.
     """
     cuda = torch.device(runner.device).type == "cuda"
     activity = torch.profiler.ProfilerActivity
+    activities = [activity.CPU, activity.CUDA] if cuda else [activity.CPU]
     schedule = torch.profiler.schedule(wait=0, warmup=1, active=TRACED, repeat=1)
-    with torch.profiler.profile(activities=[activity.CPU, *[activity.CUDA] * cuda], schedule=schedule) as profiler:
+    with torch.profiler.profile(activities=activities, schedule=schedule) as profiler:
         time_iterations(runner, 1 + TRACED, lambda number: profiler.step() if number else None)
     profiler.export_chrome_trace(str(file))
     return most_expensive(profiler.key_averages(), cuda)
 
 
-def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict]:
-    """Return what has taken most time in a trace: kernels and copies of a GPU, or torch's operators on the CPU.
+def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict[str, Any]]:
+    """Return the most expensive entries of a trace: kernels and copies of a GPU, or torch's operators on the CPU.
 
     torch's profiler sees Warp's kernels on a GPU only.
 
@@ -351,7 +345,7 @@ def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict]:
         cuda: Whether the work ran on a GPU.
 
     Returns:
-        Names, numbers of calls and total milliseconds without that of nested calls, the most expensive first.
+        Names, numbers of calls and total milliseconds without those of nested calls, the most expensive first.
     """
     kind, total = ("CUDA", "self_device_time_total") if cuda else ("CPU", "self_cpu_time_total")
     rows = [
@@ -364,24 +358,24 @@ def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict]:
 
 def is_out_of_memory(error: BaseException | None) -> bool:
     """Return whether an error, or one that led to it, says that memory has run out."""
-    words = ("out of memory", "Failed to allocate", "can't allocate memory")  # CUDA, Warp, torch on the CPU
     while error is not None:
         if isinstance(error, MemoryError | torch.OutOfMemoryError):
             return True
-        if isinstance(error, RuntimeError) and any(word in str(error) for word in words):
+        if isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY):
             return True
         error = error.__cause__ or error.__context__
     return False
 
 
-def _milliseconds(function: Callable[[], object], count: int, task: LeggedRobot) -> float:
-    """Return the mean time of one call of a function that is called ``count`` times."""
+def _milliseconds(function: Callable[[], object], task: LeggedRobot) -> float:
+    """Return the mean time of a call."""
+    count = GPU_CALLS if torch.device(task.device).type == "cuda" else 1
     _wait(task)
     start = time.perf_counter()
     for _ in range(count):
         function()
     _wait(task)
-    return 1e3 * (time.perf_counter() - start) / count
+    return _MS * (time.perf_counter() - start) / count
 
 
 def _wait(task: LeggedRobot) -> None:

@@ -1,4 +1,4 @@
-"""Whether training from CUDA graphs does what it does without."""
+"""Compares training with CUDA graphs to training without."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.task_registry import set_seed
 
 WARM_UP_ITERATIONS = 2
-"""The first calls run as they are, the second ones capture: what follows is replayed."""
+"""Iterations before everything is replayed: the first runs as it is, the second captures."""
 
 NOISE_FACTOR = 3.0
-"""How much further apart two runs may be than two that differ in nothing but the order of the physics' additions."""
+"""Accepted difference, in differences of two runs without graphs, where only the order of additions differs."""
 
 _LEARNED_FROM = ("observations", "actions", "values", "actions_log_prob", "returns", "advantages")
 
 
 @dataclass
 class Difference:
-    """How far numbers are from those that they should equal.
+    """The difference of a quantity with and without graphs.
 
     Attributes:
         largest: Largest absolute difference.
-        relative: The same in parts of the largest of the numbers.
-        rms: Root mean square of the differences in parts of that of the numbers; NaN if any of them is not finite.
-        repeated: The same for two runs without graphs. On a GPU threads may add in any order, and rounding errors grow
-            where feet touch the ground: errors of 1e-7 per step make rewards differ by 2% (rms) over 24 steps.
+        relative: Largest difference, relative to the largest absolute value.
+        rms: Root mean square of the differences, relative to that of the values; NaN if any of them is not finite.
+        repeated: ``rms`` of two runs without graphs. On a GPU threads add in any order, and rounding errors grow where
+            feet touch the ground: errors of 1e-7 per step make rewards differ by 2% (rms) over 24 steps.
     """
 
     largest: float
@@ -37,20 +37,20 @@ class Difference:
     repeated: float
 
     def within(self, tolerance: float) -> bool:
-        """Return whether ``rms`` is within the tolerance, or hardly larger than without graphs. NaN is not."""
+        """Return whether ``rms`` is within the tolerance or close to ``repeated``. NaN is not."""
         return self.rms <= max(tolerance, NOISE_FACTOR * self.repeated)
 
 
 def compare_capture(plain: OnPolicyRunner, captured: OnPolicyRunner, seed: int) -> dict[str, Difference]:
-    """Let two runners do the same iteration, and the first one twice.
+    """Run the same iteration with both runners, and with ``plain`` twice.
 
-    All three start from the networks and the counters of ``plain``, with new episodes and the same random numbers. They
+    All three start from the networks and counters of ``plain``, with new episodes and the same random numbers. They
     learn from the rollout of ``plain``, so that differences between rollouts do not hide those of the update.
 
     Args:
-        plain: A runner with ``runner.capture`` off that has done its :data:`WARM_UP_ITERATIONS`.
-        captured: One with it on that has done the same.
-        seed: Of the random numbers.
+        plain: A runner with ``runner.capture`` off, after :func:`warm_up`.
+        captured: A runner with ``runner.capture`` on, after :func:`warm_up`.
+        seed: Seed of the random numbers.
 
     Returns:
         By quantity: the rollout's observations by group, actions, rewards and returns, the changes of actor and critic,
@@ -64,7 +64,7 @@ def compare_capture(plain: OnPolicyRunner, captured: OnPolicyRunner, seed: int) 
 
 
 def warm_up(runner: OnPolicyRunner) -> None:
-    """Do the iterations after which everything that can replay does."""
+    """Run the iterations after which everything that can be captured is replayed."""
     runner.alg.train_mode()
     if runner.is_distributed:
         runner.alg.broadcast_parameters()
@@ -74,7 +74,7 @@ def warm_up(runner: OnPolicyRunner) -> None:
 
 
 def _state(runner: OnPolicyRunner) -> list[Tensor]:
-    """Return the tensors that a training carries from one iteration to the next: networks, optimizer, counters."""
+    """Return the tensors that training carries from one iteration to the next: networks, optimizer, counters."""
     alg = runner.alg
     networks = [*alg.actor.state_dict().values(), *alg.critic.state_dict().values()]
     moments = [tensor for entry in alg.optimizer.state.values() for tensor in entry.values()]
@@ -90,16 +90,16 @@ def _networks(runner: OnPolicyRunner) -> dict[str, Tensor]:
 def _iterate(
     runner: OnPolicyRunner, start: list[Tensor], seed: int, rollout: list[Tensor] | None = None
 ) -> tuple[dict[str, Tensor], list[Tensor]]:
-    """Do one iteration.
+    """Run one iteration.
 
     Args:
-        runner: Who does it.
-        start: What :func:`_state` shall be before.
-        seed: Of the random numbers.
-        rollout: What to learn from; None is the runner's own rollout.
+        runner: The runner.
+        start: Values of :func:`_state` to start from.
+        seed: Seed of the random numbers.
+        rollout: Data to learn from; None is the runner's own rollout.
 
     Returns:
-        What :func:`compare_capture` compares, and what was learned from.
+        The quantities that :func:`compare_capture` compares, and the data learned from.
     """
     env, storage = runner.env, runner.alg.storage
     for tensor, value in zip(_state(runner), start, strict=True):
@@ -124,7 +124,7 @@ def _iterate(
 
 
 def _compare(actual: Tensor, expected: Tensor, repeated: Tensor) -> Difference:
-    """Return how far ``actual`` and ``repeated`` are from ``expected``."""
+    """Return the differences of ``actual`` and ``repeated`` from ``expected``."""
 
     def ratio(error: Tensor, size: Tensor) -> float:
         return float(error / size) if error != 0.0 else 0.0

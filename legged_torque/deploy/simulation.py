@@ -12,7 +12,7 @@ import numpy as np
 
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import Robot
-from legged_torque.utils.metrics import step_sums
+from legged_torque.utils.metrics import NUM_SUMS, step_sums
 
 PUSH_ADDED = 0.5
 """Share of pushes that add a velocity; the others set one."""
@@ -68,11 +68,11 @@ class Simulation:
             on_step: Called after every control step, e.g. to record it.
 
         Returns:
-            Sums of the metrics, see :func:`~legged_torque.utils.metrics.step_sums`. Shape: (10,).
+            Sums of the metrics, see :func:`~legged_torque.utils.metrics.step_sums`. Shape: (NUM_SUMS,).
         """
         self._rng = np.random.default_rng(seed)
         self._new_episode()
-        sums = np.zeros(10)
+        sums = np.zeros(NUM_SUMS)
         for _ in range(num_steps):
             command = self.command.copy()
             self._control_step()
@@ -104,7 +104,8 @@ class Simulation:
         if self._rng.random() < self.events.push_probability:
             self._push()
         velocity = np.append(robot.trunk_velocity()[:2], robot.trunk_angular_velocity()[2])
-        return step_sums(command, velocity, force, power, robot.position()[2], fell, ended)
+        numbers = (np.linalg.norm(velocity[:2]), force, power, robot.position()[2], fell, ended)
+        return step_sums(np, command[None], velocity[None], *(np.array([number]) for number in numbers))[:, 0]
 
     def _push(self) -> None:
         """Push the trunk: half of the pushes set its velocity, half are added to it."""

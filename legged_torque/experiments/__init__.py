@@ -1,1 +1,1 @@
-"""Matrices of trainings and evaluations, and what comes of them: tables, figures, reports."""
+"""Matrices of trainings and evaluations, and their tables, figures and reports."""

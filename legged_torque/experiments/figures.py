@@ -1,4 +1,4 @@
-"""The paper's Figures 3, 5, 6 and 7, from an experiment of one's own.
+"""The paper's Figures 3, 5, 6 and 7, drawn from your own experiment, and learning curves of single trainings.
 
 A task has the same colour, line style and hatch in all figures, so that they can be read in grey too.
 """
@@ -7,18 +7,25 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean, median
-from typing import Any
+from statistics import median
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from legged_torque.experiments.paper_values import ENVIRONMENTS, METRICS, MODELS, paper_value
-from legged_torque.experiments.report import Experiment, Run, Summary, Table
+from legged_torque.experiments.curves import CURVE_METRICS, MILLION, LearningCurve, Row
+from legged_torque.experiments.paper_values import ENVIRONMENTS, MODELS, PAPER_METRICS, paper_value
+from legged_torque.experiments.results import Experiment, Summary, Table
+from legged_torque.utils.metrics import Metric
 from legged_torque.utils.plotting import load_pyplot
 
-STYLES = {  # colours of Okabe and Ito, which colour-blind eyes tell apart; near those of the paper
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+STYLES = {  # colours of Okabe and Ito, which colour-blind readers can tell apart; close to those of the paper
     "a1_position": ("#0072B2", "-", ""),
     "a1_torque": ("#009E73", ":", "..."),
     "a1_torque_gravity": ("#56B4E9", (0, (1, 1, 3, 1)), "xxx"),
@@ -26,20 +33,32 @@ STYLES = {  # colours of Okabe and Ito, which colour-blind eyes tell apart; near
     "a1_torque_multihead": ("#D55E00", "-.", "\\\\\\"),
     "a1_multihead": ("#CC79A7", (0, (6, 1, 1, 1, 1, 1)), "---"),
 }
+"""Colour, line style and hatch of each task."""
 OTHER_STYLES = (("#000000", "-", "++"), ("#777777", "--", "oo"), ("#999933", "-.", "**"))
+SEED_LINES = ("-", "--", ":", "-.")
+"""Line styles by seed, where single trainings are shown."""
 CURVES = {
-    "figure3": ("Figure 3", "track_percentage", "tracking (1 is perfect)", "linear"),
-    "figure5a": ("Figure 5a", "height", "walking height [m]", "linear"),
-    "figure5b": ("Figure 5b", "critic_gradient_norm", "gradient norm of the critic", "log"),
+    "Figure 3": ("track_percentage", "linear"),
+    "Figure 5a": ("height", "linear"),
+    "Figure 5b": ("critic_gradient_norm", "log"),
 }
-"""Title, metric, name of the axis and its scale, by name of the file."""
-BARS = {"figure6": ("Figure 6", ("low", "high")), "figure7": ("Figure 7", ("high_frequency", "doubled"))}
-"""Title and columns of Table I, by name of the file."""
+"""Metric and scale of its axis, by title."""
+BARS = {"Figure 6": ("low", "high"), "Figure 7": ("high_frequency", "doubled")}
+"""Columns of Table I, by title."""
+FIGURES = (*CURVES, *BARS)
+SINGLE_CURVES = ("track_percentage", "track_xy", "cost_of_transport")
+"""Metrics that are shown of single trainings."""
+METRICS_BY_NAME = {metric.name: metric for metric in CURVE_METRICS}
 BAND_ALPHA = 0.2
 UNFINISHED_ALPHA = 0.45
 CUT_AT = 3.0
-"""Height of a panel of bars at most, in medians of what it shows."""
-SETTINGS = {"font.size": 10, "hatch.linewidth": 0.6, "svg.hashsalt": "report", "axes.axisbelow": True}
+"""Largest height of a panel of bars, in medians of the values that it shows."""
+PAPER_MARKER: dict[str, Any] = {"marker": "D", "color": "none", "markerfacecolor": "white", "markeredgecolor": "black"}
+SETTINGS = {"font.size": 10, "hatch.linewidth": 0.6, "axes.axisbelow": True}
+DPI = 150
+
+Style = tuple[str, Any, str]
+"""Colour, line style and hatch."""
 
 
 @dataclass
@@ -49,70 +68,89 @@ class Curve:
     Attributes:
         steps: Steps of the evaluations with a finite value. Shape: (points,).
         values: The values. Shape: (points,).
-        is_finished: Whether the training is.
+        is_finished: Whether the training is finished.
     """
 
     steps: np.ndarray
     values: np.ndarray
-    is_finished: bool
+    is_finished: bool = True
+
+
+def file_name(title: str) -> str:
+    """Return the name of a figure's file."""
+    return f"{title.lower().replace(' ', '')}.png"
 
 
 def draw_all(experiment: Experiment, table: Table, out: Path) -> list[str]:
-    """Draw every figure that there is something to draw for, as PNG and SVG.
+    """Draw every figure that there are data for, as PNG.
 
     Returns:
-        The names of the files, without their endings.
+        The titles of the figures.
 
     Raises:
         UserError: If matplotlib is missing.
     """
-    pyplot = load_pyplot()
-    figures = {}
+    pyplot, drawn = load_pyplot(), []
     with pyplot.rc_context(SETTINGS):
-        for name, settings in CURVES.items():
-            figures[name] = draw_curves(pyplot, experiment, *settings)
-        for name, settings in BARS.items():
-            figures[name] = draw_bars(pyplot, experiment, table, *settings)
-        for name, figure in figures.items():
+        for title in FIGURES:
+            figure = draw_curves(experiment, title) if title in CURVES else draw_bars(experiment, table, title)
             if figure is not None:
-                figure.savefig(out / f"{name}.png", dpi=150)
-                figure.savefig(out / f"{name}.svg", metadata={"Date": None})
+                figure.savefig(out / file_name(title), dpi=DPI)
                 pyplot.close(figure)
-    return [name for name, figure in figures.items() if figure is not None]
+                drawn.append(title)
+    return drawn
 
 
-def style(experiment: Experiment, task: str) -> tuple[str, Any, str]:
-    """Return colour, line style and hatch of a task."""
-    if task in STYLES:
-        return STYLES[task]
-    others = [name for name in experiment.tasks if name not in STYLES]
-    return OTHER_STYLES[others.index(task) % len(OTHER_STYLES)]
+def style(tasks: Sequence[str], task: str) -> Style:
+    """Return the style of one of the tasks in a figure."""
+    others = [name for name in tasks if name not in STYLES]
+    return STYLES[task] if task in STYLES else OTHER_STYLES[others.index(task) % len(OTHER_STYLES)]
 
 
-def draw_curves(pyplot: Any, experiment: Experiment, title: str, metric: str, label: str, scale: str) -> Any:
-    """Draw a metric over the steps of training, a panel per environment; return None if there is nothing to draw."""
-    panels = {}
-    for environment in sorted(experiment.environments, key=environment_order):
-        curves = {task: seed_curves(experiment.runs_of(task, environment), metric) for task in experiment.tasks}
+def draw_single_curves(runs: list[LearningCurve]) -> Figure:
+    """Draw a panel per metric with a line per training."""
+    figure, axes = load_pyplot().subplots(1, len(SINGLE_CURVES), figsize=(15, 4.5), layout="constrained")
+    tasks = sorted({run.task for run in runs})
+    for axis, name in zip(axes, SINGLE_CURVES, strict=True):
+        for run in runs:
+            color, _, hatch = style(tasks, run.task)
+            line = SEED_LINES[(run.seed - 1) % len(SEED_LINES)]
+            curve = metric_curve(run.rows, name)
+            if curve.steps.size:
+                draw_curve(axis, [curve], str(run), (color, line, hatch))
+        set_axis(axis, METRICS_BY_NAME[name].label)
+        axis.set(xlim=(0, None), ylim=(0, None))
+    axes[0].legend(fontsize="small")
+    return figure
+
+
+def draw_curves(experiment: Experiment, title: str) -> Figure | None:
+    """Draw a metric over the steps of training, a panel per environment; return None without data."""
+    name, scale = CURVES[title]
+    panels: dict[str, dict[str, list[Curve]]] = {}
+    order = [*ENVIRONMENTS, *experiment.environments]  # those of Table I first
+    for environment in sorted(experiment.environments, key=order.index):
+        curves = {task: task_curves(experiment, task, environment, name) for task in experiment.tasks}
         if any(curves.values()):
             panels[environment] = {task: seeds for task, seeds in curves.items() if seeds}
     if not panels:
         return None
     size = (max(7.0, 5.5 * len(panels)), 5.6)
-    figure, axes = pyplot.subplots(1, len(panels), figsize=size, sharey=True, squeeze=False, layout="constrained")
-    end = max(run.total_steps for run in experiment.runs.values()) / 1e6
+    figure, axes = load_pyplot().subplots(
+        1, len(panels), figsize=size, sharey=True, squeeze=False, layout="constrained"
+    )
+    end = max(run.total_steps for run in experiment.runs.values()) / MILLION
     for axis, (environment, curves) in zip(axes[0], panels.items(), strict=True):
         for task, seeds in curves.items():
-            text = f"{MODELS.get(task, task)}{progress_note(seeds, len(experiment.seeds))}"
-            draw_curve(axis, seeds, text, style(experiment, task))
-        axis.set(title=ENVIRONMENTS.get(environment, environment), xlabel="environment steps [millions]")
+            label = f"{MODELS.get(task, task)}{progress_note(seeds, len(experiment.seeds))}"
+            draw_curve(axis, seeds, label, style(experiment.tasks, task))
+        set_axis(axis, ENVIRONMENTS.get(environment, environment))
         axis.set(xlim=(0, 1.02 * end), yscale=scale)
-        axis.grid(alpha=0.3)
         # below the axis: labels of unfinished curves are long and would hide others
         axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), fontsize=9, handlelength=4, frameon=False)
     if scale == "linear":
         axes[0, 0].set_ylim(0, None)
-    axes[0, 0].set_ylabel(label)
+    axes[0, 0].set_ylabel(METRICS_BY_NAME[name].label)
     text = "mean over seeds, with a band of one standard error to each side"
     if not all(curve.is_finished for curves in panels.values() for seeds in curves.values() for curve in seeds):
         text += "; cross: a training that is not finished"
@@ -120,57 +158,62 @@ def draw_curves(pyplot: Any, experiment: Experiment, title: str, metric: str, la
     return figure
 
 
-def environment_order(environment: str) -> int:
-    """Return the place of an environment: those of Table I first, in its order."""
-    names = list(ENVIRONMENTS)
-    return names.index(environment) if environment in names else len(names)
+def set_axis(axis: Axes, title: str) -> None:
+    """Set title, label and grid of a panel of learning curves."""
+    axis.set(title=title, xlabel="environment steps [millions]")
+    axis.grid(alpha=0.3)
 
 
-def seed_curves(runs: list[Run], metric: str) -> list[Curve]:
-    """Return the curve of each run that has a finite value."""
-    curves = []
-    for run in runs:
-        points = [(row["steps"], row[metric]) for row in run.rows if math.isfinite(row[metric])]
-        if points:
-            steps, values = np.array(points, dtype=float).T
-            curves.append(Curve(steps, values, run.is_finished(run.steps)))
-    return curves
+def task_curves(experiment: Experiment, task: str, environment: str, name: str) -> list[Curve]:
+    """Return a metric of every training of a task in an environment that has values of it."""
+    runs = experiment.runs_of(task, environment)
+    curves = [metric_curve(run.rows, name, run.is_finished(run.steps)) for run in runs]
+    return [curve for curve in curves if curve.steps.size]
+
+
+def metric_curve(rows: list[Row], name: str, is_finished: bool = True) -> Curve:
+    """Return the finite values of a metric in the evaluations of a training."""
+    points = [(row["steps"], row[name]) for row in rows if math.isfinite(row[name])]
+    steps, values = np.array(points, dtype=float).reshape(-1, 2).T
+    return Curve(steps, values, is_finished)
 
 
 def progress_note(seeds: list[Curve], num_planned: int) -> str:
-    """Return what a label says of a task that is not complete; nothing if it is."""
+    """Return the addition to the label of an incomplete task; nothing if the task is complete."""
     if all(curve.is_finished for curve in seeds):
         return "" if len(seeds) == num_planned else f" ({len(seeds)} of {num_planned} seeds)"
-    ends = sorted(curve.steps[-1] / 1e6 for curve in seeds)
+    ends = sorted(curve.steps[-1] / MILLION for curve in seeds)
     texts = dict.fromkeys([f"{ends[0]:.3g}", f"{ends[-1]:.3g}"])
     return f" ({len(seeds)} of {num_planned} seeds, up to {'–'.join(texts)}e6 steps)"
 
 
-def draw_curve(axis: Any, seeds: list[Curve], label: str, styles: tuple[str, Any, str]) -> None:
-    """Draw mean and standard error over the seeds that have come so far, and a cross where a training has to go on."""
+def draw_curve(axis: Axes, seeds: list[Curve], label: str, styles: Style) -> None:
+    """Draw the mean over the seeds with its standard error, and a cross where an unfinished training ends."""
     color, line, _ = styles
     steps = np.unique(np.concatenate([curve.steps for curve in seeds]))
     values = np.array([np.interp(steps, curve.steps, curve.values, left=np.nan, right=np.nan) for curve in seeds])
     count = np.isfinite(values).sum(axis=0)
     mean = np.nansum(values, axis=0) / count
-    axis.plot(steps / 1e6, mean, color=color, linestyle=line, linewidth=1.6, label=label)
+    axis.plot(steps / MILLION, mean, color=color, linestyle=line, linewidth=1.6, label=label)
     if len(seeds) > 1:
         error = np.sqrt(np.nansum((values - mean) ** 2, axis=0) / np.maximum(count - 1, 1) / count)
         error[count < 2] = np.nan
-        axis.fill_between(steps / 1e6, mean - error, mean + error, color=color, alpha=BAND_ALPHA, linewidth=0)
+        axis.fill_between(steps / MILLION, mean - error, mean + error, color=color, alpha=BAND_ALPHA, linewidth=0)
     ends = np.array([curve.steps[-1] for curve in seeds if not curve.is_finished])
-    axis.plot(ends / 1e6, np.interp(ends, steps, mean), "x", color=color, markersize=7, markeredgewidth=1.8)
+    axis.plot(ends / MILLION, np.interp(ends, steps, mean), "x", color=color, markersize=7, markeredgewidth=1.8)
 
 
-def draw_bars(pyplot: Any, experiment: Experiment, table: Table, title: str, columns: tuple[str, ...]) -> Any:
-    """Draw the metrics of Table I, a row per column of it; return None if there is nothing to draw."""
-    columns = tuple(name for name in columns if any(table.get(name, {}).values()))
+def draw_bars(experiment: Experiment, table: Table, title: str) -> Figure | None:
+    """Draw the metrics of Table I, a row of panels per column of the table; return None without data."""
+    columns = [name for name in BARS[title] if any(table.get(name, {}).values())]
     if not columns:
         return None
     size = (15.0, 3.6 * len(columns) + 0.9)
-    figure, axes = pyplot.subplots(len(columns), len(METRICS), figsize=size, squeeze=False, layout="constrained")
+    figure, axes = load_pyplot().subplots(
+        len(columns), len(PAPER_METRICS), figsize=size, squeeze=False, layout="constrained"
+    )
     for row, column in zip(axes, columns, strict=True):
-        for axis, metric in zip(row, METRICS, strict=True):
+        for axis, metric in zip(row, PAPER_METRICS, strict=True):
             draw_panel(axis, experiment, table, column, metric)
         row[0].set_ylabel(ENVIRONMENTS[column])
     draw_legend(figure, experiment)
@@ -179,58 +222,57 @@ def draw_bars(pyplot: Any, experiment: Experiment, table: Table, title: str, col
     return figure
 
 
-def draw_panel(axis: Any, experiment: Experiment, table: Table, column: str, metric: str) -> None:
-    """Draw a metric in a column of Table I. What is far beyond all others is cut off, so that these can be read."""
+def draw_panel(axis: Axes, experiment: Experiment, table: Table, column: str, metric: Metric) -> None:
+    """Draw a metric in a column of Table I. Bars far beyond the others are cut off, so that the others stay legible."""
     heights, papers, notes = [], [], []
     for place, task in enumerate(experiment.tasks):
-        summary, paper = table[column].get(task, {}).get(metric), paper_value(task, column, metric)
-        notes.append(progress_of_bar(summary, len(experiment.seeds)))
-        heights.append(fmean(summary.values) if summary else 0.0)
+        summary, paper = table[column].get(task, {}).get(metric.name), paper_value(task, column, metric.name)
+        notes.append(bar_note(summary, len(experiment.seeds)))
+        heights.append(summary.mean if summary else 0.0)
         if summary:
-            draw_bar(axis, summary, f"{heights[-1]:.{METRICS[metric].digits}f}", style(experiment, task), place)
-        if paper is not None:  # beside the middle, where the error is
-            marker = {"marker": "D", "color": "white", "markeredgecolor": "black", "markeredgewidth": 1.4}
+            draw_bar(axis, summary, f"{summary.mean:.{metric.digits}f}", style(experiment.tasks, task), place)
+        if paper is not None:  # beside the middle, where the error bar is
             papers.append(paper)
-            axis.plot(place + 0.26, paper, markersize=5.5, zorder=5, **marker)
+            axis.plot(place + 0.26, paper, markersize=5.5, markeredgewidth=1.4, zorder=5, **PAPER_MARKER)
     shown = [height for height in heights + papers if height > 0.0] or [1.0]
     top = min(1.12 * max(shown), CUT_AT * median(shown))
     notes = [f"{note}\ncut".strip() if height > top else note for note, height in zip(notes, heights, strict=True)]
     axis.set_xticks(range(len(notes)), notes, fontsize=8)
     axis.tick_params(axis="x", length=0)
-    axis.set(title=METRICS[metric].label(), xlim=(-0.6, len(notes) - 0.4), ylim=(0, top))
+    axis.set(title=metric.label, xlim=(-0.6, len(notes) - 0.4), ylim=(0, top))
     axis.grid(axis="y", alpha=0.3)
 
 
-def progress_of_bar(summary: Summary | None, num_planned: int) -> str:
-    """Return what is written below a bar that is not final; nothing below others."""
+def bar_note(summary: Summary | None, num_planned: int) -> str:
+    """Return the note below a bar that is not final; nothing below other bars."""
     if summary is None:
         return "no\ndata"
     return "" if summary.is_final else f"{len(summary.values)} of\n{num_planned} *"
 
 
-def draw_bar(axis: Any, summary: Summary, text: str, styles: tuple[str, Any, str], place: int) -> None:
+def draw_bar(axis: Axes, summary: Summary, text: str, styles: Style, place: int) -> None:
     """Draw a bar with its error and its number; pale if it is not final."""
     color, _, hatch = styles
-    mean, alpha = fmean(summary.values), 1.0 if summary.is_final else UNFINISHED_ALPHA
+    mean, alpha = summary.mean, 1.0 if summary.is_final else UNFINISHED_ALPHA
     axis.bar(place, mean, width=0.8, color=color, hatch=hatch, edgecolor="black", linewidth=0.8, alpha=alpha)
     axis.errorbar(place, mean, yerr=summary.standard_error, color="black", capsize=5, linewidth=1.5, zorder=4)
     box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
-    settings = {"rotation": 90, "ha": "center", "va": "bottom", "fontsize": 9, "bbox": box}
-    axis.text(place, 0.04, text, transform=axis.get_xaxis_transform(), **settings)
+    bottom = axis.get_xaxis_transform()
+    axis.text(place, 0.04, text, transform=bottom, rotation=90, ha="center", va="bottom", fontsize=9, bbox=box)
 
 
-def draw_legend(figure: Any, experiment: Experiment) -> None:
+def draw_legend(figure: Figure, experiment: Experiment) -> None:
     """Draw the legend of a figure of bars below it."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles = []
+    handles: list[Any] = []
     for task in experiment.tasks:
-        color, _, hatch = style(experiment, task)
+        color, _, hatch = style(experiment.tasks, task)
         handles.append(Patch(facecolor=color, hatch=hatch, edgecolor="black", label=MODELS.get(task, task)))
-    marker = {"marker": "D", "color": "none", "markerfacecolor": "white", "markeredgecolor": "black"}
-    handles.append(Line2D([], [], label="paper", **marker))
-    pale = f"pale, *: seeds are missing (n of {len(experiment.seeds)} are there) or trainings not finished"
-    handles.append(Patch(facecolor="none", edgecolor="none", label=pale))
-    handles.append(Patch(facecolor="none", edgecolor="none", label="cut: far beyond the others"))
+    handles.append(Line2D([], [], label="paper", **PAPER_MARKER))
+    pale = f"pale, *: not all {len(experiment.seeds)} seeds are there, or trainings are not finished"
+    handles += [
+        Patch(facecolor="none", edgecolor="none", label=label) for label in (pale, "cut: far beyond the others")
+    ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, handlelength=3, frameon=False)

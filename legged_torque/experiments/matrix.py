@@ -1,4 +1,4 @@
-"""A matrix of trainings, approaches x environments x seeds: its description, and how far each of its cells is."""
+"""A matrix of trainings, tasks x environments x seeds: its description, and the progress of each of its cells."""
 
 from __future__ import annotations
 
@@ -11,26 +11,28 @@ from typing import Any
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of
 from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.options import Options
 from legged_torque.utils.runs import checkpoint_numbers, load_config
 
 SETTINGS_FILE = "experiment.yaml"
-"""Copy of the description that a folder of results was made with."""
-OF_A_CELL = {"seed": "seeds", "runner.experiment_name": "tasks, environments and seeds"}
-"""Settings of a training that ``train`` must not change, because the cell says them, and where they come from."""
+"""Copy of the description, in the folder of the results."""
+CELL_SETTINGS = {"seed": "seeds", "runner.experiment_name": "tasks, environments and seeds"}
+"""Settings that ``train`` must not change, and the keys that they come from."""
+EVALUATION = {"num_envs": 256, "num_steps": 2000}
+"""Worlds and control steps of an evaluation, unless the description has others."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One training and the evaluations of its end result.
+    """One training and the evaluations of its last checkpoint.
 
     Attributes:
         task: Name of the task.
-        environment: Perturbation in which it is trained.
-        seed: Its random seed.
-        evaluated_in: Perturbations in which its end result is evaluated.
+        environment: Perturbation during training.
+        seed: Random seed.
+        evaluated_in: Perturbations in which the last checkpoint is evaluated.
     """
 
     task: str
@@ -46,15 +48,15 @@ class Cell:
 
 @dataclass(frozen=True)
 class Matrix:
-    """What is trained and evaluated.
+    """The trainings and evaluations of an experiment.
 
     Attributes:
         tasks: Names of tasks.
-        environments: For each perturbation of a training those in which its end result is evaluated.
+        environments: For each perturbation during training, those in which the last checkpoint is evaluated.
         seeds: Random seeds.
-        ranges: How far random parameters go, as ``--ranges`` takes it; empty: as the tasks have it.
+        ranges: Ranges of random parameters, as ``--ranges`` takes them; empty: the tasks' own.
         train: Changed settings of the trainings, by dotted path.
-        evaluation: "num_envs" worlds and "num_steps" control steps of an evaluation.
+        evaluation: Worlds and control steps of an evaluation, as in :data:`EVALUATION`.
     """
 
     tasks: list[str]
@@ -65,7 +67,7 @@ class Matrix:
     evaluation: dict[str, int] = field(default_factory=dict)
 
     def cells(self) -> list[Cell]:
-        """Return all cells; a seed's come before the next one's, so that half a matrix can be compared already."""
+        """Return all cells, seed by seed, so that tasks can be compared before all seeds are done."""
         return [
             Cell(task, environment, seed, tuple(evaluated_in))
             for seed in self.seeds
@@ -75,12 +77,12 @@ class Matrix:
 
 
 @dataclass(frozen=True)
-class State:
-    """How far a cell is.
+class CellState:
+    """The progress of a cell.
 
     Attributes:
-        iterations: Those of its last checkpoint.
-        total: Those after which its training is complete; None if it has no checkpoint.
+        iterations: Iterations of training before its last checkpoint.
+        total: Iterations of the whole training; None if it has no checkpoint.
         missing: Perturbations without a readable result.
     """
 
@@ -90,7 +92,7 @@ class State:
 
     @property
     def step(self) -> str:
-        """What is to be done next: "train", "resume" or "evaluate"; "" if all is done."""
+        """The next step: "train", "resume" or "evaluate"; "" if all is done."""
         if not self.missing:
             return ""
         if self.total is None:
@@ -98,7 +100,7 @@ class State:
         return "resume" if self.iterations < self.total else "evaluate"
 
     def __str__(self) -> str:
-        """Say what is to be done, all of it."""
+        """Describe all that is left to do."""
         evaluations = f"evaluate in {', '.join(self.missing)}"
         return {
             "": "done",
@@ -109,10 +111,10 @@ class State:
 
 
 def read_matrix(file: Path) -> Matrix:
-    """Return what a file describes, completely checked.
+    """Read and check the description of a matrix.
 
     Raises:
-        UserError: If it cannot be read, or something in it is unknown or makes no sense.
+        UserError: If it cannot be read or is not valid.
     """
     if not file.is_file():
         raise UserError(f"there is no file '{file}'")
@@ -134,14 +136,15 @@ def read_matrix(file: Path) -> Matrix:
     check_list("environments", list(values["environments"]), str)
     for name, evaluated_in in values["environments"].items():
         check_list(f"environments.{name}", evaluated_in, str)
-    values["evaluation"] = {"num_envs": 256, "num_steps": 2000} | check_evaluation(values["evaluation"])
+    check_evaluation(values["evaluation"])
+    values["evaluation"] = EVALUATION | values["evaluation"]
     matrix = Matrix(**values)
     check_settings(matrix)
     return matrix
 
 
 def check_list(key: str, values: Any, kind: type) -> None:
-    """Refuse what is not a list of different values of a type, or is empty.
+    """Check that an entry is a list of one value or more, of one type and all different.
 
     Raises:
         UserError: Naming the key.
@@ -153,60 +156,60 @@ def check_list(key: str, values: Any, kind: type) -> None:
         raise UserError(f"experiment key '{key}' holds something twice: {values}")
 
 
-def check_evaluation(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the numbers of an evaluation after checking them.
+def check_evaluation(values: dict[str, Any]) -> None:
+    """Check the numbers of an evaluation.
 
     Raises:
-        UserError: If a key is unknown or a number is not one.
+        UserError: If a key is unknown or a number is not valid.
     """
-    allowed = ("num_envs", "num_steps")
     for key, value in values.items():
-        if key not in allowed:
-            raise unknown_name("evaluation key", str(key), allowed)
+        if key not in EVALUATION:
+            raise unknown_name("evaluation key", str(key), EVALUATION)
         if type(value) is not int or value < 1:
             raise UserError(f"evaluation.{key} must be a whole number of at least 1, not {value!r}")
-    return values
 
 
 def check_settings(matrix: Matrix) -> None:
-    """Refuse tasks, perturbations and settings that train.py or evaluate.py would refuse hours later.
+    """Check what train.py and evaluate.py would check only hours later: tasks, perturbations and settings.
 
     Raises:
-        UserError: Naming the first one, with the nearest valid name.
+        UserError: Naming the first invalid one, with the nearest valid name.
     """
-    for key, source in OF_A_CELL.items():
+    for key, source in CELL_SETTINGS.items():
         if key in matrix.train:
             raise UserError(f"train.{key} cannot be set: it comes from {source}")
-    parser = Parser("settings of a training")
-    add_task_args(parser)
-    add_train_args(parser)
     for cell in matrix.cells():
-        words = ["--device=cpu", f"--task={cell.task}", *new_run_words(matrix, cell)]
-        env_cfg, _ = task_registry.get_cfgs(cell.task, options_of(parser.parse_args(words)))
+        env_cfg = task_settings(matrix, cell)
         check_env_cfg(env_cfg)
         for name in cell.evaluated_in:
             if name not in env_cfg.perturbations():
                 raise unknown_name("perturbation", name, env_cfg.perturbations())
 
 
-def new_run_words(matrix: Matrix, cell: Cell) -> list[str]:
-    """Return the options of train.py that a new run has and a resumed one keeps."""
-    texts = {
-        key: value if isinstance(value, str) else json.dumps(value, default=str) for key, value in matrix.train.items()
-    }
-    settings = [f"--set={key}={text}" for key, text in texts.items()]
-    settings += [f"--ranges={matrix.ranges}"] if matrix.ranges else []
-    return [f"--seed={cell.seed}", f"--perturbation={cell.environment}", *settings]
+def task_settings(matrix: Matrix, cell: Cell) -> Any:
+    """Return the settings of a cell's task in a new run.
+
+    Raises:
+        UserError: If the task or one of its settings is unknown or not valid.
+    """
+    ranges = str(matrix.ranges) if matrix.ranges else None
+    options = Options(device="cpu", seed=cell.seed, perturbation=cell.environment, ranges=ranges, set=set_words(matrix))
+    return task_registry.get_cfgs(cell.task, options)[0]
 
 
-def step_command(matrix: Matrix, out: Path, cell: Cell, state: State, device: str) -> list[str]:
+def set_words(matrix: Matrix) -> list[str]:
+    """Return the changed settings of the trainings as ``--set`` takes them."""
+    return [f"{key}={v if isinstance(v, str) else json.dumps(v, default=str)}" for key, v in matrix.train.items()]
+
+
+def step_command(matrix: Matrix, out: Path, cell: Cell, state: CellState, device: str) -> list[str]:
     """Return the command line of a cell's next step.
 
     Args:
-        matrix: What is trained and evaluated.
+        matrix: The trainings and evaluations.
         out: Folder of all results.
         cell: The cell.
-        state: How far it is.
+        state: Its progress.
         device: Device of the step, as ``--device`` takes it.
     """
     words = [f"--task={cell.task}", f"--log_root={out}", f"--experiment_name={cell.name}", f"--device={device}"]
@@ -214,15 +217,20 @@ def step_command(matrix: Matrix, out: Path, cell: Cell, state: State, device: st
         name, numbers = state.missing[0], matrix.evaluation
         words += [f"--perturbation={name}", f"--num_envs={numbers['num_envs']}", f"--steps={numbers['num_steps']}"]
         return [sys.executable, str(SCRIPTS_DIR / "evaluate.py"), *words, f"--json={part_file(out, cell, name)}"]
-    words += ["--resume"] if state.step == "resume" else new_run_words(matrix, cell)
+    if state.step == "resume":
+        words.append("--resume")
+    else:
+        words += [f"--seed={cell.seed}", f"--perturbation={cell.environment}"]
+        words += [f"--set={word}" for word in set_words(matrix)]
+        words += [f"--ranges={matrix.ranges}"] if matrix.ranges else []
     return [sys.executable, str(SCRIPTS_DIR / "train.py"), *words]
 
 
-def cell_state(out: Path, cell: Cell) -> State:
-    """Return how far a cell is.
+def cell_state(out: Path, cell: Cell) -> CellState:
+    """Return the progress of a cell.
 
     Raises:
-        UserError: If its newest run with a checkpoint does not say how many iterations it should have.
+        UserError: If the settings of its newest run with a checkpoint lack the number of iterations.
     """
     missing = tuple(name for name in cell.evaluated_in if not is_json(result_file(out, cell, name)))
     for run_dir in sorted((out / cell.name).glob("*/"), reverse=True):
@@ -231,8 +239,8 @@ def cell_state(out: Path, cell: Cell) -> State:
             total = load_config(run_dir).get("max_iterations")
             if type(total) is not int:
                 raise UserError(f"the settings of the run '{run_dir}' lack max_iterations")
-            return State(numbers[-1], total, missing)
-    return State(0, None, missing)
+            return CellState(numbers[-1], total, missing)
+    return CellState(0, None, missing)
 
 
 def result_file(out: Path, cell: Cell, environment: str) -> Path:
@@ -241,12 +249,12 @@ def result_file(out: Path, cell: Cell, environment: str) -> Path:
 
 
 def part_file(out: Path, cell: Cell, environment: str) -> Path:
-    """Return the file that an evaluation writes, which becomes the result when it is complete."""
-    return out / cell.name / f"result_{environment}.json.part"
+    """Return the file that an evaluation writes; it becomes the result when the evaluation is complete."""
+    return result_file(out, cell, environment).with_suffix(".json.part")
 
 
 def is_json(file: Path) -> bool:
-    """Return whether a file is there and holds a JSON object."""
+    """Return whether a file exists and holds a JSON object."""
     try:
         return isinstance(json.loads(file.read_text(encoding="utf-8")), dict)
     except (OSError, ValueError):
@@ -254,10 +262,10 @@ def is_json(file: Path) -> bool:
 
 
 def check_same(matrix: Matrix, out: Path) -> None:
-    """Refuse to mix results: those of a folder must be of the same settings. More cells are fine, fewer are not.
+    """Check that the results of a folder were made with the same settings. A matrix may have more cells, but not fewer.
 
     Raises:
-        UserError: Naming the first setting that differs from those that the folder was made with.
+        UserError: Naming the first setting that differs.
     """
     file = out / SETTINGS_FILE
     if not file.is_file():
@@ -269,10 +277,13 @@ def check_same(matrix: Matrix, out: Path) -> None:
             if was.get(key) != now.get(key):
                 texts = [str(values.get(key, "not set")) for values in (now, was)]
                 raise UserError(f"{differs}: {section}.{key} is {texts[0]}, was {texts[1]}; give another --out")
-    lists = {"tasks": (old.tasks, matrix.tasks), "environments": (old.environments, matrix.environments)}
-    lists["seeds"] = (old.seeds, matrix.seeds)
-    lists |= {f"environments.{key}": (old.environments[key], matrix.environments.get(key)) for key in old.environments}
-    for key, (was, now) in lists.items():
-        lost = [str(value) for value in was if value not in now]
+    for key, old_values in lists(old).items():
+        lost = [str(value) for value in old_values if value not in lists(matrix).get(key, [])]
         if lost:
             raise UserError(f"{differs}: {key} had {', '.join(lost)} as well; give another --out")
+
+
+def lists(matrix: Matrix) -> dict[str, list[Any]]:
+    """Return the lists that make up the cells of a matrix, by their keys."""
+    evaluated = {f"environments.{name}": names for name, names in matrix.environments.items()}
+    return {"tasks": matrix.tasks, "environments": list(matrix.environments), "seeds": matrix.seeds, **evaluated}

@@ -1,48 +1,20 @@
 """Table I of *Learning torque control for quadrupeds* (Schmidt, Gaumann, Bohlinger), as printed.
 
-The values are means over four runs with different seeds of all evaluations after training step 90 million (the table's
-caption). The table prints no standard errors or deviations, so that there are none here, and it has no row for default
-torque control (``a1_torque``) or gravity pre-training. Values that the authors mark in bold as significantly superior
-cannot be told from others in the text that we have; the test behind the marks is not named.
+Each value is the mean, over four runs with different seeds, of all evaluations after training step 90 million (the
+table's caption). The table prints no standard errors or deviations, and has no row for default torque control
+(``a1_torque``) or gravity pre-training. The paper marks significantly superior values in bold, which the text that we
+have does not show; the test behind the marks is not named.
 
-Units are ours (:mod:`legged_torque.envs.base.metrics`): "Track %" is printed as a share (0.76, not 76), "Track xy"
-and "Track angular" are squared deviations (section IV-F), cost of transport has no unit. The paper names no units;
-collision forces fit N, as a standing A1 presses on the ground with 122 N.
+The paper names no units; those of :mod:`legged_torque.utils.metrics` are ours. "Track %" is printed as a share
+(0.76, not 76), "Track xy" and "Track angular" are squared deviations (section IV-F), cost of transport has no unit.
+Collision forces fit newtons: a standing A1 presses on the ground with 122 N.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from legged_torque.utils.metrics import METRICS
 
-
-@dataclass(frozen=True)
-class Metric:
-    """How to tell a metric.
-
-    Attributes:
-        title: The paper's name.
-        unit: Its unit; empty if it has none.
-        digits: Decimals that the paper prints.
-        higher_is_better: Whether a larger value is the better one.
-    """
-
-    title: str
-    unit: str
-    digits: int
-    higher_is_better: bool = False
-
-    def label(self) -> str:
-        """Return the name with the unit."""
-        return f"{self.title} [{self.unit}]" if self.unit else self.title
-
-
-METRICS = {
-    "track_percentage": Metric("Track %", "share", 4, higher_is_better=True),
-    "track_xy": Metric("Track xy", "m²/s²", 4),
-    "track_angular": Metric("Track angular", "rad²/s²", 4),
-    "collision_force": Metric("Collision forces", "N", 1),
-    "cost_of_transport": Metric("Cost of transport", "", 4),
-}
+PAPER_METRICS = tuple(metric for metric in METRICS if metric.in_paper)
 """The metrics of Table I, in its order."""
 ENVIRONMENTS = {
     "low": "Low perturbation",
@@ -59,7 +31,7 @@ MODELS = {
     "a1_torque_multihead": "Torque multi-head",
     "a1_multihead": "Multi-head",
 }
-"""The paper's names of our tasks; default torque is only in its Figures 3 and 5."""
+"""The paper's names of our tasks. Default torque occurs only in its Figures 3 and 5."""
 TABLE_I = {
     "track_percentage": {
         "a1_position": (0.7642, 0.7518, 0.7163, 0.6765),

@@ -1,289 +1,245 @@
-"""What came out of an experiment: read its folder, sum up over seeds, compare approaches, write tables."""
+"""The report of an experiment, as Markdown."""
 
 from __future__ import annotations
 
-import csv
-import json
 import math
-import re
-from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
-from statistics import fmean, stdev, variance
-from typing import Any
 
-from legged_torque.experiments.paper_values import ENVIRONMENTS, METRICS, paper_value
-from legged_torque.utils.config import parse_yaml
-from legged_torque.utils.errors import UserError
-from legged_torque.utils.runs import CONFIG_FILE, load_config
+from legged_torque.experiments.curves import MILLION
+from legged_torque.experiments.figures import FIGURES, file_name
+from legged_torque.experiments.paper_values import MODELS, PAPER_METRICS, paper_value
+from legged_torque.experiments.results import (
+    EVALUATIONS_FILE,
+    LAST_SHARE,
+    TABLE_FILE,
+    CellResult,
+    Cells,
+    Experiment,
+    Table,
+    compare,
+    is_of_paper,
+)
+from legged_torque.utils.metrics import Metric
+from legged_torque.utils.paths import portable_path
 
-ALL_METRICS = (*METRICS, "height", "speed", "falls_per_minute", "critic_gradient_norm")
-LAST_SHARE = 0.18
-"""Which of its last evaluations count of a run that ends too early: as large a share as 90 to 110 million steps are."""
-PAPER_STEPS = 110_000_000
+SIGNIFICANT = 0.05
+BASELINES = ("a1_position", "a1_torque")
 
 
-@dataclass
-class Run:
-    """One training: a task, in an environment, with a seed.
+def report(
+    experiment: Experiment, table: Table, from_step: float, figures: list[str], no_figures: str, out: Path
+) -> str:
+    """Return the report.
 
-    Attributes:
-        rows: Evaluations during training, merged over its parts: "steps" and all metrics, nan where there is none.
-        results: Evaluations of the last checkpoint in other environments, in the same form.
-        configs: The ``config.yaml`` of its parts.
-        devices: Where it was trained and evaluated.
-        notes: What is wrong with its files.
+    Args:
+        experiment: The experiment.
+        table: Its summaries.
+        from_step: Step from which evaluations count.
+        figures: Titles of the figures that were drawn.
+        no_figures: Why the others were not; empty if there was no data for them.
+        out: The report's folder.
     """
-
-    task: str
-    environment: str
-    seed: int
-    rows: list[dict[str, float]] = field(default_factory=list)
-    results: dict[str, dict[str, float]] = field(default_factory=dict)
-    configs: list[dict[str, Any]] = field(default_factory=list)
-    devices: set[str] = field(default_factory=set)
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def steps(self) -> float:
-        """Steps after which the last evaluation was."""
-        return self.rows[-1]["steps"] if self.rows else 0
-
-    @property
-    def total_steps(self) -> int:
-        """Steps of the whole training, as its settings say; the paper's if they do not."""
-        try:
-            config = self.configs[-1]
-            rollout = config["env"]["env"]["num_envs"] * config["train"]["runner"]["num_steps_per_env"]
-            return config["max_iterations"] * rollout * config.get("processes", 1)
-        except (IndexError, KeyError, TypeError):
-            return PAPER_STEPS
-
-    def is_finished(self, steps: float) -> bool:
-        """Return whether so many steps are all of them, but for less than an interval between evaluations."""
-        interval = self.rows[-1]["steps"] - self.rows[-2]["steps"] if len(self.rows) > 1 else 1
-        return steps + interval > self.total_steps
-
-    def counted_rows(self, evaluated: str, from_step: float) -> list[dict[str, float]]:
-        """Return the evaluations in an environment that count for Table I."""
-        if evaluated != self.environment:
-            return [self.results[evaluated]] if evaluated in self.results else []
-        first = from_step if self.steps >= from_step else (1.0 - LAST_SHARE) * self.steps
-        return [row for row in self.rows if row["steps"] >= first]
+    missing = missing_lines(experiment, from_step)
+    sections = {
+        "What is missing": missing or ["Nothing: all trainings and evaluations are complete."],
+        "Table I": table_one(experiment, table, from_step),
+        "In other environments than those of training": other_table(experiment, table),
+        "Differences": differences(experiment, table),
+        "Figures": figure_lines(figures, no_figures),
+        "How it was made": setup_lines(experiment, from_step, out),
+    }
+    lines = [f"# Results of {experiment.folder.resolve().name}"]
+    for title, section in sections.items():
+        lines += ["", f"## {title}", "", *section]
+    return "\n".join(lines) + "\n"
 
 
-@dataclass
-class Experiment:
-    """An experiment as it was planned, and its runs.
-
-    Attributes:
-        environments: Environments of evaluation for each one of training.
-        plan: Text of ``experiment.yaml``.
-        runs: By task, environment of training and seed.
-        unplanned: Folders of runs that the plan does not name.
-    """
-
-    folder: Path
-    tasks: list[str]
-    environments: dict[str, list[str]]
-    seeds: list[int]
-    plan: str
-    runs: dict[tuple[str, str, int], Run] = field(default_factory=dict)
-    unplanned: list[str] = field(default_factory=list)
-
-    def runs_of(self, task: str, environment: str) -> list[Run]:
-        """Return the runs of a task in an environment of training that have begun."""
-        keys = [(task, environment, seed) for seed in self.seeds]
-        return [self.runs[key] for key in keys if key in self.runs]
-
-    def columns(self) -> dict[str, tuple[str, str]]:
-        """Return the environments of training and of evaluation by the name of their column, Table I's first."""
-        pairs = [(trained, name) for trained, names in self.environments.items() for name in [trained, *names]]
-        columns = {column_name(*pair): pair for pair in pairs}
-        first = [name for name in ENVIRONMENTS if name in columns]
-        return {name: columns[name] for name in [*first, *columns]}
+def markdown_table(header: list[str], rows: list[list[str]]) -> list[str]:
+    """Return the lines of a table."""
+    return [f"| {' | '.join(row)} |" for row in [header, ["---"] * len(header), *rows]]
 
 
-@dataclass
-class Summary:
-    """A metric of a task in an environment: a value for each seed, and whether none is missing or unfinished."""
-
-    values: list[float]
-    is_final: bool = True
-
-    @property
-    def standard_error(self) -> float | None:
-        """Standard error of the mean; None with one seed."""
-        return stdev(self.values) / math.sqrt(len(self.values)) if len(self.values) > 1 else None
-
-
-Table = dict[str, dict[str, dict[str, Summary]]]
-"""Summaries by column, task and metric; what has no value is not in it."""
-
-
-def column_name(trained: str, evaluated: str) -> str:
-    """Return the name of a column: the paper's "doubled" is trained in high_frequency, all others where they are."""
-    if trained == evaluated != "doubled" or (trained, evaluated) == ("high_frequency", "doubled"):
-        return evaluated
-    return f"{trained} -> {evaluated}"
-
-
-def read_experiment(folder: Path) -> Experiment:
-    """Read an experiment's folder.
-
-    Raises:
-        UserError: If there is none, or its plan cannot be read.
-    """
-    file = folder / "experiment.yaml"
-    if not folder.is_dir():
-        raise UserError(f"there is no folder '{folder}'")
-    if not file.is_file():
-        raise UserError(f"'{folder}' is not the folder of an experiment: it has no experiment.yaml")
-    text = file.read_text(encoding="utf-8", errors="replace")
-    plan = parse_yaml(text, f"'{file}'")
-    kinds = {"tasks": list, "environments": dict, "seeds": list}
-    if not isinstance(plan, dict) or not all(isinstance(plan.get(key), kind) for key, kind in kinds.items()):
-        raise UserError(f"'{file}' lacks the lists tasks and seeds, or environments as a mapping to lists")
-    environments = {name: list(evaluated or []) for name, evaluated in plan["environments"].items()}
-    experiment = Experiment(folder, plan["tasks"], environments, plan["seeds"], text)
-    for path in sorted(path for path in folder.iterdir() if path.is_dir()):
-        match = re.fullmatch(r"(.+)-(.+)-s(\d+)", path.name)
-        if not match:
-            continue
-        task, environment, seed = match[1], match[2], int(match[3])
-        if task in plan["tasks"] and environment in environments and seed in plan["seeds"]:
-            experiment.runs[task, environment, seed] = read_run(path, Run(task, environment, seed))
-        else:
-            experiment.unplanned.append(path.name)
-    return experiment
-
-
-def read_run(folder: Path, run: Run) -> Run:
-    """Fill a run with what its folder holds; a part replaces what earlier ones did from its first evaluation on."""
-    for part in sorted(path for path in folder.iterdir() if path.is_dir()):
-        if (part / CONFIG_FILE).is_file():
-            try:
-                run.configs.append(load_config(part))
-                run.devices.add(str(run.configs[-1].get("device")))
-            except UserError as error:
-                run.notes.append(str(error))
-        rows = read_rows(part / "evaluations.csv", run.notes)
-        if rows:
-            run.rows = [row for row in run.rows if row["steps"] < rows[0]["steps"]] + rows
-    for file in sorted([*folder.glob("result_*.json"), *folder.glob("*/result_*.json")]):
-        environment = file.stem.removeprefix("result_")
-        try:
-            result = json.loads(file.read_text(encoding="utf-8"))
-            values = {name: _number(result["metrics"].get(name, {}).get("mean")) for name in ALL_METRICS}
-            values["steps"] = int(result["steps"])
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            run.notes.append(f"'{file}' cannot be read")
-            continue
-        run.devices.add(str(result.get("device")))
-        if environment not in run.results or values["steps"] >= run.results[environment]["steps"]:
-            run.results[environment] = values
-    return run
-
-
-def read_rows(file: Path, notes: list[str]) -> list[dict[str, float]]:
-    """Read the evaluations of a part. A last line without an end was cut off by a kill and is left out."""
-    if not file.is_file():
-        return []
-    lines = file.read_text(encoding="utf-8", errors="replace").rpartition("\n")[0].splitlines()
-    rows = []
-    for number, line in enumerate(csv.DictReader(lines), start=2):
-        try:
-            if None in line or None in line.values():
-                raise ValueError("too many or too few cells")
-            values = {name: _number(line.get(name)) for name in ALL_METRICS}
-            rows.append({"steps": int(float(line["steps"])), **values})
-        except (KeyError, ValueError):
-            notes.append(f"line {number} of '{file}' cannot be read")
-    return rows
-
-
-def _number(cell: Any) -> float:
-    """Return a cell's number; nan if it is empty."""
-    return math.nan if cell in (None, "") else float(cell)
-
-
-def summarize(experiment: Experiment, from_step: float) -> Table:
-    """Return all metrics over seeds. A run's value is the mean of its evaluations that count and are finite."""
-    table: Table = {}
-    for column, (trained, evaluated) in experiment.columns().items():
+def missing_lines(experiment: Experiment, from_step: float) -> list[str]:
+    """Return a line for everything planned that is missing, unfinished or unreadable."""
+    lines = []
+    for environment, evaluated in experiment.environments.items():
         for task in experiment.tasks:
-            runs = experiment.runs_of(task, trained)
-            counted = [(run, run.counted_rows(evaluated, from_step)) for run in runs]
-            are_finished = [run.is_finished(rows[-1]["steps"]) for run, rows in counted if rows]
-            cell = table.setdefault(column, {}).setdefault(task, {})
-            for metric in ALL_METRICS:
-                finite = [[row[metric] for row in rows if math.isfinite(row[metric])] for _, rows in counted]
-                values = [fmean(numbers) for numbers in finite if numbers]
-                if values:
-                    is_final = all(are_finished) and len(values) == len(experiment.seeds)
-                    cell[metric] = Summary(values, is_final)
-    return table
+            place = f"- `{task}` in {environment}"
+            runs = experiment.runs_of(task, environment)
+            absent = [str(seed) for seed in experiment.seeds if (task, environment, seed) not in experiment.runs]
+            if not runs:
+                lines.append(f"{place}: no data, no training has begun.")
+            elif absent:
+                lines.append(f"{place}: no training has begun with seed {', '.join(absent)}.")
+            for run in runs:
+                problems = run_problems(run, evaluated, from_step)
+                lines += [f"{place}, seed {run.seed}: {'; '.join(problems)}."] if problems else []
+    if experiment.unplanned:
+        lines.append(f"- Left out, as experiment.yaml does not name them: {', '.join(experiment.unplanned)}.")
+    return lines
 
 
-def welch(first: list[float], second: list[float]) -> float | None:
-    """Return the two-sided p value of Welch's t-test; None if it cannot be told, with fewer than two values each."""
-    if min(len(first), len(second)) < 2:
-        return None
-    shares = [variance(values) / len(values) for values in (first, second)]
-    if sum(shares) == 0.0:
-        return None
-    t_squared = (fmean(first) - fmean(second)) ** 2 / sum(shares)
-    freedom = sum(shares) ** 2 / sum(s**2 / (len(v) - 1) for s, v in zip(shares, (first, second), strict=True))
-    return incomplete_beta(freedom / 2.0, 0.5, freedom / (freedom + t_squared))
+def run_problems(run: CellResult, evaluated: list[str], from_step: float) -> list[str]:
+    """Return the problems of a training: missing, unfinished or unreadable parts."""
+    problems, total = list(run.notes), f"{run.total_steps / MILLION:.4g} million steps"
+    if not run.rows:
+        problems.append("no evaluation during training yet")
+    elif not run.is_finished(run.steps):
+        share = run.steps / run.total_steps
+        problems.append(f"not finished, {run.steps / MILLION:.4g} of {total} ({share:.0%})")
+    if run.rows and run.steps < from_step:
+        end = f"ends before {from_step / MILLION:g} million steps"
+        problems.append(f"{end}; its number is the mean of its last {LAST_SHARE:.0%}")
+    rows = run.counted_rows(run.environment, from_step)
+    for name in (metric.name for metric in PAPER_METRICS):
+        count = sum(not math.isfinite(row[name]) for row in rows)
+        if count:
+            problems.append(f"{count} of the {len(rows)} evaluations that count have no {name}")
+    for name in evaluated:
+        if name == run.environment:
+            continue
+        if name not in run.results:
+            problems.append(f"not evaluated in {name}")
+        elif not run.is_finished(run.results[name]["steps"]):
+            problems.append(f"evaluated in {name} after {run.results[name]['steps'] / MILLION:.4g} of {total}")
+    return problems
 
 
-def incomplete_beta(a: float, b: float, x: float) -> float:
-    """Return the regularized incomplete beta function: the tail of Student's t for b = 1/2."""
-    if x > 0.5:
-        return 1.0 - incomplete_beta(b, a, 1.0 - x)
-    if x == 0.0:
-        return 0.0
-    log_beta = math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
-    term = math.exp(a * math.log(x) + b * math.log1p(-x) - log_beta) / a
-    total, k = 0.0, 0
-    while term > 1e-16 * total:  # all terms are positive, and at last each is less than 0.6 of the one before
-        total += term
-        term *= x * (a + b + k) / (a + 1.0 + k)
-        k += 1
-    return total
+def number(table: Table, column: str, task: str, metric: Metric) -> str:
+    """Return an entry of Table I: mean, standard error, number of seeds; bold if significantly the best."""
+    summary, digits = table[column][task].get(metric.name), metric.digits
+    if summary is None:
+        return "–"
+    error = "" if summary.standard_error is None else f" ± {summary.standard_error:.{digits}f}"
+    text = f"{summary.mean:.{digits}f}{error} ({len(summary.values)})"
+    if is_best(table[column], task, metric):
+        text = f"**{text}**"
+    return text if summary.is_final else f"{text} †"
 
 
-def holm(p_values: list[float | None]) -> list[float | None]:
-    """Return the p values with Holm's correction for as many tests as there are; None stays None."""
-    order = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
-    corrected, largest = list(p_values), 0.0
-    for rank, (p, i) in enumerate(order):
-        largest = max(largest, min(1.0, (len(order) - rank) * p))
-        corrected[i] = largest
-    return corrected
+def is_best(cells: Cells, task: str, metric: Metric) -> bool:
+    """Return whether a task is significantly better than every other task that has a value."""
+    means = {name: cell[metric.name].mean for name, cell in cells.items() if metric.name in cell}
+    pairs = list(combinations(means, 2))
+    own = [p for pair, p in zip(pairs, compare(cells, metric.name, pairs), strict=True) if task in pair]
+    best = (min if metric.lower_is_better else max)(means.values())
+    return means[task] == best and bool(own) and all(p is not None and p < SIGNIFICANT for p in own)
 
 
-def compare(cells: dict[str, dict[str, Summary]], metric: str, pairs: list[tuple[str, str]]) -> list[float | None]:
-    """Return the corrected p value of each pair of tasks in a column of the table; these tests are one family."""
-    values = {task: cell[metric].values if metric in cell else [] for task, cell in cells.items()}
-    return holm([welch(values[first], values[second]) for first, second in pairs])
+def metric_table(experiment: Experiment, table: Table, columns: list[str], with_paper: bool) -> list[str]:
+    """Return the lines of a table with a row per metric and task, if wished with the paper's values beside ours."""
+    rows = []
+    for metric in PAPER_METRICS:
+        for task in experiment.tasks:
+            row = [metric.label, f"`{task}` ({MODELS[task]})" if task in MODELS else f"`{task}`"]
+            for column in columns:
+                row.append(number(table, column, task, metric))
+                if with_paper:
+                    paper = paper_value(task, column, metric.name)
+                    row.append("–" if paper is None else f"{paper:.{metric.digits}f}")
+            rows.append(row)
+    header = [cell for name in columns for cell in ([name, "paper"] if with_paper else [name])]
+    return markdown_table(["metric", "task", *header], rows)
 
 
-def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
-    """Write ``table.csv`` (summaries) and ``evaluations.csv`` (every evaluation during training)."""
-    with (out / "table.csv").open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean", "paper_error"])
-        for column, cells in table.items():
-            for task, metric in ((task, metric) for task in cells for metric in ALL_METRICS):
-                summary = cells[task].get(metric)
-                numbers = (
-                    [fmean(summary.values), summary.standard_error, len(summary.values)] if summary else ["", "", 0]
-                )
-                writer.writerow([task, column, metric, *numbers, paper_value(task, column, metric), ""])
-    with (out / "evaluations.csv").open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(["task", "environment", "seed", "steps", *ALL_METRICS])
-        for (task, environment, seed), run in experiment.runs.items():
-            for row in run.rows:
-                values = [row[name] if math.isfinite(row[name]) else None for name in ALL_METRICS]
-                writer.writerow([task, environment, seed, row["steps"], *values])
+def table_one(experiment: Experiment, table: Table, from_step: float) -> list[str]:
+    """Return Table I next to the paper's."""
+    return [
+        f"Mean ± standard error over seeds (number of seeds, of {len(experiment.seeds)} that were planned). A seed's",
+        "number is the mean of its evaluations during training, in the environment of training, from step",
+        f"{from_step / MILLION:g} million on, or of the last {LAST_SHARE:.0%} if training has not come that far. The",
+        "exception is `doubled`: trained in `high_frequency`, with the last checkpoint evaluated in `doubled`. The",
+        "paper's column is the mean of all evaluations after step 90 million.",
+        "**Bold**: significantly better than every other task of the column (see Differences). †: seeds are missing",
+        "or trainings are not finished, so the number will change. Tracking % is better when higher, all else when",
+        "lower. The paper's means are of four seeds; it prints no errors, and no numbers of default torque control.",
+        "",
+        *metric_table(experiment, table, [name for name in table if is_of_paper(name)], with_paper=True),
+    ]
+
+
+def other_table(experiment: Experiment, table: Table) -> list[str]:
+    """Return the metrics in environments other than those of training, which the paper does not have."""
+    columns = [name for name in table if not is_of_paper(name)]
+    if not columns:
+        return ["None were planned."]
+    text = "Trained -> evaluated: metrics of the last checkpoint, over seeds as above. The paper has no such numbers."
+    return [text, "", *metric_table(experiment, table, columns, with_paper=False)]
+
+
+def differences(experiment: Experiment, table: Table) -> list[str]:
+    """Return tests of all pairs of tasks in each column of Table I, and of each task against the baselines."""
+    lines = [
+        "First minus second task, and the p value of a two-sided Welch's t-test over seeds with Holm's correction.",
+        "The tests of one metric in one table are one family.",
+        f"**Bold**: p < {SIGNIFICANT}. †: seeds are missing or trainings are not finished. With so few seeds, a",
+        "difference may be real without being significant. Tasks without data are left out.",
+    ]
+    for column in filter(is_of_paper, table):
+        cells = table[column]
+        lines += ["", f"### {column}"]
+        tasks = [task for task in experiment.tasks if cells[task]]
+        families = {"All pairs": list(combinations(tasks, 2))}
+        for baseline in BASELINES:
+            if baseline in tasks:
+                families[f"Against `{baseline}`"] = [(task, baseline) for task in tasks if task != baseline]
+        for title, pairs in families.items():
+            if all(p is None for metric in PAPER_METRICS for p in compare(cells, metric.name, pairs)):
+                lines += ["", f"{title}: no test is possible; it takes at least two seeds of two tasks."]
+            else:
+                lines += ["", f"{title}:", "", *difference_table(cells, pairs)]
+    return lines
+
+
+def difference_table(cells: Cells, pairs: list[tuple[str, str]]) -> list[str]:
+    """Return the differences of pairs of tasks in all metrics."""
+    rows = [[f"`{first}` - `{second}`"] for first, second in pairs]
+    for metric in PAPER_METRICS:
+        p_values = compare(cells, metric.name, pairs)
+        for row, (first, second), p in zip(rows, pairs, p_values, strict=True):
+            row.append(difference(cells, first, second, metric, p))
+    return markdown_table(["pair", *(metric.label for metric in PAPER_METRICS)], rows)
+
+
+def difference(cells: Cells, first: str, second: str, metric: Metric, p: float | None) -> str:
+    """Return the entry for a pair of tasks: the difference of their means and its p value."""
+    one, other = cells[first].get(metric.name), cells[second].get(metric.name)
+    if one is None or other is None:
+        return "no data"
+    text = f"{one.mean - other.mean:+.{metric.digits}f}, " + ("no p value" if p is None else f"p = {p:.2g}")
+    text = f"**{text}**" if p is not None and p < SIGNIFICANT else text
+    return text if one.is_final and other.is_final else f"{text} †"
+
+
+def figure_lines(figures: list[str], problem: str) -> list[str]:
+    """Return the figures, and which of the paper's are absent."""
+    lines = [f"![{title}]({file_name(title)})\n" for title in figures]
+    absent = [title for title in FIGURES if title not in figures]
+    if absent:
+        lines.append(f"No {', '.join(absent)}: {problem or 'there are no data for it'}.")
+    return [*lines, f"The numbers are in `{TABLE_FILE}`, all evaluations in `{EVALUATIONS_FILE}`."]
+
+
+def setup_lines(experiment: Experiment, from_step: float, out: Path) -> list[str]:
+    """Return machines, versions, the plan and the commands that repeat the experiment."""
+    devices = sorted({device for run in experiment.runs.values() for device in run.devices})
+    configs = [config for run in experiment.runs.values() for config in run.configs]
+    versions = {", ".join(f"{k} {v}" for k, v in (config.get("versions") or {}).items()) for config in configs}
+    folder, report_folder = portable_path(experiment.folder), portable_path(out)
+    return [
+        f"- Devices, as named in settings and results: {', '.join(devices) or 'unknown'}",
+        *(f"- Versions: {text or 'unknown'}" for text in sorted(versions)),
+        "- Plan (`experiment.yaml`); all settings of a training are in its `config.yaml`:",
+        "",
+        "```yaml",
+        experiment.plan.rstrip(),
+        "```",
+        "",
+        "To repeat it:",
+        "",
+        "```bash",
+        f"python scripts/experiment.py {folder}/experiment.yaml --out {folder}_again",
+        f"python scripts/report.py {folder}_again --out {report_folder}_again --from_step {from_step:.0f}",
+        "```",
+    ]

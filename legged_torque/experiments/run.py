@@ -1,4 +1,4 @@
-"""Running a matrix of trainings: one process per GPU, skipping what is done, however often it was interrupted."""
+"""Runs a matrix of trainings, one process per GPU. Finished steps are skipped and interrupted ones resumed."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import sys
 import time
 from datetime import datetime
 from pathlib import Path
+from statistics import fmean
 from types import FrameType
 from typing import BinaryIO
 
-from legged_torque.experiments.job import Job, Worker, start_job, try_lock
+from legged_torque.experiments.job import Job, Worker, try_lock
 from legged_torque.experiments.matrix import (
     SETTINGS_FILE,
     Cell,
@@ -29,16 +30,16 @@ from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
 
 POLL = 0.2
-"""Seconds between two looks at the processes."""
+"""Seconds between checks of the processes."""
 SHOW_EVERY = 1.0
-"""Seconds between two changes of the live line."""
+"""Seconds between updates of the live line."""
 
 
 class CountedStop(StopRequest):
     """While this context is open, Ctrl-C and SIGTERM are only counted, so that they can be passed on.
 
     Attributes:
-        count: How often it was asked to stop.
+        count: Number of signals so far.
     """
 
     count = 0
@@ -50,13 +51,13 @@ class CountedStop(StopRequest):
 
 
 class ExperimentRun:
-    """Brings all cells of a matrix to their end."""
+    """Trains and evaluates all cells of a matrix."""
 
     def __init__(self, matrix: Matrix, out: Path, workers: list[Worker]) -> None:
-        """Look how far the cells are; nothing is written or started yet.
+        """Find the cells that are not done; nothing is written or started yet.
 
         Args:
-            matrix: What is trained and evaluated.
+            matrix: The trainings and evaluations.
             out: Folder of all results, as an absolute path.
             workers: Where processes run.
         """
@@ -64,25 +65,25 @@ class ExperimentRun:
         self.queue = [cell for cell in matrix.cells() if not self._is_done(cell)]
         self._num_cells = len(matrix.cells())
         self._num_done = self._num_cells - len(self.queue)
-        self._failures: list[str] = []  # a text for each cell that has failed
-        self._told: set[Cell] = set()  # cells that another process works on
-        self._durations: list[float] = []  # of the cells finished here [s]
+        self._failures: list[str] = []  # a message per failed cell
+        self._reported: set[Cell] = set()  # cells reported to be held by another process
+        self._durations: list[float] = []  # of cells finished here [s]
         self._start = time.monotonic()
-        self._shown = 0.0  # when the live line was changed last [s]
+        self._shown = 0.0  # when the live line was last updated [s]
 
     def run(self) -> int:
         """Work until all cells are done or have failed, or the user asks to stop.
 
         Returns:
-            Exit status: 0 if all is done, 1 if a cell has failed.
+            Exit status: 0 if all cells are done, 1 if one has failed.
 
         Raises:
-            KeyboardInterrupt: If the user has asked to stop. No process is left running.
+            KeyboardInterrupt: If the user asked to stop. No process is left running.
         """
         print(f"{self._num_done} of {self._num_cells} cells are done in {self.out}", flush=True)
-        passed_on = 0
+        passed_on, stop = 0, CountedStop()
         try:
-            with CountedStop() as stop:
+            with stop:
                 while True:
                     if stop.count > passed_on:
                         passed_on = stop.count
@@ -94,7 +95,7 @@ class ExperimentRun:
                     self._show_live_line()
                     time.sleep(POLL)
         finally:
-            self._ask_to_stop()  # nothing runs here any more, unless something unforeseen has happened
+            self._ask_to_stop()  # clean up after an exception
             for job in self._jobs():
                 job.process.wait()
         print(f"{self._num_done} of {self._num_cells} cells are done.", flush=True)
@@ -105,15 +106,15 @@ class ExperimentRun:
         return 1 if self._failures else 0
 
     def _jobs(self) -> list[Job]:
-        """Return what is going on."""
+        """Return the jobs that are running."""
         return [worker.job for worker in self.workers if worker.job is not None]
 
     def _is_done(self, cell: Cell) -> bool:
-        """Return whether all results of a cell are there."""
+        """Return whether a cell has all its results."""
         return all(is_json(result_file(self.out, cell, name)) for name in cell.evaluated_in)
 
     def _attend(self, worker: Worker, stopping: bool) -> None:
-        """See to a worker: end its step if the process has ended, and give it the next one if it is free."""
+        """Finish a worker's step if its process has ended, and give it the next step if it is free."""
         job = worker.job
         if job is not None and job.process.poll() is not None:
             worker.job = None
@@ -122,35 +123,35 @@ class ExperimentRun:
             self._take_cell(worker)
 
     def _take_cell(self, worker: Worker) -> None:
-        """Begin with the first cell that no other process works on, if there is one."""
+        """Start the first cell that no other process holds, if there is one."""
         for cell in list(self.queue):
             lock = try_lock(self.out / cell.name / "lock")
             if lock is None:
-                if cell not in self._told:
-                    self._told.add(cell)
+                if cell not in self._reported:
+                    self._reported.add(cell)
                     self._print(f"{cell.name}: another process works on it; left for later")
                 continue
             self.queue.remove(cell)
             if not self._is_done(cell):
                 self._start_step(worker, cell, lock, time.monotonic())
                 return
-            self._num_done += 1  # by that other process
+            self._num_done += 1  # finished by another process
             lock.close()
 
     def _start_step(self, worker: Worker, cell: Cell, lock: BinaryIO, cell_start: float) -> None:
         """Start a process for the next step of a cell."""
         try:
             state = cell_state(self.out, cell)
-            if state.step != "evaluate":  # results of another training are no results of this one
+            if state.step != "evaluate":  # they would be results of another training
                 for name in cell.evaluated_in:
                     result_file(self.out, cell, name).unlink(missing_ok=True)
             command = step_command(self.matrix, self.out, cell, state, worker.device)
-            worker.job = start_job(self.out, cell, state, command, worker.variables, lock, cell_start)
+            worker.job = Job(cell, state, lock, cell_start, command, worker)
         except (OSError, subprocess.SubprocessError, UserError) as error:
             self._fail(cell, lock, str(error))
 
     def _end_step(self, worker: Worker, job: Job, stopping: bool) -> None:
-        """Note what has become of a step whose process has ended, and go on with its cell."""
+        """Record the outcome of a step whose process has ended, and continue with its cell."""
         try:
             problem = self._problem(job)
         except (OSError, UserError) as error:
@@ -172,7 +173,7 @@ class ExperimentRun:
             self._start_step(worker, job.cell, job.lock, job.cell_start)
 
     def _problem(self, job: Job) -> str:
-        """Return what is wrong with an ended step, nothing if all is well; a complete result is put in its place."""
+        """Return the failure of an ended step, or an empty text; a complete result gets its final name."""
         status = job.process.returncode
         if status:
             how = f"was ended by signal {-status}" if status < 0 else f"has failed with exit status {status}"
@@ -188,28 +189,28 @@ class ExperimentRun:
         return ""
 
     def _fail(self, cell: Cell, lock: BinaryIO, reason: str, job: Job | None = None) -> None:
-        """Give a cell up; the last lines of the job's log are kept for the end."""
+        """Give up a cell; the last lines of the job's log are printed at the end."""
         lock.close()
         lines = [f"the last lines of {job.log}:", *job.last_lines()] if job else []
         self._failures.append("\n    ".join([f"{cell.name}: {reason}", *lines]))
         self._print(f"{cell.name}: {reason} | {self._progress()}")
 
     def _ask_to_stop(self) -> None:
-        """Ask all processes to end. A training finishes its iteration and saves; asked once more it ends at once."""
+        """Ask all processes to end. A training finishes its iteration and saves; a second request ends it at once."""
         for job in self._jobs():
             job.process.terminate()
         if self._jobs():
             self._print("Stopping: trainings finish their iteration and save; once more to stop at once.")
 
     def _progress(self) -> str:
-        """Say how far all is and how long it will take."""
+        """Describe the progress of all cells and the time left."""
         left = time_left(self._durations, self._num_left(), len(self.workers))
         text = "time left unknown yet" if left is None else f"{duration_text(left)} left"
         elapsed = duration_text(time.monotonic() - self._start)
         return f"{self._num_done} of {self._num_cells} cells done, {elapsed}, {text}"
 
     def _num_left(self) -> float:
-        """Return how many cells are left, with the parts of those that are trained at the moment."""
+        """Return how many cells are left; cells in training count in part."""
         left = self._num_cells - self._num_done - len(self._failures)
         return left - sum(job.fraction() for job in self._jobs())
 
@@ -219,7 +220,7 @@ class ExperimentRun:
         print(line.ljust(columns() if sys.stdout.isatty() else 0), flush=True)
 
     def _show_live_line(self) -> None:
-        """Show what is going on, if that is due and somebody looks."""
+        """Update the live line, if there is a terminal and the update is due."""
         if not sys.stdout.isatty() or time.monotonic() - self._shown < SHOW_EVERY:
             return
         self._shown = time.monotonic()
@@ -228,20 +229,20 @@ class ExperimentRun:
 
 
 def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
-    """Create the folder of the results, or check that it fits, and keep a copy of the description in it.
+    """Create the folder of the results, or check that its settings are the same, and copy the description into it.
 
     Args:
-        matrix: What the file describes.
+        matrix: The matrix that the file describes.
         file: The description.
         out: The folder.
 
     Raises:
-        UserError: If it was made with other settings.
+        UserError: If the folder was made with other settings.
     """
-    check_same(matrix, out)  # a mistake leaves nothing behind
+    check_same(matrix, out)  # before anything is created
     out.mkdir(parents=True, exist_ok=True)
     with open(out / "lock", "a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # another one may do the same at this moment
+        fcntl.flock(lock, fcntl.LOCK_EX)  # another process may do the same right now
         check_same(matrix, out)
         copy, text = out / SETTINGS_FILE, file.read_bytes()
         if not copy.is_file() or copy.read_bytes() != text:
@@ -251,22 +252,22 @@ def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
 
 
 def time_left(durations: list[float], cells: float, num_workers: int) -> float | None:
-    """Return how long the rest will take [s]; None if that is unknown.
+    """Return the remaining time [s]; None if it is unknown.
 
     Args:
-        durations: How long finished cells took [s].
-        cells: How many are left; a cell that is trained at the moment counts in part.
-        num_workers: How many are worked on at a time.
+        durations: Durations of finished cells [s].
+        cells: Number of cells left; cells in training count in part.
+        num_workers: Number of cells worked on at a time.
     """
     if cells <= 0:
         return 0.0
     if not durations:
         return None
-    return sum(durations) / len(durations) * max(cells / num_workers, min(cells, 1.0))
+    return fmean(durations) * max(cells / num_workers, min(cells, 1.0))
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration as a person says it."""
+    """Return a duration as text, in its two largest units."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:
@@ -275,5 +276,5 @@ def duration_text(seconds: float) -> str:
 
 
 def columns() -> int:
-    """Return how many characters of a line the terminal shows."""
+    """Return the usable width of the terminal, in characters."""
     return shutil.get_terminal_size().columns - 1

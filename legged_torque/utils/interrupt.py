@@ -1,44 +1,42 @@
-"""Stopping long work without losing it."""
+"""Stopping on Ctrl-C without losing work."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
-from types import FrameType, TracebackType
+from types import FrameType
 
 
 class StopRequest:
     """While this context is open, the first Ctrl-C or SIGTERM only asks to stop; the second one stops at once.
 
     Attributes:
-        requested: Whether it was asked to stop.
+        requested: Whether a signal has asked to stop.
     """
 
     _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
     def __init__(self) -> None:
-        """Nothing was asked yet."""
+        """Start without a request."""
         self.requested = False
 
     def __enter__(self) -> StopRequest:
-        """Take over the signals, which only a process's main thread can."""
+        """Take over the signals; only a process's main thread can do so."""
         self._old = {}
         if threading.current_thread() is threading.main_thread():
             self._old = {number: signal.signal(number, self._handle) for number in self._SIGNALS}
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Give the signals back."""
+    def __exit__(self, *exception: object) -> None:
+        """Restore the previous handlers of the signals."""
         for number, handler in self._old.items():
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        """Remember the first signal, obey the second."""
+        """Note the first signal; interrupt at the second."""
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
-        # print would fail if the signal came in the middle of a print
+        # print fails inside another print
         os.write(2, b"\nStopping after this iteration and saving; once more to stop at once.\n")

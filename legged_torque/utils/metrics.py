@@ -1,63 +1,156 @@
-"""The metrics of :mod:`legged_torque.envs.base.metrics` in numpy, for robots that run one after another."""
+"""The metrics of walking (paper, IV-A): names, units, formulas. Needs no torch; formulas take numpy arrays or tensors.
+
+Every metric is a ratio of two sums over steps. Velocities are those of the trunk in its own frame. Steps after which a
+world was reset are left out, but for the count of falls.
+
+- track_percentage: mean of max(0, mean over the commands that are not 0 of 1 - |v - v*| / |v*|); 1 is perfect.
+- track_xy: mean of |v*_xy - v_xy|^2 [m^2/s^2]. track_angular: mean of (w*_z - w_z)^2 [rad^2/s^2].
+- collision_force: mean of the sum over geoms of the norm of the ground's force, in the last physics step of a
+  control step [N]. A robot that stands still has its weight, 122 N for the A1, and a little more where its feet
+  push sideways: 127 N in the nominal pose.
+- cost_of_transport: mean of sum |tau_i qd_i| over m g times mean horizontal speed, with the nominal m g.
+- height: mean height of the trunk's origin above the ground [m]. speed: mean horizontal speed [m/s].
+- falls_per_minute: resets that are not time-outs, per minute of one robot.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import ModuleType
+from typing import TYPE_CHECKING, TypeVar
+
 import numpy as np
 
-UNITS = {
-    "track_percentage": "",
-    "track_xy": "m^2/s^2",
-    "track_angular": "rad^2/s^2",
-    "collision_force": "N",
-    "cost_of_transport": "",
-    "height": "m",
-    "speed": "m/s",
-    "falls_per_minute": "1/min",
-}
-"""The metrics, the paper's five first, and their units."""
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    Array = TypeVar("Array", np.ndarray, Tensor)
+else:
+    Array = TypeVar("Array")
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a metric is named and shown.
+
+    Attributes:
+        name: Its name in files and on the terminal.
+        unit: Its unit; empty if it has none.
+        title: Its name in tables and figures. The paper's own name, if the metric is in Table I.
+        lower_is_better: Whether smaller values are better; None if neither direction is.
+        in_paper: Whether Table I of the paper has it.
+        digits: Decimals shown in tables; as many as the paper prints.
+    """
+
+    name: str
+    unit: str
+    title: str
+    lower_is_better: bool | None
+    in_paper: bool = False
+    digits: int = 4
+
+    @property
+    def label(self) -> str:
+        """The title with the unit."""
+        return f"{self.title} [{self.unit.replace('^2', '²')}]" if self.unit else self.title
+
+
+METRICS = (
+    Metric("track_percentage", "", "Track % [share]", False, in_paper=True),  # the paper prints 0.76, not 76
+    Metric("track_xy", "m^2/s^2", "Track xy", True, in_paper=True),
+    Metric("track_angular", "rad^2/s^2", "Track angular", True, in_paper=True),
+    Metric("collision_force", "N", "Collision forces", True, in_paper=True, digits=1),
+    Metric("cost_of_transport", "", "Cost of transport", True, in_paper=True),
+    Metric("height", "m", "Walking height", None),
+    Metric("speed", "m/s", "Speed", None),
+    Metric("falls_per_minute", "1/min", "Falls per minute", True),
+)
+"""The metrics of an evaluation, the five of the paper first; each has its formula in :func:`ratios`."""
+
+UNITS = {metric.name: metric.unit for metric in METRICS}
+"""Unit of each metric."""
+
+NUM_SUMS = 10
+"""Numbers that :func:`step_sums` returns for each world."""
+
+
+@dataclass
+class Estimate:
+    """A mean over worlds and steps.
+
+    Attributes:
+        mean: The mean; NaN where nothing was measured.
+        standard_error: Its standard error, from the differences between worlds; NaN with one world.
+    """
+
+    mean: float
+    standard_error: float
+
+
+def tracking_percentage(xp: ModuleType, error: Array, commands: Array) -> tuple[Array, Array]:
+    """Return how much of its commands each world follows, and 1 where anything was commanded, else 0.
+
+    Args:
+        xp: ``numpy`` or ``torch``, whichever the arrays are of.
+        error: |v - v*|. Shape: (worlds, 3).
+        commands: v*. Shape: (worlds, 3). Those that are exactly 0 do not count.
+    """
+    counts = commands != 0.0
+    relative = xp.where(counts, 1.0 - error / xp.where(counts, abs(commands), 1.0), 0.0)
+    number = counts.sum(axis=1)
+    return xp.clip(relative.sum(axis=1) / xp.clip(number, 1, None), 0.0, None), (number > 0) * 1.0
 
 
 def step_sums(
-    command: np.ndarray, velocity: np.ndarray, force: float, power: float, height: float, fell: bool, ended: bool
-) -> np.ndarray:
-    """Return what one control step of one robot adds to the sums.
+    xp: ModuleType,
+    commands: Array,
+    velocity: Array,
+    speed: Array,
+    force: Array,
+    power: Array,
+    height: Array,
+    fell: Array,
+    ended: Array,
+) -> Array:
+    """Return what one control step of each world adds to the sums.
 
     Args:
-        command: That held during the step: v_x, v_y [m/s], yaw rate [rad/s]. Shape: (3,).
-        velocity: Of the trunk in its own frame after the step, likewise. Shape: (3,).
-        force: Sum over geoms of the norm of the ground's force [N].
-        power: Sum over joints of |torque times velocity| [W].
-        height: Of the trunk's origin [m].
-        fell: Whether the episode ended with the step, but not by its time.
-        ended: Whether it ended at all; then nothing but the fall counts.
+        xp: ``numpy`` or ``torch``, whichever the arrays are of.
+        commands: Those that held during the step: v_x, v_y [m/s], yaw rate [rad/s]. Shape: (worlds, 3).
+        velocity: Of the trunk in its own frame after the step, likewise. Shape: (worlds, 3).
+        speed: Horizontal speed of the trunk [m/s]. Shape: (worlds,).
+        force: Sum over geoms of the norm of the ground's force [N]. Shape: (worlds,).
+        power: Sum over joints of |torque times velocity| [W]. Shape: (worlds,).
+        height: Of the trunk's origin above the ground [m]. Shape: (worlds,).
+        fell: Whether the episode ended with the step, but not by its time. Shape: (worlds,), bool.
+        ended: Whether it ended at all; then nothing but the fall counts. Shape: (worlds,), bool.
 
     Returns:
-        Shape: (10,): steps, tracking percentage, steps with a command, xy, angular, force, power, height, speed, falls.
+        Shape: (:data:`NUM_SUMS`, worlds): steps, tracking percentage, steps with a command, xy, angular, force, power,
+        height, speed, falls.
     """
-    if ended:
-        return np.array([0.0] * 9 + [float(fell)])
-    error = np.abs(command - velocity)
-    counts = command != 0.0
-    relative = 1.0 - error[counts] / np.abs(command[counts])
-    percentage = max(0.0, relative.mean()) if counts.any() else 0.0
-    speed = np.linalg.norm(velocity[:2])
-    xy = np.square(error[:2]).sum()
-    return np.array([1.0, percentage, float(counts.any()), xy, error[2] ** 2, force, power, height, speed, 0.0])
+    error = abs(commands - velocity)
+    percentage, is_commanded = tracking_percentage(xp, error, commands)
+    ones, zeros = xp.ones_like(percentage), xp.zeros_like(percentage)
+    squares = error**2
+    xy, angular = squares[:, :2].sum(axis=1), squares[:, 2]
+    rows = xp.stack([ones, percentage, is_commanded, xy, angular, force, power, height, speed, zeros])
+    rows = xp.where(ended, 0.0, rows)
+    rows[-1] = fell
+    return rows
 
 
-def estimates(sums: np.ndarray, weight: float, control_step: float) -> dict[str, dict[str, float]]:
-    """Return the metrics with standard errors, which take robots as independent.
+def ratios(sums: Array, weight: float, control_step: float) -> dict[str, tuple[Array, Array]]:
+    """Return numerator and denominator of each metric, per world. Shapes: (worlds,).
 
     Args:
-        sums: Of :func:`step_sums`, per robot. Shape: (robots, 10).
+        sums: Sums of :func:`step_sums`. Shape: (:data:`NUM_SUMS`, worlds).
         weight: Of the robot, m g [N].
         control_step: [s].
-
-    Returns:
-        "mean" and "standard_error" of each metric; NaN where nothing was measured, and the error with one robot.
     """
-    steps, percentage, commanded, xy, angular, force, power, height, speed, falls = sums.T
-    ratios = {
+    steps, percentage, commanded, xy, angular, force, power, height, speed, falls = sums
+    return {
         "track_percentage": (percentage, commanded),
         "track_xy": (xy, steps),
         "track_angular": (angular, steps),
@@ -67,16 +160,25 @@ def estimates(sums: np.ndarray, weight: float, control_step: float) -> dict[str,
         "speed": (speed, steps),
         "falls_per_minute": (falls, steps * (control_step / 60.0)),
     }
-    return {name: _estimate(*ratio) for name, ratio in ratios.items()}
 
 
-def _estimate(numerator: np.ndarray, denominator: np.ndarray) -> dict[str, float]:
-    """Return a ratio of sums over robots with its standard error (delta method). Shapes: (robots,)."""
+def estimates(of: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Estimate]:
+    """Return metrics with standard errors, from their :func:`ratios`."""
+    return {name: estimate(*parts) for name, parts in of.items()}
+
+
+def estimate(numerator: np.ndarray, denominator: np.ndarray) -> Estimate:
+    """Return a ratio of sums over worlds with its standard error, which takes worlds as independent (delta method).
+
+    Args:
+        numerator: Shape: (worlds,).
+        denominator: Shape: (worlds,).
+    """
     total, count = denominator.sum(), len(numerator)
     if total == 0.0:
-        return {"mean": float("nan"), "standard_error": float("nan")}
+        return Estimate(float("nan"), float("nan"))
     mean = numerator.sum() / total
     if count == 1:
-        return {"mean": float(mean), "standard_error": float("nan")}
+        return Estimate(float(mean), float("nan"))
     variance = np.square(numerator - mean * denominator).sum() * count / (count - 1)
-    return {"mean": float(mean), "standard_error": float(np.sqrt(variance) / total)}
+    return Estimate(float(mean), float(np.sqrt(variance) / total))

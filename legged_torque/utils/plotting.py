@@ -1,17 +1,22 @@
-"""Drawing without a screen."""
+"""Drawing to files, without a screen."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from legged_torque.utils.errors import UserError
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DPI = 130
+
 
 def load_pyplot() -> ModuleType:
-    """Return ``matplotlib.pyplot``, which then writes files and opens no windows.
+    """Return ``matplotlib.pyplot``, set up to write files and open no windows.
 
     Raises:
         UserError: If matplotlib is missing.
@@ -27,15 +32,15 @@ def load_pyplot() -> ModuleType:
 
 
 def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
-    """Return what a script has written as JSON.
+    """Return the JSON object that a script has written.
 
     Args:
         file: The file.
-        keys: What it must have.
+        keys: Keys that the object must have.
         script: Name of the script, for the message.
 
     Raises:
-        UserError: If the file is not such a one.
+        UserError: If the file cannot be read or was not written by ``script``.
     """
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
@@ -46,14 +51,14 @@ def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
     return data
 
 
-def save_figure(figure: Any, file: Path) -> None:
-    """Write a picture; its ending says in which format.
+def save_figure(figure: Figure, file: Path) -> None:
+    """Write a figure in the format that the file's ending names.
 
     Raises:
-        UserError: If it cannot be written, or the format is unknown.
+        UserError: If the file cannot be written or the format is unknown.
     """
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(file, dpi=130)
-    except (OSError, ValueError) as error:  # ValueError: of an unknown format
+        figure.savefig(file, dpi=DPI)
+    except (OSError, ValueError) as error:  # ValueError: unknown format
         raise UserError(f"cannot write '{file}': {error}") from None

@@ -90,7 +90,7 @@ class Recorder:
             world: The world that is followed.
         """
         task = self._task
-        velocities = torch.cat([task.base_lin_vel[:, :2], task.base_ang_vel[:, 2:]], dim=1)
+        velocities = task.planar_velocity()
         before = torch.where(task.reset_buf, 0.0, self._sums)
         rewards = (task.episode_sums - before)[:, world] / task.dt
         timeouts = task.time_out_buf.sum()

@@ -34,7 +34,7 @@ class Recorder:
             self._worlds = torch.arange(self._num_worlds, device=task.device)
             if self._num_worlds == 1:
                 self._worlds = task.commands[:, :2].norm(dim=1).argmax().view(1)
-        velocity = torch.cat([task.base_lin_vel[:, :2], task.base_ang_vel[:, 2:]], dim=1)
+        velocity = task.planar_velocity()
         parts = [part[self._worlds].double().cpu().numpy() for part in (task.sim.qpos, task.commands, velocity)]
         self._steps.append([Moment(*moment) for moment in zip(*parts, strict=True)])
 

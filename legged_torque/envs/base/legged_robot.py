@@ -172,6 +172,10 @@ class LeggedRobot(BaseTask):
         """Height of the trunk's origin above the ground under it [m]. Shape: (num_envs,)."""
         return self.terrain.height_above(self.base_pos)
 
+    def planar_velocity(self) -> Tensor:
+        """Return v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame, as commands are. Shape: (num_envs, 3)."""
+        return torch.cat([self.base_lin_vel[:, :2], self.base_ang_vel[:, 2:]], dim=1)
+
     def check_termination(self) -> None:
         """End episodes whose trunk touches the ground, whose state diverged, or whose time is over."""
         touching = self.contacts[:, self.termination_contact_indices].any(dim=1)

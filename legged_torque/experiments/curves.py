@@ -1,0 +1,107 @@
+"""Learning curves: the metrics of a policy over the steps of its training, read from all files that hold them."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.metrics import METRICS, Metric
+from legged_torque.utils.plotting import read_data
+from legged_torque.utils.runs import load_config
+
+MILLION = 1e6
+"""Steps in a million, the unit of axes and texts."""
+CRITIC_GRADIENT_NORM = Metric("critic_gradient_norm", "", "Gradient norm of the critic", None)
+CURVE_METRICS = (*METRICS, CRITIC_GRADIENT_NORM)
+"""The metrics of an evaluation during training."""
+
+Row = dict[str, float]
+"""One evaluation: "steps" and all of :data:`CURVE_METRICS`; NaN where nothing was measured."""
+
+
+@dataclass
+class LearningCurve:
+    """The evaluations of one training, in the order of training. Some files do not name its environment."""
+
+    task: str
+    seed: int
+    environment: str = ""
+    rows: list[Row] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        """Name the training."""
+        return ", ".join(filter(None, [self.task, self.environment, f"seed {self.seed}"]))
+
+
+def read_curves(file: Path) -> list[LearningCurve]:
+    """Read learning curves.
+
+    Args:
+        file: JSON of ``learning_curve.py``, the ``evaluations.csv`` in a run's folder, or the ``evaluations.csv.gz`` of
+            a report, which holds many trainings.
+
+    Raises:
+        UserError: If the file cannot be read or holds something else.
+    """
+    training: dict[str, Any] = {}
+    if file.suffix == ".json":
+        training = read_data(file, {"task", "seed", "points"}, "learning_curve.py")
+        entries = training["points"]
+    else:
+        entries = read_csv(file)
+        if entries and "task" not in entries[0]:
+            config = load_config(file.parent)
+            training = {"task": config["task"], "seed": config["train"]["seed"]}
+    curves: dict[tuple, LearningCurve] = {}
+    try:
+        for entry in entries:
+            names = training or entry
+            key = (names["task"], int(names["seed"]), names.get("environment", ""))
+            curves.setdefault(key, LearningCurve(*key)).rows.append(to_row(entry))
+    except (LookupError, ValueError, TypeError, AttributeError) as error:
+        raise UserError(f"'{file}' does not hold learning curves: {error!r}") from None
+    return list(curves.values())
+
+
+def read_csv(file: Path) -> list[dict[str, Any]]:
+    """Read a CSV file, compressed or not. A last line without its end was cut off by a kill and is left out.
+
+    Raises:
+        UserError: If the file cannot be read.
+    """
+    try:
+        content = file.read_bytes()
+        text = (gzip.decompress(content) if file.suffix == ".gz" else content).decode("utf-8", errors="replace")
+    except (OSError, EOFError) as error:
+        raise UserError(f"cannot read '{file}': {error}") from None
+    return list(csv.DictReader(text.rpartition("\n")[0].splitlines()))
+
+
+def read_rows(file: Path, notes: list[str]) -> list[Row]:
+    """Return the evaluations of a run; none if the file is missing. Each unreadable line adds a note."""
+    rows = []
+    for number, line in enumerate(read_csv(file) if file.is_file() else [], start=2):
+        try:
+            if None in line or None in line.values():
+                raise ValueError("too many or too few cells")
+            rows.append(to_row(line))
+        except (LookupError, ValueError):
+            notes.append(f"line {number} of '{file}' cannot be read")
+    return rows
+
+
+def to_row(entry: Mapping[str, Any]) -> Row:
+    """Return an evaluation from the cells of a line or the entries of a JSON object."""
+    values = {metric.name: to_number(entry.get(metric.name)) for metric in CURVE_METRICS}
+    return {"steps": int(float(entry["steps"])), **values}
+
+
+def to_number(cell: Any) -> float:
+    """Return a cell's number; NaN if it is empty."""
+    return math.nan if cell in (None, "") else float(cell)

@@ -1,0 +1,251 @@
+"""The results of an experiment: reads its folder, averages over seeds, compares tasks, writes tables."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import json
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+from legged_torque.experiments.curves import CURVE_METRICS, Row, read_rows, to_row
+from legged_torque.experiments.paper_values import ENVIRONMENTS, paper_value
+from legged_torque.experiments.significance import holm, welch
+from legged_torque.utils.config import parse_yaml
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.runs import CONFIG_FILE, load_config
+
+LAST_SHARE = 0.18
+"""Fraction of final evaluations averaged for unfinished runs: that of steps 90 to 110 million in a whole one."""
+PAPER_STEPS = 110_000_000
+TABLE_FILE = "table.csv"
+EVALUATIONS_FILE = "evaluations.csv.gz"
+
+
+@dataclass
+class CellResult:
+    """One training: a task, in an environment, with a seed.
+
+    Attributes:
+        rows: Evaluations during training, merged over its runs.
+        results: Evaluations of the last checkpoint, by environment.
+        configs: The ``config.yaml`` of its runs.
+        devices: Where it was trained and evaluated.
+        notes: Problems with its files.
+    """
+
+    task: str
+    environment: str
+    seed: int
+    rows: list[Row] = field(default_factory=list)
+    results: dict[str, Row] = field(default_factory=dict)
+    configs: list[dict[str, Any]] = field(default_factory=list)
+    devices: set[str] = field(default_factory=set)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def steps(self) -> float:
+        """Steps of training before the last evaluation."""
+        return self.rows[-1]["steps"] if self.rows else 0
+
+    @property
+    def total_steps(self) -> int:
+        """Steps of the whole training according to its settings, or else the paper's."""
+        try:
+            config = self.configs[-1]
+            rollout = config["env"]["env"]["num_envs"] * config["train"]["runner"]["num_steps_per_env"]
+            return config["max_iterations"] * rollout * config.get("processes", 1)
+        except (IndexError, KeyError, TypeError):
+            return PAPER_STEPS
+
+    def is_finished(self, steps: float) -> bool:
+        """Return whether fewer steps are left than lie between two evaluations."""
+        interval = self.rows[-1]["steps"] - self.rows[-2]["steps"] if len(self.rows) > 1 else 1
+        return steps + interval > self.total_steps
+
+    def counted_rows(self, evaluated: str, from_step: float) -> list[Row]:
+        """Return the evaluations in an environment that count for Table I."""
+        if evaluated != self.environment:
+            return [self.results[evaluated]] if evaluated in self.results else []
+        first = from_step if self.steps >= from_step else (1.0 - LAST_SHARE) * self.steps
+        return [row for row in self.rows if row["steps"] >= first]
+
+
+@dataclass
+class Experiment:
+    """An experiment as planned, and its results.
+
+    Attributes:
+        environments: Environments of evaluation for each environment of training.
+        plan: Text of ``experiment.yaml``.
+        runs: Trainings that have begun, by task, environment and seed.
+        unplanned: Folders of trainings that the plan does not name.
+    """
+
+    folder: Path
+    tasks: list[str]
+    environments: dict[str, list[str]]
+    seeds: list[int]
+    plan: str
+    runs: dict[tuple[str, str, int], CellResult] = field(default_factory=dict)
+    unplanned: list[str] = field(default_factory=list)
+
+    def runs_of(self, task: str, environment: str) -> list[CellResult]:
+        """Return the trainings of a task in an environment that have begun."""
+        keys = [(task, environment, seed) for seed in self.seeds]
+        return [self.runs[key] for key in keys if key in self.runs]
+
+    def columns(self) -> dict[str, tuple[str, str]]:
+        """Return the environments of training and evaluation by column, those of Table I first."""
+        pairs = [(trained, name) for trained, names in self.environments.items() for name in [trained, *names]]
+        columns = {column_name(*pair): pair for pair in pairs}
+        first = [name for name in ENVIRONMENTS if name in columns]
+        return {name: columns[name] for name in [*first, *columns]}
+
+
+@dataclass
+class Summary:
+    """A metric of a task in an environment: one value per seed, and whether all seeds are there and finished."""
+
+    values: list[float]
+    is_final: bool = True
+
+    @property
+    def mean(self) -> float:
+        """Mean over the seeds."""
+        return fmean(self.values)
+
+    @property
+    def standard_error(self) -> float | None:
+        """Standard error of the mean; None with one seed."""
+        return stdev(self.values) / math.sqrt(len(self.values)) if len(self.values) > 1 else None
+
+
+Cells = dict[str, dict[str, Summary]]
+"""Summaries of a column by task and metric; metrics without a value are absent."""
+Table = dict[str, Cells]
+"""Summaries by column."""
+
+
+def column_name(trained: str, evaluated: str) -> str:
+    """Return the name of a column: the paper trains "doubled" in high_frequency, and all others in themselves."""
+    if trained == evaluated != "doubled" or (trained, evaluated) == ("high_frequency", "doubled"):
+        return evaluated
+    return f"{trained} -> {evaluated}"
+
+
+def is_of_paper(column: str) -> bool:
+    """Return whether a column is one of Table I."""
+    return " -> " not in column
+
+
+def read_experiment(folder: Path) -> Experiment:
+    """Read the folder of an experiment.
+
+    Raises:
+        UserError: If there is none, or its plan cannot be read.
+    """
+    file = folder / "experiment.yaml"
+    if not folder.is_dir():
+        raise UserError(f"there is no folder '{folder}'")
+    if not file.is_file():
+        raise UserError(f"'{folder}' is not the folder of an experiment: it has no experiment.yaml")
+    text = file.read_text(encoding="utf-8", errors="replace")
+    plan = parse_yaml(text, f"'{file}'")
+    kinds = {"tasks": list, "environments": dict, "seeds": list}
+    if not isinstance(plan, dict) or not all(isinstance(plan.get(key), kind) for key, kind in kinds.items()):
+        raise UserError(f"'{file}' lacks the lists tasks and seeds, or environments as a mapping to lists")
+    environments = {name: list(evaluated or []) for name, evaluated in plan["environments"].items()}
+    experiment = Experiment(folder, plan["tasks"], environments, plan["seeds"], text)
+    for path in sorted(path for path in folder.iterdir() if path.is_dir()):
+        match = re.fullmatch(r"(.+)-(.+)-s(\d+)", path.name)
+        if not match:
+            continue
+        task, environment, seed = match[1], match[2], int(match[3])
+        if task in plan["tasks"] and environment in environments and seed in plan["seeds"]:
+            run = read_cell(path, CellResult(task, environment, seed))
+            run.notes = [note.replace(f"{folder}/", "") for note in run.notes]
+            experiment.runs[task, environment, seed] = run
+        else:
+            experiment.unplanned.append(path.name)
+    return experiment
+
+
+def read_cell(folder: Path, cell: CellResult) -> CellResult:
+    """Read the files of a cell's folder. A run's rows replace those of earlier runs from its first evaluation on."""
+    for run_dir in sorted(path for path in folder.iterdir() if path.is_dir()):
+        if (run_dir / CONFIG_FILE).is_file():
+            try:
+                cell.configs.append(load_config(run_dir))
+                cell.devices.add(str(cell.configs[-1].get("device")))
+            except UserError as error:
+                cell.notes.append(str(error))
+        rows = read_rows(run_dir / "evaluations.csv", cell.notes)
+        if rows:
+            cell.rows = [row for row in cell.rows if row["steps"] < rows[0]["steps"]] + rows
+    for file in sorted([*folder.glob("result_*.json"), *folder.glob("*/result_*.json")]):
+        try:
+            result = json.loads(file.read_text(encoding="utf-8"))
+            means = {name: estimate.get("mean") for name, estimate in result["metrics"].items()}
+            row = to_row({"steps": result["steps"], **means})
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            cell.notes.append(f"'{file}' cannot be read")
+            continue
+        cell.devices.add(str(result.get("device")))
+        environment = file.stem.removeprefix("result_")
+        if environment not in cell.results or row["steps"] >= cell.results[environment]["steps"]:
+            cell.results[environment] = row
+    return cell
+
+
+def summarize(experiment: Experiment, from_step: float) -> Table:
+    """Return all metrics over seeds. The value of a seed is the mean of its finite evaluations that count."""
+    table: Table = {}
+    for column, (trained, evaluated) in experiment.columns().items():
+        for task in experiment.tasks:
+            runs = experiment.runs_of(task, trained)
+            counted = [(run, run.counted_rows(evaluated, from_step)) for run in runs]
+            are_finished = all(run.is_finished(rows[-1]["steps"]) for run, rows in counted if rows)
+            cell = table.setdefault(column, {}).setdefault(task, {})
+            for name in (metric.name for metric in CURVE_METRICS):
+                finite = [[row[name] for row in rows if math.isfinite(row[name])] for _, rows in counted]
+                values = [fmean(numbers) for numbers in finite if numbers]
+                if values:
+                    cell[name] = Summary(values, are_finished and len(values) == len(experiment.seeds))
+    return table
+
+
+def compare(cells: Cells, metric: str, pairs: list[tuple[str, str]]) -> list[float | None]:
+    """Return the corrected p value of each pair of tasks in a column of the table; these tests are one family."""
+    values = {task: cell[metric].values if metric in cell else [] for task, cell in cells.items()}
+    return holm([welch(values[first], values[second]) for first, second in pairs])
+
+
+def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
+    """Write all summaries as CSV, and every evaluation during training as compressed CSV."""
+    names = [metric.name for metric in CURVE_METRICS]
+    summaries: list[list[Any]] = [["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean"]]
+    for column, cells in table.items():
+        for task, name in ((task, name) for task in cells for name in names):
+            found = cells[task].get(name)
+            numbers = [found.mean, found.standard_error, len(found.values)] if found else [None, None, 0]
+            summaries.append([task, column, name, *numbers, paper_value(task, column, name)])
+    evaluations: list[list[Any]] = [["task", "environment", "seed", "steps", *names]]
+    for (task, environment, seed), run in experiment.runs.items():
+        for row in run.rows:
+            values = [row[name] if math.isfinite(row[name]) else None for name in names]
+            evaluations.append([task, environment, seed, row["steps"], *values])
+    (out / TABLE_FILE).write_bytes(csv_bytes(summaries))
+    (out / EVALUATIONS_FILE).write_bytes(gzip.compress(csv_bytes(evaluations), mtime=0))  # the same bytes every time
+
+
+def csv_bytes(rows: list[list[Any]]) -> bytes:
+    """Return rows as the bytes of a CSV file."""
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows(rows)
+    return stream.getvalue().encode()
