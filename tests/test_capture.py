@@ -140,7 +140,7 @@ def test_comparison_of_equal_runners(pair):
 
 def set_rewards(runner):
     """Let rewards be negative, as they are at the start."""
-    runner.env.cfg.rewards.only_positive_rewards = False
+    runner.env.rewards.only_positive = False
 
 
 def set_clip(runner):
@@ -150,7 +150,7 @@ def set_clip(runner):
 
 def set_nan(runner):
     """Spoil the rollout's observations."""
-    runner.env._command_scales.fill_(math.nan)
+    runner.env.default_dof_pos.fill_(math.nan)
 
 
 @pytest.mark.parametrize(

@@ -163,7 +163,7 @@ def test_a_cell_that_another_process_works_on(stage, tmp_path):
     """It is left for later, told once, and begun when the other process lets it go."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (out / "a1_position-low-s1").mkdir(parents=True)
-    lock = open(out / "a1_position-low-s1" / "lock", "a")
+    lock = (out / "a1_position-low-s1" / "lock").open("a")
     fcntl.flock(lock, fcntl.LOCK_EX)
 
     def release():
@@ -278,7 +278,7 @@ def test_live_line(stage, tmp_path):
         (stage / "behaviour").write_text("")
         os.kill(int((out / "a1_position-low-s1" / "lock").read_text()), signal.SIGTERM)
         thread.join()
-    live = [line for line in stream.getvalue().split("\r") if "75%" in line][0]
+    live = next(line for line in stream.getvalue().split("\r") if "75%" in line)
     assert live.startswith("0 of 2 cells done, ") and live.strip().endswith(" | a1_position-low-s1 75%")
     assert len(live) == 119
 

@@ -381,7 +381,7 @@ def test_rounds(task, controller, capsys):
     nothing_dropped = {"max_mean_torque": 1e6, "max_residual": 1e6, "held_out": 0.3}
 
     def note(module, inputs, output):
-        if "critic" in inputs[0].keys():  # asked by the task: what is learned from has no such observations
+        if "critic" in inputs[0]:  # asked by the task: what is learned from has no such observations
             acted.append(output.clone())
             ignorant.append(untrained(*inputs))
 

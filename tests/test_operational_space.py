@@ -189,7 +189,7 @@ def test_contact_forces_and_task_dynamics(states, mask):
 @pytest.mark.parametrize("mask", ENOUGH)
 def test_task_torques_accelerate_the_trunk_as_wanted(states, mask):
     """Task torques give the trunk f*, and posture torques do not change that (eqs. 4, 5)."""
-    contacts, task = spaces(states, mask)
+    _, task = spaces(states, mask)
     wanted = torch.randn(6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     to_torques = osc.torque_map(task, joints_of(mask), 0.0)
     torques = osc.apply(to_torques, osc.task_force(task, wanted))

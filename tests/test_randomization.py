@@ -113,7 +113,7 @@ def test_derived_constants(make_task):
     check_constants(task.sim)
     before = {name: task.sim.field(name).clone() for name in (*FIELDS, "body_invweight0", "dof_invweight0")}
     mask = torch.tensor([True, False, True, False, False, False])
-    task._randomize_parameters(mask)
+    task.events.draw_parameters(mask)
     for name, old in before.items():
         new = task.sim.field(name)
         assert torch.equal(new[~mask], old[~mask]), name
@@ -334,9 +334,7 @@ class ThighMassRobot(LeggedRobot):
 
 
 def test_a_variant_draws_more():
-    """What a task adds is drawn, acts on what follows from it, is seen by the critic and mirrored; unless nobody knows
-    its mirror image.
-    """
+    """What a task adds is drawn, acts, is seen by the critic and mirrored, unless its mirror image is not known."""
     cfg = get_cfgs("--set=env.num_envs=20", "--set=domain_rand.randomize_parameters=true")[0]
     task = ThighMassRobot(cfg)
     thighs = task.sim.field("body_mass")[:, [3, 6, 9, 12]]
@@ -359,7 +357,7 @@ def test_everything_at_once(make_task, task):
     world = make_task(task, 16, **settings, **{"noise.add_noise": True})
     masses = world.sim.field("body_mass").clone()
     for _ in range(60):
-        obs, rewards, dones, _ = world.step(torch.randn(16, world.num_actions))
+        obs, rewards, _, _ = world.step(torch.randn(16, world.num_actions))
         assert torch.isfinite(obs["policy"]).all() and torch.isfinite(rewards).all()
     assert not torch.equal(world.sim.field("body_mass"), masses)
 

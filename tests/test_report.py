@@ -45,7 +45,7 @@ def line(million, tracking, **others):
 def write_part(folder, lines, end="\n", **settings):
     """Write the folder of a run, or of a part of one."""
     folder.mkdir(parents=True)
-    task, environment = folder.parent.name.split("-")[:2]
+    task, _ = folder.parent.name.split("-")[:2]
     config = {"task": task, **SETTINGS, **settings}
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     (folder / "evaluations.csv").write_text("\n".join([HEADER, *lines]) + end)

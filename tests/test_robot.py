@@ -274,7 +274,7 @@ def test_foot_position_by_hand_at_random_angles(model):
         angles = rng.uniform(low, high, size=(4, 3))
         data.qpos[7:] = angles.ravel()
         mujoco.mj_kinematics(model, data)
-        for leg, leg_angles in zip(LEGS, angles):
+        for leg, leg_angles in zip(LEGS, angles, strict=True):
             np.testing.assert_allclose(data.geom(f"{leg}_foot").xpos, foot_by_hand(leg, leg_angles), atol=1e-9)
 
 

@@ -171,9 +171,12 @@ def test_both_or_one_of_observations_and_actions(make_task):
 
 def test_counterparts():
     """Parts are paired by name; one without a counterpart is refused."""
-    assert counterparts(["FR_hip_joint", "FL_hip_joint", "L_knee", "R_knee"]) == [1, 0, 3, 2]
+    pairs = [["FR", "FL"], ["right", "left"]]
+    assert counterparts(["FR_hip_joint", "FL_hip_joint", "left_knee", "right_knee"], pairs) == (1, 0, 3, 2)
     with pytest.raises(UserError, match="'FR_hip' has no counterpart 'FL_hip'"):
-        counterparts(["FR_hip", "RL_hip"])
+        counterparts(["FR_hip", "left_hip"], pairs)
+    with pytest.raises(UserError, match="'RL_hip' has no counterpart: asset"):
+        counterparts(["RL_hip"], pairs)
 
 
 # --------------------------------------------------------------------------------------------------- learning

@@ -53,7 +53,7 @@ def test_air_time_ends_with_a_touch(make_task):
     for touches in (0.0, 0.0, 0.0, 1.0, 1.0, 0.0):
         task.feet_contact.fill_(touches)
         seen.append(task._reward_feet_air_time().item())
-        task._update_feet_air_time()
+        task.update_feet_air_time()
     np.testing.assert_allclose(seen, [0.0, 0.0, 0.0, 4 * (0.06 - 0.5), 4 * -0.5, 0.0], rtol=1e-5)
     np.testing.assert_allclose(task.feet_air_time, 0.02, rtol=1e-5)
 

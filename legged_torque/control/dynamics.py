@@ -140,7 +140,7 @@ class RobotDynamics:
         self.contact_bias, self.trunk_jacobian = zeros(n, k, 3), zeros(n, 6, nv)
         points, jacobians = zeros(k, n, 3), zeros(k, n, 3, nv)
         self.contact_points, self.contact_jacobians = points.transpose(0, 1), jacobians.transpose(0, 1)
-        self._jacobian_jobs = [
+        self._jacobian_jobs: list[tuple] = [
             (self._body_ids(body), wp.from_torch(point, dtype=wp.vec3), wp.from_torch(jacobian), None)
             for body, point, jacobian in zip(bodies, points, jacobians, strict=True)
         ]

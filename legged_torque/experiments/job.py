@@ -135,7 +135,7 @@ def try_lock(file: Path) -> BinaryIO | None:
     The lock lasts until the file is closed here and in all processes that inherited it.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
-    lock = open(file, "ab")
+    lock = file.open("ab")
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -34,6 +34,8 @@ class OnDevicePPO(PPO):
         update_graph: The update from one minibatch.
     """
 
+    optimizer: torch.optim.Adam
+
     def __init__(
         self,
         actor: MLPModel,
@@ -85,7 +87,7 @@ class OnDevicePPO(PPO):
         )
         self._actor_learns = torch.ones((), device=self.device)
         self._skip = torch.zeros((), device=self.device)
-        self.optimizer.found_inf = self._skip  # where torch's own gradient scaler tells a fused optimizer to skip
+        self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # where torch's own gradient scaler tells a fused optimizer to skip
         self._losses = torch.zeros(len(LOSS_NAMES), device=self.device)
         self._indices = torch.zeros(self._batch_size, dtype=torch.long, device=self.device)
         self.update_graph = CudaGraph(self._update_minibatch, self.device)

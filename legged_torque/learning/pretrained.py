@@ -18,7 +18,14 @@ from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import all_experiments_dir
 
 SPACES = {
-    "env": ("asset.file", "env.num_actions", "env.history_length", "sim.dt", "control", "normalization"),
+    "env": (
+        "asset.file",
+        "init_state.default_joint_angles",
+        "env.history_length",
+        "sim.dt",
+        "control",
+        "normalization",
+    ),
     "train": ("actor.class_name", "actor.hidden_dims", "actor.activation", "obs_groups.actor"),
 }
 """Settings of task and training in which a pre-trained policy must agree: observations, actions and network."""
@@ -82,12 +89,12 @@ def check_spaces(file: Path, env_cfg: Any, train_cfg: Any) -> None:
     Raises:
         UserError: Naming the first setting that differs.
     """
-    own = spaces(env_cfg, train_cfg)
-    for name, value in read_pretrained(file)["spaces"].items():
-        if own.get(name) != value:
+    of_file = read_pretrained(file)["spaces"]
+    for name, value in spaces(env_cfg, train_cfg).items():
+        if of_file.get(name) != value:
             raise UserError(
-                f"the pre-trained policy '{file}' does not fit this task: its {name} is {value!r}, here it is "
-                f"{own.get(name)!r}; make another one in a file of its own: --set pretraining.file=FILE"
+                f"the pre-trained policy '{file}' does not fit this task: its {name} is {of_file.get(name)!r}, here it "
+                f"is {value!r}; make another one in a file of its own: --set pretraining.file=FILE"
             )
 
 

@@ -53,8 +53,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         torch.set_float32_matmul_precision("high")  # TF32 on a GPU
         for key, groups in train_cfg["obs_groups"].items():
             for group in groups or [""]:
-                if group not in env.obs_buf.keys():
-                    raise unknown_name(f"observation group in obs_groups.{key}", group, env.obs_buf.keys())
+                if group not in env.obs_buf:
+                    raise unknown_name(f"observation group in obs_groups.{key}", group, map(str, env.obs_buf.keys()))
         perturbation = train_cfg["evaluation"]["perturbation"]
         if perturbation and perturbation not in env.cfg.perturbations():
             raise unknown_name("evaluation.perturbation", perturbation, env.cfg.perturbations())
@@ -113,6 +113,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
 
     def claim_log_dir(self) -> None:
         """Create the run's folder, under another name if a run that started in the same second has it already."""
+        assert self.log_dir is not None, "nothing is kept of this training"
         self.log_dir = self.logger.log_dir = str(claim_run_dir(Path(self.log_dir)))
 
     def close(self) -> None:
@@ -251,6 +252,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             **metrics,
             "critic_gradient_norm": losses["critic_gradient_norm"],
         }
+        assert self.log_dir is not None  # there is a writer only where something is kept
         append_row(Path(self.log_dir) / EVALUATIONS_FILE, row)
         logged = {f"Evaluation/{name}": value for name, value in metrics.items()}
         return {**logged, "Perf/evaluation_time": time.perf_counter() - start}

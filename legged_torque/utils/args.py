@@ -21,17 +21,17 @@ class Parser(argparse.ArgumentParser):
         """Report a mistake in the arguments."""
         raise UserError(message)
 
-    def parse_args(self, args: list[str] | None = None, namespace: argparse.Namespace | None = None):
-        """Parse the command line.
+    def parse_known_args(self, args=None, namespace=None):
+        """Parse the command line; what is unknown is refused here already.
 
         Raises:
             UserError: If it cannot be parsed.
         """
-        namespace, unknown = self.parse_known_args(args, namespace)
+        namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
             options = [option for action in self._actions for option in action.option_strings]
             raise unknown_name("option", unknown[0], options)
-        return namespace
+        return namespace, unknown
 
 
 def add_settings_args(parser: argparse.ArgumentParser) -> None:

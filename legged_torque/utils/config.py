@@ -38,8 +38,10 @@ class Section:
         _check_names(cls)
         names = [name for owner in reversed(cls.__mro__) for name in vars(owner)]
         for name in dict.fromkeys(names):
-            if inspect.isclass(getattr(cls, name)) and not name.startswith("_"):
-                setattr(cls, name, _merge(cls, name))
+            if not name.startswith("_") and inspect.isclass(getattr(cls, name)):
+                merged = _merge(cls, name)
+                if merged is not getattr(cls, name):
+                    setattr(cls, name, merged)
 
     def __init__(self) -> None:
         """Instantiate the nested sections, all the way down."""

@@ -18,16 +18,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import ModuleType
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    Array = TypeVar("Array", np.ndarray, Tensor)
-else:
-    Array = TypeVar("Array")
+Array: TypeAlias = Any
+"""A numpy array or a torch tensor."""
 
 
 @dataclass(frozen=True)

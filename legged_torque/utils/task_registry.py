@@ -54,7 +54,7 @@ class TaskRegistry:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._tasks: dict[str, tuple[type[VecEnv], BaseConfig, BaseConfig]] = {}
+        self._tasks: dict[str, tuple[type[VecEnv], Any, Any]] = {}
 
     def register(self, name: str, task_class: type[VecEnv], env_cfg: BaseConfig, train_cfg: BaseConfig) -> None:
         """Make a task known.
@@ -92,7 +92,7 @@ class TaskRegistry:
         Raises:
             UserError: If there is no such task or an option makes no sense.
         """
-        env_cfg, train_cfg = copy.deepcopy(self._get(name)[1:])
+        env_cfg, train_cfg = (copy.deepcopy(cfg) for cfg in self._get(name)[1:])
         train_cfg.runner.experiment_name = train_cfg.runner.experiment_name or name
         if args is not None:
             apply_options(env_cfg, train_cfg, args, run_config)
@@ -184,7 +184,7 @@ class TaskRegistry:
         runner.load(str(run.checkpoint))
         return env, runner
 
-    def _get(self, name: str) -> tuple[type[VecEnv], BaseConfig, BaseConfig]:
+    def _get(self, name: str) -> tuple[type[VecEnv], Any, Any]:
         """Return what was registered under a name."""
         if name not in self._tasks:
             raise unknown_name("task", name, self._tasks)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from legged_torque.envs.base.actions import ActionTerm
+from legged_torque.envs.base.actions import ActionTerm, position_residual, torque
 from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO, LinearChange
@@ -18,6 +18,8 @@ class MultiHeadRobot(LeggedRobot):
         mixing: theta_pd and theta_torque of eq. 7. Shape: (2,).
     """
 
+    cfg: TorqueMultiHeadCfg
+
     def _init_buffers(self) -> None:
         """Allocate the mixing weights as well."""
         super()._init_buffers()
@@ -28,7 +30,8 @@ class MultiHeadRobot(LeggedRobot):
 
     def action_terms(self) -> list[ActionTerm]:
         """Return a position residual and a torque per joint, mixed by their weights."""
-        return [self.position_actions(self.mixing[0]), self.torque_actions(self.mixing[1])]
+        theta_pd, theta_torque = self.mixing
+        return [position_residual(self.action_scale, theta_pd), torque(self.torque_scale, theta_torque)]
 
     def update_curriculum(self) -> None:
         """Set the mixing weights by eq. 1, at the last multiple of the update interval."""
@@ -38,8 +41,8 @@ class MultiHeadRobot(LeggedRobot):
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """tau = theta_pd tau_pd(a[:n]) + theta_torque torque_scale a[n:] (eq. 7) [N m]. Shape: (num_envs, n)."""
         theta_pd, theta_torque = self.mixing
-        torque = self.torque_scale * actions[:, self.num_dof :]
-        return theta_pd * self._pd_torques(actions[:, : self.num_dof]) + theta_torque * torque
+        positions, torques = actions.split(self.num_dof, dim=1)
+        return theta_pd * self._pd_torques(positions) + theta_torque * (self.torque_scale * torques)
 
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the mixing weights too."""

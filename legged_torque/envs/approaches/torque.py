@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from legged_torque.envs.base.actions import ActionTerm
+from legged_torque.envs.base.actions import ActionTerm, torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 
@@ -14,7 +14,7 @@ class TorqueRobot(LeggedRobot):
 
     def action_terms(self) -> list[ActionTerm]:
         """Return one torque per joint."""
-        return [self.torque_actions()]
+        return [torque(self.torque_scale)]
 
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """tau = torque_scale a [N m]. Shapes: (num_envs, num_dof)."""

@@ -12,6 +12,8 @@ from legged_torque.envs.base.legged_robot_config import LinearChange
 class TorqueCurriculumRobot(TorqueRobot):
     """Torque control with one more reward term."""
 
+    cfg: TorqueCurriculumCfg
+
     def _reward_nominal_position(self) -> Tensor:
         """exp(-gamma |q - q_nominal|^2), joint angles [rad]. Shape: (num_envs,)."""
         error = (self.dof_pos - self.default_dof_pos).square().sum(dim=1)

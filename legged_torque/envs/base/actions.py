@@ -26,3 +26,15 @@ class ActionTerm:
     unit: str
     meaning: str
     weight: Tensor | None = None
+
+
+def position_residual(scale: Tensor, weight: Tensor | None = None) -> ActionTerm:
+    """Return the term of PD targets (eq. 8); for the arguments see :class:`ActionTerm`."""
+    return ActionTerm(
+        "position_residual", scale, "rad", "joint position relative to nominal_pose, for PD control", weight
+    )
+
+
+def torque(scale: Tensor, weight: Tensor | None = None) -> ActionTerm:
+    """Return the term of joint torques; for the arguments see :class:`ActionTerm`."""
+    return ActionTerm("torque", scale, "N m", "joint torque", weight)

@@ -47,24 +47,24 @@ class Asset:
         return self.mj_model.jnt_axis[1:]
 
 
-def load_asset(settings: LeggedRobotCfg.asset, timestep: float) -> Asset:
+def load_asset(cfg: LeggedRobotCfg) -> Asset:
     """Load a robot.
 
     Args:
-        settings: ``asset`` of the settings.
-        timestep: Physics step [s].
+        cfg: Settings of the task, of which ``asset`` and ``sim.dt`` count.
 
     Raises:
         UserError: If the file cannot be read, a name in the settings matches nothing, or motors are in another order
             than joints.
     """
+    settings = cfg.asset
     spec = read_spec(resource_path(settings.file))
     geoms = collision_geoms(spec)
     feet = indices_matching(geoms, [settings.foot_name])
     penalized = indices_matching(geoms, settings.penalize_contacts_on)
     terminating = indices_matching(geoms, settings.terminate_after_contacts_on)
     model = build_model(spec, geoms)
-    model.opt.timestep = timestep
+    model.opt.timestep = cfg.sim.dt
     dof_names = [model.joint(i).name for i in range(1, model.njnt)]
     _check_motors(model, dof_names, settings.file)
     return Asset(model, dof_names, geoms, feet, penalized, terminating)

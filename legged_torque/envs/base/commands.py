@@ -18,15 +18,15 @@ class UniformCommands:
         values: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
     """
 
-    def __init__(self, ranges: LeggedRobotCfg.commands.ranges, num_envs: int, device: str) -> None:
+    def __init__(self, cfg: LeggedRobotCfg, device: str) -> None:
         """Start with commands of 0.
 
         Args:
-            ranges: ``commands.ranges`` of the settings.
-            num_envs: Number of worlds.
+            cfg: Settings of the task, of which ``commands.ranges`` and the number of worlds count.
             device: Name of the device.
         """
-        self.values = torch.zeros(num_envs, 3, device=device)
+        ranges = cfg.commands.ranges
+        self.values = torch.zeros(cfg.env.num_envs, 3, device=device)
         limits = [ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw]
         low, high = torch.tensor(limits, dtype=torch.float32, device=device).unbind(dim=1)
         self._low, self._span = low.clone(), high - low

@@ -16,7 +16,7 @@ class LinearCurriculum:
     A value is a function of the step count alone, so that a resumed training continues exactly where it was.
     """
 
-    def __init__(self, settings: Sequence[LinearChange | None], device: str) -> None:
+    def __init__(self, settings: Sequence[LinearChange | type[LinearChange] | None], device: str) -> None:
         """Create the curricula.
 
         Args:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from legged_torque.sim.randomization import Parameter
+from legged_torque.sim.randomization import Parameter, Range
 from legged_torque.utils.mirroring import SCALAR, VECTOR, Mirroring
 
 if TYPE_CHECKING:
@@ -40,15 +41,15 @@ def initial_state(task: LeggedRobot) -> list[Parameter]:
     shortest, longest = rand.action_delay
 
     def velocity(name: str, columns: Any) -> Parameter:
-        return Parameter(name, qvel, list(columns), base=0.0, offset=tuple(getattr(rand, name)))
+        return Parameter(name, qvel, list(columns), base=0.0, offset=pair(getattr(rand, name)))
 
-    delay = {"base": 0.0, "offset": (shortest, longest + 1), "limits": ([shortest], [longest + 0.5])}
-    dof_pos = {"base": pose, "scale": tuple(rand.init_dof_pos_scale), "limits": limits}
+    delay: dict[str, Any] = {"base": 0.0, "offset": (shortest, longest + 1), "limits": ([shortest], [longest + 0.5])}
+    dof_pos: dict[str, Any] = {"base": pose, "scale": pair(rand.init_dof_pos_scale), "limits": limits}
     return [
         Parameter("base_pos", qpos, range(3), base=task.cfg.init_state.pos, shared=True),
-        Parameter("roll", task.init_angles, [0], base=0.0, offset=tuple(rand.init_roll)),
-        Parameter("pitch", task.init_angles, [1], base=0.0, offset=tuple(rand.init_pitch)),
-        Parameter("yaw", task.init_angles, [2], base=0.0, offset=tuple(rand.init_yaw)),
+        Parameter("roll", task.init_angles, [0], base=0.0, offset=pair(rand.init_roll)),
+        Parameter("pitch", task.init_angles, [1], base=0.0, offset=pair(rand.init_pitch)),
+        Parameter("yaw", task.init_angles, [2], base=0.0, offset=pair(rand.init_yaw)),
         Parameter("dof_pos", qpos, [7 + dof for dof in dofs], **dof_pos),
         velocity("init_lin_vel", range(3)),
         velocity("init_ang_vel", range(3, 6)),
@@ -129,19 +130,15 @@ def control_parameters(task: LeggedRobot) -> list[Parameter]:
     ]
 
 
-def mirrors(drawn: list[Parameter], sizes: dict[str, int]) -> Mirroring | None:
-    """Return the mirror image of the numbers of :attr:`Randomization.values`; None if that of one is not known.
+def mirrors(drawn: list[Parameter], sizes: dict[str, int]) -> dict[str, Mirroring | None]:
+    """Return the mirror images of the numbers of :attr:`Randomization.values`, by name; None where it is not known.
 
     Args:
         drawn: The parameters.
         sizes: How many numbers of its own each has.
     """
-    parts = [
-        parameter.mirror or (SCALAR if sizes[parameter.name] == 1 else None)
-        for parameter in drawn
-        if parameter.name in sizes
-    ]
-    return None if None in parts else Mirroring.joined([part for part in parts if part])
+    own = [parameter for parameter in drawn if parameter.name in sizes]
+    return {p.name: p.mirror or (SCALAR if sizes[p.name] == 1 else None) for p in own}
 
 
 def draws_legs(task: LeggedRobot, drawn: list[Parameter]) -> bool:
@@ -161,6 +158,12 @@ def entries(width: int, rows: list[int]) -> list[int]:
     return [row * width + part for row in rows for part in range(width)]
 
 
+def pair(limits: Sequence[float]) -> Range:
+    """Return a range of the settings as lowest and highest value."""
+    low, high = limits
+    return low, high
+
+
 def is_drawn(cfg: Any, name: str) -> bool:
     """Return whether a parameter has a range and is not kept fixed."""
     return getattr(cfg, name) is not None and name not in cfg.keep_fixed
@@ -168,16 +171,16 @@ def is_drawn(cfg: Any, name: str) -> bool:
 
 def offset(cfg: Any, name: str) -> dict[str, Any]:
     """Return settings for a value that is changed by an offset, unless it is kept fixed."""
-    return {"offset": tuple(getattr(cfg, name))} if is_drawn(cfg, name) else {}
+    return {"offset": pair(getattr(cfg, name))} if is_drawn(cfg, name) else {}
 
 
 def scale(cfg: Any, name: str) -> dict[str, Any]:
     """Return settings for a value that is multiplied, unless it is kept fixed."""
-    return {"scale": tuple(getattr(cfg, name))} if is_drawn(cfg, name) else {}
+    return {"scale": pair(getattr(cfg, name))} if is_drawn(cfg, name) else {}
 
 
 def absolute(cfg: Any, name: str, weight: list[float] | float = 1.0) -> dict[str, Any]:
     """Return settings for a value that is replaced, times a weight, unless it is kept fixed."""
     if not is_drawn(cfg, name):
         return {}
-    return {"base": 0.0, "offset": tuple(getattr(cfg, name)), "weight": weight}
+    return {"base": 0.0, "offset": pair(getattr(cfg, name)), "weight": weight}

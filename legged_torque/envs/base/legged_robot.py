@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from legged_torque.envs.base.actions import ActionTerm
+from legged_torque.envs.base.actions import ActionTerm, position_residual
 from legged_torque.envs.base.asset import by_joint, load_asset, nominal_pose
 from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.commands import UniformCommands
@@ -17,7 +17,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
 from legged_torque.envs.base.random_events import RandomEvents
 from legged_torque.envs.base.rewards import Rewards
-from legged_torque.envs.base.symmetry import Mirror, RobotSymmetry
+from legged_torque.envs.base.symmetry import Mirror, RobotSymmetry, make_mirror
 from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.motors import make_motors
@@ -28,7 +28,6 @@ from legged_torque.terrain import make_terrain
 from legged_torque.utils.config import section_keys, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.math import quat_rotate_inverse
-from legged_torque.utils.mirroring import Mirroring
 
 
 class LeggedRobot(BaseTask):
@@ -48,6 +47,7 @@ class LeggedRobot(BaseTask):
         dof_vel: Joint velocities [rad/s]. Shape: (num_envs, num_dof).
         torques: Torques of the last physics step [N m]. Shape: (num_envs, num_dof).
         torque_limits: Lowest and highest torques [N m]. Shape: (2, num_dof).
+        motor_strength: Factor on the torques of each motor. Shape: (num_envs, num_dof).
         actions: Last actions. Shape: (num_envs, num_actions).
         commands: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
         contacts: 1 for each collision geom that touches the ground, else 0. Shape: (num_envs, geoms).
@@ -102,16 +102,7 @@ class LeggedRobot(BaseTask):
 
     def action_terms(self) -> list[ActionTerm]:
         """Return what the actions of :meth:`_compute_torques` are, one term per action of a joint."""
-        return [self.position_actions()]
-
-    def position_actions(self, weight: Tensor | None = None) -> ActionTerm:
-        """Return the term of PD targets; for ``weight`` see :class:`ActionTerm`."""
-        meaning = "joint position relative to nominal_pose, for PD control"
-        return ActionTerm("position_residual", self.action_scale, "rad", meaning, weight)
-
-    def torque_actions(self, weight: Tensor | None = None) -> ActionTerm:
-        """Return the term of joint torques; for ``weight`` see :class:`ActionTerm`."""
-        return ActionTerm("torque", self.torque_scale, "N m", "joint torque", weight)
+        return [position_residual(self.action_scale)]
 
     def observation_terms(self) -> list[ObservationTerm]:
         """Return what policy and critic see."""
@@ -154,7 +145,7 @@ class LeggedRobot(BaseTask):
         self.check_termination()
         self.compute_reward()
         self.log.add_step(self)
-        self.feet_air_time.copy_((self.feet_air_time + self.dt) * (1.0 - self.feet_contact))
+        self.update_feet_air_time()
         self._reset_worlds()
         self._finish_step()
 
@@ -166,6 +157,10 @@ class LeggedRobot(BaseTask):
         self.projected_gravity.copy_(gravity)
         self.contacts.copy_(self.sim.contact_found > 0)
         self.feet_contact.copy_(self.contacts[:, self.feet_indices])
+
+    def update_feet_air_time(self) -> None:
+        """Count the time of each foot since it left the ground."""
+        self.feet_air_time.copy_((self.feet_air_time + self.dt) * (1.0 - self.feet_contact))
 
     @property
     def base_height(self) -> Tensor:
@@ -236,7 +231,7 @@ class LeggedRobot(BaseTask):
     def _create_sim(self) -> None:
         """Load robot, ground and motors, and build the simulator and its views."""
         cfg, sim = self.cfg, self.cfg.sim
-        self.asset = load_asset(cfg.asset, sim.dt)
+        self.asset = load_asset(cfg)
         model = self.asset.mj_model
         per_world = MODEL_FIELDS if cfg.domain_rand.randomize_parameters else ()
         self.sim = Simulator(
@@ -249,7 +244,7 @@ class LeggedRobot(BaseTask):
         )
         self.terrain = make_terrain(cfg.terrain.mesh_type)
         self.motors = make_motors(cfg.motors.model, self.num_envs, self._tensor(model.actuator_forcerange.T))
-        self.torque_limits = self.motors.limits
+        self.torque_limits, self.motor_strength = self.motors.limits, self.motors.strength
         self.base_pos, self.base_quat = self.sim.qpos[:, :3], self.sim.qpos[:, 3:7]
         self.dof_pos, self.dof_vel = self.sim.qpos[:, 7:], self.sim.qvel[:, 6:]
         self.base_ang_vel = self.sim.qvel[:, 3:6]
@@ -308,34 +303,20 @@ class LeggedRobot(BaseTask):
     def _init_random_events(self) -> None:
         """Prepare commands, initial states, random parameters and pushes."""
         cfg = self.cfg
-        self.command_generator = UniformCommands(cfg.commands.ranges, self.num_envs, self.device)
+        self.command_generator = UniformCommands(cfg, self.device)
         self.commands = self.command_generator.values
         self.init_angles = torch.zeros(self.num_envs, 3, device=self.device)
         drawn = self.random_parameters()
-        self.events = RandomEvents(
-            cfg.domain_rand,
-            cfg.commands.resampling_probability,
-            self.sim,
-            self.command_generator,
-            self.init_angles,
-            initial_state(self),
-            drawn,
-        )
+        self.events = RandomEvents(cfg, self.sim, self.command_generator, self.init_angles, initial_state(self), drawn)
         self.randomization = self.events.parameters
-        self.parameter_mirror = mirrors(drawn, self.randomization.sizes)
+        self.parameter_mirrors = mirrors(drawn, self.randomization.sizes)
         if cfg.domain_rand.randomize_parameters and draws_legs(self, drawn):
             self.sim.vary_legs()
 
     @functools.cached_property
     def mirror(self) -> Mirror:
         """Reflects observations and actions of this robot left to right."""
-        actions = [(term.name, self.symmetry.joints) for term in self.action_terms()]
-        return Mirror({**self.observations.mirrors(), "actions": actions}, self.symmetry.problem, self.device)
-
-    def action_mirror(self) -> Mirroring | None:
-        """Return the mirror image of all actions; None without symmetry."""
-        joints = self.symmetry.joints
-        return joints and Mirroring.joined([joints] * len(self.action_terms()))
+        return make_mirror(self)
 
     def _tensor(self, values) -> Tensor:
         """Return values as a float tensor on the task's device."""

@@ -18,7 +18,7 @@ NUM_BINS = 4
 
 
 class WalkingMetrics:
-    """Sums over the steps of a task, per world and kept on the device; :mod:`legged_torque.utils.metrics` defines them."""
+    """Sums of :mod:`legged_torque.utils.metrics` over the steps of a task, per world and kept on the device."""
 
     def __init__(self, task: LeggedRobot) -> None:
         """Start with empty sums."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import torch
@@ -51,6 +52,8 @@ def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
     scales, noise, symmetry = task.cfg.normalization.obs_scales, task.cfg.noise.noise_scales, task.symmetry
     command_scales = (scales.lin_vel, scales.lin_vel, scales.ang_vel)
     joints, feet = symmetry.joints, symmetry.feet
+    parameters = [mirror for mirror in task.parameter_mirrors.values() if mirror]
+    parameter_mirror = Mirroring.joined(parameters) if len(parameters) == len(task.parameter_mirrors) else None
     return [
         ObservationTerm(
             "projected_gravity",
@@ -102,7 +105,7 @@ def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
         ObservationTerm(
             "last_action",
             lambda: task.actions,
-            task.action_mirror(),
+            joints and Mirroring.joined([joints] * len(task.action_terms())),
             meaning="clipped actions of the step before, 0 at the start",
         ),
         ObservationTerm("linear_velocity", lambda: task.base_lin_vel, VECTOR, scales.lin_vel, privileged=True),
@@ -111,7 +114,7 @@ def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
         ObservationTerm(
             "random_parameters",
             lambda: task.randomization.values,
-            task.parameter_mirror,
+            parameter_mirror,
             privileged=True,
             meaning="drawn parameters as shares of their ranges, -1 to 1",
         ),
@@ -145,10 +148,10 @@ class Observations:
         self.sizes = {term.name: value.shape[1] for term, value in zip(self.terms, values, strict=True)}
         self._history_length, self._clip, self._add_noise = history_length, clip, add_noise
         scales = [_per_value(term.scale, self.sizes[term.name]) for term in self.terms]
-        errors = [_scaled(term.noise, scale) for term, scale in zip(self.terms, scales, strict=True)]
-        self._scales = torch.tensor(sum(scales, []), dtype=torch.float32, device=device)
+        errors = [[term.noise * factor for factor in scale] for term, scale in zip(self.terms, scales, strict=True)]
+        self._scales = torch.tensor([*chain(*scales)], dtype=torch.float32, device=device)
         self._policy_size = sum(self.sizes[term.name] for term in self.policy_terms())
-        self._noise = torch.tensor(sum(errors, [])[: self._policy_size], dtype=torch.float32, device=device)
+        self._noise = torch.tensor([*chain(*errors)][: self._policy_size], dtype=torch.float32, device=device)
         sizes = {"policy": self._policy_size * history_length, "critic": len(self._scales)}
         groups = {name: torch.zeros(num_envs, size, device=device) for name, size in sizes.items()}
         self.buffers = TensorDict(groups, batch_size=[num_envs], device=device)
@@ -198,8 +201,3 @@ class Observations:
 def _per_value(value: float | Sequence[float], size: int) -> list[float]:
     """Return one number per value of a term."""
     return [value] * size if isinstance(value, (int, float)) else list(value)
-
-
-def _scaled(noise: float, scales: list[float]) -> list[float]:
-    """Return the largest errors of scaled values."""
-    return [noise * scale for scale in scales]

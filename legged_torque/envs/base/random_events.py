@@ -30,8 +30,7 @@ class RandomEvents:
 
     def __init__(
         self,
-        settings: LeggedRobotCfg.domain_rand,
-        command_probability: float,
+        cfg: LeggedRobotCfg,
         sim: Simulator,
         commands: UniformCommands,
         init_angles: Tensor,
@@ -41,17 +40,18 @@ class RandomEvents:
         """Prepare; nothing is drawn yet.
 
         Args:
-            settings: ``domain_rand`` of the settings.
-            command_probability: Of new commands, per control step.
+            cfg: Settings of the task, of which ``domain_rand`` and the probability of new commands count.
             sim: The worlds.
             commands: What draws commands.
             init_angles: See above; one of the fields of ``initial_state``.
             initial_state: What to draw at resets.
             parameters: What to draw of robot, ground and controller.
         """
-        self._settings, self._sim, self._commands, self.init_angles = settings, sim, commands, init_angles
+        settings = self._settings = cfg.domain_rand
+        self._sim, self._commands, self.init_angles = sim, commands, init_angles
         device, n = sim.device, sim.num_envs
-        chances = [command_probability, settings.resampling_probability, settings.push_probability, PUSH_ADDED]
+        chances = [cfg.commands.resampling_probability, settings.resampling_probability]
+        chances += [settings.push_probability, PUSH_ADDED]
         self._probabilities = torch.tensor(chances, device=device).unsqueeze(1)
         self._push_velocity = torch.zeros(n, 3, device=device)
         self.initial_state = Randomization(initial_state, n, device)
@@ -67,6 +67,15 @@ class RandomEvents:
         self.initial_state.draw(mask)
         self._sim.set_orientation(mask, self.init_angles)
 
+    def draw_parameters(self, mask: Tensor) -> None:
+        """Draw parameters of robot, ground and controller anew.
+
+        Args:
+            mask: In which worlds. Shape: (num_envs,), bool.
+        """
+        self.parameters.draw(mask)
+        self._sim.update_constants(mask)
+
     def happen(self, is_new: Tensor) -> None:
         """Draw commands and parameters where an episode begins or chance says so, and push where chance says so.
 
@@ -78,7 +87,6 @@ class RandomEvents:
         push, add = chosen[2:]
         self._commands.resample(new_commands)
         if self._settings.randomize_parameters:
-            self.parameters.draw(new_parameters)
-            self._sim.update_constants(new_parameters)
+            self.draw_parameters(new_parameters)
         if self._settings.push_robots:
             self._sim.push(push, self._push_velocity.uniform_(*self._settings.push_velocity), add)

@@ -20,6 +20,7 @@ class Rewards:
     Attributes:
         names: Names of the terms.
         episode_sums: Weighted sums of each term over the episode so far. Shape: (terms, num_envs).
+        only_positive: Whether the sum is clipped at 0 from below.
     """
 
     def __init__(
@@ -46,7 +47,7 @@ class Rewards:
         self.names = list(functions)
         self.episode_sums = torch.zeros(len(self.names), num_envs, device=device)
         self._functions = list(functions.values())
-        self._only_positive = only_positive
+        self.only_positive = only_positive
         self._scales = torch.tensor([scales[name] for name in self.names], dtype=torch.float32, device=device) * dt
         self._curriculum = LinearCurriculum([curricula.get(name) for name in self.names], device)
 
@@ -69,4 +70,4 @@ class Rewards:
         terms *= self.weights(total_steps).unsqueeze(1)
         self.episode_sums += terms
         total = terms.sum(dim=0)
-        return total.clamp(min=0.0) if self._only_positive else total
+        return total.clamp(min=0.0) if self.only_positive else total

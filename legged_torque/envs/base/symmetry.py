@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict
@@ -119,6 +119,19 @@ class Mirror:
         return values[:, order] * signs
 
 
+def make_mirror(task: LeggedRobot) -> Mirror:
+    """Return what reflects a task's observations and actions.
+
+    Raises:
+        UserError: If the robot is not symmetric, or the mirror image of a term or of a random parameter is not known.
+    """
+    actions = [(term.name, task.symmetry.joints) for term in task.action_terms()]
+    unknown = [name for name, mirroring in task.parameter_mirrors.items() if mirroring is None]
+    problem = f"the mirror image of the random parameter '{unknown[0]}' is not known" if unknown else ""
+    parts = {**task.observations.mirrors(), "actions": actions}
+    return Mirror(parts, task.symmetry.problem or problem, task.device)
+
+
 def with_mirror_images(
     env: LeggedRobot, obs: TensorDict | None, actions: Tensor | None
 ) -> tuple[TensorDict | None, Tensor | None]:
@@ -130,7 +143,8 @@ def with_mirror_images(
         actions: Shape: (samples, num_actions), or None.
     """
     if obs is not None:
-        groups = {name: torch.cat([group, env.mirror(name, group)]) for name, group in obs.items()}
+        tensors: Any = obs.items()
+        groups = {name: torch.cat([group, env.mirror(name, group)]) for name, group in tensors}
         obs = TensorDict(groups, [2 * len(obs)])
     if actions is not None:
         actions = torch.cat([actions, env.mirror("actions", actions)])

@@ -42,9 +42,9 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     }.items():
         if value < 1:
             raise UserError(f"{key} must be at least 1, not {value}")
-    for key, value in {"sim.dt": cfg.sim.dt, "env.episode_length_s": cfg.env.episode_length_s}.items():
-        if not value > 0.0:
-            raise UserError(f"{key} must be greater than 0, not {value}")
+    for key, seconds in {"sim.dt": cfg.sim.dt, "env.episode_length_s": cfg.env.episode_length_s}.items():
+        if not seconds > 0.0:
+            raise UserError(f"{key} must be greater than 0, not {seconds}")
     if len(cfg.init_state.pos) != 3:
         raise UserError(f"init_state.pos must be [x, y, z], not {cfg.init_state.pos}")
     if cfg.rewards.scales.symmetry and not cfg.asset.mirrored_legs:

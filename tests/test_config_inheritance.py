@@ -1,0 +1,148 @@
+"""Nested settings inherit by themselves, and misspelt ones are refused when a class is made."""
+
+import pytest
+
+from legged_torque.utils.config import BaseConfig, Section, to_dict
+from legged_torque.utils.errors import UserError
+
+
+class Base(BaseConfig):
+    """What all others inherit."""
+
+    class control:
+        stiffness = 1.0
+        damping = 2.0
+
+        class mixing:
+            start = 3.0
+            end = 4.0
+
+    class rewards:
+        scale = 5.0
+
+
+class Robot(Base):
+    """A robot's settings."""
+
+    class control:
+        stiffness = 20.0
+
+        class mixing:
+            end = 40.0
+
+
+class Approach(Base):
+    """An approach's settings, with a section and a setting of its own."""
+
+    class control:
+        damping = 9.0
+
+        class ramp(Section):
+            time = 0.5
+
+        class mixing:
+            start = 30.0
+
+    class rewards:
+        temperature: float = 7.0
+
+
+class Both(Approach, Robot):
+    """An approach on a robot."""
+
+
+def test_sections_of_several_bases_combine():
+    """Each base contributes what it says, at every depth; entries keep the order of the first base that has them."""
+    assert to_dict(Both()) == {
+        "control": {
+            "stiffness": 20.0,
+            "damping": 9.0,
+            "mixing": {"start": 30.0, "end": 40.0},
+            "ramp": {"time": 0.5},
+        },
+        "rewards": {"scale": 5.0, "temperature": 7.0},
+    }
+    assert list(to_dict(Both())["control"]) == ["stiffness", "damping", "mixing", "ramp"]
+    assert to_dict(Robot())["control"]["damping"] == 2.0 and to_dict(Base())["control"]["stiffness"] == 1.0
+
+
+def test_the_first_base_wins():
+    """Settings that two bases change follow Python's method resolution order."""
+
+    class Stiff(Base):
+        class control:
+            stiffness = 50.0
+
+    class First(Stiff, Robot):
+        pass
+
+    class Last(Robot, Stiff):
+        pass
+
+    assert (First.control.stiffness, Last.control.stiffness) == (50.0, 20.0)
+    assert First.control.mixing.end == Last.control.mixing.end == 40.0
+
+
+def test_named_bases_change_nothing():
+    """legged_gym's explicit way gives the same, also where it names only one of the bases."""
+
+    class Explicit(Approach, Robot):
+        class control(Robot.control):
+            class mixing(Robot.control.mixing):
+                end = 41.0
+
+    class Short(Approach, Robot):
+        class control:
+            class mixing:
+                end = 41.0
+
+    assert to_dict(Explicit()) == to_dict(Short())
+    assert Explicit.control.damping == 9.0 and Explicit.control.mixing.start == 30.0
+
+
+def test_a_section_of_another_configuration():
+    """What it names comes before what is inherited, and behind what it says itself."""
+
+    class Other(Base):
+        class control:
+            stiffness = 60.0
+            damping = 61.0
+
+    class Mixed(Robot):
+        class control(Other.control):
+            damping = 62.0
+
+    assert (Mixed.control.stiffness, Mixed.control.damping, Mixed.control.mixing.end) == (60.0, 62.0, 40.0)
+
+
+MISTAKES = {
+    "class control: stifness = 1.0": "setting or section of V.control 'stifness'; did you mean 'stiffness'?",
+    "class control(Robot.control): stifness = 1.0": "of V.control 'stifness'; did you mean 'stiffness'?",
+    "class contrl: stiffness = 1.0": "setting or section of V 'contrl'; did you mean 'control'?",
+    "class control:\n  class mixin: start = 1.0": "of V.control 'mixin'; did you mean 'mixing'?",
+    "class control:\n  class mixing: stat = 1.0": "of V.control.mixing 'stat'; did you mean 'start'?",
+    "control = 3": "V.control is a setting, but in Both it is a section",
+    "class rewards:\n  class scale: a = 1": "V.rewards.scale is a section, but in Approach.rewards it is a setting",
+}
+
+
+@pytest.mark.parametrize("text", MISTAKES)
+def test_misspelt_names_are_refused(text):
+    """A name that no base has is told with the nearest one, before anything is built."""
+    lines = "\n".join(f" {line}" for line in text.splitlines())
+    with pytest.raises(UserError) as error:
+        exec(f"class V(Both):\n{lines}", globals())  # the only way to write a class from a table
+    assert MISTAKES[text] in str(error.value) and "\n" not in str(error.value)
+
+
+def test_instances_do_not_share():
+    """Changing a configuration changes neither its class nor another instance."""
+
+    class Listed(Base):
+        class rewards:
+            names: list[str] = ["a"]  # noqa: RUF012
+
+    first, second = Listed(), Listed()
+    first.rewards.names.append("b")
+    first.control.stiffness = 0.0
+    assert second.rewards.names == Listed.rewards.names == ["a"] and second.control.stiffness == 1.0
