@@ -4,7 +4,7 @@ import mujoco
 import pytest
 
 from legged_torque import ROOT_DIR
-from legged_torque.sim.fused.robot import read_tree
+from legged_torque.sim.fused.tree import read_tree
 from legged_torque.sim.model import build_model, read_spec
 from legged_torque.sim.simulator import Simulator
 from legged_torque.utils.errors import UserError

@@ -11,7 +11,7 @@ import mujoco_warp as mjw
 import warp as wp
 from torch import Tensor
 
-from legged_torque.sim.fused.constants import DerivedConstants
+from legged_torque.sim.fused.set_const import DerivedConstants
 from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
