@@ -10,6 +10,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from legged_torque.utils.errors import UserError
+
 Range = tuple[float, float]
 """Lowest and highest value."""
 
@@ -30,6 +32,7 @@ class Parameter:
         same_draw_as: Name of an earlier parameter whose draws it takes.
         may_keep: Whether it keeps its value at the start in a share of the draws.
         limits: Lowest and highest values, per column, into which draws are clipped.
+        model_field: Name of the field of the model that ``field`` shows; None if it is none.
     """
 
     name: str
@@ -43,6 +46,19 @@ class Parameter:
     same_draw_as: str | None = None
     may_keep: bool = False
     limits: tuple[Sequence[float], Sequence[float]] | None = None
+    model_field: str | None = None
+
+
+_NUMBERS_PER_BODY = {"body_mass": 1, "body_inertia": 3, "body_ipos": 3, "body_iquat": 4, "body_pos": 3, "body_quat": 4}
+"""Fields of the model on which the inverse weights of legs depend, apart from armatures."""
+_TRUNK = 1
+"""The trunk's body."""
+
+
+def changes_legs(parameters: Sequence[Parameter]) -> bool:
+    """Return whether masses or places of bodies other than the trunk are drawn, see ``Simulator.vary_legs``."""
+    widths = [(_NUMBERS_PER_BODY.get(parameter.model_field or ""), parameter) for parameter in parameters]
+    return any(width and any(i // width != _TRUNK for i in parameter.columns) for width, parameter in widths)
 
 
 class Randomization:
@@ -65,6 +81,9 @@ class Randomization:
             num_envs: Number of worlds.
             device: "cpu" or "cuda:N".
             keep_probability: Share of draws in which the parameters that may keep their values at the start do so.
+
+        Raises:
+            UserError: If numbers are not kept as the kernel writes them.
         """
         self._fields = [parameter.field for parameter in parameters]  # their memory must not be freed
         self.sizes: dict[str, int] = {}
@@ -72,6 +91,7 @@ class Randomization:
         first_draw: dict[str, int] = {}
         num_draws = 1  # number 0 decides what is kept
         for parameter in parameters:
+            check_field(parameter, num_envs)
             count = 1 if parameter.shared else len(parameter.columns)
             start = first_draw.setdefault(parameter.same_draw_as or parameter.name, num_draws)
             is_new = start == num_draws
@@ -80,7 +100,7 @@ class Randomization:
                 num_draws += count
             for i, (column, row) in enumerate(zip(parameter.columns, table(parameter, keep_probability), strict=True)):
                 rows.append(row)
-                addresses.append(parameter.field.data_ptr() + column * parameter.field.element_size())
+                addresses.append(parameter.field[:, column].data_ptr())
                 strides.append(parameter.field.stride(0) * parameter.field.element_size())
                 draws.append(start + (0 if parameter.shared else i))
                 places.append(len(at_start) if is_new and i < count else -1)
@@ -162,6 +182,14 @@ def _draw(
         target[0] = value
         if places[column] >= 0:
             values[world, places[column]] = (value - row.middle) * row.per_half_range
+
+
+def check_field(parameter: Parameter, num_envs: int) -> None:
+    """Raise a UserError unless the kernel can write a parameter's numbers: it knows no more than their addresses."""
+    field = parameter.field
+    if field.dtype != torch.float32 or field.dim() != 2 or len(field) != num_envs:
+        expected = f"float32 of shape ({num_envs}, any)"
+        raise UserError(f"random parameter '{parameter.name}': {field.dtype} {tuple(field.shape)} is not {expected}")
 
 
 def table(parameter: Parameter, keep_probability: float) -> list[_Row]:

@@ -26,8 +26,8 @@ from legged_torque.sim.fused.solver import (
     turn_to,
 )
 from legged_torque.sim.fused.tables import Tables, Worlds, dof
-from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem, WholeBody, trunk_slopes
-from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_type, links_type
+from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
+from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types
 
 LINE_SEARCH_TOLERANCE = wp.constant(0.01)
 """The line search stops when the slope has come down to this share of that at its start."""
@@ -80,19 +80,18 @@ def ends(layout: Layout) -> SimpleNamespace:
     """Return what comes before and after the solver: ``make_all``, ``damp_all`` and ``integrate_all``."""
     branches, depth, points, lanes = layout
     per_lane, place = layout.per_lane, places(layout.per_lane)
-    Branch, Links = branch_type(depth), links_type(depth)
+    Branch, Links, _ = branch_types(depth)
+    Kept = wp.array(dtype=Branch)
 
     @wp.func
-    def make_branch(
-        tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, normal: wp.vec3, contacts: Contacts
-    ) -> Branch:
+    def make_branch(tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, contacts: Contacts) -> Branch:
         """Return a branch with its equations of motion, constraints and the accelerations to start from."""
         poses = wp.zeros(shape=wp.static(depth + 1), dtype=Pose)
         branch, links = make_links(Branch(), Links(), tables, worlds, world, b, trunk, poses)
         branch = make_equations(branch, links, tables, world, b, trunk.rot)
         branch.rows = make_joint_rows(branch.rows, tables, worlds, world, b)
         branch.first_contact = (world * wp.static(branches) + b) * wp.static(points)
-        branch.num_contacts = find_contacts(tables, world, b, trunk.pos, normal, poses, contacts, branch.first_contact)
+        branch.num_contacts = find_contacts(tables, world, b, trunk.pos, poses, contacts, branch.first_contact)
         for j in range(wp.static(depth)):
             branch.acc[j] = worlds.qacc_warmstart[world, dof(tables.branch_joint[b, j])]
         return branch
@@ -105,9 +104,8 @@ def ends(layout: Layout) -> SimpleNamespace:
         lane: int,
         trunk: Trunk,
         acc: TrunkMotion,
-        normal: wp.vec3,
         contacts: Contacts,
-        kept: wp.array(dtype=Branch),
+        kept: Kept,
     ):
         """Build the branches; return (the last of) them and the sum of their inertias and wrenches."""
         branch = Branch()
@@ -115,14 +113,14 @@ def ends(layout: Layout) -> SimpleNamespace:
         for i in range(wp.static(per_lane)):
             b = lane + i * wp.static(lanes)
             if b < wp.static(branches):
-                branch = make_branch(tables, worlds, world, b, trunk, normal, contacts)
-                branch = start(branch, trunk.rot, acc, normal, contacts)
+                branch = make_branch(tables, worlds, world, b, trunk, contacts)
+                branch = start(branch, trunk.rot, acc, contacts)
                 total = add_bodies(total, branch.smooth.total)
             place.keep(kept, world, i, branch)
         return branch, total
 
     @wp.func
-    def damp_all(timestep: float, world: int, lane: int, branch: Branch, kept: wp.array(dtype=Branch)):
+    def damp_all(timestep: float, world: int, lane: int, branch: Branch, kept: Kept):
         """Assemble the equations of implicit damping; return also what is left for the trunk."""
         system = TrunkSystem()
         for i in range(wp.static(per_lane)):
@@ -140,9 +138,8 @@ def ends(layout: Layout) -> SimpleNamespace:
         world: int,
         lane: int,
         branch: Branch,
-        kept: wp.array(dtype=Branch),
+        kept: Kept,
         damped: TrunkMotion,
-        normal: wp.vec3,
         contacts: Contacts,
         sense: bool,
     ):
@@ -153,7 +150,7 @@ def ends(layout: Layout) -> SimpleNamespace:
             if b < wp.static(branches):
                 integrate_branch(tables, worlds, world, b, branch, damped)
                 if sense:
-                    sense_branch(tables, worlds, world, b, branch, normal, contacts)
+                    sense_branch(tables, worlds, world, b, branch, contacts)
 
     return SimpleNamespace(Branch=Branch, make_all=make_all, damp_all=damp_all, integrate_all=integrate_all)
 
@@ -162,60 +159,40 @@ def ends(layout: Layout) -> SimpleNamespace:
 def iteration(layout: Layout) -> SimpleNamespace:
     """Return the parts of a solver iteration: ``assemble_all``, ``turn_all``, ``line_search`` and ``move_all``."""
     branches, _, _, lanes = layout
-    per_lane, place, Branch = layout.per_lane, places(layout.per_lane), branch_type(layout.depth)
+    per_lane, place, Branch = layout.per_lane, places(layout.per_lane), branch_types(layout.depth).Branch
+    Kept = wp.array(dtype=Branch)
 
     @wp.func
     def assemble_all(
-        world: int,
-        lane: int,
-        branch: Branch,
-        kept: wp.array(dtype=Branch),
-        rot: wp.mat33,
-        acc: TrunkMotion,
-        normal: wp.vec3,
-        contacts: Contacts,
+        world: int, lane: int, branch: Branch, kept: Kept, rot: wp.mat33, acc: TrunkMotion, contacts: Contacts
     ):
         """Assemble and eliminate the branches' Newton equations; return also what is left for the trunk."""
         system = TrunkSystem()
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
             if lane + i * wp.static(lanes) < wp.static(branches):
-                branch, add = assemble(branch, rot, acc, normal, contacts)
+                branch, add = assemble(branch, rot, acc, contacts)
                 system = eliminate(branch, system, add)
             place.keep(kept, world, i, branch)
         return branch, system
 
     @wp.func
     def turn_all(
-        world: int,
-        lane: int,
-        branch: Branch,
-        kept: wp.array(dtype=Branch),
-        rot: wp.mat33,
-        whole: WholeBody,
-        residual: TrunkMotion,
-        step: TrunkMotion,
-        normal: wp.vec3,
-        contacts: Contacts,
+        world: int, lane: int, branch: Branch, kept: Kept, rot: wp.mat33, step: TrunkMotion, contacts: Contacts
     ):
-        """Find the branches' parts of the step; return also the slopes of the cost along it, see trunk_slopes."""
+        """Find the branches' parts of the step; return also their slopes of the cost along it."""
         slopes = wp.vec3(0.0)
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
             if lane + i * wp.static(lanes) < wp.static(branches):
-                branch = turn_to(branch, rot, step, normal, contacts)
+                branch = turn_to(branch, rot, step, contacts)
                 slopes += slopes_at_start(branch, step, contacts)
             place.keep(kept, world, i, branch)
-        return branch, group_sum3(slopes, wp.static(lanes)) + trunk_slopes(whole, residual, step)
+        return branch, group_sum3(slopes, wp.static(lanes))
 
     @wp.func
     def line_search(
-        iterations: int,
-        world: int,
-        branch: Branch,
-        kept: wp.array(dtype=Branch),
-        at_start: wp.vec3,
-        contacts: Contacts,
+        iterations: int, world: int, branch: Branch, kept: Kept, at_start: wp.vec3, contacts: Contacts
     ) -> float:
         """Return the share of the step at which the cost is least: Newton's method, kept between bounds."""
         alpha = float(1.0)
@@ -240,7 +217,7 @@ def iteration(layout: Layout) -> SimpleNamespace:
         return alpha
 
     @wp.func
-    def move_all(world: int, branch: Branch, kept: wp.array(dtype=Branch), contacts: Contacts, alpha: float):
+    def move_all(world: int, branch: Branch, kept: Kept, contacts: Contacts, alpha: float):
         """Move the branches along the step; return also how many rows of the world changed their state."""
         flips = float(0.0)
         for i in range(wp.static(per_lane)):

@@ -4,7 +4,7 @@ import warp as wp
 
 from legged_torque.sim.fused.constraint import MIN_VALUE, constraint_mass, reference_dynamics, row_force
 from legged_torque.sim.fused.math import quat_to_matrix
-from legged_torque.sim.fused.smooth import Pose
+from legged_torque.sim.fused.smooth import Poses
 from legged_torque.sim.fused.tables import Tables, of_world
 from legged_torque.sim.fused.types import vec4
 
@@ -35,11 +35,12 @@ class Contact:
 
 @wp.struct
 class Contacts:
-    """The contacts of all worlds; each branch has room for as many as it has points."""
+    """The contacts with the floor; each branch of each world has room for as many as it has points."""
 
     found: wp.array(dtype=Contact)
     residual: wp.array(dtype=vec4)  # J a - a_ref of the four rows
     change: wp.array(dtype=vec4)  # of the residual per unit of the solver's step
+    normal: wp.vec3  # the floor's
 
 
 @wp.func
@@ -142,16 +143,10 @@ def contact_stiffness(contact: Contact, normal: wp.vec3, x: vec4) -> wp.mat33:
 
 @wp.func
 def find_contacts(
-    tables: Tables,
-    world: int,
-    b: int,
-    origin: wp.vec3,
-    normal: wp.vec3,
-    poses: wp.array(dtype=Pose),
-    contacts: Contacts,
-    first: int,
+    tables: Tables, world: int, b: int, origin: wp.vec3, poses: Poses, contacts: Contacts, first: int
 ) -> int:
     """Write the contacts of a branch with the floor from index ``first`` on and return how many there are."""
+    normal = contacts.normal
     count = int(0)
     last_geom = int(-1)
     in_geom = int(0)

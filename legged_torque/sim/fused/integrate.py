@@ -45,9 +45,7 @@ def integrate_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch:
 
 
 @wp.func
-def sense_branch(
-    tables: Tables, worlds: Worlds, world: int, b: int, branch: AnyBranch, normal: wp.vec3, contacts: Contacts
-):
+def sense_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch: AnyBranch, contacts: Contacts):
     """Write the contact sensors of a branch's geoms: number of contacts, and the sum of their forces."""
     for k in range(tables.point_count[b]):
         address = tables.geom_sensor[tables.point_geom[b, k]]
@@ -57,7 +55,7 @@ def sense_branch(
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
         address = contacts.found[k].sensor
         if address >= 0:
-            force = contact_force(contacts.found[k], normal, contacts.residual[k])
+            force = contact_force(contacts.found[k], contacts.normal, contacts.residual[k])
             worlds.sensordata[world, address] = worlds.sensordata[world, address] + 1.0
             for r in range(3):
                 worlds.sensordata[world, address + 1 + r] = worlds.sensordata[world, address + 1 + r] + force[r]

@@ -14,7 +14,7 @@ from legged_torque.sim.fused.solver import assemble_damping, eliminate
 from legged_torque.sim.fused.tables import Tables, Worlds, dof, make_tables, of_world, row
 from legged_torque.sim.fused.tree import lanes_per_world, read_tree
 from legged_torque.sim.fused.trunk import TrunkSystem, trunk_matrix, whole_inertia
-from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_type, links_type, mat66, smooth_type, vec6
+from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types, mat66, vec6
 from legged_torque.sim.per_world import expand
 
 KINDS = 3
@@ -49,7 +49,7 @@ class DerivedConstants:
         branches, depth = tree.joints.shape
         lanes = lanes_per_world(branches, self._device.is_cuda)
         self._measure, self._derive = make_measure(depth), make_derive(Layout(branches, depth, 0, lanes))
-        self._smooth, self._places = smooth_type(depth), (branches, depth)
+        self._smooth, self._places = branch_types(depth).Smooth, (branches, depth)
         self._dim = (num_envs, (depth + 1) * KINDS * lanes)
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, mj_model.qpos0[3:7])
@@ -172,7 +172,7 @@ def branch_at_rest(branch: AnyBranch, tables: Tables, world: int, b: int):
 @functools.cache
 def make_measure(depth: int) -> wp.Kernel:
     """Return the kernel that measures branches of ``depth`` joints."""
-    Branch, Links, Smooth = branch_type(depth), links_type(depth), smooth_type(depth)
+    Branch, Links, Smooth = branch_types(depth)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def measure_branches(
@@ -220,7 +220,7 @@ def make_derive(layout: Layout) -> wp.Kernel:
     All of them run the same loop, which is short, since code that runs once must first be fetched.
     """
     branches, depth, _, lanes = layout
-    per_lane, Branch, Smooth = layout.per_lane, branch_type(depth), smooth_type(depth)
+    per_lane, (Branch, _, Smooth) = layout.per_lane, branch_types(depth)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def derive_constants(

@@ -28,6 +28,10 @@ class Pose:
     lin_vel: wp.vec3
 
 
+Poses = wp.array(dtype=Pose)
+"""Of the trunk and of each body of a branch, by depth."""
+
+
 @wp.func
 def body_dynamics(tables: Tables, world: int, body: int, pose: Pose, ang_acc: wp.vec3, lin_acc: wp.vec3) -> Body:
     """Return a body's inertia and wrench (Newton-Euler) from its pose, velocity and acceleration."""
@@ -111,7 +115,7 @@ def joint_force(
 
 @wp.func
 def turn_hinge(tables: Tables, world: int, joint: int, angle: float, pos: wp.vec3, quat: wp.quat):
-    """Return position and orientation of the body behind a hinge, given its parent's, and the hinge's anchor and axis."""
+    """Return position and orientation of the body behind a hinge, given its parent's, and its anchor and axis."""
     body = joint + 1
     origin = pos + quat_to_matrix(quat) * of_world(tables.body_pos, world, body)
     unturned = quat_multiply(quat, of_world(tables.body_quat, world, body))
@@ -126,16 +130,9 @@ def turn_hinge(tables: Tables, world: int, joint: int, angle: float, pos: wp.vec
 
 @wp.func
 def make_links(
-    branch: AnyBranch,
-    links: AnyLinks,
-    tables: Tables,
-    worlds: Worlds,
-    world: int,
-    b: int,
-    trunk: Trunk,
-    poses: wp.array(dtype=Pose),
+    branch: AnyBranch, links: AnyLinks, tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, poses: Poses
 ):
-    """Return a branch with its joints, and its bodies; fill their poses, the trunk's at index 0."""
+    """Return a branch with its joints, and its bodies; fill their poses."""
     pose = trunk_pose(trunk)
     quat, ang, lin = 1.0 * trunk.quat, 1.0 * trunk.ang_vel, 1.0 * trunk.lin_vel  # values, not references
     pos = wp.vec3(0.0)

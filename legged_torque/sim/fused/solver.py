@@ -40,20 +40,20 @@ def contact_rows_times(
 
 
 @wp.func
-def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, normal: wp.vec3, contacts: Contacts):
+def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: Contacts):
     """Return a branch with the residuals of the accelerations that it starts from."""
     branch.residuals = joint_rows_times(branch, branch.acc)
     branch.residuals.friction = branch.residuals.friction - branch.rows.friction_reference
     branch.residuals.limit = branch.residuals.limit - branch.rows.limit_reference
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
         contact = contacts.found[k]
-        motion = contact_rows_times(branch, rot, trunk_acc, branch.acc, normal, contact)
+        motion = contact_rows_times(branch, rot, trunk_acc, branch.acc, contacts.normal, contact)
         contacts.residual[k] = motion - contact.reference
     return branch
 
 
 @wp.func
-def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, normal: wp.vec3, contacts: Contacts):
+def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: Contacts):
     """Return a branch with gradient and Hessian of the cost, and what its contacts add for the trunk."""
     add = TrunkSystem()
     hessian = 1.0 * branch.smooth.mass
@@ -80,11 +80,11 @@ def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, normal: w
             if j < contact.depth:
                 motion = column(branch.smooth.lever, j) + wp.cross(column(branch.smooth.axis, j), contact.pos)
                 jacobian = with_column(jacobian, j, motion)
-        force = contact_force(contact, normal, contacts.residual[k])
+        force = contact_force(contact, contacts.normal, contacts.residual[k])
         gradient -= wp.transpose(jacobian) * force
         gradient_lin -= force
         gradient_ang -= wp.transpose(lever) * force
-        stiffness = contact_stiffness(contact, normal, contacts.residual[k])
+        stiffness = contact_stiffness(contact, contacts.normal, contacts.residual[k])
         pushed = stiffness * jacobian
         hessian += wp.transpose(jacobian) * pushed
         coupling_lin += pushed
@@ -148,12 +148,13 @@ def branch_step(branch: AnyBranch, trunk_step: TrunkMotion):
 
 
 @wp.func
-def turn_to(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, normal: wp.vec3, contacts: Contacts):
+def turn_to(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts: Contacts):
     """Return a branch with its part of the Newton step and the changes of its residuals along it."""
     branch.step = branch_step(branch, trunk_step)
     branch.change = joint_rows_times(branch, branch.step)
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
-        contacts.change[k] = contact_rows_times(branch, rot, trunk_step, branch.step, normal, contacts.found[k])
+        contact = contacts.found[k]
+        contacts.change[k] = contact_rows_times(branch, rot, trunk_step, branch.step, contacts.normal, contact)
     return branch
 
 

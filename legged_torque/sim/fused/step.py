@@ -1,4 +1,4 @@
-"""One physics step as one kernel: a group of threads per world, one thread per leg.
+"""One physics step as one kernel: a group of threads per world, one thread per branch.
 
 MuJoCo Warp runs a step as some hundred small kernels, which wait for each other and for memory. A legged robot on a
 plane is small: a trunk and a few branches of hinge joints that meet only there. Here a thread holds a branch in
@@ -17,8 +17,8 @@ from legged_torque.sim.fused.integrate import integrate_trunk
 from legged_torque.sim.fused.smooth import make_trunk
 from legged_torque.sim.fused.tables import Tables, Worlds, make_tables
 from legged_torque.sim.fused.tree import lanes_per_world, read_tree
-from legged_torque.sim.fused.trunk import TrunkMotion, solve_trunk, trunk_residual, whole_body
-from legged_torque.sim.fused.types import branch_type, vec4
+from legged_torque.sim.fused.trunk import TrunkMotion, solve_trunk, trunk_residual, trunk_slopes, whole_body
+from legged_torque.sim.fused.types import branch_types, vec4
 
 BLOCK_DIM = 128
 """Threads per block: the fastest of 32, 64 and 128 from 4096 worlds on."""
@@ -50,7 +50,7 @@ class FusedStep:
             tables = make_tables(mj_model, model, tree)
             self._scratch = [wp.empty(room * layout.points, dtype=dtype) for dtype in (Contact, vec4, vec4)]
             waiting = room if layout.per_lane > 1 else 1  # a GPU's threads have one branch each
-            self._scratch.append(wp.empty(waiting, dtype=branch_type(depth)))
+            self._scratch.append(wp.empty(waiting, dtype=branch_types(depth).Branch))
         self._model = [tables, mj_model.opt.iterations, mj_model.opt.ls_iterations]
         self._data = [data.ctrl, data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, data.solver_niter]
         self._kernel, self._dim = make_kernel(layout), (data.nworld, lanes)
@@ -74,7 +74,7 @@ class FusedStep:
 def make_kernel(layout: Layout) -> wp.Kernel:
     """Return the kernel for a robot's structure."""
     outer, inner, lanes = ends(layout), iteration(layout), layout.lanes
-    Branch = branch_type(layout.depth)
+    Branch = branch_types(layout.depth).Branch
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def fused_step(
@@ -101,23 +101,21 @@ def make_kernel(layout: Layout) -> wp.Kernel:
     ):
         world, lane = wp.tid()
         worlds = Worlds(ctrl, qpos, qvel, qacc_warmstart, sensordata)
-        contacts = Contacts(found, residuals, changes)
+        contacts = Contacts(found, residuals, changes, floor_normal(tables, world))
         trunk = make_trunk(tables, worlds, world)
-        normal = floor_normal(tables, world)
         acc = TrunkMotion()
         acc.lin = wp.vec3(qacc_warmstart[world, 0], qacc_warmstart[world, 1], qacc_warmstart[world, 2])
         acc.ang = wp.vec3(qacc_warmstart[world, 3], qacc_warmstart[world, 4], qacc_warmstart[world, 5])
-        branch, total = outer.make_all(tables, worlds, world, lane, trunk, acc, normal, contacts, kept)
+        branch, total = outer.make_all(tables, worlds, world, lane, trunk, acc, contacts, kept)
         whole = whole_body(trunk, total, wp.static(lanes))
         used = int(0)
         for _iteration in range(iterations):
             used += 1
-            branch, system = inner.assemble_all(world, lane, branch, kept, trunk.rot, acc, normal, contacts)
+            branch, system = inner.assemble_all(world, lane, branch, kept, trunk.rot, acc, contacts)
             residual = trunk_residual(whole, acc)
             step = solve_trunk(whole, residual, system, wp.static(lanes))
-            branch, start = inner.turn_all(
-                world, lane, branch, kept, trunk.rot, whole, residual, step, normal, contacts
-            )
+            branch, slopes = inner.turn_all(world, lane, branch, kept, trunk.rot, step, contacts)
+            start = slopes + trunk_slopes(whole, residual, step)
             if not (-start[0] * tables.cost_scale > TOLERANCE):
                 break
             alpha = inner.line_search(ls_iterations, world, branch, kept, start, contacts)
@@ -128,7 +126,7 @@ def make_kernel(layout: Layout) -> wp.Kernel:
                 break  # the whole step stayed in one piece of the piecewise quadratic cost: this is its minimum
         branch, system = outer.damp_all(tables.timestep, world, lane, branch, kept)
         damped = solve_trunk(whole, TrunkMotion(), system, wp.static(lanes))
-        outer.integrate_all(tables, worlds, world, lane, branch, kept, damped, normal, contacts, sense)
+        outer.integrate_all(tables, worlds, world, lane, branch, kept, damped, contacts, sense)
         if lane == 0:
             integrate_trunk(tables.timestep, worlds, world, trunk, acc, damped)
             solver_niter[world] = used

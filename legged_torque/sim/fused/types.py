@@ -5,7 +5,7 @@ per number of joints. Loops over ``len(vector)`` are unrolled.
 """
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -14,18 +14,10 @@ vec5 = wp.types.vector(length=5, dtype=wp.float32)
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
 
-AnyVector = Any
-"""A number per joint of a branch."""
-AnyMatrix = Any
-"""A square matrix."""
-AnyColumns = Any
-"""A vector in space per joint of a branch."""
-AnyBranch = Any
-"""A branch, see :func:`branch_type`."""
-AnyRows = Any
-"""The friction and limit rows of a branch, see :func:`joint_rows_type`."""
-AnyLinks = Any
-"""The bodies of a branch, see :func:`links_type`."""
+AnyVector = AnyMatrix = AnyColumns = Any
+"""A number per joint of a branch; a square matrix; a vector in space per joint."""
+AnyBranch = AnyLinks = AnyRows = Any
+"""``Branch``, ``Links`` and ``JointRows`` of :func:`branch_types`."""
 
 
 @wp.struct
@@ -51,20 +43,24 @@ class Trunk:
     body: Body
 
 
-@functools.cache
-def columns_type(n: int) -> type:
-    """Return the type of ``n`` vectors in space, side by side."""
-    return wp.types.matrix(shape=(3, n), dtype=wp.float32)
+class BranchTypes(NamedTuple):
+    """The structs of branches with the same number of joints."""
+
+    Branch: Any
+    Links: Any
+    Smooth: Any
 
 
 @functools.cache
-def links_type(n: int) -> Any:
-    """Return the type of the bodies of a branch of ``n`` joints, as :class:`Body` says of each."""
-    vector, columns = wp.types.vector(length=n, dtype=wp.float32), columns_type(n)
+def branch_types(n: int) -> BranchTypes:
+    """Return the structs of branches of ``n`` joints."""
+    vector = wp.types.vector(length=n, dtype=wp.float32)
+    matrix = wp.types.matrix(shape=(n, n), dtype=wp.float32)
+    columns = wp.types.matrix(shape=(3, n), dtype=wp.float32)
 
     @wp.struct
     class Links:
-        """The bodies of a branch."""
+        """The bodies of a branch; of each what :class:`Body` says."""
 
         mass: vector
         moment: columns
@@ -73,18 +69,9 @@ def links_type(n: int) -> Any:
         force: columns
         torque: columns
 
-    return Links
-
-
-@functools.cache
-def smooth_type(n: int) -> Any:
-    """Return the type of the equations of motion of a branch of ``n`` joints."""
-    vector, columns = wp.types.vector(length=n, dtype=wp.float32), columns_type(n)
-    matrix = wp.types.matrix(shape=(n, n), dtype=wp.float32)
-
     @wp.struct
     class Smooth:
-        """Equations of motion of one branch without constraints, and what it adds to the trunk's."""
+        """Equations of motion of a branch without constraints, and what it adds to the trunk's."""
 
         axis: columns  # of each joint, in the world
         lever: columns  # velocity at the trunk's origin per unit of joint velocity
@@ -94,14 +81,6 @@ def smooth_type(n: int) -> Any:
         force: vector  # torques, springs and dampers less the bias [N m]
         damping: vector
         total: Body
-
-    return Smooth
-
-
-@functools.cache
-def joint_rows_type(n: int) -> Any:
-    """Return the type of the friction and limit rows of a branch of ``n`` joints."""
-    vector = wp.types.vector(length=n, dtype=wp.float32)
 
     @wp.struct
     class JointRows:
@@ -114,30 +93,12 @@ def joint_rows_type(n: int) -> Any:
         limit_sign: vector  # +1 at the lower limit, -1 at the upper one
         limit_reference: vector
 
-    return JointRows
-
-
-@functools.cache
-def residuals_type(n: int) -> Any:
-    """Return the type of the residuals of the joint rows of a branch of ``n`` joints."""
-    vector = wp.types.vector(length=n, dtype=wp.float32)
-
     @wp.struct
     class Residuals:
         """J a - a_ref of the joint rows, or J times a direction."""
 
         friction: vector
         limit: vector
-
-    return Residuals
-
-
-@functools.cache
-def branch_type(n: int) -> Any:
-    """Return the type of a branch of ``n`` joints."""
-    vector, columns = wp.types.vector(length=n, dtype=wp.float32), columns_type(n)
-    matrix = wp.types.matrix(shape=(n, n), dtype=wp.float32)
-    Smooth, JointRows, Residuals = smooth_type(n), joint_rows_type(n), residuals_type(n)
 
     @wp.struct
     class Branch:
@@ -158,4 +119,4 @@ def branch_type(n: int) -> Any:
         trunk_gradient_lin: wp.vec3  # this branch's part
         trunk_gradient_ang: wp.vec3
 
-    return Branch
+    return BranchTypes(Branch, Links, Smooth)
