@@ -26,6 +26,7 @@ from legged_torque.sim.fused.solver import (
     turn_to,
 )
 from legged_torque.sim.fused.tables import Tables, Worlds, dof
+from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
 from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types
 
@@ -47,6 +48,12 @@ class Layout(NamedTuple):
     depth: int
     points: int
     lanes: int
+
+    @classmethod
+    def of(cls, tree: Tree, on_gpu: bool) -> "Layout":
+        """Return a robot's layout: on a GPU a thread per branch, rounded up to a power of two, else one per world."""
+        branches, depth = tree.joints.shape
+        return cls(branches, depth, tree.most_points, 1 << (branches - 1).bit_length() if on_gpu else 1)
 
     @property
     def per_lane(self) -> int:

@@ -38,15 +38,16 @@ def group_sum33(value: wp.mat33, lanes: int) -> wp.mat33:
 
 
 @wp.func
+def symmetric(diagonal: wp.vec3, rest: wp.vec3) -> wp.mat33:
+    """Return a symmetric matrix from xx, yy, zz and xy, xz, yz."""
+    return wp.mat33(diagonal[0], rest[0], rest[1], rest[0], diagonal[1], rest[2], rest[1], rest[2], diagonal[2])
+
+
+@wp.func
 def group_sum33_symmetric(value: wp.mat33, lanes: int) -> wp.mat33:
     """Return the sum of a symmetric matrix over the threads of a world."""
-    xy = group_sum(value[0, 1], lanes)
-    xz = group_sum(value[0, 2], lanes)
-    yz = group_sum(value[1, 2], lanes)
-    xx = group_sum(value[0, 0], lanes)
-    yy = group_sum(value[1, 1], lanes)
-    zz = group_sum(value[2, 2], lanes)
-    return wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+    rest = group_sum3(wp.vec3(value[0, 1], value[0, 2], value[1, 2]), lanes)
+    return symmetric(group_sum3(wp.get_diag(value), lanes), rest)
 
 
 @wp.func
@@ -82,12 +83,6 @@ def quat_to_matrix(q: wp.quat) -> wp.mat33:
         2.0 * (y * z + w * x),
         1.0 - 2.0 * (x * x + y * y),
     )
-
-
-@wp.func
-def symmetric(diagonal: wp.vec3, rest: wp.vec3) -> wp.mat33:
-    """Return a symmetric matrix from xx, yy, zz and xy, xz, yz."""
-    return wp.mat33(diagonal[0], rest[0], rest[1], rest[0], diagonal[1], rest[2], rest[1], rest[2], diagonal[2])
 
 
 @wp.func

@@ -12,7 +12,7 @@ from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, forwa
 from legged_torque.sim.fused.smooth import Pose, add_bodies, body_dynamics, make_equations, make_links, make_trunk
 from legged_torque.sim.fused.solver import assemble_damping, eliminate
 from legged_torque.sim.fused.tables import Tables, Worlds, dof, make_tables, of_world, row
-from legged_torque.sim.fused.tree import lanes_per_world, read_tree
+from legged_torque.sim.fused.tree import read_tree
 from legged_torque.sim.fused.trunk import TrunkSystem, trunk_matrix, whole_inertia
 from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types, mat66, vec6
 from legged_torque.sim.per_world import expand
@@ -46,11 +46,9 @@ class DerivedConstants:
         self._device = model.qpos0.device
         for name in ("body_invweight0", "dof_invweight0"):
             expand(model, name, num_envs)
-        branches, depth = tree.joints.shape
-        lanes = lanes_per_world(branches, self._device.is_cuda)
-        self._measure, self._derive = make_measure(depth), make_derive(Layout(branches, depth, 0, lanes))
-        self._smooth, self._places = branch_types(depth).Smooth, (branches, depth)
-        self._dim = (num_envs, (depth + 1) * KINDS * lanes)
+        self._layout = layout = Layout.of(tree, self._device.is_cuda)
+        self._measure, self._derive = make_measure(layout.depth), make_derive(layout)
+        self._dim = (num_envs, (layout.depth + 1) * KINDS * layout.lanes)
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, mj_model.qpos0[3:7])
         self._rotation = wp.mat33(rotation)
@@ -83,9 +81,10 @@ class DerivedConstants:
 
     def _measure_worlds(self, num_worlds: int) -> None:
         """Allocate and measure the branches of all worlds, or of one for all."""
+        branches, depth, *_ = self._layout
         with wp.ScopedDevice(self._device):
-            self._measured = wp.zeros((num_worlds, self._places[0]), dtype=self._smooth)
-            self._coms = wp.zeros((num_worlds, *self._places), dtype=wp.vec3)
+            self._measured = wp.zeros((num_worlds, branches), dtype=branch_types(depth).Smooth)
+            self._coms = wp.zeros((num_worlds, branches, depth), dtype=wp.vec3)
             self._qpos = wp.array(np.tile(self._reference_pose, (num_worlds, 1)), dtype=wp.float32)
             self._rest = wp.zeros((num_worlds, len(self._reference_pose) - 1), dtype=wp.float32)
             self._measure_branches(wp.full(num_worlds, True, dtype=wp.bool))

@@ -16,7 +16,7 @@ from legged_torque.sim.fused.contact import Contact, Contacts, floor_normal
 from legged_torque.sim.fused.integrate import integrate_trunk
 from legged_torque.sim.fused.smooth import make_trunk
 from legged_torque.sim.fused.tables import Tables, Worlds, make_tables
-from legged_torque.sim.fused.tree import lanes_per_world, read_tree
+from legged_torque.sim.fused.tree import read_tree
 from legged_torque.sim.fused.trunk import TrunkMotion, solve_trunk, trunk_residual, trunk_slopes, whole_body
 from legged_torque.sim.fused.types import branch_types, vec4
 
@@ -41,19 +41,17 @@ class FusedStep:
             UserError: If the robot has something that this step does not simulate.
         """
         tree = read_tree(mj_model)
-        branches, depth = tree.joints.shape
         self._device = data.qpos.device
-        lanes = lanes_per_world(branches, self._device.is_cuda)
-        layout = Layout(branches, depth, tree.most_points, lanes)
-        room = data.nworld * branches
+        layout = Layout.of(tree, self._device.is_cuda)
+        room = data.nworld * layout.branches
         with wp.ScopedDevice(self._device):
             tables = make_tables(mj_model, model, tree)
             self._scratch = [wp.empty(room * layout.points, dtype=dtype) for dtype in (Contact, vec4, vec4)]
             waiting = room if layout.per_lane > 1 else 1  # a GPU's threads have one branch each
-            self._scratch.append(wp.empty(waiting, dtype=branch_types(depth).Branch))
+            self._scratch.append(wp.empty(waiting, dtype=branch_types(layout.depth).Branch))
         self._model = [tables, mj_model.opt.iterations, mj_model.opt.ls_iterations]
         self._data = [data.ctrl, data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, data.solver_niter]
-        self._kernel, self._dim = make_kernel(layout), (data.nworld, lanes)
+        self._kernel, self._dim = make_kernel(layout), (data.nworld, layout.lanes)
 
     def __call__(self, sense: bool) -> None:
         """Advance every world by one physics step.

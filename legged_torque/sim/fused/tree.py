@@ -71,11 +71,6 @@ def read_tree(model: mujoco.MjModel) -> Tree:
     return Tree(np.array([[model.body_jntadr[body] for body in chain] for chain in chains]), points)
 
 
-def lanes_per_world(branches: int, on_gpu: bool) -> int:
-    """Return how many threads work on a world: on a GPU one per branch, rounded up to a power of two, else one."""
-    return 1 << (branches - 1).bit_length() if on_gpu else 1
-
-
 def _require(holds: bool, reason: str) -> None:
     """Raise a UserError with the reason if something does not hold."""
     if not holds:
