@@ -14,7 +14,7 @@ from legged_torque.sim.fused.constraint import make_joint_rows
 from legged_torque.sim.fused.contact import Contacts, find_contacts
 from legged_torque.sim.fused.integrate import integrate_branch, sense_branch
 from legged_torque.sim.fused.math import group_sum, group_sum3
-from legged_torque.sim.fused.smooth import Pose, add_bodies, make_equations, make_links
+from legged_torque.sim.fused.smooth import Pose, add_bodies, links_maker, make_equations
 from legged_torque.sim.fused.solver import (
     assemble,
     assemble_damping,
@@ -87,14 +87,14 @@ def ends(layout: Layout) -> SimpleNamespace:
     """Return what comes before and after the solver: ``make_all``, ``damp_all`` and ``integrate_all``."""
     branches, depth, points, lanes = layout
     per_lane, place = layout.per_lane, places(layout.per_lane)
-    Branch, Links, _ = branch_types(depth)
+    Branch, make_links = branch_types(depth).Branch, links_maker(depth)
     Kept = wp.array(dtype=Branch)
 
     @wp.func
     def make_branch(tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, contacts: Contacts) -> Branch:
         """Return a branch with its equations of motion, constraints and the accelerations to start from."""
         poses = wp.zeros(shape=wp.static(depth + 1), dtype=Pose)
-        branch, links = make_links(Branch(), Links(), tables, worlds, world, b, trunk, poses)
+        branch, links = make_links(tables, worlds, world, b, trunk, poses)
         branch = make_equations(branch, links, tables, world, b, trunk.rot)
         branch.rows = make_joint_rows(branch.rows, tables, worlds, world, b)
         branch.first_contact = (world * wp.static(branches) + b) * wp.static(points)

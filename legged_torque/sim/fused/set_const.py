@@ -9,7 +9,7 @@ import warp as wp
 
 from legged_torque.sim.fused.branches import Layout
 from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, forward_solve
-from legged_torque.sim.fused.smooth import Pose, add_bodies, body_dynamics, make_equations, make_links, make_trunk
+from legged_torque.sim.fused.smooth import Pose, add_bodies, body_dynamics, links_maker, make_equations, make_trunk
 from legged_torque.sim.fused.solver import assemble_damping, eliminate
 from legged_torque.sim.fused.tables import Tables, Worlds, dof, make_tables, of_world, row
 from legged_torque.sim.fused.tree import read_tree
@@ -171,7 +171,7 @@ def branch_at_rest(branch: AnyBranch, tables: Tables, world: int, b: int):
 @functools.cache
 def make_measure(depth: int) -> wp.Kernel:
     """Return the kernel that measures branches of ``depth`` joints."""
-    Branch, Links, Smooth = branch_types(depth)
+    Smooth, make_links = branch_types(depth).Smooth, links_maker(depth)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def measure_branches(
@@ -195,7 +195,7 @@ def make_measure(depth: int) -> wp.Kernel:
         worlds.qvel = rest
         poses = wp.zeros(shape=wp.static(depth + 1), dtype=Pose)
         trunk = make_trunk(tables, worlds, world)
-        branch, links = make_links(Branch(), Links(), tables, worlds, world, b, trunk, poses)
+        branch, links = make_links(tables, worlds, world, b, trunk, poses)
         branch = make_equations(branch, links, tables, world, b, trunk.rot)
         for j in range(wp.static(depth)):
             joint = tables.branch_joint[b, j]

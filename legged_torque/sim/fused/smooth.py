@@ -4,6 +4,8 @@ All spatial quantities stand in world axes and about the trunk's origin. The tru
 about its own axes, as in MuJoCo; they are turned into world axes where they enter.
 """
 
+import functools
+
 import warp as wp
 
 from legged_torque.sim.fused.math import (
@@ -15,7 +17,7 @@ from legged_torque.sim.fused.math import (
     with_column,
 )
 from legged_torque.sim.fused.tables import Tables, Worlds, dof, of_world, qadr, row
-from legged_torque.sim.fused.types import AnyBranch, AnyLinks, Body, Trunk
+from legged_torque.sim.fused.types import AnyBranch, AnyLinks, Body, Trunk, branch_types
 
 
 @wp.struct
@@ -128,45 +130,52 @@ def turn_hinge(tables: Tables, world: int, joint: int, angle: float, pos: wp.vec
     return anchor - rot * local_anchor, out, anchor, rot * local_axis
 
 
-@wp.func
-def make_links(
-    branch: AnyBranch, links: AnyLinks, tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, poses: Poses
-):
-    """Return a branch with its joints, and its bodies; fill their poses."""
-    pose = trunk_pose(trunk)
-    quat, ang, lin = 1.0 * trunk.quat, 1.0 * trunk.ang_vel, 1.0 * trunk.lin_vel  # values, not references
-    pos = wp.vec3(0.0)
-    ang_acc = wp.vec3(0.0)
-    lin_acc = trunk_acc(tables, world, trunk)
-    poses[0] = pose
-    for j in range(len(branch.acc)):
-        joint = tables.branch_joint[b, j]
-        angle = worlds.qpos[world, qadr(joint)]
-        vel = worlds.qvel[world, dof(joint)]
-        pos, quat, anchor, axis = turn_hinge(tables, world, joint, angle, pos, quat)
-        lever = wp.cross(anchor, axis)
-        ang_acc += wp.cross(ang, axis) * vel
-        lin_acc += (wp.cross(ang, lever) + wp.cross(lin, axis)) * vel
-        ang += axis * vel
-        lin += lever * vel
-        pose.pos = pos
-        pose.rot = quat_to_matrix(quat)
-        pose.ang_vel = ang
-        pose.lin_vel = lin
-        poses[j + 1] = pose
-        body = body_dynamics(tables, world, joint + 1, pose, ang_acc, lin_acc)
-        links.mass[j] = body.mass
-        links.moment = with_column(links.moment, j, body.moment)
-        links.inertia_diagonal = with_column(links.inertia_diagonal, j, wp.get_diag(body.inertia))
-        rest = wp.vec3(body.inertia[0, 1], body.inertia[0, 2], body.inertia[1, 2])
-        links.inertia_rest = with_column(links.inertia_rest, j, rest)
-        links.force = with_column(links.force, j, body.force)
-        links.torque = with_column(links.torque, j, body.torque)
-        branch.smooth.axis = with_column(branch.smooth.axis, j, axis)
-        branch.smooth.lever = with_column(branch.smooth.lever, j, lever)
-        branch.smooth.force[j] = joint_force(tables, world, b, j, angle, vel, worlds.ctrl)
-        branch.smooth.damping[j] = of_world(tables.dof_damping, world, dof(joint))
-    return branch, links
+@functools.cache
+def links_maker(n: int) -> wp.Function:
+    """Return ``make_links`` for branches of ``n`` joints; a function for any number would get a copy of the poses."""
+    Branch, Links, _ = branch_types(n)
+
+    @wp.func
+    def make_links(tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, poses: Poses):
+        """Return a branch with its joints, and its bodies; fill their poses."""
+        branch = Branch()
+        links = Links()
+        pose = trunk_pose(trunk)
+        quat, ang, lin = 1.0 * trunk.quat, 1.0 * trunk.ang_vel, 1.0 * trunk.lin_vel  # values, not references
+        pos = wp.vec3(0.0)
+        ang_acc = wp.vec3(0.0)
+        lin_acc = trunk_acc(tables, world, trunk)
+        poses[0] = pose
+        for j in range(wp.static(n)):
+            joint = tables.branch_joint[b, j]
+            angle = worlds.qpos[world, qadr(joint)]
+            vel = worlds.qvel[world, dof(joint)]
+            pos, quat, anchor, axis = turn_hinge(tables, world, joint, angle, pos, quat)
+            lever = wp.cross(anchor, axis)
+            ang_acc += wp.cross(ang, axis) * vel
+            lin_acc += (wp.cross(ang, lever) + wp.cross(lin, axis)) * vel
+            ang += axis * vel
+            lin += lever * vel
+            pose.pos = pos
+            pose.rot = quat_to_matrix(quat)
+            pose.ang_vel = ang
+            pose.lin_vel = lin
+            poses[j + 1] = pose
+            body = body_dynamics(tables, world, joint + 1, pose, ang_acc, lin_acc)
+            links.mass[j] = body.mass
+            links.moment = with_column(links.moment, j, body.moment)
+            links.inertia_diagonal = with_column(links.inertia_diagonal, j, wp.get_diag(body.inertia))
+            rest = wp.vec3(body.inertia[0, 1], body.inertia[0, 2], body.inertia[1, 2])
+            links.inertia_rest = with_column(links.inertia_rest, j, rest)
+            links.force = with_column(links.force, j, body.force)
+            links.torque = with_column(links.torque, j, body.torque)
+            branch.smooth.axis = with_column(branch.smooth.axis, j, axis)
+            branch.smooth.lever = with_column(branch.smooth.lever, j, lever)
+            branch.smooth.force[j] = joint_force(tables, world, b, j, angle, vel, worlds.ctrl)
+            branch.smooth.damping[j] = of_world(tables.dof_damping, world, dof(joint))
+        return branch, links
+
+    return make_links
 
 
 @wp.func
