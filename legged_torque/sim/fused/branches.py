@@ -83,7 +83,7 @@ def places(per_lane: int) -> SimpleNamespace:
 
 
 @functools.cache
-def ends(layout: Layout) -> SimpleNamespace:
+def around_solver(layout: Layout) -> SimpleNamespace:
     """Return what comes before and after the solver: ``make_all``, ``damp_all`` and ``integrate_all``."""
     branches, depth, points, lanes = layout
     per_lane, place = layout.per_lane, places(layout.per_lane)
@@ -159,11 +159,11 @@ def ends(layout: Layout) -> SimpleNamespace:
                 if sense:
                     sense_branch(tables, worlds, world, b, branch, contacts)
 
-    return SimpleNamespace(Branch=Branch, make_all=make_all, damp_all=damp_all, integrate_all=integrate_all)
+    return SimpleNamespace(make_all=make_all, damp_all=damp_all, integrate_all=integrate_all)
 
 
 @functools.cache
-def iteration(layout: Layout) -> SimpleNamespace:
+def in_solver(layout: Layout) -> SimpleNamespace:
     """Return the parts of a solver iteration: ``assemble_all``, ``turn_all``, ``line_search`` and ``move_all``."""
     branches, _, _, lanes = layout
     per_lane, place, Branch = layout.per_lane, places(layout.per_lane), branch_types(layout.depth).Branch

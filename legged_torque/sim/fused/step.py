@@ -11,7 +11,7 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from legged_torque.sim.fused.branches import Layout, ends, iteration
+from legged_torque.sim.fused.branches import Layout, around_solver, in_solver
 from legged_torque.sim.fused.contact import Contact, Contacts, floor_normal
 from legged_torque.sim.fused.integrate import integrate_trunk
 from legged_torque.sim.fused.smooth import make_trunk
@@ -71,7 +71,7 @@ class FusedStep:
 @functools.cache
 def make_kernel(layout: Layout) -> wp.Kernel:
     """Return the kernel for a robot's structure."""
-    outer, inner, lanes = ends(layout), iteration(layout), layout.lanes
+    around, solver, lanes = around_solver(layout), in_solver(layout), layout.lanes
     Branch = branch_types(layout.depth).Branch
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
@@ -104,27 +104,27 @@ def make_kernel(layout: Layout) -> wp.Kernel:
         acc = TrunkMotion()
         acc.lin = wp.vec3(qacc_warmstart[world, 0], qacc_warmstart[world, 1], qacc_warmstart[world, 2])
         acc.ang = wp.vec3(qacc_warmstart[world, 3], qacc_warmstart[world, 4], qacc_warmstart[world, 5])
-        branch, total = outer.make_all(tables, worlds, world, lane, trunk, acc, contacts, kept)
+        branch, total = around.make_all(tables, worlds, world, lane, trunk, acc, contacts, kept)
         whole = whole_body(trunk, total, wp.static(lanes))
         used = int(0)
         for _iteration in range(iterations):
             used += 1
-            branch, system = inner.assemble_all(world, lane, branch, kept, trunk.rot, acc, contacts)
+            branch, system = solver.assemble_all(world, lane, branch, kept, trunk.rot, acc, contacts)
             residual = trunk_residual(whole, acc)
             step = solve_trunk(whole, residual, system, wp.static(lanes))
-            branch, slopes = inner.turn_all(world, lane, branch, kept, trunk.rot, step, contacts)
+            branch, slopes = solver.turn_all(world, lane, branch, kept, trunk.rot, step, contacts)
             start = slopes + trunk_slopes(whole, residual, step)
             if not (-start[0] * tables.cost_scale > TOLERANCE):
                 break
-            alpha = inner.line_search(ls_iterations, world, branch, kept, start, contacts)
+            alpha = solver.line_search(ls_iterations, world, branch, kept, start, contacts)
             acc.lin = acc.lin + alpha * step.lin
             acc.ang = acc.ang + alpha * step.ang
-            branch, flips = inner.move_all(world, branch, kept, contacts, alpha)
+            branch, flips = solver.move_all(world, branch, kept, contacts, alpha)
             if alpha == 1.0 and flips == 0.0:
                 break  # the whole step stayed in one piece of the piecewise quadratic cost: this is its minimum
-        branch, system = outer.damp_all(tables.timestep, world, lane, branch, kept)
+        branch, system = around.damp_all(tables.timestep, world, lane, branch, kept)
         damped = solve_trunk(whole, TrunkMotion(), system, wp.static(lanes))
-        outer.integrate_all(tables, worlds, world, lane, branch, kept, damped, contacts, sense)
+        around.integrate_all(tables, worlds, world, lane, branch, kept, damped, contacts, sense)
         if lane == 0:
             integrate_trunk(tables.timestep, worlds, world, trunk, acc, damped)
             solver_niter[world] = used
