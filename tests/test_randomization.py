@@ -10,7 +10,7 @@ from settings import error_of, get_cfgs
 
 from legged_torque.envs.base.domain_rand import view
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.sim.randomization import Parameter
+from legged_torque.sim.randomization import Parameter, Randomization, changes_legs
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
 
@@ -329,7 +329,8 @@ class ThighMassRobot(LeggedRobot):
     def random_parameters(self):
         """The masses of the thighs as well."""
         thighs = [body for body in range(2, 14) if "thigh" in self.sim.mj_model.body(body).name]
-        more = Parameter("thigh_mass", view(self, "body_mass"), thighs, shared=self.shared, scale=(0.5, 0.9))
+        masses = view(self, "body_mass")
+        more = Parameter("thigh_mass", masses, thighs, model_field="body_mass", shared=self.shared, scale=(0.5, 0.9))
         return [*super().random_parameters(), more]
 
 
@@ -382,3 +383,22 @@ def test_settings_that_make_no_sense(make_task, key, value):
     """They are refused by their names."""
     with pytest.raises(UserError, match=key.replace(".", r"\.")):
         make_task("a1_torque", 1, **{key: value})
+
+
+def test_what_the_kernel_cannot_write_is_refused():
+    """Numbers of another type are refused at once, and worlds that share numbers when they are to be drawn."""
+    with pytest.raises(UserError, match="'wide' must be float32"):
+        Randomization([Parameter("wide", torch.zeros(3, 2, dtype=torch.float64), [0])], 3, "cpu")
+    shared = Randomization([Parameter("shared", torch.ones(1, 2), [0])], 3, "cpu")
+    with pytest.raises(UserError, match="without a row per world: shared"):
+        shared.draw(torch.ones(3, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(
+    ("field", "columns", "changes"),
+    [("body_mass", [1], False), ("body_mass", [1, 2], True), ("body_ipos", [3, 4, 5], False), ("body_ipos", [6], True)]
+    + [("dof_armature", [7], False), (None, [7], False)],
+)
+def test_changes_of_legs(field, columns, changes):
+    """Masses and places of bodies tell whether legs vary, those of the trunk aside."""
+    assert changes_legs([Parameter("drawn", torch.ones(1, 9), columns, model_field=field)]) == changes

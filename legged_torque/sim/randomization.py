@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import Mirroring
 
 Range = tuple[float, float]
@@ -32,6 +33,7 @@ class Parameter:
         same_draw_as: Name of an earlier parameter whose draws it takes.
         may_keep: Whether it keeps its value at the start in a share of the draws.
         limits: Lowest and highest values, per column, into which draws are clipped.
+        model_field: Name of the field of the model that ``field`` shows; None if it is none.
         mirror: Left-right mirror image of the numbers that are drawn; None: that of one number is itself, that of
             several is not known.
     """
@@ -47,7 +49,20 @@ class Parameter:
     same_draw_as: str | None = None
     may_keep: bool = False
     limits: tuple[Sequence[float], Sequence[float]] | None = None
+    model_field: str | None = None
     mirror: Mirroring | None = None
+
+
+_NUMBERS_PER_BODY = {"body_mass": 1, "body_inertia": 3, "body_ipos": 3, "body_iquat": 4, "body_pos": 3, "body_quat": 4}
+"""Fields of the model on which the inverse weights of legs depend, apart from armatures."""
+_TRUNK = 1
+"""The trunk's body."""
+
+
+def changes_legs(parameters: Sequence[Parameter]) -> bool:
+    """Return whether masses or places of bodies other than the trunk are drawn, see ``Simulator.vary_legs``."""
+    widths = [(_NUMBERS_PER_BODY.get(parameter.model_field or ""), parameter) for parameter in parameters]
+    return any(width and any(i // width != _TRUNK for i in parameter.columns) for width, parameter in widths)
 
 
 class Randomization:
@@ -70,13 +85,19 @@ class Randomization:
             num_envs: Number of worlds.
             device: "cpu" or "cuda:N".
             keep_probability: Share of draws in which the parameters that may keep their values at the start do so.
+
+        Raises:
+            UserError: If a parameter is not float32 or has not two axes.
         """
         self._fields = [parameter.field for parameter in parameters]  # their memory must not be freed
+        self._without_rows = [parameter.name for parameter in parameters if len(parameter.field) != num_envs]
         self.sizes: dict[str, int] = {}
-        rows, addresses, strides, draws, places, at_start = [], [], [], [], [], []
+        rows: list[_Row] = []
+        at_start: list[float] = []
         first_draw: dict[str, int] = {}
         num_draws = 1  # number 0 decides what is kept
         for parameter in parameters:
+            check_field(parameter)
             count = 1 if parameter.shared else len(parameter.columns)
             start = first_draw.setdefault(parameter.same_draw_as or parameter.name, num_draws)
             is_new = start == num_draws
@@ -84,50 +105,47 @@ class Randomization:
                 self.sizes[parameter.name] = count
                 num_draws += count
             for i, (column, row) in enumerate(zip(parameter.columns, table(parameter, keep_probability), strict=True)):
-                rows.append(row)
-                addresses.append(parameter.field.data_ptr() + column * parameter.field.element_size())
-                strides.append(parameter.field.stride(0) * parameter.field.element_size())
-                draws.append(start + (0 if parameter.shared else i))
-                places.append(len(at_start) if is_new and i < count else -1)
-                if places[-1] >= 0:
+                row.address = parameter.field[:, column].data_ptr()
+                row.stride = parameter.field.stride(0) * parameter.field.element_size()
+                row.draw = start + (0 if parameter.shared else i)
+                row.place = -1
+                if is_new and i < count:
+                    row.place = len(at_start)
                     at_start.append((row.own_value - row.middle) * row.per_half_range)
+                rows.append(row)
         self._num_envs, self._device = num_envs, device
         self.values = torch.tensor(at_start, device=device).repeat(num_envs, 1)
         self._seeds = torch.zeros(num_envs, dtype=torch.int32, device=device)
         self._rows = wp.array(rows, dtype=_Row, device=device)
-        self._addresses = wp.array(addresses, dtype=wp.uint64, device=device)
-        self._strides = wp.array(strides, dtype=wp.uint64, device=device)
-        self._draws = wp.array(draws, dtype=wp.int32, device=device)
-        self._places = wp.array(places, dtype=wp.int32, device=device)
 
     def draw(self, mask: Tensor) -> None:
         """Draw all parameters anew.
 
         Args:
             mask: In which worlds. Shape: (num_envs,), bool.
+
+        Raises:
+            UserError: If worlds share a parameter.
         """
+        if self._without_rows:
+            raise UserError(f"random parameters without a row per world: {', '.join(self._without_rows)}")
         self._seeds.random_()
         wp.launch(
             _draw,
             dim=(self._num_envs, len(self._rows)),
-            inputs=[
-                wp.from_torch(mask),
-                wp.from_torch(self._seeds),
-                self._rows,
-                self._addresses,
-                self._strides,
-                self._draws,
-                self._places,
-                wp.from_torch(self.values),
-            ],
+            inputs=[wp.from_torch(mask), wp.from_torch(self._seeds), self._rows, wp.from_torch(self.values)],
             device=self._device,
         )
 
 
 @wp.struct
 class _Row:
-    """How one column is drawn, and how its value is brought to [-1, 1]."""
+    """How one column is drawn, where it is kept, and how its value is brought to [-1, 1]."""
 
+    address: wp.uint64  # of the first world's number
+    stride: wp.uint64  # from world to world [bytes]
+    draw: wp.int32  # number of the random numbers that it takes
+    place: wp.int32  # in the values, -1 without
     base: wp.float32
     weight: wp.float32
     offset_low: wp.float32
@@ -147,26 +165,30 @@ def _draw(
     mask: wp.array(dtype=wp.bool),
     seeds: wp.array(dtype=wp.int32),
     rows: wp.array(dtype=_Row),
-    addresses: wp.array(dtype=wp.uint64),
-    strides: wp.array(dtype=wp.uint64),
-    draws: wp.array(dtype=wp.int32),
-    places: wp.array(dtype=wp.int32),
     values: wp.array2d(dtype=wp.float32),
 ):
     """Write one number of one world."""
     world, column = wp.tid()
     if mask[world]:
         row = rows[column]
-        random = wp.rand_init(seeds[world], draws[column])
+        random = wp.rand_init(seeds[world], row.draw)
         offset = row.offset_low + row.offset_span * wp.randf(random)
         scale = row.scale_low + row.scale_span * wp.randf(random)
         value = wp.clamp((row.base + row.weight * offset) * scale, row.lowest, row.highest)
         if wp.randf(wp.rand_init(seeds[world], 0)) < row.keep_probability:
             value = row.own_value
-        target = wp.array(ptr=addresses[column] + wp.uint64(world) * strides[column], shape=(1,), dtype=wp.float32)
+        target = wp.array(ptr=row.address + wp.uint64(world) * row.stride, shape=(1,), dtype=wp.float32)
         target[0] = value
-        if places[column] >= 0:
-            values[world, places[column]] = (value - row.middle) * row.per_half_range
+        if row.place >= 0:
+            values[world, row.place] = (value - row.middle) * row.per_half_range
+
+
+def check_field(parameter: Parameter) -> None:
+    """Raise a UserError unless a parameter's numbers are of the kind that the kernel writes to their addresses."""
+    field = parameter.field
+    if field.dtype != torch.float32 or field.dim() != 2:
+        shape = tuple(field.shape)
+        raise UserError(f"random parameter '{parameter.name}' must be float32 with two axes, not {field.dtype} {shape}")
 
 
 def table(parameter: Parameter, keep_probability: float) -> list[_Row]:

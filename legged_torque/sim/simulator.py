@@ -11,7 +11,7 @@ import mujoco_warp as mjw
 import warp as wp
 from torch import Tensor
 
-from legged_torque.sim.fused.constants import DerivedConstants
+from legged_torque.sim.fused.set_const import DerivedConstants
 from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
@@ -121,7 +121,10 @@ class Simulator:
         return wp.to_torch(getattr(owner(self.model, name), name))
 
     def vary_legs(self) -> None:
-        """Expect changes of legs as well; otherwise constants follow from the trunk's mass and from armatures only."""
+        """Also recompute per-leg constants, see :func:`~legged_torque.sim.randomization.changes_legs`.
+
+        Without this they follow from the trunk's mass and from armatures only.
+        """
         self._constants.vary_branches()
 
     def update_constants(self, mask: Tensor) -> None:
@@ -147,13 +150,8 @@ class Simulator:
             mask: Which worlds. Shape: (num_envs,), bool.
         """
         data = self.data
-        wp.launch(
-            _reset_worlds,
-            dim=self.num_envs,
-            inputs=[wp.from_torch(mask), self._reference_pose],
-            outputs=[data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, data.sensordata],
-            device=self._wp_device,
-        )
+        state = (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, data.sensordata)
+        self._launch(_reset_worlds, wp.from_torch(mask), self._reference_pose, *state)
 
     def set_orientation(self, mask: Tensor, angles: Tensor) -> None:
         """Turn trunks: about x (roll), then y (pitch), then z (yaw), all axes of the world.
@@ -162,13 +160,7 @@ class Simulator:
             mask: In which worlds. Shape: (num_envs,), bool.
             angles: Roll, pitch and yaw [rad]. Shape: (num_envs, 3).
         """
-        wp.launch(
-            _set_orientation,
-            dim=self.num_envs,
-            inputs=[wp.from_torch(mask), wp.from_torch(angles)],
-            outputs=[self.data.qpos],
-            device=self._wp_device,
-        )
+        self._launch(_set_orientation, wp.from_torch(mask), wp.from_torch(angles), self.data.qpos)
 
     def push(self, mask: Tensor, velocity: Tensor, add: Tensor) -> None:
         """Change velocities of trunks.
@@ -178,13 +170,8 @@ class Simulator:
             velocity: In the world frame [m/s]. Shape: (num_envs, 3).
             add: Where it is added; elsewhere it replaces the trunk's own. Shape: (num_envs,), bool.
         """
-        wp.launch(
-            _push,
-            dim=self.num_envs,
-            inputs=[wp.from_torch(mask), wp.from_torch(velocity), wp.from_torch(add)],
-            outputs=[self.data.qvel],
-            device=self._wp_device,
-        )
+        drawn = (wp.from_torch(mask), wp.from_torch(velocity), wp.from_torch(add))
+        self._launch(_push, *drawn, self.data.qvel)
 
     def clear_diverged(self) -> None:
         """Forget which worlds have diverged."""
@@ -192,13 +179,9 @@ class Simulator:
 
     def flag_diverged(self) -> None:
         """Mark the worlds whose state is not finite or absurdly large; MuJoCo Warp has no such check."""
-        wp.launch(
-            _flag_diverged,
-            dim=self.num_envs,
-            inputs=[self.data.qpos, self.data.qvel, self.data.qacc_warmstart, self.data.overflow],
-            outputs=[self._diverged, self._overflow],
-            device=self._wp_device,
-        )
+        data = self.data
+        state = (data.qpos, data.qvel, data.qacc_warmstart, data.overflow)
+        self._launch(_flag_diverged, *state, self._diverged, self._overflow)
 
     def check_buffers(self) -> str | None:
         """Return a warning if contacts or constraints were dropped since the start because a buffer was full.
@@ -210,6 +193,10 @@ class Simulator:
         if not names:
             return None
         return f"simulation buffers overflowed ({', '.join(names)}): some contacts were ignored"
+
+    def _launch(self, kernel: wp.Kernel, *arrays: wp.array) -> None:
+        """Run a kernel once per world."""
+        wp.launch(kernel, dim=self.num_envs, inputs=arrays, device=self._wp_device)
 
 
 @wp.kernel(enable_backward=False)

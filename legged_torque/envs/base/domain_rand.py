@@ -74,7 +74,7 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
     foot_vectors = symmetry.feet and symmetry.feet.of_vectors(VECTOR)
 
     def drawn(name: str, field: str, columns: Any, **settings: Any) -> Parameter:
-        return Parameter(name, view(task, field), list(columns), **settings)
+        return Parameter(name, view(task, field), list(columns), model_field=field, **settings)
 
     def of_joints(name: str, field: str, columns: Any) -> Parameter:
         return drawn(name, field, columns, may_keep=True, mirror=joint_values, **absolute(cfg, name))
@@ -139,13 +139,6 @@ def mirrors(drawn: list[Parameter], sizes: dict[str, int]) -> dict[str, Mirrorin
     """
     own = [parameter for parameter in drawn if parameter.name in sizes]
     return {p.name: p.mirror or (SCALAR if sizes[p.name] == 1 else None) for p in own}
-
-
-def draws_legs(task: LeggedRobot, drawn: list[Parameter]) -> bool:
-    """Return whether masses or places of bodies other than the trunk are drawn."""
-    widths = {"body_mass": 1, "body_inertia": 3, "body_ipos": 3, "body_iquat": 4, "body_pos": 3, "body_quat": 4}
-    of_trunk = {view(task, name).data_ptr(): entries(width, [TRUNK]) for name, width in widths.items()}
-    return any(not set(p.columns) <= set(of_trunk.get(p.field.data_ptr(), p.columns)) for p in drawn)
 
 
 def view(task: LeggedRobot, field: str) -> Tensor:

@@ -12,7 +12,7 @@ from legged_torque.envs.base.actions import ActionTerm, position_residual
 from legged_torque.envs.base.asset import by_joint, load_asset, nominal_pose
 from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.commands import UniformCommands
-from legged_torque.envs.base.domain_rand import MODEL_FIELDS, draws_legs, initial_state, mirrors, parameters
+from legged_torque.envs.base.domain_rand import MODEL_FIELDS, initial_state, mirrors, parameters
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
 from legged_torque.envs.base.random_events import RandomEvents
@@ -22,7 +22,7 @@ from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.motors import make_motors
 from legged_torque.motors.action_delay import ActionDelay
-from legged_torque.sim.randomization import Parameter
+from legged_torque.sim.randomization import Parameter, changes_legs
 from legged_torque.sim.simulator import Simulator
 from legged_torque.terrain import make_terrain
 from legged_torque.utils.config import section_keys, to_dict
@@ -310,7 +310,7 @@ class LeggedRobot(BaseTask):
         self.events = RandomEvents(cfg, self.sim, self.command_generator, self.init_angles, initial_state(self), drawn)
         self.randomization = self.events.parameters
         self.parameter_mirrors = mirrors(drawn, self.randomization.sizes)
-        if cfg.domain_rand.randomize_parameters and draws_legs(self, drawn):
+        if cfg.domain_rand.randomize_parameters and changes_legs(drawn):
             self.sim.vary_legs()
 
     @functools.cached_property

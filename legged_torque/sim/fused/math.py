@@ -1,13 +1,8 @@
 """What the kernels calculate with: quaternions, small matrices, and sums over the threads of one world."""
 
-import functools
-from types import SimpleNamespace
-
 import warp as wp
 
-vec4 = wp.types.vector(length=4, dtype=wp.float32)
-vec5 = wp.types.vector(length=5, dtype=wp.float32)
-vec6 = wp.types.vector(length=6, dtype=wp.float32)
+from legged_torque.sim.fused.types import AnyColumns, AnyMatrix, AnyVector
 
 
 @wp.func_native("""
@@ -43,21 +38,16 @@ def group_sum33(value: wp.mat33, lanes: int) -> wp.mat33:
 
 
 @wp.func
-def group_sum33_symmetric(value: wp.mat33, lanes: int) -> wp.mat33:
-    """Return the sum of a symmetric matrix over the threads of a world."""
-    xy = group_sum(value[0, 1], lanes)
-    xz = group_sum(value[0, 2], lanes)
-    yz = group_sum(value[1, 2], lanes)
-    xx = group_sum(value[0, 0], lanes)
-    yy = group_sum(value[1, 1], lanes)
-    zz = group_sum(value[2, 2], lanes)
-    return wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+def symmetric(diagonal: wp.vec3, rest: wp.vec3) -> wp.mat33:
+    """Return a symmetric matrix from xx, yy, zz and xy, xz, yz."""
+    return wp.mat33(diagonal[0], rest[0], rest[1], rest[0], diagonal[1], rest[2], rest[1], rest[2], diagonal[2])
 
 
 @wp.func
-def row(world: int, rows: int) -> int:
-    """Return a world's row in a table that has one row per world or one for all."""
-    return wp.where(rows == 1, 0, world)
+def group_sum33_symmetric(value: wp.mat33, lanes: int) -> wp.mat33:
+    """Return the sum of a symmetric matrix over the threads of a world."""
+    rest = group_sum3(wp.vec3(value[0, 1], value[0, 2], value[1, 2]), lanes)
+    return symmetric(group_sum3(wp.get_diag(value), lanes), rest)
 
 
 @wp.func
@@ -83,70 +73,76 @@ def quat_to_matrix(q: wp.quat) -> wp.mat33:
     """Return the rotation matrix of a unit quaternion (w, x, y, z)."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     return wp.mat33(
-        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
-    )  # fmt: skip
-
-
-@functools.cache
-def linear_algebra(n: int) -> SimpleNamespace:
-    """Return functions on symmetric positive definite matrices of a fixed size, all loops unrolled.
-
-    Args:
-        n: Number of rows.
-
-    Returns:
-        The types ``matrix`` and ``vector``; ``cholesky(a)``; ``forward_solve`` and ``cholesky_solve`` with its result.
-    """
-    matrix = wp.types.matrix(shape=(n, n), dtype=wp.float32)
-    vector = wp.types.vector(length=n, dtype=wp.float32)
-
-    @wp.func
-    def cholesky(a: matrix) -> matrix:
-        """Return the lower factor, with the inverse of its diagonal in the diagonal's place."""
-        lower = matrix()
-        for j in range(wp.static(n)):
-            pivot = a[j, j]
-            for k in range(wp.static(n)):
-                if k < j:
-                    pivot -= lower[j, k] * lower[j, k]
-            inverse = 1.0 / wp.sqrt(wp.max(pivot, 1.0e-12))
-            lower[j, j] = inverse
-            for i in range(wp.static(n)):
-                if i > j:
-                    rest = a[i, j]
-                    for k in range(wp.static(n)):
-                        if k < j:
-                            rest -= lower[i, k] * lower[j, k]
-                    lower[i, j] = rest * inverse
-        return lower
-
-    @wp.func
-    def forward_solve(lower: matrix, b: vector) -> vector:
-        """Return the solution of lower x = b, of a factor as ``cholesky`` returns it."""
-        x = vector()
-        for i in range(wp.static(n)):
-            rest = b[i]
-            for k in range(wp.static(n)):
-                if k < i:
-                    rest -= lower[i, k] * x[k]
-            x[i] = rest * lower[i, i]
-        return x
-
-    @wp.func
-    def cholesky_solve(lower: matrix, b: vector) -> vector:
-        """Return the solution of a x = b from the factor of a."""
-        x = forward_solve(lower, b)
-        for reverse in range(wp.static(n)):
-            i = wp.static(n - 1) - reverse
-            rest = x[i]
-            for k in range(wp.static(n)):
-                if k > i:
-                    rest -= lower[k, i] * x[k]
-            x[i] = rest * lower[i, i]
-        return x
-
-    return SimpleNamespace(
-        matrix=matrix, vector=vector, cholesky=cholesky, cholesky_solve=cholesky_solve, forward_solve=forward_solve
+        1.0 - 2.0 * (y * y + z * z),
+        2.0 * (x * y - w * z),
+        2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z),
+        1.0 - 2.0 * (x * x + z * z),
+        2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y),
+        2.0 * (y * z + w * x),
+        1.0 - 2.0 * (x * x + y * y),
     )
+
+
+@wp.func
+def column(m: AnyColumns, j: int) -> wp.vec3:
+    """Return a column of a matrix with three rows."""
+    return wp.vec3(m[0, j], m[1, j], m[2, j])
+
+
+@wp.func
+def with_column(m: AnyColumns, j: int, v: wp.vec3):
+    """Return a matrix with another column."""
+    m[0, j] = v[0]
+    m[1, j] = v[1]
+    m[2, j] = v[2]
+    return m
+
+
+@wp.func
+def cholesky(a: AnyMatrix):
+    """Return the lower factor of a symmetric matrix, with the inverse of its diagonal in the diagonal's place."""
+    lower = type(a)()
+    for j in range(len(a)):
+        pivot = a[j, j]
+        for k in range(len(a)):
+            if k < j:
+                pivot -= lower[j, k] * lower[j, k]
+        inverse = 1.0 / wp.sqrt(wp.max(pivot, 1.0e-12))
+        lower[j, j] = inverse
+        for i in range(len(a)):
+            if i > j:
+                rest = a[i, j]
+                for k in range(len(a)):
+                    if k < j:
+                        rest -= lower[i, k] * lower[j, k]
+                lower[i, j] = rest * inverse
+    return lower
+
+
+@wp.func
+def forward_solve(lower: AnyMatrix, b: AnyVector):
+    """Return the solution of lower x = b, of a factor as :func:`cholesky` returns it."""
+    x = type(b)()
+    for i in range(len(b)):
+        rest = b[i]
+        for k in range(len(b)):
+            if k < i:
+                rest -= lower[i, k] * x[k]
+        x[i] = rest * lower[i, i]
+    return x
+
+
+@wp.func
+def cholesky_solve(lower: AnyMatrix, b: AnyVector):
+    """Return the solution of a x = b from the factor of a."""
+    x = forward_solve(lower, b)
+    for reverse in range(len(b)):
+        i = len(b) - 1 - reverse
+        rest = x[i]
+        for k in range(len(b)):
+            if k > i:
+                rest -= lower[k, i] * x[k]
+        x[i] = rest * lower[i, i]
+    return x

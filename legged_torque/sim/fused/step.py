@@ -1,4 +1,4 @@
-"""One physics step as one kernel: a group of threads per world, one thread per leg.
+"""One physics step as one kernel: a group of threads per world, one thread per branch.
 
 MuJoCo Warp runs a step as some hundred small kernels, which wait for each other and for memory. A legged robot on a
 plane is small: a trunk and a few branches of hinge joints that meet only there. Here a thread holds a branch in
@@ -11,14 +11,14 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from legged_torque.sim.fused.constraints import Contact, floor_normal
-from legged_torque.sim.fused.dynamics import make_trunk
-from legged_torque.sim.fused.legs import all_legs
-from legged_torque.sim.fused.math import vec4
-from legged_torque.sim.fused.newton import branch_newton
-from legged_torque.sim.fused.robot import Robot, lanes_per_world, make_robot, read_tree
-from legged_torque.sim.fused.stages import integrate_trunk
-from legged_torque.sim.fused.trunk import TrunkMotion, solve_trunk, trunk_residual, whole_body
+from legged_torque.sim.fused.branches import Layout, around_solver, in_solver
+from legged_torque.sim.fused.contact import Contact, Contacts, floor_normal
+from legged_torque.sim.fused.integrate import integrate_trunk
+from legged_torque.sim.fused.smooth import make_trunk
+from legged_torque.sim.fused.tables import Tables, Worlds, make_tables
+from legged_torque.sim.fused.tree import read_tree
+from legged_torque.sim.fused.trunk import TrunkMotion, solve_trunk, trunk_residual, trunk_slopes, whole_body
+from legged_torque.sim.fused.types import branch_types, vec4
 
 BLOCK_DIM = 128
 """Threads per block: the fastest of 32, 64 and 128 from 4096 worlds on."""
@@ -41,19 +41,17 @@ class FusedStep:
             UserError: If the robot has something that this step does not simulate.
         """
         tree = read_tree(mj_model)
-        branches, depth = tree.joints.shape
-        self._data = data
         self._device = data.qpos.device
+        layout = Layout.of(tree, self._device.is_cuda)
+        room = data.nworld * layout.branches
         with wp.ScopedDevice(self._device):
-            self._robot = make_robot(mj_model, model, tree)
-        self._lanes = lanes_per_world(branches, self._device.is_cuda)
-        points = max(1, *(len(points) for points in tree.points))
-        room = data.nworld * branches * points
-        self._scratch = [wp.empty(room, dtype=dtype, device=self._device) for dtype in (Contact, vec4, vec4)]
-        waiting = 1 if self._device.is_cuda else data.nworld * branches  # a GPU's threads have one branch each
-        self._scratch.append(wp.empty(waiting, dtype=branch_newton(depth).Leg, device=self._device))
-        self._kernel = make_kernel(branches, depth, points, self._lanes)
-        self._limits = (mj_model.opt.iterations, mj_model.opt.ls_iterations)
+            tables = make_tables(mj_model, model, tree)
+            self._scratch = [wp.empty(room * layout.points, dtype=dtype) for dtype in (Contact, vec4, vec4)]
+            waiting = room if layout.per_lane > 1 else 1  # a GPU's threads have one branch each
+            self._scratch.append(wp.empty(waiting, dtype=branch_types(layout.depth).Branch))
+        self._model = [tables, mj_model.opt.iterations, mj_model.opt.ls_iterations]
+        self._data = [data.ctrl, data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, data.solver_niter]
+        self._kernel, self._dim = make_kernel(layout), (data.nworld, layout.lanes)
 
     def __call__(self, sense: bool) -> None:
         """Advance every world by one physics step.
@@ -61,76 +59,74 @@ class FusedStep:
         Args:
             sense: Whether to write the contact sensors.
         """
-        data = self._data
         wp.launch(
             self._kernel,
-            dim=(data.nworld, self._lanes),
-            inputs=[self._robot, *self._limits, sense, data.ctrl],
-            outputs=[
-                data.qpos,
-                data.qvel,
-                data.qacc_warmstart,
-                data.sensordata,
-                data.solver_niter,
-                *self._scratch,
-            ],  # fmt: skip
+            dim=self._dim,
+            inputs=[*self._model, sense, *self._data, *self._scratch],
             block_dim=BLOCK_DIM,
             device=self._device,
         )
 
 
 @functools.cache
-def make_kernel(branches: int, depth: int, points: int, lanes: int) -> wp.Kernel:
-    """Return the kernel for a robot's structure.
-
-    Args:
-        branches: Number of branches.
-        depth: Joints per branch.
-        points: Most contacts of a branch with the floor.
-        lanes: Threads per world, a power of two; 1 on a CPU.
-    """
-    parts = all_legs(branches, depth, points, lanes)
-    Leg, make_all, assemble_all, turn_all = parts.Leg, parts.make_all, parts.assemble_all, parts.turn_all
-    line_search, move_all, damp_all = parts.line_search, parts.move_all, parts.damp_all
-    integrate_all = parts.integrate_all
+def make_kernel(layout: Layout) -> wp.Kernel:
+    """Return the kernel for a robot's structure."""
+    around, solver, lanes = around_solver(layout), in_solver(layout), layout.lanes
+    Branch = branch_types(layout.depth).Branch
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def fused_step(
-        robot: Robot, iterations: int, ls_iterations: int, sense: bool, ctrl: wp.array2d(dtype=float),
-        qpos: wp.array2d(dtype=float), qvel: wp.array2d(dtype=float), warmstart: wp.array2d(dtype=float),
-        sensordata: wp.array2d(dtype=float), niter: wp.array(dtype=int), contacts: wp.array(dtype=Contact),
-        x: wp.array(dtype=vec4), dx: wp.array(dtype=vec4), legs: wp.array(dtype=Leg),
-    ):  # fmt: skip
+        # Model:
+        tables: Tables,
+        iterations: int,
+        ls_iterations: int,
+        # In:
+        sense: bool,
+        # Data in:
+        ctrl: wp.array2d(dtype=float),
+        # Data in and out:
+        qpos: wp.array2d(dtype=float),
+        qvel: wp.array2d(dtype=float),
+        qacc_warmstart: wp.array2d(dtype=float),
+        # Data out:
+        sensordata: wp.array2d(dtype=float),
+        solver_niter: wp.array(dtype=int),
+        # Scratch:
+        found: wp.array(dtype=Contact),
+        residuals: wp.array(dtype=vec4),
+        changes: wp.array(dtype=vec4),
+        kept: wp.array(dtype=Branch),
+    ):
         world, lane = wp.tid()
-        trunk = make_trunk(robot, world, qpos, qvel)
-        normal = floor_normal(robot, world)
+        worlds = Worlds(ctrl, qpos, qvel, qacc_warmstart, sensordata)
+        contacts = Contacts(found, residuals, changes, floor_normal(tables, world))
+        trunk = make_trunk(tables, worlds, world)
         acc = TrunkMotion()
-        acc.lin = wp.vec3(warmstart[world, 0], warmstart[world, 1], warmstart[world, 2])
-        acc.ang = wp.vec3(warmstart[world, 3], warmstart[world, 4], warmstart[world, 5])
-        leg, total = make_all(robot, world, lane, legs, trunk, acc, normal, ctrl, qpos, qvel, warmstart, contacts, x)
+        acc.lin = wp.vec3(qacc_warmstart[world, 0], qacc_warmstart[world, 1], qacc_warmstart[world, 2])
+        acc.ang = wp.vec3(qacc_warmstart[world, 3], qacc_warmstart[world, 4], qacc_warmstart[world, 5])
+        branch, total = around.make_all(tables, worlds, world, lane, trunk, acc, contacts, kept)
         whole = whole_body(trunk, total, wp.static(lanes))
         used = int(0)
         for _iteration in range(iterations):
             used += 1
-            leg, system = assemble_all(world, lane, leg, legs, trunk.rot, acc, normal, contacts, x)
+            branch, system = solver.assemble_all(world, lane, branch, kept, trunk.rot, acc, contacts)
             residual = trunk_residual(whole, acc)
             step = solve_trunk(whole, residual, system, wp.static(lanes))
-            leg, start = turn_all(world, lane, leg, legs, trunk.rot, whole, residual, step, normal, contacts, x, dx)
-            if not (-start[0] * robot.cost_scale > TOLERANCE):
+            branch, slopes = solver.turn_all(world, lane, branch, kept, trunk.rot, step, contacts)
+            start = slopes + trunk_slopes(whole, residual, step)
+            if not (-start[0] * tables.cost_scale > TOLERANCE):
                 break
-            alpha = line_search(ls_iterations, world, leg, legs, start, contacts, x, dx)
+            alpha = solver.line_search(ls_iterations, world, branch, kept, start, contacts)
             acc.lin = acc.lin + alpha * step.lin
             acc.ang = acc.ang + alpha * step.ang
-            leg, flips = move_all(world, leg, legs, x, dx, alpha)
+            branch, flips = solver.move_all(world, branch, kept, contacts, alpha)
             if alpha == 1.0 and flips == 0.0:
                 break  # the whole step stayed in one piece of the piecewise quadratic cost: this is its minimum
-        leg, system = damp_all(robot, world, lane, leg, legs)
+        branch, system = around.damp_all(tables.timestep, world, lane, branch, kept)
         damped = solve_trunk(whole, TrunkMotion(), system, wp.static(lanes))
-        integrate_all(
-            robot, world, lane, leg, legs, damped, normal, sense, contacts, x, qpos, qvel, warmstart, sensordata
-        )
+        around.integrate_all(tables, worlds, world, lane, branch, kept, damped, contacts, sense)
         if lane == 0:
-            integrate_trunk(robot, world, trunk, acc, damped, qpos, qvel, warmstart)
-            niter[world] = used
+            integrate_trunk(tables.timestep, worlds, world, trunk, acc, damped)
+            solver_niter[world] = used
 
     return fused_step

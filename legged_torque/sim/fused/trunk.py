@@ -2,17 +2,15 @@
 
 import warp as wp
 
-from legged_torque.sim.fused.dynamics import Body, Trunk
 from legged_torque.sim.fused.math import (
+    cholesky,
+    cholesky_solve,
     group_sum,
     group_sum3,
     group_sum33,
     group_sum33_symmetric,
-    linear_algebra,
-    vec6,
 )
-
-mat66 = linear_algebra(6).matrix
+from legged_torque.sim.fused.types import Body, Trunk, mat66, vec6
 
 
 @wp.struct
@@ -105,8 +103,8 @@ def solve_trunk(whole: WholeBody, residual: TrunkMotion, branches: TrunkSystem, 
     """Return the trunk's Newton step, given what the branches of this thread add."""
     lin = group_sum3(branches.rhs_lin, lanes) - residual.lin
     ang = group_sum3(branches.rhs_ang, lanes) - residual.ang
-    factor = wp.static(linear_algebra(6).cholesky)(trunk_matrix(whole, branches, lanes))
-    x = wp.static(linear_algebra(6).cholesky_solve)(factor, vec6(lin[0], lin[1], lin[2], ang[0], ang[1], ang[2]))
+    factor = cholesky(trunk_matrix(whole, branches, lanes))
+    x = cholesky_solve(factor, vec6(lin[0], lin[1], lin[2], ang[0], ang[1], ang[2]))
     out = TrunkMotion()
     out.lin = wp.vec3(x[0], x[1], x[2])
     out.ang = wp.vec3(x[3], x[4], x[5])

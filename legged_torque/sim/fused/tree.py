@@ -1,13 +1,10 @@
-"""The robots that the fused step can simulate, and their tables on the device."""
+"""The structure of a robot, if it is one that the fused step can simulate."""
 
 from dataclasses import dataclass
 
 import mujoco
-import mujoco_warp as mjw
 import numpy as np
-import warp as wp
 
-from legged_torque.sim.fused.math import vec5
 from legged_torque.utils.errors import UserError
 
 MAX_BRANCHES = 16
@@ -22,62 +19,6 @@ _GEOM_POINTS = {
 """Where a geom can touch a plane: points in units of its half sizes, and how many radii it is thick around them."""
 
 
-@wp.struct
-class Robot:
-    """A robot's tables: fields of the MuJoCo model as MuJoCo Warp keeps them, and the structure of the tree.
-
-    Fields with two axes have one row per world, or one for all; (branch, depth) counts from the trunk outwards.
-    """
-
-    gravity: wp.array(dtype=wp.vec3)
-    qpos0: wp.array2d(dtype=wp.float32)
-    qpos_spring: wp.array2d(dtype=wp.float32)
-    body_pos: wp.array2d(dtype=wp.vec3)
-    body_quat: wp.array2d(dtype=wp.quat)
-    body_ipos: wp.array2d(dtype=wp.vec3)
-    body_iquat: wp.array2d(dtype=wp.quat)
-    body_mass: wp.array2d(dtype=wp.float32)
-    body_inertia: wp.array2d(dtype=wp.vec3)
-    body_invweight0: wp.array2d(dtype=wp.vec2)
-    jnt_pos: wp.array2d(dtype=wp.vec3)
-    jnt_axis: wp.array2d(dtype=wp.vec3)
-    jnt_stiffness: wp.array2d(dtype=wp.float32)
-    jnt_range: wp.array2d(dtype=wp.vec2)
-    jnt_solref: wp.array2d(dtype=wp.vec2)
-    jnt_solimp: wp.array2d(dtype=vec5)
-    dof_damping: wp.array2d(dtype=wp.float32)
-    dof_armature: wp.array2d(dtype=wp.float32)
-    dof_frictionloss: wp.array2d(dtype=wp.float32)
-    dof_invweight0: wp.array2d(dtype=wp.float32)
-    dof_solref: wp.array2d(dtype=wp.vec2)
-    dof_solimp: wp.array2d(dtype=vec5)
-    geom_pos: wp.array2d(dtype=wp.vec3)
-    geom_quat: wp.array2d(dtype=wp.quat)
-    geom_size: wp.array2d(dtype=wp.vec3)
-    geom_friction: wp.array2d(dtype=wp.vec3)
-    geom_solmix: wp.array2d(dtype=wp.float32)
-    geom_solref: wp.array2d(dtype=wp.vec2)
-    geom_solimp: wp.array2d(dtype=vec5)
-    actuator_gear: wp.array2d(dtype=wp.spatial_vector)
-    actuator_ctrlrange: wp.array2d(dtype=wp.vec2)
-    actuator_forcerange: wp.array2d(dtype=wp.vec2)
-    geom_type: wp.array(dtype=wp.int32)
-    geom_bodyid: wp.array(dtype=wp.int32)
-    geom_priority: wp.array(dtype=wp.int32)
-    geom_sensor: wp.array(dtype=wp.int32)  # address of the geom's contact sensor, -1 without
-    branch_joint: wp.array2d(dtype=wp.int32)  # (branch, depth)
-    branch_actuator: wp.array2d(dtype=wp.int32)  # (branch, depth), -1 without
-    point_geom: wp.array2d(dtype=wp.int32)  # (branch, point)
-    point_depth: wp.array2d(dtype=wp.int32)  # (branch, point), 0 is the trunk
-    point_offset: wp.array2d(dtype=wp.vec3)  # (branch, point), in half sizes of the geom
-    point_radius: wp.array2d(dtype=wp.float32)  # (branch, point), in first sizes of the geom
-    point_count: wp.array(dtype=wp.int32)  # (branch)
-    floor: wp.int32
-    timestep: wp.float32
-    impratio: wp.float32
-    cost_scale: wp.float32
-
-
 @dataclass
 class Tree:
     """A robot's structure: a floating trunk and branches of hinge joints, each with ``depth`` joints.
@@ -90,6 +31,11 @@ class Tree:
 
     joints: np.ndarray
     points: list[list[tuple[int, int, tuple[float, float, float], float]]]
+
+    @property
+    def most_points(self) -> int:
+        """Most points of a branch, at least one."""
+        return max(1, *(len(points) for points in self.points))
 
 
 def read_tree(model: mujoco.MjModel) -> Tree:
@@ -123,39 +69,6 @@ def read_tree(model: mujoco.MjModel) -> Tree:
         offsets, radius = _GEOM_POINTS[mujoco.mjtGeom(model.geom_type[geom])]
         points[branch] += [(geom, depth, offset, radius) for offset in offsets]
     return Tree(np.array([[model.body_jntadr[body] for body in chain] for chain in chains]), points)
-
-
-def make_robot(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Robot:
-    """Return a robot's tables on the current device; parameters stay those of MuJoCo Warp's model, not copies."""
-    robot = Robot()
-    for name in Robot.vars:
-        if hasattr(warp_model, name):
-            setattr(robot, name, getattr(warp_model, name))
-    robot.gravity = warp_model.opt.gravity
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    robot.floor = int(np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & collides)[0])
-    robot.timestep = model.opt.timestep
-    robot.impratio = model.opt.impratio
-    robot.cost_scale = 1.0 / (model.stat.meaninertia * model.nv)
-    sensors = np.full(model.ngeom, -1, np.int32)
-    sensors[model.sensor_refid] = model.sensor_adr
-    robot.geom_sensor = wp.array(sensors, dtype=wp.int32)
-    actuator_of = {int(model.actuator_trnid[i, 0]): i for i in range(model.nu)}
-    robot.branch_joint = wp.array(tree.joints, dtype=wp.int32)
-    robot.branch_actuator = wp.array(np.vectorize(lambda j: actuator_of.get(j, -1))(tree.joints), dtype=wp.int32)
-    most = max(1, *(len(points) for points in tree.points))
-    padded = [points + [(0, 0, (0.0, 0.0, 0.0), 0.0)] * (most - len(points)) for points in tree.points]
-    for place, name, dtype in ((0, "geom", wp.int32), (1, "depth", wp.int32), (2, "offset", wp.vec3)):
-        values = np.array([[point[place] for point in points] for points in padded])
-        setattr(robot, f"point_{name}", wp.array(values, dtype=dtype))
-    robot.point_radius = wp.array([[point[3] for point in points] for points in padded], dtype=wp.float32)
-    robot.point_count = wp.array([len(points) for points in tree.points], dtype=wp.int32)
-    return robot
-
-
-def lanes_per_world(branches: int, on_gpu: bool) -> int:
-    """Return how many threads work on a world: on a GPU one per branch, rounded up to a power of two, else one."""
-    return 1 << (branches - 1).bit_length() if on_gpu else 1
 
 
 def _require(holds: bool, reason: str) -> None:

@@ -1,0 +1,237 @@
+"""The parts of a step over all branches of a thread: its one branch on a GPU, a world's all on a CPU.
+
+On a GPU the branch stays in registers: it is handed from function to function as ``branch``. On a CPU the array
+``kept`` holds the branches of the worlds while others have their turn, see :func:`places`.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import warp as wp
+
+from legged_torque.sim.fused.constraint import make_joint_rows
+from legged_torque.sim.fused.contact import Contacts, find_contacts
+from legged_torque.sim.fused.integrate import integrate_branch, sense_branch
+from legged_torque.sim.fused.math import group_sum, group_sum3
+from legged_torque.sim.fused.smooth import Pose, add_bodies, links_maker, make_equations
+from legged_torque.sim.fused.solver import (
+    assemble,
+    assemble_damping,
+    eliminate,
+    move,
+    row_slopes,
+    slopes_at_start,
+    start,
+    turn_to,
+)
+from legged_torque.sim.fused.tables import Tables, Worlds, dof
+from legged_torque.sim.fused.tree import Tree
+from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
+from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types
+
+LINE_SEARCH_TOLERANCE = wp.constant(0.01)
+"""The line search stops when the slope has come down to this share of that at its start."""
+
+
+class Layout(NamedTuple):
+    """What a kernel is made for: a robot's structure, and how its branches are spread over threads.
+
+    Attributes:
+        branches: Number of branches.
+        depth: Joints per branch.
+        points: Most contacts of a branch with the floor.
+        lanes: Threads per world, a power of two; 1 on a CPU.
+    """
+
+    branches: int
+    depth: int
+    points: int
+    lanes: int
+
+    @classmethod
+    def of(cls, tree: Tree, on_gpu: bool) -> "Layout":
+        """Return a robot's layout: on a GPU a thread per branch, rounded up to a power of two, else one per world."""
+        branches, depth = tree.joints.shape
+        return cls(branches, depth, tree.most_points, 1 << (branches - 1).bit_length() if on_gpu else 1)
+
+    @property
+    def per_lane(self) -> int:
+        """Most branches of a thread."""
+        return -(-self.branches // self.lanes)
+
+
+@functools.cache
+def places(per_lane: int) -> SimpleNamespace:
+    """Return how threads keep their branches: ``take`` and ``keep`` the one number ``i`` of a thread.
+
+    A thread that has only one keeps it in registers: both do nothing.
+    """
+
+    @wp.func
+    def take(kept: wp.array(dtype=AnyBranch), world: int, i: int, branch: AnyBranch):
+        if wp.static(per_lane > 1):
+            branch = kept[world * wp.static(per_lane) + i]
+        return branch
+
+    @wp.func
+    def keep(kept: wp.array(dtype=AnyBranch), world: int, i: int, branch: AnyBranch):
+        if wp.static(per_lane > 1):
+            kept[world * wp.static(per_lane) + i] = branch
+
+    return SimpleNamespace(take=take, keep=keep)
+
+
+@functools.cache
+def around_solver(layout: Layout) -> SimpleNamespace:
+    """Return what comes before and after the solver: ``make_all``, ``damp_all`` and ``integrate_all``."""
+    branches, depth, points, lanes = layout
+    per_lane, place = layout.per_lane, places(layout.per_lane)
+    Branch, make_links = branch_types(depth).Branch, links_maker(depth)
+    Kept = wp.array(dtype=Branch)
+
+    @wp.func
+    def make_branch(tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, contacts: Contacts) -> Branch:
+        """Return a branch with its equations of motion, constraints and the accelerations to start from."""
+        poses = wp.zeros(shape=wp.static(depth + 1), dtype=Pose)
+        branch, links = make_links(tables, worlds, world, b, trunk, poses)
+        branch = make_equations(branch, links, tables, world, b, trunk.rot)
+        branch.rows = make_joint_rows(branch.rows, tables, worlds, world, b)
+        branch.first_contact = (world * wp.static(branches) + b) * wp.static(points)
+        branch.num_contacts = find_contacts(tables, world, b, trunk.pos, poses, contacts, branch.first_contact)
+        for j in range(wp.static(depth)):
+            branch.acc[j] = worlds.qacc_warmstart[world, dof(tables.branch_joint[b, j])]
+        return branch
+
+    @wp.func
+    def make_all(
+        tables: Tables,
+        worlds: Worlds,
+        world: int,
+        lane: int,
+        trunk: Trunk,
+        acc: TrunkMotion,
+        contacts: Contacts,
+        kept: Kept,
+    ):
+        """Build the branches; return (the last of) them and the sum of their inertias and wrenches."""
+        branch = Branch()
+        total = Body()
+        for i in range(wp.static(per_lane)):
+            b = lane + i * wp.static(lanes)
+            if b < wp.static(branches):
+                branch = make_branch(tables, worlds, world, b, trunk, contacts)
+                branch = start(branch, trunk.rot, acc, contacts)
+                total = add_bodies(total, branch.smooth.total)
+            place.keep(kept, world, i, branch)
+        return branch, total
+
+    @wp.func
+    def damp_all(timestep: float, world: int, lane: int, branch: Branch, kept: Kept):
+        """Assemble the equations of implicit damping; return also what is left for the trunk."""
+        system = TrunkSystem()
+        for i in range(wp.static(per_lane)):
+            branch = place.take(kept, world, i, branch)
+            if lane + i * wp.static(lanes) < wp.static(branches):
+                branch = assemble_damping(branch, timestep)
+                system = eliminate(branch, system, TrunkSystem())
+            place.keep(kept, world, i, branch)
+        return branch, system
+
+    @wp.func
+    def integrate_all(
+        tables: Tables,
+        worlds: Worlds,
+        world: int,
+        lane: int,
+        branch: Branch,
+        kept: Kept,
+        damped: TrunkMotion,
+        contacts: Contacts,
+        sense: bool,
+    ):
+        """Write the branches' state after the step, and their contact sensors."""
+        for i in range(wp.static(per_lane)):
+            b = lane + i * wp.static(lanes)
+            branch = place.take(kept, world, i, branch)
+            if b < wp.static(branches):
+                integrate_branch(tables, worlds, world, b, branch, damped)
+                if sense:
+                    sense_branch(tables, worlds, world, b, branch, contacts)
+
+    return SimpleNamespace(make_all=make_all, damp_all=damp_all, integrate_all=integrate_all)
+
+
+@functools.cache
+def in_solver(layout: Layout) -> SimpleNamespace:
+    """Return the parts of a solver iteration: ``assemble_all``, ``turn_all``, ``line_search`` and ``move_all``."""
+    branches, _, _, lanes = layout
+    per_lane, place, Branch = layout.per_lane, places(layout.per_lane), branch_types(layout.depth).Branch
+    Kept = wp.array(dtype=Branch)
+
+    @wp.func
+    def assemble_all(
+        world: int, lane: int, branch: Branch, kept: Kept, rot: wp.mat33, acc: TrunkMotion, contacts: Contacts
+    ):
+        """Assemble and eliminate the branches' Newton equations; return also what is left for the trunk."""
+        system = TrunkSystem()
+        for i in range(wp.static(per_lane)):
+            branch = place.take(kept, world, i, branch)
+            if lane + i * wp.static(lanes) < wp.static(branches):
+                branch, add = assemble(branch, rot, acc, contacts)
+                system = eliminate(branch, system, add)
+            place.keep(kept, world, i, branch)
+        return branch, system
+
+    @wp.func
+    def turn_all(
+        world: int, lane: int, branch: Branch, kept: Kept, rot: wp.mat33, step: TrunkMotion, contacts: Contacts
+    ):
+        """Find the branches' parts of the step; return also their slopes of the cost along it."""
+        slopes = wp.vec3(0.0)
+        for i in range(wp.static(per_lane)):
+            branch = place.take(kept, world, i, branch)
+            if lane + i * wp.static(lanes) < wp.static(branches):
+                branch = turn_to(branch, rot, step, contacts)
+                slopes += slopes_at_start(branch, step, contacts)
+            place.keep(kept, world, i, branch)
+        return branch, group_sum3(slopes, wp.static(lanes))
+
+    @wp.func
+    def line_search(
+        iterations: int, world: int, branch: Branch, kept: Kept, at_start: wp.vec3, contacts: Contacts
+    ) -> float:
+        """Return the share of the step at which the cost is least: Newton's method, kept between bounds."""
+        alpha = float(1.0)
+        low = float(0.0)
+        high = float(0.0)
+        for _search in range(iterations):
+            slopes = wp.vec2(0.0, 0.0)
+            for i in range(wp.static(per_lane)):
+                branch = place.take(kept, world, i, branch)
+                slopes += row_slopes(branch, contacts, alpha)
+            slope = at_start[1] + alpha * at_start[2] + group_sum(slopes[0], wp.static(lanes))
+            curvature = at_start[2] + group_sum(slopes[1], wp.static(lanes))
+            if wp.abs(slope) <= -LINE_SEARCH_TOLERANCE * at_start[0]:
+                break
+            if slope < 0.0:
+                low = alpha
+            else:
+                high = alpha
+            alpha -= slope / curvature
+            if high > 0.0 and (alpha <= low or alpha >= high):
+                alpha = 0.5 * (low + high)
+        return alpha
+
+    @wp.func
+    def move_all(world: int, branch: Branch, kept: Kept, contacts: Contacts, alpha: float):
+        """Move the branches along the step; return also how many rows of the world changed their state."""
+        flips = float(0.0)
+        for i in range(wp.static(per_lane)):
+            branch = place.take(kept, world, i, branch)
+            branch, changed = move(branch, contacts, alpha)
+            flips += changed
+            place.keep(kept, world, i, branch)
+        return branch, group_sum(flips, wp.static(lanes))
+
+    return SimpleNamespace(assemble_all=assemble_all, turn_all=turn_all, line_search=line_search, move_all=move_all)

@@ -1,0 +1,182 @@
+"""Contacts with the floor: where a robot touches it, and the constraint rows and forces of a contact."""
+
+import warp as wp
+
+from legged_torque.sim.fused.constraint import MIN_VALUE, constraint_mass, reference_dynamics, row_force
+from legged_torque.sim.fused.math import quat_to_matrix
+from legged_torque.sim.fused.smooth import Poses
+from legged_torque.sim.fused.tables import Tables, of_world
+from legged_torque.sim.fused.types import vec4
+
+MIN_FRICTION = wp.constant(1.0e-5)
+"""MuJoCo's mjMINMU."""
+MAX_CONTACT_MASS = wp.constant(1.0e5)
+"""Contacts get stiffer with less friction, without limit; above this, which one of 0.2 has with impratio 100, float32
+loses the solution, while the softness that it stands for no longer matters."""
+CAPSULE = wp.constant(3)
+BOX = wp.constant(6)
+"""MuJoCo's mjGEOM_CAPSULE and mjGEOM_BOX."""
+MAX_CORNERS = wp.constant(4)
+"""Most contacts of a box with a plane: MuJoCo takes the first four corners below its centre that touch."""
+
+
+@wp.struct
+class Contact:
+    """A point of the robot that touches the floor."""
+
+    pos: wp.vec3  # from the trunk's origin, in world axes [m]
+    tangent: wp.vec3  # first direction of friction; the second is normal x tangent
+    depth: wp.int32  # of its body; 0 is the trunk
+    sensor: wp.int32  # address of its geom's contact sensor, -1 without
+    friction: wp.float32
+    mass: wp.float32  # D of its four rows
+    reference: vec4  # a_ref of its four rows
+
+
+@wp.struct
+class Contacts:
+    """The contacts with the floor; each branch of each world has room for as many as it has points."""
+
+    found: wp.array(dtype=Contact)
+    residual: wp.array(dtype=vec4)  # J a - a_ref of the four rows
+    change: wp.array(dtype=vec4)  # of the residual per unit of the solver's step
+    normal: wp.vec3  # the floor's
+
+
+@wp.func
+def floor_normal(tables: Tables, world: int) -> wp.vec3:
+    """Return the unit normal of the floor."""
+    rot = quat_to_matrix(of_world(tables.geom_quat, world, tables.floor))
+    return wp.vec3(rot[0, 2], rot[1, 2], rot[2, 2])
+
+
+@wp.func
+def contact_tangent(normal: wp.vec3, axis: wp.vec3, is_capsule: bool) -> wp.vec3:
+    """Return the first direction of friction: along a capsule, else MuJoCo's choice for a normal."""
+    along = axis - normal * wp.dot(normal, axis)
+    length = wp.length(along)
+    tangent = along / wp.max(length, MIN_VALUE)
+    if not is_capsule or length < 1.0e-6:
+        tangent = wp.vec3(0.0, 1.0, 0.0)
+        if wp.abs(normal[1]) >= 0.5:
+            tangent = wp.vec3(0.0, 0.0, 1.0)
+        tangent = wp.normalize(tangent - normal * wp.dot(normal, tangent))
+    return tangent
+
+
+@wp.func
+def set_contact_rows(
+    tables: Tables, world: int, geom: int, dist: float, velocity: wp.vec3, normal: wp.vec3, contact: Contact
+) -> Contact:
+    """Return a contact with friction, mass and references of its rows, mixed from geom and floor as MuJoCo does."""
+    floor = tables.floor
+    weight_floor, weight_geom = of_world(tables.geom_solmix, world, floor), of_world(tables.geom_solmix, world, geom)
+    mix = float(0.5)
+    if weight_floor + weight_geom > 2.0 * MIN_VALUE:
+        mix = weight_geom / (weight_floor + weight_geom)
+    ref_floor, ref_geom = of_world(tables.geom_solref, world, floor), of_world(tables.geom_solref, world, geom)
+    solref = wp.min(ref_floor, ref_geom)
+    if ref_floor[0] > 0.0 and ref_geom[0] > 0.0:
+        solref = mix * ref_geom + (1.0 - mix) * ref_floor
+    friction_floor = of_world(tables.geom_friction, world, floor)[0]
+    friction_geom = of_world(tables.geom_friction, world, geom)[0]
+    friction = wp.max(friction_floor, friction_geom)
+    if tables.geom_priority[geom] > tables.geom_priority[floor]:
+        mix = 1.0
+        solref = 1.0 * ref_geom
+        friction = 1.0 * friction_geom
+    if tables.geom_priority[geom] < tables.geom_priority[floor]:
+        mix = 0.0
+        solref = 1.0 * ref_floor
+        friction = 1.0 * friction_floor
+    solimp = mix * of_world(tables.geom_solimp, world, geom) + (1.0 - mix) * of_world(tables.geom_solimp, world, floor)
+    params = reference_dynamics(solref, solimp, dist, tables.timestep)
+    friction = wp.max(friction, MIN_FRICTION)
+    invweight = of_world(tables.body_invweight0, world, tables.geom_bodyid[geom])[0]
+    invweight *= (1.0 + friction * friction) * 2.0 * friction * friction / tables.impratio
+    contact.friction = friction
+    contact.mass = wp.min(constraint_mass(invweight, params[2]), MAX_CONTACT_MASS)
+    along = row_values(contact, normal, velocity)
+    contact.reference = vec4(-params[0] * params[2] * dist) - params[1] * along
+    return contact
+
+
+@wp.func
+def row_values(contact: Contact, normal: wp.vec3, motion: wp.vec3) -> vec4:
+    """Return a motion of the contact point along its four rows: normal +- friction x each tangent."""
+    up = wp.dot(normal, motion)
+    first = contact.friction * wp.dot(contact.tangent, motion)
+    second = contact.friction * wp.dot(wp.cross(normal, contact.tangent), motion)
+    return vec4(up + first, up - first, up + second, up - second)
+
+
+@wp.func
+def contact_force(contact: Contact, normal: wp.vec3, x: vec4) -> wp.vec3:
+    """Return the force on the robot in world axes [N] from the residuals J qacc - a_ref of its rows."""
+    f0, f1 = row_force(contact.mass, x[0]), row_force(contact.mass, x[1])
+    f2, f3 = row_force(contact.mass, x[2]), row_force(contact.mass, x[3])
+    second = wp.cross(normal, contact.tangent)
+    sideways = contact.friction * ((f0 - f1) * contact.tangent + (f2 - f3) * second)
+    return (f0 + f1 + f2 + f3) * normal + sideways
+
+
+@wp.func
+def contact_stiffness(contact: Contact, normal: wp.vec3, x: vec4) -> wp.mat33:
+    """Return D times the sum over the pushing rows of direction x direction^T."""
+    result = wp.mat33()
+    first = contact.friction * contact.tangent
+    second = contact.friction * wp.cross(normal, contact.tangent)
+    for k in range(4):
+        direction = normal
+        if k == 0:
+            direction = normal + first
+        if k == 1:
+            direction = normal - first
+        if k == 2:
+            direction = normal + second
+        if k == 3:
+            direction = normal - second
+        if x[k] < 0.0:
+            result += contact.mass * wp.outer(direction, direction)
+    return result
+
+
+@wp.func
+def find_contacts(
+    tables: Tables, world: int, b: int, origin: wp.vec3, poses: Poses, contacts: Contacts, first: int
+) -> int:
+    """Write the contacts of a branch with the floor from index ``first`` on and return how many there are."""
+    normal = contacts.normal
+    count = int(0)
+    last_geom = int(-1)
+    in_geom = int(0)
+    height = origin - of_world(tables.geom_pos, world, tables.floor)
+    for point in range(tables.point_count[b]):
+        geom = tables.point_geom[b, point]
+        depth = tables.point_depth[b, point]
+        size = of_world(tables.geom_size, world, geom)
+        is_capsule = tables.geom_type[geom] == CAPSULE
+        half = size
+        if is_capsule:
+            half = wp.vec3(0.0, 0.0, size[1])
+        turn = poses[depth].rot * quat_to_matrix(of_world(tables.geom_quat, world, geom))
+        arm = turn * wp.cw_mul(tables.point_offset[b, point], half)
+        centre = poses[depth].pos + poses[depth].rot * of_world(tables.geom_pos, world, geom) + arm
+        radius = tables.point_radius[b, point] * size[0]
+        dist = wp.dot(height + centre, normal) - radius
+        if geom != last_geom:
+            last_geom = geom
+            in_geom = 0
+        if tables.geom_type[geom] == BOX and (wp.dot(arm, normal) > 0.0 or in_geom == MAX_CORNERS):
+            dist = 0.0
+        if dist < 0.0:
+            in_geom += 1
+            contact = Contact()
+            contact.pos = centre - (radius + 0.5 * dist) * normal
+            contact.depth = depth
+            contact.sensor = tables.geom_sensor[geom]
+            contact.tangent = contact_tangent(normal, wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2]), is_capsule)
+            velocity = poses[depth].lin_vel + wp.cross(poses[depth].ang_vel, contact.pos)
+            contacts.found[first + count] = set_contact_rows(tables, world, geom, dist, velocity, normal, contact)
+            count += 1
+    return count

@@ -1,0 +1,132 @@
+"""What the kernels read and write: a robot's tables, and the worlds' state, in MuJoCo Warp's own arrays."""
+
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from legged_torque.sim.fused.tree import Tree
+from legged_torque.sim.fused.types import vec5
+
+
+@wp.struct
+class Tables:
+    """A robot: fields of MuJoCo Warp's model, and the structure of its tree.
+
+    The model's fields with two axes have one row per world, or one for all; :func:`of_world` reads both.
+    """
+
+    # Model:
+    gravity: wp.array(dtype=wp.vec3)
+    qpos0: wp.array2d(dtype=wp.float32)
+    qpos_spring: wp.array2d(dtype=wp.float32)
+    body_pos: wp.array2d(dtype=wp.vec3)
+    body_quat: wp.array2d(dtype=wp.quat)
+    body_ipos: wp.array2d(dtype=wp.vec3)
+    body_iquat: wp.array2d(dtype=wp.quat)
+    body_mass: wp.array2d(dtype=wp.float32)
+    body_inertia: wp.array2d(dtype=wp.vec3)
+    body_invweight0: wp.array2d(dtype=wp.vec2)
+    jnt_pos: wp.array2d(dtype=wp.vec3)
+    jnt_axis: wp.array2d(dtype=wp.vec3)
+    jnt_stiffness: wp.array2d(dtype=wp.float32)
+    jnt_range: wp.array2d(dtype=wp.vec2)
+    jnt_solref: wp.array2d(dtype=wp.vec2)
+    jnt_solimp: wp.array2d(dtype=vec5)
+    dof_damping: wp.array2d(dtype=wp.float32)
+    dof_armature: wp.array2d(dtype=wp.float32)
+    dof_frictionloss: wp.array2d(dtype=wp.float32)
+    dof_invweight0: wp.array2d(dtype=wp.float32)
+    dof_solref: wp.array2d(dtype=wp.vec2)
+    dof_solimp: wp.array2d(dtype=vec5)
+    geom_pos: wp.array2d(dtype=wp.vec3)
+    geom_quat: wp.array2d(dtype=wp.quat)
+    geom_size: wp.array2d(dtype=wp.vec3)
+    geom_friction: wp.array2d(dtype=wp.vec3)
+    geom_solmix: wp.array2d(dtype=wp.float32)
+    geom_solref: wp.array2d(dtype=wp.vec2)
+    geom_solimp: wp.array2d(dtype=vec5)
+    actuator_gear: wp.array2d(dtype=wp.spatial_vector)
+    actuator_ctrlrange: wp.array2d(dtype=wp.vec2)
+    actuator_forcerange: wp.array2d(dtype=wp.vec2)
+    geom_type: wp.array(dtype=wp.int32)
+    geom_bodyid: wp.array(dtype=wp.int32)
+    geom_priority: wp.array(dtype=wp.int32)
+    # Structure:
+    geom_sensor: wp.array(dtype=wp.int32)  # address of the geom's contact sensor, -1 without
+    branch_joint: wp.array2d(dtype=wp.int32)  # (branch, depth)
+    branch_actuator: wp.array2d(dtype=wp.int32)  # (branch, depth), -1 without
+    point_geom: wp.array2d(dtype=wp.int32)  # (branch, point)
+    point_depth: wp.array2d(dtype=wp.int32)  # (branch, point), 0 is the trunk
+    point_offset: wp.array2d(dtype=wp.vec3)  # (branch, point), in half sizes of the geom
+    point_radius: wp.array2d(dtype=wp.float32)  # (branch, point), in first sizes of the geom
+    point_count: wp.array(dtype=wp.int32)  # (branch)
+    floor: wp.int32  # its geom
+    # Options:
+    timestep: wp.float32
+    impratio: wp.float32
+    cost_scale: wp.float32
+
+
+@wp.struct
+class Worlds:
+    """The state of the worlds: fields of MuJoCo Warp's data, one row per world."""
+
+    ctrl: wp.array2d(dtype=wp.float32)
+    qpos: wp.array2d(dtype=wp.float32)
+    qvel: wp.array2d(dtype=wp.float32)
+    qacc_warmstart: wp.array2d(dtype=wp.float32)
+    sensordata: wp.array2d(dtype=wp.float32)
+
+
+@wp.func
+def row(world: int, rows: int) -> int:
+    """Return a world's row in a table that has one row per world or one for all."""
+    return wp.where(rows == 1, 0, world)
+
+
+@wp.func
+def of_world(field: wp.array2d(dtype=Any), world: int, i: int):
+    """Return what a world has in column ``i`` of a field of the model."""
+    return field[row(world, field.shape[0]), i]
+
+
+@wp.func
+def dof(joint: int) -> int:
+    """Return the degree of freedom of a hinge; joint 0 is the trunk's and has six."""
+    return joint + 5
+
+
+@wp.func
+def qadr(joint: int) -> int:
+    """Return the place of a hinge's angle in ``qpos``; joint 0 has seven numbers."""
+    return joint + 6
+
+
+def make_tables(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Tables:
+    """Return a robot's tables on the current device; parameters stay those of MuJoCo Warp's model, not copies."""
+    tables = Tables()
+    for name in Tables.vars:
+        if hasattr(warp_model, name):
+            setattr(tables, name, getattr(warp_model, name))
+    tables.gravity = warp_model.opt.gravity
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    tables.floor = int(np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & collides)[0])
+    tables.timestep = model.opt.timestep
+    tables.impratio = model.opt.impratio
+    tables.cost_scale = 1.0 / (model.stat.meaninertia * model.nv)
+    sensors = np.full(model.ngeom, -1, np.int32)
+    sensors[model.sensor_refid] = model.sensor_adr
+    tables.geom_sensor = wp.array(sensors, dtype=wp.int32)
+    actuator_of = {int(model.actuator_trnid[i, 0]): i for i in range(model.nu)}
+    tables.branch_joint = wp.array(tree.joints, dtype=wp.int32)
+    tables.branch_actuator = wp.array(np.vectorize(lambda j: actuator_of.get(j, -1))(tree.joints), dtype=wp.int32)
+    padded = [points + [(0, 0, (0.0, 0.0, 0.0), 0.0)] * (tree.most_points - len(points)) for points in tree.points]
+    columns = (("geom", wp.int32), ("depth", wp.int32), ("offset", wp.vec3), ("radius", wp.float32))
+    for place, (name, dtype) in enumerate(columns):
+        values = [[point[place] for point in points] for points in padded]
+        setattr(tables, f"point_{name}", wp.array(values, dtype=dtype))
+    tables.point_count = wp.array([len(points) for points in tree.points], dtype=wp.int32)
+    return tables
