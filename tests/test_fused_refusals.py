@@ -3,14 +3,14 @@
 import mujoco
 import pytest
 
-from legged_torque import ROOT_DIR
+from legged_torque import RESOURCES_DIR
 from legged_torque.sim.fused.tree import read_tree
 from legged_torque.sim.model import build_model, read_spec
 from legged_torque.sim.simulator import Simulator
 from legged_torque.utils.errors import UserError
 
 GEOM, JOINT, TRN = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtTrn
-A1 = ROOT_DIR / "resources/robots/a1/a1.xml"
+A1 = RESOURCES_DIR / "robots/a1/a1.xml"
 MOTOR = {"gear": [1, 0, 0, 0, 0, 0], "ctrlrange": (-9, 9), "forcerange": (-9, 9), "trntype": TRN.mjTRN_JOINT}
 HINGES = "each body but the trunk must have one hinge joint"
 SPHERE = "type=GEOM.mjGEOM_SPHERE, size=(0.1, 0, 0)"

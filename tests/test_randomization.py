@@ -8,7 +8,7 @@ import pytest
 import torch
 from settings import error_of, get_cfgs
 
-from legged_torque.envs.base.domain_rand import view
+from legged_torque.envs.base.domain_rand import of_model
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.sim.randomization import Parameter, Randomization, changes_legs
 from legged_torque.utils.config import to_dict
@@ -329,8 +329,7 @@ class ThighMassRobot(LeggedRobot):
     def random_parameters(self):
         """The masses of the thighs as well."""
         thighs = [body for body in range(2, 14) if "thigh" in self.sim.mj_model.body(body).name]
-        masses = view(self, "body_mass")
-        more = Parameter("thigh_mass", masses, thighs, model_field="body_mass", shared=self.shared, scale=(0.5, 0.9))
+        more = of_model(self, "thigh_mass", "body_mass", thighs, shared=self.shared, scale=(0.5, 0.9))
         return [*super().random_parameters(), more]
 
 
@@ -396,8 +395,14 @@ def test_what_the_kernel_cannot_write_is_refused():
 
 @pytest.mark.parametrize(
     ("field", "columns", "changes"),
-    [("body_mass", [1], False), ("body_mass", [1, 2], True), ("body_ipos", [3, 4, 5], False), ("body_ipos", [6], True)]
-    + [("dof_armature", [7], False), (None, [7], False)],
+    [
+        ("body_mass", [1], False),
+        ("body_mass", [1, 2], True),
+        ("body_ipos", [3, 4, 5], False),
+        ("body_ipos", [6], True),
+        ("dof_armature", [7], False),
+        (None, [7], False),
+    ],
 )
 def test_changes_of_legs(field, columns, changes):
     """Masses and places of bodies tell whether legs vary, those of the trunk aside."""

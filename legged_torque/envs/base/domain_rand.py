@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
-
 from legged_torque.sim.randomization import Parameter, Range
 from legged_torque.utils.mirroring import SCALAR, VECTOR, Mirroring
 
@@ -73,20 +71,19 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
     joint_values = symmetry.joints and symmetry.joints.unsigned()
     foot_vectors = symmetry.feet and symmetry.feet.of_vectors(VECTOR)
 
-    def drawn(name: str, field: str, columns: Any, **settings: Any) -> Parameter:
-        return Parameter(name, view(task, field), list(columns), model_field=field, **settings)
-
     def of_joints(name: str, field: str, columns: Any) -> Parameter:
-        return drawn(name, field, columns, may_keep=True, mirror=joint_values, **absolute(cfg, name))
+        return of_model(task, name, field, columns, may_keep=True, mirror=joint_values, **absolute(cfg, name))
 
     trunk_com, foot_offset = offset(cfg, "trunk_com_offset"), offset(cfg, "foot_offset")
     inertia = {**trunk, "weight": inertia_per_mass, "shared": True, "same_draw_as": "trunk_mass"}
     return [
-        drawn("trunk_mass", "body_mass", [TRUNK], **trunk),
-        drawn("trunk_inertia", "body_inertia", entries(3, [TRUNK]), **inertia),
-        drawn("trunk_com", "body_ipos", entries(3, [TRUNK]), mirror=VECTOR, **trunk_com),
-        drawn("foot_radius", "geom_size", [3 * foot for foot in feet], shared=True, **absolute(cfg, "foot_radius")),
-        drawn("foot_offset", "geom_pos", entries(3, feet), mirror=foot_vectors, **foot_offset),
+        of_model(task, "trunk_mass", "body_mass", [TRUNK], **trunk),
+        of_model(task, "trunk_inertia", "body_inertia", entries(3, [TRUNK]), **inertia),
+        of_model(task, "trunk_com", "body_ipos", entries(3, [TRUNK]), mirror=VECTOR, **trunk_com),
+        of_model(
+            task, "foot_radius", "geom_size", [3 * foot for foot in feet], shared=True, **absolute(cfg, "foot_radius")
+        ),
+        of_model(task, "foot_offset", "geom_pos", entries(3, feet), mirror=foot_vectors, **foot_offset),
         of_joints("dof_damping", "dof_damping", dofs),
         of_joints("dof_armature", "dof_armature", dofs),
         of_joints("dof_stiffness", "jnt_stiffness", joints),
@@ -99,16 +96,13 @@ def ground_parameters(task: LeggedRobot) -> list[Parameter]:
     cfg, model = task.cfg.domain_rand, task.sim.mj_model
     geoms = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
     kinds = list((model.geom_friction[geoms] / model.geom_friction[geoms, :1]).ravel())
-    friction, solref = view(task, "geom_friction"), view(task, "geom_solref")
-    stiffness = absolute(cfg, "contact_stiffness", -1.0)
+    friction, stiffness = absolute(cfg, "ground_friction", kinds), absolute(cfg, "contact_stiffness", -1.0)
     damping = absolute(cfg, "contact_damping", -1.0) | {"same_draw_as": "contact_stiffness"}
     return [
-        Parameter(
-            "ground_friction", friction, entries(3, geoms), shared=True, **absolute(cfg, "ground_friction", kinds)
-        ),
-        Parameter("contact_stiffness", solref, [2 * geom for geom in geoms], shared=True, **stiffness),
-        Parameter("contact_damping", solref, [2 * geom + 1 for geom in geoms], shared=True, **damping),
-        Parameter("gravity", view(task, "gravity"), [2], **absolute(cfg, "gravity", -1.0)),
+        of_model(task, "ground_friction", "geom_friction", entries(3, geoms), shared=True, **friction),
+        of_model(task, "contact_stiffness", "geom_solref", [2 * geom for geom in geoms], shared=True, **stiffness),
+        of_model(task, "contact_damping", "geom_solref", [2 * geom + 1 for geom in geoms], shared=True, **damping),
+        of_model(task, "gravity", "gravity", [2], **absolute(cfg, "gravity", -1.0)),
     ]
 
 
@@ -141,9 +135,17 @@ def mirrors(drawn: list[Parameter], sizes: dict[str, int]) -> dict[str, Mirrorin
     return {p.name: p.mirror or (SCALAR if sizes[p.name] == 1 else None) for p in own}
 
 
-def view(task: LeggedRobot, field: str) -> Tensor:
-    """Return a field of the model as one row of numbers per world."""
-    return task.sim.field(field).flatten(1)
+def of_model(task: LeggedRobot, name: str, field: str, columns: Sequence[int], **settings: Any) -> Parameter:
+    """Return a parameter that is kept in a field of the model.
+
+    Args:
+        task: The task.
+        name: Name of the parameter.
+        field: Name of the field, one of :data:`MODEL_FIELDS`, or "gravity".
+        columns: Which numbers of a world's part of the field, all of its entries behind each other.
+        settings: All else that a :class:`~legged_torque.sim.randomization.Parameter` takes.
+    """
+    return Parameter(name, task.sim.field(field).flatten(1), list(columns), model_field=field, **settings)
 
 
 def entries(width: int, rows: list[int]) -> list[int]:
