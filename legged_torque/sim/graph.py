@@ -89,19 +89,20 @@ class CudaGraph:
             self._calls += 1
             self._function()
             return
-        if self._graph is None:
-            self._capture()
+        self._graph = self._graph or self._capture()
         self._graph.replay()
 
     def reset(self) -> None:
         """Give the graph back; the next call runs the function as it is, the one after captures anew."""
         self._calls, self._graph = 0, None
 
-    def _capture(self) -> None:
+    def _capture(self) -> torch.cuda.CUDAGraph:
         """Record the function into a graph; the recorded work does not run."""
         stream, warp_stream = _STREAMS[self._device]
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
-            with wp.ScopedCapture(stream=warp_stream, external=True):
-                self._function()
-        self._graph = graph
+        with (
+            torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+            wp.ScopedCapture(stream=warp_stream, external=True),
+        ):
+            self._function()
+        return graph

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
+from legged_torque.sim import kernels
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import Mirroring
 
@@ -92,7 +94,7 @@ class Randomization:
         self._fields = [parameter.field for parameter in parameters]  # their memory must not be freed
         self._without_rows = [parameter.name for parameter in parameters if len(parameter.field) != num_envs]
         self.sizes: dict[str, int] = {}
-        rows: list[_Row] = []
+        rows: list[kernels.Row] = []
         at_start: list[float] = []
         first_draw: dict[str, int] = {}
         num_draws = 1  # number 0 decides what is kept
@@ -116,7 +118,7 @@ class Randomization:
         self._num_envs, self._device = num_envs, device
         self.values = torch.tensor(at_start, device=device).repeat(num_envs, 1)
         self._seeds = torch.zeros(num_envs, dtype=torch.int32, device=device)
-        self._rows = wp.array(rows, dtype=_Row, device=device)
+        self._rows: wp.array = wp.array(rows, dtype=kernels.Row, device=device)
 
     def draw(self, mask: Tensor) -> None:
         """Draw all parameters anew.
@@ -131,56 +133,11 @@ class Randomization:
             raise UserError(f"random parameters without a row per world: {', '.join(self._without_rows)}")
         self._seeds.random_()
         wp.launch(
-            _draw,
+            kernels.draw,
             dim=(self._num_envs, len(self._rows)),
             inputs=[wp.from_torch(mask), wp.from_torch(self._seeds), self._rows, wp.from_torch(self.values)],
             device=self._device,
         )
-
-
-@wp.struct
-class _Row:
-    """How one column is drawn, where it is kept, and how its value is brought to [-1, 1]."""
-
-    address: wp.uint64  # of the first world's number
-    stride: wp.uint64  # from world to world [bytes]
-    draw: wp.int32  # number of the random numbers that it takes
-    place: wp.int32  # in the values, -1 without
-    base: wp.float32
-    weight: wp.float32
-    offset_low: wp.float32
-    offset_span: wp.float32
-    scale_low: wp.float32
-    scale_span: wp.float32
-    own_value: wp.float32
-    keep_probability: wp.float32
-    middle: wp.float32
-    per_half_range: wp.float32
-    lowest: wp.float32
-    highest: wp.float32
-
-
-@wp.kernel(enable_backward=False)
-def _draw(
-    mask: wp.array(dtype=wp.bool),
-    seeds: wp.array(dtype=wp.int32),
-    rows: wp.array(dtype=_Row),
-    values: wp.array2d(dtype=wp.float32),
-):
-    """Write one number of one world."""
-    world, column = wp.tid()
-    if mask[world]:
-        row = rows[column]
-        random = wp.rand_init(seeds[world], row.draw)
-        offset = row.offset_low + row.offset_span * wp.randf(random)
-        scale = row.scale_low + row.scale_span * wp.randf(random)
-        value = wp.clamp((row.base + row.weight * offset) * scale, row.lowest, row.highest)
-        if wp.randf(wp.rand_init(seeds[world], 0)) < row.keep_probability:
-            value = row.own_value
-        target = wp.array(ptr=row.address + wp.uint64(world) * row.stride, shape=(1,), dtype=wp.float32)
-        target[0] = value
-        if row.place >= 0:
-            values[world, row.place] = (value - row.middle) * row.per_half_range
 
 
 def check_field(parameter: Parameter) -> None:
@@ -191,7 +148,7 @@ def check_field(parameter: Parameter) -> None:
         raise UserError(f"random parameter '{parameter.name}' must be float32 with two axes, not {field.dtype} {shape}")
 
 
-def table(parameter: Parameter, keep_probability: float) -> list[_Row]:
+def table(parameter: Parameter, keep_probability: float) -> list[Any]:
     """Return how each column of a parameter is drawn."""
     defaults = parameter.field[0, list(parameter.columns)].tolist()
     bases = defaults if parameter.base is None else per_column(parameter.base, len(defaults))
@@ -199,7 +156,7 @@ def table(parameter: Parameter, keep_probability: float) -> list[_Row]:
     lowest, highest = parameter.limits or ([-math.inf] * len(defaults), [math.inf] * len(defaults))
     rows = []
     for default, base, weight, low, high in zip(defaults, bases, weights, lowest, highest, strict=True):
-        row = _Row()
+        row: Any = kernels.Row()
         row.lowest, row.highest = low, high
         row.base, row.weight, row.own_value = base, weight, default
         row.offset_low, row.offset_span = parameter.offset[0], parameter.offset[1] - parameter.offset[0]

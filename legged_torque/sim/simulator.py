@@ -5,12 +5,14 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
 from torch import Tensor
 
+from legged_torque.sim import kernels
 from legged_torque.sim.fused.set_const import DerivedConstants
 from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.graph import prepare_device
@@ -22,12 +24,6 @@ from legged_torque.utils.errors import unknown_name
 ENGINES = ("fused", "mujoco_warp")
 """What may step the worlds: one kernel per step for legged robots on a plane, or MuJoCo Warp for any robot."""
 
-MAX_POSITION = 1e4
-"""Largest position [m, rad] of a world that is still believed."""
-MAX_VELOCITY = 1e4
-"""Largest velocity [m/s, rad/s] of a world that is still believed."""
-MAX_ACCELERATION = 1e10
-"""Largest acceleration [m/s^2, rad/s^2] of a world that is still believed."""
 _BUFFER_FLAGS = (
     mjw.OverflowType.NEFC,
     mjw.OverflowType.NJMAX_NNZ,
@@ -100,7 +96,7 @@ class Simulator:
                 expand(self.model, name, num_envs)
             self._diverged = wp.zeros(num_envs, dtype=wp.bool)
             self._overflow = wp.zeros(num_envs, dtype=wp.int32)
-            self._reference_pose = wp.array(model.qpos0, dtype=wp.float32)
+            self._reference_pose: wp.array = wp.array(model.qpos0, dtype=wp.float32)
         self._constants = DerivedConstants(model, self.model, num_envs) if per_world else None
         self._step = FusedStep(model, self.model, self.data) if engine == "fused" else WarpStep(self.model, self.data)
         self.qpos = wp.to_torch(self.data.qpos)
@@ -125,7 +121,7 @@ class Simulator:
 
         Without this they follow from the trunk's mass and from armatures only.
         """
-        self._constants.vary_branches()
+        self._derived_constants().vary_branches()
 
     def update_constants(self, mask: Tensor) -> None:
         """Recompute what MuJoCo derives from masses and armatures, after they have been changed, see :meth:`vary_legs`.
@@ -133,7 +129,13 @@ class Simulator:
         Args:
             mask: In which worlds. Shape: (num_envs,), bool.
         """
-        self._constants.update(wp.from_torch(mask))
+        self._derived_constants().update(wp.from_torch(mask))
+
+    def _derived_constants(self) -> Any:
+        """Return what recomputes them; only worlds with fields of their own have it."""
+        if self._constants is None:
+            raise ValueError("all worlds share one model: no field was asked for per_world")
+        return self._constants
 
     def step(self, sense: bool = True) -> None:
         """Advance every world by one physics step under the torques in ``ctrl``.
@@ -151,7 +153,7 @@ class Simulator:
         """
         data = self.data
         state = (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, data.sensordata)
-        self._launch(_reset_worlds, wp.from_torch(mask), self._reference_pose, *state)
+        self._launch(kernels.reset_worlds, wp.from_torch(mask), self._reference_pose, *state)
 
     def set_orientation(self, mask: Tensor, angles: Tensor) -> None:
         """Turn trunks: about x (roll), then y (pitch), then z (yaw), all axes of the world.
@@ -160,7 +162,7 @@ class Simulator:
             mask: In which worlds. Shape: (num_envs,), bool.
             angles: Roll, pitch and yaw [rad]. Shape: (num_envs, 3).
         """
-        self._launch(_set_orientation, wp.from_torch(mask), wp.from_torch(angles), self.data.qpos)
+        self._launch(kernels.set_orientation, wp.from_torch(mask), wp.from_torch(angles), self.data.qpos)
 
     def push(self, mask: Tensor, velocity: Tensor, add: Tensor) -> None:
         """Change velocities of trunks.
@@ -171,7 +173,7 @@ class Simulator:
             add: Where it is added; elsewhere it replaces the trunk's own. Shape: (num_envs,), bool.
         """
         drawn = (wp.from_torch(mask), wp.from_torch(velocity), wp.from_torch(add))
-        self._launch(_push, *drawn, self.data.qvel)
+        self._launch(kernels.push, *drawn, self.data.qvel)
 
     def clear_diverged(self) -> None:
         """Forget which worlds have diverged."""
@@ -181,7 +183,7 @@ class Simulator:
         """Mark the worlds whose state is not finite or absurdly large; MuJoCo Warp has no such check."""
         data = self.data
         state = (data.qpos, data.qvel, data.qacc_warmstart, data.overflow)
-        self._launch(_flag_diverged, *state, self._diverged, self._overflow)
+        self._launch(kernels.flag_diverged, *state, self._diverged, self._overflow)
 
     def check_buffers(self) -> str | None:
         """Return a warning if contacts or constraints were dropped since the start because a buffer was full.
@@ -194,82 +196,6 @@ class Simulator:
             return None
         return f"simulation buffers overflowed ({', '.join(names)}): some contacts were ignored"
 
-    def _launch(self, kernel: wp.Kernel, *arrays: wp.array) -> None:
+    def _launch(self, kernel: wp.Kernel, *arrays: Any) -> None:
         """Run a kernel once per world."""
         wp.launch(kernel, dim=self.num_envs, inputs=arrays, device=self._wp_device)
-
-
-@wp.kernel(enable_backward=False)
-def _reset_worlds(
-    mask: wp.array(dtype=wp.bool),
-    reference_pose: wp.array(dtype=wp.float32),
-    qpos: wp.array2d(dtype=wp.float32),
-    qvel: wp.array2d(dtype=wp.float32),
-    qacc_warmstart: wp.array2d(dtype=wp.float32),
-    ctrl: wp.array2d(dtype=wp.float32),
-    sensordata: wp.array2d(dtype=wp.float32),
-):
-    """Write everything that a world carries from one step to the next."""
-    world = wp.tid()
-    if mask[world]:
-        for i in range(qpos.shape[1]):
-            qpos[world, i] = reference_pose[i]
-        for i in range(qvel.shape[1]):
-            qvel[world, i] = 0.0
-            qacc_warmstart[world, i] = 0.0
-        for i in range(ctrl.shape[1]):
-            ctrl[world, i] = 0.0
-        for i in range(sensordata.shape[1]):
-            sensordata[world, i] = 0.0
-
-
-@wp.kernel(enable_backward=False)
-def _set_orientation(
-    mask: wp.array(dtype=wp.bool), angles: wp.array2d(dtype=wp.float32), qpos: wp.array2d(dtype=wp.float32)
-):
-    """Write the quaternion (w, x, y, z) of one world; Warp's own are (x, y, z, w)."""
-    world = wp.tid()
-    if mask[world]:
-        roll = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), angles[world, 0])
-        pitch = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), angles[world, 1])
-        yaw = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angles[world, 2])
-        quat = yaw * pitch * roll
-        qpos[world, 3] = quat[3]
-        for i in range(3):
-            qpos[world, 4 + i] = quat[i]
-
-
-@wp.kernel(enable_backward=False)
-def _push(
-    mask: wp.array(dtype=wp.bool),
-    velocity: wp.array2d(dtype=wp.float32),
-    add: wp.array(dtype=wp.bool),
-    qvel: wp.array2d(dtype=wp.float32),
-):
-    """Set or add the trunk's linear velocity of one world."""
-    world = wp.tid()
-    if mask[world]:
-        for i in range(3):
-            qvel[world, i] = velocity[world, i] + wp.where(add[world], qvel[world, i], 0.0)
-
-
-@wp.kernel(enable_backward=False)
-def _flag_diverged(
-    qpos: wp.array2d(dtype=wp.float32),
-    qvel: wp.array2d(dtype=wp.float32),
-    qacc: wp.array2d(dtype=wp.float32),
-    overflow: wp.array(dtype=wp.int32),
-    diverged: wp.array(dtype=wp.bool),
-    overflow_seen: wp.array(dtype=wp.int32),
-):
-    """Check one world; comparisons are written so that NaN fails them."""
-    world = wp.tid()
-    good = bool(True)  # a variable; Warp would take True for a constant
-    for i in range(qpos.shape[1]):
-        good = good and wp.abs(qpos[world, i]) <= wp.static(MAX_POSITION)
-    for i in range(qvel.shape[1]):
-        good = good and wp.abs(qvel[world, i]) <= wp.static(MAX_VELOCITY)
-        good = good and wp.abs(qacc[world, i]) <= wp.static(MAX_ACCELERATION)
-    if not good:
-        diverged[world] = True
-    overflow_seen[world] = overflow_seen[world] | overflow[world]

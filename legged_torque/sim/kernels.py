@@ -1,0 +1,131 @@
+"""The kernels of simulator and randomization: one thread per world, or per number of a world."""
+
+import warp as wp
+
+MAX_POSITION = 1e4
+"""Largest position [m, rad] of a world that is still believed."""
+MAX_VELOCITY = 1e4
+"""Largest velocity [m/s, rad/s] of a world that is still believed."""
+MAX_ACCELERATION = 1e10
+"""Largest acceleration [m/s^2, rad/s^2] of a world that is still believed."""
+
+
+@wp.kernel(enable_backward=False)
+def reset_worlds(
+    mask: wp.array(dtype=wp.bool),
+    reference_pose: wp.array(dtype=wp.float32),
+    qpos: wp.array2d(dtype=wp.float32),
+    qvel: wp.array2d(dtype=wp.float32),
+    qacc_warmstart: wp.array2d(dtype=wp.float32),
+    ctrl: wp.array2d(dtype=wp.float32),
+    sensordata: wp.array2d(dtype=wp.float32),
+):
+    """Write everything that a world carries from one step to the next."""
+    world = wp.tid()
+    if mask[world]:
+        for i in range(qpos.shape[1]):
+            qpos[world, i] = reference_pose[i]
+        for i in range(qvel.shape[1]):
+            qvel[world, i] = 0.0
+            qacc_warmstart[world, i] = 0.0
+        for i in range(ctrl.shape[1]):
+            ctrl[world, i] = 0.0
+        for i in range(sensordata.shape[1]):
+            sensordata[world, i] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def set_orientation(
+    mask: wp.array(dtype=wp.bool), angles: wp.array2d(dtype=wp.float32), qpos: wp.array2d(dtype=wp.float32)
+):
+    """Write the quaternion (w, x, y, z) of one world; Warp's own are (x, y, z, w)."""
+    world = wp.tid()
+    if mask[world]:
+        roll = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), angles[world, 0])
+        pitch = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), angles[world, 1])
+        yaw = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angles[world, 2])
+        quat = yaw * pitch * roll
+        qpos[world, 3] = quat[3]
+        for i in range(3):
+            qpos[world, 4 + i] = quat[i]
+
+
+@wp.kernel(enable_backward=False)
+def push(
+    mask: wp.array(dtype=wp.bool),
+    velocity: wp.array2d(dtype=wp.float32),
+    add: wp.array(dtype=wp.bool),
+    qvel: wp.array2d(dtype=wp.float32),
+):
+    """Set or add the trunk's linear velocity of one world."""
+    world = wp.tid()
+    if mask[world]:
+        for i in range(3):
+            qvel[world, i] = velocity[world, i] + wp.where(add[world], qvel[world, i], 0.0)
+
+
+@wp.kernel(enable_backward=False)
+def flag_diverged(
+    qpos: wp.array2d(dtype=wp.float32),
+    qvel: wp.array2d(dtype=wp.float32),
+    qacc: wp.array2d(dtype=wp.float32),
+    overflow: wp.array(dtype=wp.int32),
+    diverged: wp.array(dtype=wp.bool),
+    overflow_seen: wp.array(dtype=wp.int32),
+):
+    """Check one world; comparisons are written so that NaN fails them."""
+    world = wp.tid()
+    good = bool(True)  # a variable; Warp would take True for a constant
+    for i in range(qpos.shape[1]):
+        good = good and wp.abs(qpos[world, i]) <= wp.static(MAX_POSITION)
+    for i in range(qvel.shape[1]):
+        good = good and wp.abs(qvel[world, i]) <= wp.static(MAX_VELOCITY)
+        good = good and wp.abs(qacc[world, i]) <= wp.static(MAX_ACCELERATION)
+    if not good:
+        diverged[world] = True
+    overflow_seen[world] = overflow_seen[world] | overflow[world]
+
+
+@wp.struct
+class Row:
+    """How one column is drawn, where it is kept, and how its value is brought to [-1, 1]."""
+
+    address: wp.uint64  # of the first world's number
+    stride: wp.uint64  # from world to world [bytes]
+    draw: wp.int32  # number of the random numbers that it takes
+    place: wp.int32  # in the values, -1 without
+    base: wp.float32
+    weight: wp.float32
+    offset_low: wp.float32
+    offset_span: wp.float32
+    scale_low: wp.float32
+    scale_span: wp.float32
+    own_value: wp.float32
+    keep_probability: wp.float32
+    middle: wp.float32
+    per_half_range: wp.float32
+    lowest: wp.float32
+    highest: wp.float32
+
+
+@wp.kernel(enable_backward=False)
+def draw(
+    mask: wp.array(dtype=wp.bool),
+    seeds: wp.array(dtype=wp.int32),
+    rows: wp.array(dtype=Row),
+    values: wp.array2d(dtype=wp.float32),
+):
+    """Write one number of one world."""
+    world, column = wp.tid()
+    if mask[world]:
+        row = rows[column]
+        random = wp.rand_init(seeds[world], row.draw)
+        offset = row.offset_low + row.offset_span * wp.randf(random)
+        scale = row.scale_low + row.scale_span * wp.randf(random)
+        value = wp.clamp((row.base + row.weight * offset) * scale, row.lowest, row.highest)
+        if wp.randf(wp.rand_init(seeds[world], 0)) < row.keep_probability:
+            value = row.own_value
+        target = wp.array(ptr=row.address + wp.uint64(world) * row.stride, shape=(1,), dtype=wp.float32)
+        target[0] = value
+        if row.place >= 0:
+            values[world, row.place] = (value - row.middle) * row.per_half_range
