@@ -1,0 +1,159 @@
+"""The code in the how-to pages and in the README, run as it stands there."""
+
+import re
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from legged_torque.envs import task_registry
+from legged_torque.envs.base.curriculum import LinearCurriculum
+from legged_torque.utils.options import Options
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def blocks(page, language):
+    """The code blocks of a page in one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / page).read_text(), flags=re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture
+def run_page(monkeypatch, tmp_path):
+    """Run a page's Python as one program; its tasks are forgotten afterwards."""
+    monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
+    monkeypatch.chdir(tmp_path)
+
+    def run(page):
+        names = {}
+        exec("\n".join(blocks(page, "python")), names)
+        return names
+
+    return run
+
+
+def make(name, *settings, num_envs=4):
+    """Build a task of a page on the CPU."""
+    torch.manual_seed(0)
+    options = Options(device="cpu", num_envs=num_envs, set=list(settings))
+    return task_registry.make_env(name, options)[0]
+
+
+def train(task, name):
+    """Train a task for two short iterations."""
+    settings = ["runner.num_steps_per_env=4", "evaluation.interval=0", "actor.hidden_dims=[16, 16]"]
+    _, train_cfg = task_registry.get_cfgs(name, Options(device="cpu", set=settings))
+    runner, _ = task_registry.make_alg_runner(task, name, train_cfg=train_cfg, log_root=None)
+    before = [parameter.clone() for parameter in runner.alg.actor.parameters()]
+    runner.learn(2)
+    after = list(runner.alg.actor.parameters())
+    assert all(torch.isfinite(parameter).all() for parameter in after)
+    assert any(not torch.equal(*pair) for pair in zip(before, after, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("page", "name"), [("README.md", "a1_quiet_torque"), ("docs/howto/reward.md", "a1_quiet_torque")]
+)
+def test_reward(run_page, page, name):
+    """The new term counts with its weight."""
+    names = run_page(page)
+    task = make(name)
+    assert "dof_vel" in task.reward_names
+    task.dof_vel.copy_(torch.arange(48.0).view(4, 12))
+    expected = np.square(np.arange(48.0).reshape(4, 12)).sum(axis=1)
+    np.testing.assert_allclose(task._reward_dof_vel().numpy(), expected, rtol=1e-6)
+    weights = dict(zip(task.reward_names, task.reward_weights().tolist(), strict=True))
+    assert weights["dof_vel"] == pytest.approx(-1e-4 * 0.02)
+    if "FadedCfg" in names:
+        assert "torques" not in task.reward_names
+        factor = LinearCurriculum([names["FadedCfg"]().rewards.curriculum.dof_vel], "cpu")
+        assert [factor(torch.tensor(steps)).item() for steps in (0, 5_000_000, 20_000_000)] == [0.0, 0.5, 1.0]
+    else:
+        assert task.cfg.control.torque_scale == 5.0
+
+
+def test_observation(run_page):
+    """The new terms are seen, scaled, noisy for the policy only, mirrored, and sized everywhere."""
+    run_page("docs/howto/observation.md")
+    task = make("a1_feeling_torque", "noise.add_noise=true", num_envs=256)
+    for _ in range(3):
+        obs = task.step(torch.randn(256, 12))[0]
+    assert obs["policy"].shape[1] == 57 and obs["critic"].shape[1] == 45 + 12 + 8 + 84 + 1
+    columns = task.observations.policy_columns("torque")
+    assert columns == list(range(45, 57))
+    torch.testing.assert_close(obs["critic"][:, columns], 0.03 * task.torques)
+    error = (obs["policy"] - obs["critic"][:, :57])[:, columns].abs() / 0.03
+    assert 0.45 < error.max() <= 0.5 + 1e-4
+    torch.testing.assert_close(obs["critic"][:, -1], task.feet_air_time.mean(dim=1))
+    mirrored = task.mirror("policy", obs["policy"])[:, columns].view(-1, 4, 3)
+    swapped = obs["policy"][:, columns].view(-1, 4, 3)[:, [1, 0, 3, 2]] * torch.tensor([-1.0, 1.0, 1.0])
+    assert torch.equal(mirrored, swapped)
+    train(make("a1_feeling_torque"), "a1_feeling_torque")
+
+
+def test_parameter(run_page):
+    """The masses are drawn from their range, and what follows from them is what MuJoCo says."""
+    run_page("docs/howto/parameter.md")
+    task = make("a1_thigh_mass", "domain_rand.randomize_parameters=true", num_envs=64)
+    model = task.sim.mj_model
+    thighs = [model.body(f"{leg}_thigh").id for leg in ("FR", "FL", "RR", "RL")]
+    ratio = task.sim.field("body_mass")[:, thighs] / torch.tensor(model.body_mass[thighs], dtype=torch.float32)
+    assert (ratio.amax(dim=1) - ratio.amin(dim=1)).max() < 1e-6
+    assert ratio.min() > 0.8 and ratio.max() < 1.2 and ratio.std() > 0.08
+    critic = task.get_observations()["critic"]
+    torch.testing.assert_close(critic[:, -1], (ratio[:, 0] - 1.0) / 0.2, atol=1e-4, rtol=0)
+    train(make("a1_thigh_mass", "domain_rand.randomize_parameters=true"), "a1_thigh_mass")
+
+
+def test_combination(run_page):
+    """Actions are those of the multi-head task, the curriculum is that of the torque curriculum."""
+    run_page("docs/howto/approach.md")
+    task = make("a1_curriculum_multihead")
+    assert task.num_actions == 24 and "nominal_position" in task.reward_names
+    actions = torch.randn(4, 24)
+    pd = 20.0 * (task.default_dof_pos + 0.25 * actions[:, :12] - task.dof_pos) - 0.5 * task.dof_vel
+    task.total_steps.fill_(32_000_000)
+    task.update_curriculum()
+    torch.testing.assert_close(task._compute_torques(actions), 0.36 * pd + 4.0 * actions[:, 12:])
+    weights = task.curriculum_values()
+    assert weights["weight_nominal_position"].item() == 1.0 and weights["mixing_pd"].item() == pytest.approx(0.36)
+    assert task.cfg.rewards.curriculum.tracking_lin_vel.t_start == 3_000_000
+    train(make("a1_curriculum_multihead"), "a1_curriculum_multihead")
+
+
+def test_approach(run_page):
+    """Actions are joint velocities, and their number follows from the terms."""
+    run_page("docs/howto/approach.md")
+    task = make("a1_velocity")
+    actions = torch.randn(4, 12)
+    assert task.cfg.env.num_actions == 12
+    torch.testing.assert_close(task._compute_torques(actions), 2.0 * (10.0 * actions - task.dof_vel))
+    train(task, "a1_velocity")
+
+
+def test_robot(run_page):
+    """The page's robot stands in its nominal pose under PD control, as in MuJoCo's own simulation, and can be trained."""
+    (xml,) = blocks("docs/howto/robot.md", "xml")
+    Path("minidog.xml").write_text(xml)
+    run_page("docs/howto/robot.md")
+    Path("minidog.xml").write_text(xml)  # the page's program runs in a folder of its own
+    task = make("minidog_position")
+    assert task.num_dof == 8 and task.foot_names == ["FR_foot", "FL_foot", "RR_foot", "RL_foot"]
+    assert task.p_gains[0].tolist() == [15.0, 10.0] * 4
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    pose = np.array([0.6, -1.2] * 4)
+    data.qpos[2], data.qpos[7:] = 0.3, pose
+    start = torch.tensor(data.qpos, dtype=torch.float32).expand(4, -1)
+    task.set_state(start, torch.zeros(4, model.nv))
+    for _ in range(100):
+        task.step(torch.zeros(4, 8))
+        for _ in range(4):
+            data.ctrl[:] = np.array([15.0, 10.0] * 4) * (pose - data.qpos[7:]) - 0.4 * data.qvel[6:]
+            mujoco.mj_step(model, data)
+    assert not task.num_diverged and (task.episode_length_buf == 100).all()
+    np.testing.assert_allclose(task.base_pos[0].numpy(), data.qpos[:3], atol=2e-3)
+    assert 0.2 < data.qpos[2] < 0.3
+    train(make("minidog_torque"), "minidog_torque")
