@@ -4,37 +4,12 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from typing import NoReturn
 
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.cli import Parser
 from legged_torque.utils.options import DEFAULT_TASK, Options
 
 
-class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line with the nearest valid name."""
-
-    def __init__(self, description: str) -> None:
-        """Create a parser; abbreviations of options are not accepted."""
-        super().__init__(description=description, allow_abbrev=False)
-
-    def error(self, message: str) -> NoReturn:
-        """Report a mistake in the arguments."""
-        raise UserError(message)
-
-    def parse_args(self, args: list[str] | None = None, namespace: argparse.Namespace | None = None):
-        """Parse the command line.
-
-        Raises:
-            UserError: If it cannot be parsed.
-        """
-        namespace, unknown = self.parse_known_args(args, namespace)
-        if unknown:
-            options = [option for action in self._actions for option in action.option_strings]
-            raise unknown_name("option", unknown[0], options)
-        return namespace
-
-
-def add_settings_args(parser: argparse.ArgumentParser) -> None:
+def add_settings_args(parser: Parser) -> None:
     """Add what chooses a task and its settings."""
     parser.add_argument(
         "--task", default=DEFAULT_TASK, help="name of the task, see train.py --list; default: %(default)s"
@@ -62,7 +37,7 @@ def add_settings_args(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_build_args(parser: argparse.ArgumentParser) -> None:
+def add_build_args(parser: Parser) -> None:
     """Add what decides how a task is built."""
     add_settings_args(parser)
     parser.add_argument(
@@ -70,7 +45,7 @@ def add_build_args(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_task_args(parser: argparse.ArgumentParser) -> None:
+def add_task_args(parser: Parser) -> None:
     """Add what all scripts take that build a task and keep or load runs of it."""
     add_build_args(parser)
     parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in the current directory")
@@ -79,7 +54,7 @@ def add_task_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--checkpoint", type=int, help="checkpoint to load; default: the last one")
 
 
-def add_train_args(parser: argparse.ArgumentParser) -> None:
+def add_train_args(parser: Parser) -> None:
     """Add what only training takes."""
     parser.add_argument("--max_iterations", type=int, help="iterations in all; default: 110e6 environment steps")
     parser.add_argument(
