@@ -109,7 +109,7 @@ def test_permuted_joints(policy, tmp_path):
             assert robot.data.joint(name).qfrc_actuator[0] == pytest.approx(torque)
             assert robot.data.actuator(name.removesuffix("_joint")).force[0] == pytest.approx(torque)
         np.testing.assert_allclose(robot.applied_torques(), torques[-1], rtol=1e-6)
-        moved.append(np.concatenate([robot.joint_positions(), robot.position(), robot.quat()]))
+        moved.append(np.concatenate([robot.joint_positions(), robot.position, robot.quat]))
     for pair in (seen, torques, moved):
         np.testing.assert_allclose(pair[0], pair[1], atol=1e-6)
     assert np.unique(np.abs(torques[0])).size == 12
@@ -198,9 +198,9 @@ def test_standing_robot(policy):
         assert not robot.has_fallen()
     assert robot.weight == pytest.approx(122.2, abs=0.1)
     assert robot.contact_force() == pytest.approx(robot.weight, rel=0.1)
-    assert np.linalg.norm(robot.trunk_velocity()) < 0.02
-    robot.velocity()[:] = [math.cos(1.0), math.sin(1.0), 0.0]
-    np.testing.assert_allclose(robot.trunk_velocity()[:2], [1.0, 0.0], atol=0.1)
+    assert np.linalg.norm(robot.velocity) < 0.02
+    robot.velocity[:] = [math.cos(1.0), math.sin(1.0), 0.0]
+    np.testing.assert_allclose(robot.planar_velocity()[:2], [1.0, 0.0], atol=0.1)
 
 
 # --------------------------------------------------------------------------------------------------- metrics, events
@@ -245,7 +245,7 @@ def test_recorder(policy, monkeypatch):
 
     def on_step():
         recorder.add_step()
-        velocity = [*robot.trunk_velocity()[:2], robot.trunk_angular_velocity()[2]]
+        velocity = [*robot.planar_velocity()[:2], robot.angular_velocity[2]]
         seen.append((robot.data.qpos.tolist(), [0.5, -0.1, 0.2], velocity))
 
     simulation.run(3, 1, on_step)
@@ -262,9 +262,9 @@ def test_pushes(policy):
     simulation.run(1, 1)
     added = []
     for _ in range(300):
-        robot.velocity()[:] = 10.0
+        robot.velocity[:] = 10.0
         simulation._push()
-        added.append(robot.velocity().copy())
+        added.append(robot.velocity.copy())
     is_added = np.min(added, axis=1) > 5.0
     assert 0.4 < is_added.mean() < 0.6
     assert (np.abs(np.array(added) - 10.0 * is_added[:, None]) <= 0.5).all() and np.std(added, axis=0).min() > 0.2
@@ -279,7 +279,7 @@ def test_episodes_end(policy):
     robot.reset(*random_state(1, height=0.03))
     simulation._control_step()
     assert simulation._finish_step(simulation.command).tolist() == [0.0] * 9 + [1.0]
-    assert robot.position()[2] == 0.4 and simulation._steps == 0 and (policy.last_action == 0).all()
+    assert robot.position[2] == 0.4 and simulation._steps == 0 and (policy.last_action == 0).all()
     simulation._control_step()
     simulation._steps = 1000
     assert simulation._finish_step(simulation.command).tolist() == [0.0] * 10

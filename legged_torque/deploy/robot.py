@@ -22,6 +22,12 @@ class MujocoRobot:
         model: The compiled MJCF, with the policy's time step.
         data: Its state.
         notes: Differences of the MJCF from ``policy.yaml``, a line each.
+        trunk: Number of the trunk's body.
+        position: The trunk's position in the world, a view of the state like the next ones [m]. Shape: (3,).
+        quat: The trunk's orientation (w, x, y, z). Shape: (4,).
+        velocity: The trunk's linear velocity in the world [m/s]. Shape: (3,).
+        angular_velocity: The trunk's angular velocity in its own frame [rad/s]. Shape: (3,).
+        weight: m g of the whole robot [N].
     """
 
     def __init__(self, xml: str | Path, description: dict[str, Any]) -> None:
@@ -48,7 +54,8 @@ class MujocoRobot:
 
     def state(self) -> State:
         """Return the measurements of perfect sensors."""
-        return State(self.trunk_angular_velocity(), self.joint_positions(), self.joint_velocities(), None, self.quat())
+        angular_velocity, quat = self.angular_velocity.copy(), self.quat.copy()
+        return State(angular_velocity, self.joint_positions(), self.joint_velocities(), quaternion=quat)
 
     def joint_positions(self) -> np.ndarray:
         """Return joint positions. Shape: (joints,) [rad]."""
@@ -71,33 +78,11 @@ class MujocoRobot:
         self.data.ctrl[self._motors] = torques / self._torque_per_ctrl
         mujoco.mj_step(self.model, self.data)
 
-    # ---- the trunk ---------------------------------------------------------------------------------------------------
-
-    def position(self) -> np.ndarray:
-        """Return the trunk's position in the world. Shape: (3,) [m]."""
-        return self.data.qpos[self._root_qpos : self._root_qpos + 3]
-
-    def quat(self) -> np.ndarray:
-        """Return the trunk's orientation (w, x, y, z). Shape: (4,)."""
-        return self.data.qpos[self._root_qpos + 3 : self._root_qpos + 7]
-
-    def velocity(self) -> np.ndarray:
-        """Return the trunk's linear velocity in the world, writable. Shape: (3,) [m/s]."""
-        return self.data.qvel[self._root_dof : self._root_dof + 3]
-
-    def trunk_velocity(self) -> np.ndarray:
-        """Return the trunk's linear velocity in its own frame. Shape: (3,) [m/s]."""
-        matrix = np.zeros(9)
-        mujoco.mju_quat2Mat(matrix, self.quat())
-        return matrix.reshape(3, 3).T @ self.velocity()
-
-    def trunk_angular_velocity(self) -> np.ndarray:
-        """Return the trunk's angular velocity in its own frame. Shape: (3,) [rad/s]."""
-        return self.data.qvel[self._root_dof + 3 : self._root_dof + 6]
-
     def planar_velocity(self) -> np.ndarray:
         """Return v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame, as commands are. Shape: (3,)."""
-        return np.append(self.trunk_velocity()[:2], self.trunk_angular_velocity()[2])
+        matrix = np.zeros(9)
+        mujoco.mju_quat2Mat(matrix, self.quat)
+        return np.append((matrix.reshape(3, 3).T @ self.velocity)[:2], self.angular_velocity[2])
 
     def reset(
         self, position: np.ndarray, quat: np.ndarray, joint_positions: np.ndarray, velocities: tuple[np.ndarray, ...]
@@ -111,9 +96,9 @@ class MujocoRobot:
             velocities: Linear (world) [m/s] and angular (trunk) [rad/s], shapes (3,), and joint velocities (joints,).
         """
         mujoco.mj_resetData(self.model, self.data)
-        self.position()[:], self.quat()[:] = position, quat
+        self.position[:], self.quat[:] = position, quat
         self.data.qpos[self._qpos] = np.clip(joint_positions, *self._joint_limits)
-        self.velocity()[:], self.trunk_angular_velocity()[:] = velocities[:2]
+        self.velocity[:], self.angular_velocity[:] = velocities[:2]
         self.data.qvel[self._dofs] = velocities[2]
 
     # ---- contacts ----------------------------------------------------------------------------------------------------
@@ -173,8 +158,9 @@ class MujocoRobot:
         if len(free) != 1:
             raise UserError(f"the MJCF must have one free joint, that of the trunk; it has {len(free)}")
         self.trunk = int(self.model.jnt_bodyid[free[0]])
-        self._root_qpos = int(self.model.jnt_qposadr[free[0]])
-        self._root_dof = int(self.model.jnt_dofadr[free[0]])
+        qpos, qvel = self.data.joint(int(free[0])).qpos, self.data.joint(int(free[0])).qvel
+        self.position, self.quat = qpos[:3], qpos[3:]
+        self.velocity, self.angular_velocity = qvel[:3], qvel[3:]
 
     def _find_joints(self, joint_order: list[str]) -> None:
         """Find the policy's joints by name."""

@@ -106,12 +106,12 @@ class Simulation:
         if self._rng.random() < self.events.push_probability:
             self._push()
         velocity = robot.planar_velocity()
-        numbers = (np.linalg.norm(velocity[:2]), force, power, robot.position()[2], fell, ended)
+        numbers = (np.linalg.norm(velocity[:2]), force, power, robot.position[2], fell, ended)
         return step_sums(np, command[None], velocity[None], *(np.array([number]) for number in numbers))[:, 0]
 
     def _push(self) -> None:
         """Push the trunk: half of the pushes set its velocity, the others add to it."""
-        velocity = self.robot.velocity()
+        velocity = self.robot.velocity
         drawn = self._rng.uniform(-self.events.push_velocity, self.events.push_velocity, 3)
         velocity[:] = drawn + velocity if self._rng.random() < PUSH_ADDED else drawn
 
