@@ -50,29 +50,17 @@ UNIT_OF = {name: f" [{unit}]" for unit, names in UNITS.items() for name in names
 
 @dataclass
 class Panel:
-    """Numbers that were drawn, and how they should be distributed: U(offset) x U(scale).
+    """Numbers that were drawn, and how they should be distributed: U(offset) x U(scale)."""
 
-    Attributes:
-        group: One of :data:`GROUPS`.
-        title: Title with the unit.
-        values: The numbers, a row per world.
-        offset: Range of the offset, including what it is added to.
-        scale: Range of the scale.
-        own: Values without draws, one per column.
-        may_keep: Whether some worlds keep their own values.
-        bins: Number of bars.
-        geometric: Probability of a geometric distribution in place of the uniform ones; 0 for none.
-    """
-
-    group: str
-    title: str
-    values: torch.Tensor
-    offset: Sequence[float]
-    scale: Sequence[float] = (1.0, 1.0)
-    own: Sequence[float] = (0.0,)
-    may_keep: bool = False
+    group: str  # one of GROUPS
+    title: str  # with its unit
+    values: torch.Tensor  # a row per world
+    offset: Sequence[float]  # range, including what the offset is added to
+    scale: Sequence[float] = (1.0, 1.0)  # range
+    own: Sequence[float] = (0.0,)  # values without draws, one per column
+    may_keep: bool = False  # whether some worlds keep their own values
     bins: int = BINS
-    geometric: float = 0.0
+    geometric: float = 0.0  # probability of a geometric distribution in place of the uniform ones
 
     def __post_init__(self) -> None:
         """Copy the numbers, because the task changes them later."""
@@ -107,42 +95,36 @@ def main() -> None:
     fixed_cfg.env.num_envs, fixed_cfg.domain_rand.randomize_parameters = 1, False
     fixed, _ = task_registry.make_env(options.task, options, fixed_cfg)
     task, _ = task_registry.make_env(options.task, options, env_cfg)
-    panels = [*initial_state(task), *random_parameters(task, fixed), *sensors(task), *events(task)]
+    panels = [*parameters(task, fixed), *sensors(task), *events(task)]
     draw(sorted(panels, key=lambda panel: GROUPS.index(panel.group)), args.out)  # events change the task, so come last
 
 
-def initial_state(task: LeggedRobot) -> list[Panel]:
-    """Return the panels of the start of an episode."""
-    not_uniform = ("base_pos", "action_delay")  # the former is not random, the latter a whole number
-    drawn = [parameter for parameter in domain_rand.initial_state(task) if parameter.name not in not_uniform]
-    bases = [per_column(parameter.base, len(parameter.columns)) for parameter in drawn]
-    low, high = task.cfg.domain_rand.action_delay
-    ends = (low - 0.5, high + 0.5) if high > low else (low, low)
-    title = f"action delay [{task.cfg.domain_rand.action_delay_unit.replace('_', ' ')}]"
-    delay = Panel("initial state", title, task.action_delay.drawn.floor(), ends, bins=high - low + 1)
-    return [*(panel_of(drawn, "initial state", base) for drawn, base in zip(drawn, bases, strict=True)), delay]
-
-
-def random_parameters(task: LeggedRobot, fixed: LeggedRobot) -> list[Panel]:
-    """Return the panels of robot, ground and controller.
+def parameters(task: LeggedRobot, fixed: LeggedRobot) -> list[Panel]:
+    """Return the panels of initial state, robot, ground and controller.
 
     Args:
         task: The task.
         fixed: The same task without random parameters.
     """
-    readers = {
-        "robot": domain_rand.robot_parameters,
-        "ground": domain_rand.ground_parameters,
-        "controller": domain_rand.control_parameters,
-    }
-    group_of = {parameter.name: group for group, read in readers.items() for parameter in read(task)}
-    panels = []
+    panels = [action_delay(task)]
+    for drawn in domain_rand.initial_state(task):
+        if drawn.name not in ("base_pos", "action_delay"):  # never random, and a whole number
+            panels.append(panel_of(drawn, "initial state", per_column(drawn.base, len(drawn.columns))))
+    readers = (domain_rand.robot_parameters, domain_rand.ground_parameters, domain_rand.control_parameters)
+    group_of = {drawn.name: group for group, read in zip(GROUPS[1:], readers, strict=False) for drawn in read(task)}
     for drawn, own in zip(task.random_parameters(), fixed.random_parameters(), strict=True):
         if not task.cfg.domain_rand.randomize_parameters:
-            drawn = own
-        values = own.field[0, list(own.columns)].tolist()
-        panels.append(panel_of(drawn, group_of.get(drawn.name, "other"), values))
+            drawn = Parameter(own.name, own.field, own.columns, shared=own.shared)
+        panels.append(panel_of(drawn, group_of.get(own.name, "other"), own.field[0, list(own.columns)].tolist()))
     return panels
+
+
+def action_delay(task: LeggedRobot) -> Panel:
+    """Return the panel of the delay, which is a whole number."""
+    low, high = task.cfg.domain_rand.action_delay
+    ends = (low - 0.5, high + 0.5) if high > low else (low, low)
+    title = f"action delay [{task.cfg.domain_rand.action_delay_unit.replace('_', ' ')}]"
+    return Panel("initial state", title, task.action_delay.drawn.floor(), ends, bins=high - low + 1)
 
 
 def panel_of(drawn: Parameter, group: str, own: list[float]) -> Panel:
@@ -157,18 +139,23 @@ def panel_of(drawn: Parameter, group: str, own: list[float]) -> Panel:
         own: Values without draws, per column.
     """
     columns = list(drawn.columns)[: 1 if drawn.shared else None]
-    values, own = drawn.field[:, columns], np.array(own[: len(columns)])
+    own = np.array(own[: len(columns)])
+    base = own if drawn.base is None else np.array(per_column(drawn.base, len(drawn.columns)))[: len(columns)]
     weight = per_column(drawn.weight, len(drawn.columns))[0]
-    title, unit = drawn.name.replace("_", " "), UNIT_OF.get(drawn.name, "")
-    base = own[0]
-    if drawn.base == 0.0:
-        values, own, base, weight = values / weight, own / weight, 0.0, 1.0
-    elif np.ptp(own) > 0.0 and drawn.scale == (1.0, 1.0):
-        title, values, own, base = f"{title} - own", values - torch.tensor(own).to(values), 0.0 * own, 0.0
-    elif np.ptp(own) > 0.0:
-        title, unit, values, own, base = f"{title} / own", "", values / torch.tensor(own).to(values), own / own, 1.0
-    offset = tuple(base + weight * np.array(drawn.offset))
-    return Panel(group, title + unit, values, offset, drawn.scale, own, drawn.may_keep)
+    title, unit, shift, factor = drawn.name.replace("_", " "), UNIT_OF.get(drawn.name, ""), 0.0 * own, 1.0
+    if not base.any():
+        factor = weight
+    elif np.ptp(base) > 0.0 and drawn.scale == (1.0, 1.0):
+        title, shift = f"{title} - own", base
+    elif np.ptp(base) > 0.0:
+        title, unit, factor = f"{title} / own", "", base
+
+    def shown(values: np.ndarray) -> np.ndarray:
+        return (values - shift) / factor
+
+    values = torch.as_tensor(shown(drawn.field[:, columns].cpu().numpy()))
+    offset = [shown(base + weight * end)[0] for end in drawn.offset]
+    return Panel(group, title + unit, values, offset, drawn.scale, shown(own), drawn.may_keep)
 
 
 def sensors(task: LeggedRobot) -> list[Panel]:
