@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import viser
 
-from legged_torque.viewer.reading import HISTORY_STEPS, Reading
-from legged_torque.viewer.session import Session
+from legged_torque.viewer.reading import Reading
+from legged_torque.viewer.session import HISTORY_STEPS, Session
 from legged_torque.viewer.state import SessionState
 
 COMMAND, ACTUAL, APPLIED = "#1faa55", "#2f7df6", "#343a40"
@@ -81,17 +81,19 @@ class Plots:
 
     def _update_curves(self, now: float) -> None:
         """Draw the last seconds before a simulated time [s]."""
-        past = self._session.history.read()
-        num_steps = len(past.get("time", ()))
-        if num_steps < 2 * STRIDE:
+        past = list(self._session.history)
+        past = past[len(past) % STRIDE :: STRIDE]  # the same steps every time, so that curves do not jitter
+        if len(past) < 2:
             return
-        chosen = slice(num_steps % STRIDE, None, STRIDE)  # the same steps every time, so that curves do not jitter
-        past["time"] -= now
-        past = {name: values[chosen].astype(np.float32) for name, values in past.items()}
+        time = np.array([reading.time - now for reading in past], np.float32)
+        velocities = np.array(
+            [[reading.commands[reading.world], reading.velocities[reading.world]] for reading in past]
+        )
         for i, plot in enumerate(self._velocities):
-            plot.data = (past["time"], past["commands"][:, i], past["velocities"][:, i])
+            plot.data = (time, *velocities[:, :, i].T)
+        torques = np.array([[*reading.torque_parts, reading.torques] for reading in past])
         for plot, joint in zip(self._torques, self._chosen, strict=False):
-            plot.data = (past["time"], *past["torque_parts"][:, :, joint].T, past["torques"][:, joint])
+            plot.data = (time, *torques[:, :, joint].T)
 
     def _torque_bars(self, reading: Reading, mixing: dict[str, float]) -> str:
         """Return all torques of this moment as bars, in parts if the task mixes action terms."""

@@ -1,9 +1,7 @@
-"""What a viewer reads from a running task: torques by part, reward terms, and the last seconds of one world."""
+"""What a viewer reads from a running task after each step."""
 
 from __future__ import annotations
 
-import threading
-from collections import deque
 from dataclasses import dataclass
 from typing import cast
 
@@ -13,15 +11,14 @@ from torch import Tensor
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
 
-HISTORY_STEPS = 500
-"""Control steps that :class:`History` keeps: 10 s."""
-
 
 @dataclass(frozen=True)
 class Reading:
     """A task after one control step, in the host's memory.
 
     Attributes:
+        time: Simulated time since the session's start [s].
+        world: The followed world.
         qpos: Positions of all worlds, as ``sim.qpos``. Shape: (num_envs, nq).
         commands: Commands of all worlds during the step [m/s, m/s, rad/s]. Shape: (num_envs, 3).
         velocities: Actual v_x, v_y and yaw rates, in the trunks' frames. Shape: (num_envs, 3).
@@ -31,6 +28,8 @@ class Reading:
         resets: Number of worlds whose episode ended: [fallen or diverged, timed out].
     """
 
+    time: float
+    world: int
     qpos: np.ndarray
     commands: np.ndarray
     velocities: np.ndarray
@@ -88,10 +87,11 @@ class TaskReader:
         self._commands.copy_(self._task.commands)
         self._sums.copy_(self._task.episode_sums)
 
-    def read(self, world: int) -> Reading:
+    def read(self, time: float, world: int) -> Reading:
         """Return what the last step did.
 
         Args:
+            time: Simulated time since the session's start [s].
             world: The followed world.
         """
         task = self._task
@@ -110,51 +110,5 @@ class TaskReader:
         flat = torch.cat([part.reshape(-1).float() for part in parts]).cpu().numpy()
         ends = np.cumsum([part.numel() for part in parts])
         arrays = np.split(flat, ends[:-1])
-        return Reading(*(array.reshape(tuple(part.shape)) for array, part in zip(arrays, parts, strict=True)))
-
-
-class History:
-    """The last seconds of one world; may be read from other threads."""
-
-    def __init__(self, steps: int = HISTORY_STEPS) -> None:
-        """Start empty.
-
-        Args:
-            steps: Steps to keep.
-        """
-        self._lock = threading.Lock()
-        self._steps: deque[dict[str, np.ndarray | float]] = deque(maxlen=steps)
-
-    def add(self, reading: Reading, world: int, time: float) -> None:
-        """Append a step.
-
-        Args:
-            reading: The step.
-            world: The followed world.
-            time: Simulated time [s].
-        """
-        step = {
-            "time": time,
-            "commands": reading.commands[world],
-            "velocities": reading.velocities[world],
-            "torques": reading.torques,
-            "torque_parts": reading.torque_parts,
-        }
-        with self._lock:
-            self._steps.append(step)
-
-    def clear(self) -> None:
-        """Forget everything, for another world or task."""
-        with self._lock:
-            self._steps.clear()
-
-    def read(self) -> dict[str, np.ndarray]:
-        """Return the steps, oldest first; an empty dictionary if there are none.
-
-        Returns:
-            "time" [s], shape (steps,); "commands" and "velocities", shape (steps, 3); "torques" [N m], shape
-            (steps, num_dof); "torque_parts" [N m], shape (steps, parts, num_dof).
-        """
-        with self._lock:
-            steps = list(self._steps)
-        return {name: np.array([step[name] for step in steps]) for name in (steps[0] if steps else ())}
+        shaped = [array.reshape(tuple(part.shape)) for array, part in zip(arrays, parts, strict=True)]
+        return Reading(time, world, *shaped)

@@ -9,6 +9,7 @@ import math
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Concatenate, ParamSpec
 
@@ -21,9 +22,11 @@ from legged_torque.utils.options import apply_perturbation
 from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers
 from legged_torque.utils.task_registry import LoadedRun, task_registry
 from legged_torque.viewer.pacing import Pacer
-from legged_torque.viewer.reading import History, TaskReader, WatchedRobot, watched, weighted_terms
+from legged_torque.viewer.reading import Reading, TaskReader, WatchedRobot, watched, weighted_terms
 from legged_torque.viewer.state import AS_LOADED, Command, SessionState
 
+HISTORY_STEPS = 500
+"""Control steps that are kept for plots: 10 s."""
 SCAN_INTERVAL = 1.0
 """Seconds between looks for new checkpoints."""
 IDLE = 0.02
@@ -55,7 +58,7 @@ class Session:
     Attributes:
         requests: Requests that have not been carried out yet.
         state: What is shown.
-        history: The last seconds of the followed world.
+        history: The last steps of the followed world; copy it before iterating in another thread.
         task: The task; only the stepping thread may touch its tensors.
     """
 
@@ -86,7 +89,7 @@ class Session:
         self._stop = threading.Event()
         self._refused: dict[int, float] = {}
         self._next_scan = -math.inf
-        self.history = History()
+        self.history: deque[Reading] = deque(maxlen=HISTORY_STEPS)
         self.state = SessionState()
         self.task = self._make_task(self._cfg)
         self._obs = self.task.get_observations()
@@ -133,15 +136,14 @@ class Session:
         self._reader.before_step()
         self._obs = self.task.step(self._policy(self._obs))[0]
         self.task.total_steps.copy_(self._trained_steps)  # curricula stay where the checkpoint was saved
-        world, simulated = self.state.world, self.state.time + self.task.dt
-        reading = self._reader.read(world)
-        self.history.add(reading, world, simulated)
+        reading = self._reader.read(self.state.time + self.task.dt, self.state.world)
+        self.history.append(reading)
         self._rewards += SMOOTHING * (reading.rewards - self._rewards)
         self._falls += int(reading.resets[0])
         self._show(
             reading=reading,
             rewards=dict(zip(self.task.reward_names, self._rewards.tolist(), strict=True)),
-            time=simulated,
+            time=reading.time,
             real_time=self._pacer.achieved(),
             falls=self._falls,
         )
