@@ -5,7 +5,9 @@ from legged_torque.utils.rendering import choose_offscreen_renderer
 NO_RENDERER = choose_offscreen_renderer()  # before anything imports mujoco
 
 import argparse
+import functools
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 from legged_torque import resource_path
@@ -19,6 +21,7 @@ from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.task_registry import set_seed
+from legged_torque.viewer import native
 from legged_torque.viewer.session import Session
 from legged_torque.viewer.video import TaskRecorder
 
@@ -55,17 +58,13 @@ def main() -> None:
     choose_worlds(args)
     options = options_of(args)
     run = task_registry.load_run(options)
-    watch = import_viewer(args.viewer)
     set_seed(args.seed)
-    if watch is None:
+    if args.viewer == "none":
         roll_out(args, *task_registry.make_loaded(run, options), run.checkpoint)
-        return
-    session = Session(task_registry.get_task_class(args.task), run, resolve_device(args.device))
-    robot = resource_path(run.env_cfg.asset.file)
-    if args.viewer == "web":
-        watch(session, robot, args.task, args.host, args.port)
     else:
-        watch(session, robot)
+        watch = import_viewer(args)  # whatever is missing is reported before anything slow is done
+        session = Session(task_registry.get_task_class(args.task), run, resolve_device(args.device))
+        watch(session, resource_path(run.env_cfg.asset.file))
 
 
 def choose_worlds(args: argparse.Namespace) -> None:
@@ -85,24 +84,20 @@ def choose_worlds(args: argparse.Namespace) -> None:
         raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
 
 
-def import_viewer(name: str):
-    """Return the function that shows a session, or None for no viewer.
+def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
+    """Return the function that shows a session of the robot in an MJCF file.
 
     Raises:
         UserError: If a package or a screen is missing.
     """
-    if name == "web":
-        try:
-            from legged_torque.viewer.web import watch
-        except ImportError as error:
-            raise UserError(f"--viewer web needs the extra: pip install -e .[viewer] ({error})") from None
-        return watch
-    if name == "native":
-        from legged_torque.viewer.native import check_display, watch
-
-        check_display("--viewer web")
-        return watch
-    return None
+    if args.viewer == "native":
+        native.check_display("--viewer web")
+        return native.watch
+    try:
+        from legged_torque.viewer import web
+    except ImportError as error:
+        raise UserError(f"--viewer web needs the extra: pip install -e .[viewer] ({error})") from None
+    return functools.partial(web.watch, title=args.task, host=args.host, port=args.port)
 
 
 def roll_out(args: argparse.Namespace, env: LeggedRobot, runner: OnPolicyRunner, checkpoint: Path) -> None:
