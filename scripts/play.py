@@ -94,10 +94,10 @@ def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
         native.check_display("--viewer web")
         return native.watch
     try:
-        from legged_torque.viewer import web
+        from legged_torque.viewer.web import watch
     except ImportError as error:
         raise UserError(f"--viewer web needs the extra: pip install -e .[viewer] ({error})") from None
-    return functools.partial(web.watch, title=args.task, host=args.host, port=args.port)
+    return functools.partial(watch, title=args.task, host=args.host, port=args.port)
 
 
 def roll_out(args: argparse.Namespace, env: LeggedRobot, runner: OnPolicyRunner, checkpoint: Path) -> None:
