@@ -8,8 +8,8 @@ from pathlib import Path
 
 from legged_torque.deploy.export import export_policy, nominal_cfg
 from legged_torque.envs import task_registry
-from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import run_script
+from legged_torque.utils.args import add_task_args, options_of
+from legged_torque.utils.cli import Parser, run_script
 
 
 def main() -> None:

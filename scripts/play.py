@@ -7,6 +7,7 @@ NO_RENDERER = choose_offscreen_renderer()  # before anything imports mujoco
 import argparse
 import functools
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 from legged_torque import resource_path
@@ -14,21 +15,24 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import measure
 from legged_torque.learning.runner import OnPolicyRunner
-from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import run_script
+from legged_torque.utils.args import add_task_args, options_of
+from legged_torque.utils.cli import Parser, run_script
+from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.task_registry import set_seed
-from legged_torque.viewer.task_recorder import Recorder
+from legged_torque.viewer import native
+from legged_torque.viewer.session import Session
+from legged_torque.viewer.video import TaskRecorder
 
 NUM_ENVS = {"none": 16, "web": 4, "native": 1}
 """Default number of worlds, by viewer."""
 MAX_GRID = 25
-"""Robots of a video at most; in more of them one would see nothing."""
+"""Maximum number of tiles; more would be unreadable."""
 
 
 def main() -> None:
-    """Load a run; roll it out, or let it be watched live."""
+    """Load a run; roll it out or show it live."""
     parser = Parser(__doc__)
     add_task_args(parser)
     parser.set_defaults(seed=1)
@@ -36,14 +40,12 @@ def main() -> None:
         "--steps", type=int, default=500, help="control steps, 50 of them a second; default: %(default)s"
     )
     parser.add_argument("--video", type=Path, help="mp4 to write; default: in the run's folder")
-    parser.add_argument(
-        "--grid", type=int, help="draw that many robots, those of the first worlds: 4, 9, 16 or 25; default: one"
-    )
+    parser.add_argument("--grid", type=int, help="number of robots in the video: 1, 4, 9, 16 or 25; default: 1")
     parser.add_argument(
         "--viewer",
         choices=NUM_ENVS,
         default="none",
-        help="none: roll out, print how it walks, save a video; web: a page to watch and steer it; native: MuJoCo's "
+        help="none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's "
         "window; default: %(default)s",
     )
     parser.add_argument("--host", default="127.0.0.1", help="address of the page; default: %(default)s, this machine")
@@ -56,25 +58,17 @@ def main() -> None:
     choose_worlds(args)
     options = options_of(args)
     run = task_registry.load_run(options)
-    watch = import_viewer(args.viewer)
     set_seed(args.seed)
-    env, runner = task_registry.make_loaded(run, options)
-    if watch is None:
-        roll_out(args, env, runner, run.checkpoint)
-        return
-    from legged_torque.viewer.session import Session
-
-    make_task = functools.partial(type(env), device=env.device)
-    session = Session(make_task, run.env_cfg, runner, run.folder, run.iterations)
-    robot = resource_path(run.env_cfg.asset.file)
-    if args.viewer == "web":
-        watch(session, robot, args.task, args.host, args.port)
+    if args.viewer == "none":
+        roll_out(args, *task_registry.make_loaded(run, options), run.checkpoint)
     else:
-        watch(session, robot)
+        watch = import_viewer(args)  # whatever is missing is reported before anything slow is done
+        session = Session(task_registry.get_task_class(args.task), run, resolve_device(args.device))
+        watch(session, resource_path(run.env_cfg.asset.file))
 
 
 def choose_worlds(args: argparse.Namespace) -> None:
-    """Fill in the number of worlds and how many of them are drawn.
+    """Choose how many worlds there are and how many of them are drawn.
 
     Raises:
         UserError: If that many cannot be drawn.
@@ -90,42 +84,31 @@ def choose_worlds(args: argparse.Namespace) -> None:
         raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
 
 
-def import_viewer(name: str):
-    """Return the function that shows a session, or None for no viewer; before anything slow is done.
+def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
+    """Return the function that shows a session of the robot in an MJCF file.
 
     Raises:
-        UserError: If what it needs is not there.
+        UserError: If a package or a screen is missing.
     """
-    if name == "web":
-        try:
-            from legged_torque.viewer.web import watch
-        except ImportError as error:
-            raise UserError(f"--viewer web needs the extra: pip install -e .[viewer] ({error})") from None
-        return watch
-    if name == "native":
-        from legged_torque.viewer.native import check_display, watch
-
-        check_display()
-        return watch
-    return None
+    if args.viewer == "native":
+        native.check_display("--viewer web")
+        return native.watch
+    try:
+        from legged_torque.viewer.web import watch
+    except ImportError as error:
+        raise UserError(f"--viewer web needs the extra: pip install -e .[viewer] ({error})") from None
+    return functools.partial(watch, title=args.task, host=args.host, port=args.port)
 
 
 def roll_out(args: argparse.Namespace, env: LeggedRobot, runner: OnPolicyRunner, checkpoint: Path) -> None:
-    """Roll out mean actions, print how it walks, save a video."""
-    recorder = Recorder(env, args.grid)
+    """Roll out mean actions, print the metrics, save a video."""
+    recorder = TaskRecorder(env, args.grid)
     policy = runner.get_inference_policy(env.device)
     metrics = measure(env, policy, args.steps, lambda commands: recorder.add_step())
     print(f"{checkpoint}, after {int(runner.logger.tot_timesteps):,} steps of training:")
     for name, value in metrics.means().items():
         print(f"  {name:<18} {value:8.4f} {UNITS[name]}")
-    video = args.video or checkpoint.parent / "videos" / f"{checkpoint.stem}.mp4"
-    try:
-        if NO_RENDERER:
-            raise UserError(NO_RENDERER)
-        recorder.save(video)
-        print(f"video: {video}")
-    except UserError as error:
-        print(f"no video: {error}")
+    recorder.save(args.video or checkpoint.parent / "videos" / f"{checkpoint.stem}.mp4", NO_RENDERER)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
 """Draw what a task draws at random: ``python scripts/plot_randomization.py --out distributions.png``.
 
-Builds 2000 worlds of a1_position with --perturbation low, unless told otherwise, and reads their numbers where physics
-and controller read them.
+Builds 2000 worlds of a1_position with --perturbation low, unless told otherwise, and reads the numbers that physics and
+controller use. Every random parameter of the task has a panel.
 """
 
+import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,35 +18,52 @@ import numpy as np
 import torch
 
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.domain_rand import TRUNK
+from legged_torque.envs.base import domain_rand
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import run_script
+from legged_torque.sim.randomization import Parameter, per_column
+from legged_torque.utils.args import add_build_args, options_of
+from legged_torque.utils.cli import Parser, run_script
 from legged_torque.utils.plotting import load_pyplot, save_figure
 from legged_torque.utils.task_registry import set_seed
 
-GROUPS = ("initial state", "robot", "ground", "controller", "events", "sensors")
-COLORS = dict(zip(GROUPS, ("#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#F0E442", "#999999"), strict=True))
-OWN = "#D55E00"  # all are told apart by colour-blind eyes
+GROUPS = ("initial state", "robot", "ground", "controller", "other", "events", "sensors")
+COLORS = dict(zip(GROUPS, ("#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#0072B2", "#F0E442", "#999999"), strict=True))
+OWN = "#D55E00"  # all can be told apart by colour-blind people
 COLUMNS, BINS = 6, 20
 STEPS = 1000  # control steps over which events are watched
+UNITS = {
+    "rad": ("roll", "pitch", "yaw", "joint_offset", "action_scale"),
+    "rad/s": ("init_ang_vel", "init_dof_vel"),
+    "m": ("trunk_com", "foot_radius", "foot_offset"),
+    "m/s": ("init_lin_vel",),
+    "m/s²": ("gravity",),
+    "kg": ("trunk_mass",),
+    "kg m²": ("trunk_inertia", "dof_armature"),
+    "N m": ("torque_scale", "dof_frictionloss"),
+    "N m/rad": ("p_gains", "dof_stiffness"),
+    "N m s/rad": ("d_gains", "dof_damping"),
+    "1/s": ("contact_damping",),
+    "1/s²": ("contact_stiffness",),
+}
+UNIT_OF = {name: f" [{unit}]" for unit, names in UNITS.items() for name in names}
 
 
 @dataclass
 class Panel:
     """Numbers that were drawn, and how they should be distributed: U(offset) x U(scale)."""
 
-    group: str
+    group: str  # one of GROUPS
     title: str  # with its unit
     values: torch.Tensor  # a row per world
-    offset: tuple[float, float]  # range, with what the offset is added to
-    scale: tuple[float, float] = (1.0, 1.0)
-    own: np.ndarray | float = 0.0  # without draws: one number, or as many as a world has
+    offset: Sequence[float]  # range, including what the offset is added to
+    scale: Sequence[float] = (1.0, 1.0)  # range
+    own: Sequence[float] = (0.0,)  # values without draws, one per column
+    may_keep: bool = False  # whether some worlds keep their own values
     bins: int = BINS
-    geometric: float = 0.0  # probability of a geometric distribution, in place of the uniform ones
+    geometric: float = 0.0  # probability of a geometric distribution in place of the uniform ones
 
     def __post_init__(self) -> None:
-        """Copy the numbers, which the task goes on to change."""
+        """Copy the numbers, because the task changes them later."""
         self.values = self.values.unsqueeze(-1).flatten(1).cpu().double().numpy().copy()
 
     def limits(self) -> tuple[float, float]:
@@ -52,7 +71,7 @@ class Panel:
         return np.outer(self.offset, self.scale).min(), np.outer(self.offset, self.scale).max()
 
     def density(self, at: np.ndarray) -> np.ndarray:
-        """Return the density of what should be drawn."""
+        """Return the expected density."""
         if self.geometric:
             return self.geometric * (1.0 - self.geometric) ** (at - 1.0)
         if self.offset[0] == self.offset[1]:
@@ -63,7 +82,7 @@ class Panel:
 
 
 def main() -> None:
-    """Build a task, read what it has drawn, and draw one panel per parameter."""
+    """Build a task, read what it has drawn, and draw a panel per parameter."""
     parser = Parser(__doc__)
     add_build_args(parser)
     parser.set_defaults(task="a1_position", perturbation="low", num_envs=2000)
@@ -72,134 +91,103 @@ def main() -> None:
     options = options_of(args)
     env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     set_seed(train_cfg.seed)
+    fixed_cfg = copy.deepcopy(env_cfg)
+    fixed_cfg.env.num_envs, fixed_cfg.domain_rand.randomize_parameters = 1, False
+    fixed, _ = task_registry.make_env(options.task, options, fixed_cfg)
     task, _ = task_registry.make_env(options.task, options, env_cfg)
-    panels = [panel for read in (initial_state, robot, ground, controller, sensors, events) for panel in read(task)]
-    draw(sorted(panels, key=lambda panel: GROUPS.index(panel.group)), args.out)  # events were read last
+    panels = [*parameters(task, fixed), *sensors(task), *events(task)]
+    draw(sorted(panels, key=lambda panel: GROUPS.index(panel.group)), args.out)  # events change the task, so come last
 
 
-def drawn(
-    task: LeggedRobot, group: str, title: str, values: torch.Tensor, own: np.ndarray | float,
-    limits: str = "", offset: str = "", scale: str = "", weight: float = 1.0,
-) -> Panel:  # fmt: skip
-    """Return the panel of (limits or own + weight x offset) x scale, three settings of which none needs be drawn."""
-    rand = task.cfg.domain_rand
+def parameters(task: LeggedRobot, fixed: LeggedRobot) -> list[Panel]:
+    """Return the panels of initial state, robot, ground and controller.
 
-    def setting(name: str, neutral: float) -> np.ndarray:
-        fixed = not name or name in rand.keep_fixed or not rand.randomize_parameters
-        return np.array([neutral, neutral] if fixed else getattr(rand, name))
-
-    first = setting(limits, np.ravel(own)[0]) if limits else own + weight * setting(offset, 0.0)
-    return Panel(group, title, values, tuple(first), tuple(setting(scale, 1.0)), own)
-
-
-def initial_state(task: LeggedRobot) -> list[Panel]:
-    """Return the panels of the state at the start of an episode."""
-    rand, panel = task.cfg.domain_rand, partial(Panel, "initial state")
-    w, x, y, z = task.base_quat.T
-    roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    yaw = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    low, high = rand.action_delay
-    bars = np.add([low, high], [-0.5, 0.5] if high > low else 0.0)
-    unit = rand.action_delay_unit.replace("_", " ")
-    return [
-        panel("roll [rad]", roll, rand.init_roll),
-        panel("pitch [rad]", torch.asin(2.0 * (w * y - z * x)), rand.init_pitch),
-        panel("yaw [rad]", yaw, rand.init_yaw),
-        panel("joint angle / nominal", task.dof_pos / task.default_dof_pos, rand.init_dof_pos_scale, own=1.0),
-        panel("joint velocity [rad/s]", task.dof_vel, rand.init_dof_vel),
-        panel("linear velocity [m/s]", task.sim.qvel[:, :3], rand.init_lin_vel),
-        panel("angular velocity [rad/s]", task.base_ang_vel, rand.init_ang_vel),
-        panel(f"action delay [{unit}]", task.action_delay.drawn.floor(), bars, bins=high - low + 1),
-    ]
+    Args:
+        task: The task.
+        fixed: The same task without random parameters.
+    """
+    panels = [action_delay(task)]
+    for drawn in domain_rand.initial_state(task):
+        if drawn.name not in ("base_pos", "action_delay"):  # never random, and a whole number
+            panels.append(panel_of(drawn, "initial state", per_column(drawn.base, len(drawn.columns))))
+    readers = (domain_rand.robot_parameters, domain_rand.ground_parameters, domain_rand.control_parameters)
+    group_of = {drawn.name: group for group, read in zip(GROUPS[1:], readers, strict=False) for drawn in read(task)}
+    for drawn, own in zip(task.random_parameters(), fixed.random_parameters(), strict=True):
+        if not task.cfg.domain_rand.randomize_parameters:
+            drawn = Parameter(own.name, own.field, own.columns, shared=own.shared)
+        panels.append(panel_of(drawn, group_of.get(own.name, "other"), own.field[0, list(own.columns)].tolist()))
+    return panels
 
 
-def robot(task: LeggedRobot) -> list[Panel]:
-    """Return the panels of the robot's body and joints."""
-    model, field, panel = task.sim.mj_model, task.sim.field, partial(drawn, task, "robot")
-    feet = [model.geom(name).id for name in task.foot_names]
-    mass, inertia = model.body_mass[TRUNK], model.body_inertia[TRUNK, 0]
-    trunk = {"offset": "trunk_mass_offset", "scale": "trunk_mass_scale"}
-    com = field("body_ipos")[:, TRUNK].cpu() - torch.as_tensor(model.body_ipos[TRUNK])
-    places = field("geom_pos")[:, feet].cpu() - torch.as_tensor(model.geom_pos[feet])
-
-    def joints(title: str, name: str, first: int = 6) -> Panel:
-        return panel(title, field(name)[:, first:], getattr(model, name)[first:], limits=name.replace("jnt", "dof"))
-
-    return [
-        panel("trunk mass [kg]", field("body_mass")[:, TRUNK], mass, **trunk),
-        panel("trunk inertia, x [kg m²]", field("body_inertia")[:, TRUNK, 0], inertia, **trunk, weight=inertia / mass),
-        panel("trunk COM offset [m]", com, 0.0, offset="trunk_com_offset"),
-        panel("foot radius [m]", field("geom_size")[:, feet[0], 0], model.geom_size[feet[0], 0], limits="foot_radius"),
-        panel("foot offset [m]", places, 0.0, offset="foot_offset"),
-        joints("joint damping [N m s/rad]", "dof_damping"),
-        joints("joint armature [kg m²]", "dof_armature"),
-        joints("joint stiffness [N m/rad]", "jnt_stiffness", first=1),
-        joints("joint friction loss [N m]", "dof_frictionloss"),
-    ]
+def action_delay(task: LeggedRobot) -> Panel:
+    """Return the panel of the delay, which is a whole number."""
+    low, high = task.cfg.domain_rand.action_delay
+    ends = (low - 0.5, high + 0.5) if high > low else (low, low)
+    title = f"action delay [{task.cfg.domain_rand.action_delay_unit.replace('_', ' ')}]"
+    return Panel("initial state", title, task.action_delay.drawn.floor(), ends, bins=high - low + 1)
 
 
-def ground(task: LeggedRobot) -> list[Panel]:
-    """Return the panels of contacts and gravity, read at a foot."""
-    model, field, panel = task.sim.mj_model, task.sim.field, partial(drawn, task, "ground")
-    foot = model.geom(task.foot_names[0]).id
-    friction, (stiffness, damping) = model.geom_friction[foot, 0], -model.geom_solref[foot]
-    solref = -field("geom_solref")[:, foot]
-    return [
-        panel("ground friction", field("geom_friction")[:, foot, 0], friction, limits="ground_friction"),
-        panel("contact stiffness [1/s²]", solref[:, 0], stiffness, limits="contact_stiffness"),
-        panel("contact damping [1/s]", solref[:, 1], damping, limits="contact_damping"),
-        panel("gravity [m/s²]", -field("gravity")[:, 2], -model.opt.gravity[2], limits="gravity"),
-    ]
+def panel_of(drawn: Parameter, group: str, own: list[float]) -> Panel:
+    """Return the panel of a parameter: of its first column if all columns share a draw.
 
+    Numbers that replace the own values are shown over their weight. If columns have different own values, the
+    differences to these are shown, or the ratios if a factor is drawn.
 
-def controller(task: LeggedRobot) -> list[Panel]:
-    """Return the panels of motors and PD controller."""
-    control, panel = task.cfg.control, partial(drawn, task, "controller")
-    action, torque, change = control.action_scale, control.torque_scale, "action_scale_offset"
-    kp, kd = ({"offset": f"{name}_offset", "scale": f"{name}_scale"} for name in ("stiffness", "damping"))
-    return [
-        panel("motor strength", task.motor_strength[:, 0], 1.0, scale="motor_strength"),
-        panel("joint offset [rad]", task.joint_offset, 0.0, offset="joint_offset"),
-        panel("action scale [rad]", task.action_scale, action, offset=change),
-        panel("torque scale [N m]", task.torque_scale, torque, offset=change, weight=torque / action),
-        panel("Kp [N m/rad]", task.p_gains[:, 0], control.stiffness, **kp),
-        panel("Kd [N m s/rad]", task.d_gains[:, 0], control.damping, **kd),
-    ]
+    Args:
+        drawn: The parameter.
+        group: One of :data:`GROUPS`.
+        own: Values without draws, per column.
+    """
+    columns = list(drawn.columns)[: 1 if drawn.shared else None]
+    own = np.array(own[: len(columns)])
+    base = own if drawn.base is None else np.array(per_column(drawn.base, len(drawn.columns)))[: len(columns)]
+    weight = per_column(drawn.weight, len(drawn.columns))[0]
+    title, unit, shift, factor = drawn.name.replace("_", " "), UNIT_OF.get(drawn.name, ""), 0.0 * own, 1.0
+    if not base.any():
+        factor = weight
+    elif np.ptp(base) > 0.0 and drawn.scale == (1.0, 1.0):
+        title, shift = f"{title} - own", base
+    elif np.ptp(base) > 0.0:
+        title, unit, factor = f"{title} / own", "", base
+
+    def shown(values: np.ndarray) -> np.ndarray:
+        return (values - shift) / factor
+
+    values = torch.as_tensor(shown(drawn.field[:, columns].cpu().numpy()))
+    offset = [shown(base + weight * end)[0] for end in drawn.offset]
+    return Panel(group, title + unit, values, offset, drawn.scale, shown(own), drawn.may_keep)
 
 
 def sensors(task: LeggedRobot) -> list[Panel]:
-    """Return the panels of the policy's observations minus the critic's, in the units of the sensors."""
-    noise, scales, obs = task.cfg.noise, task.cfg.normalization.obs_scales, task.get_observations()
-
-    def panel(title: str, name: str, start: int, end: int) -> Panel:
-        error = (obs["policy"][:, start:end] - obs["critic"][:, start:end]) / getattr(scales, name, 1.0)
-        largest = getattr(noise.noise_scales, name) * noise.add_noise
-        return Panel("sensors", title, error, (-largest, largest))
-
-    n = task.num_dof
-    return [
-        panel("gravity vector error", "gravity", 0, 3),
-        panel("angular vel. error [rad/s]", "ang_vel", 3, 6),
-        panel("joint angle error [rad]", "dof_pos", 9, 9 + n),
-        panel("joint vel. error [rad/s]", "dof_vel", 9 + n, 9 + 2 * n),
-    ]
+    """Return the panels of the errors of noisy observations, in the units of the sensors."""
+    observations, groups = task.observations, task.get_observations()
+    panels = []
+    for term in observations.policy_terms():
+        if term.noise:
+            newest = observations.policy_columns(term.name)[: observations.sizes[term.name]]
+            scale = torch.as_tensor(term.scale, device=task.device)
+            error = (groups["policy"][:, newest] - groups["critic"][:, newest]) / scale
+            largest = term.noise * task.cfg.noise.add_noise
+            unit = f" [{term.unit}]" if term.unit else ""
+            panels.append(Panel("sensors", f"{term.name.replace('_', ' ')} error{unit}", error, (-largest, largest)))
+    return panels
 
 
 def events(task: LeggedRobot) -> list[Panel]:
-    """Return the panels of pushes and redraws, in steps without physics whose trunks are at rest."""
+    """Return the panels of pushes and redraws, from steps without physics in which trunks start at rest."""
     rand, velocity, numbers = task.cfg.domain_rand, task.sim.qvel[:, :3], task.randomization.values
     start, first, pushes = numbers.clone(), torch.full((task.num_envs,), torch.inf, device=task.device), []
-    task.reset_buf.fill_(False)
+    nowhere = torch.zeros_like(task.reset_buf)
     for step in range(1, STEPS + 1):
         velocity.zero_()
-        task._reset_worlds()
+        task.events.happen(nowhere)
         first.clamp_(max=torch.where((numbers != start).any(dim=1), step, torch.inf))
         pushes.append(velocity[(velocity != 0.0).any(dim=1)])
     chance = rand.resampling_probability * rand.randomize_parameters
     until, push = np.multiply([1.0, STEPS], chance > 0.0), np.multiply(rand.push_velocity, rand.push_robots)
     return [
         Panel("events", "push, per axis [m/s]", torch.cat(pushes), push),
-        Panel("events", "steps to the next redraw", first, until, own=np.zeros(0), geometric=chance),
+        Panel("events", "steps to the next redraw", first, until, own=(), geometric=chance),
     ]
 
 
@@ -212,14 +200,16 @@ def draw(panels: list[Panel], file: Path) -> None:
     for axis, panel in zip(axes.flat, panels + [None] * (axes.size - len(panels)), strict=True):
         draw_panel(axis, panel) if panel else axis.set_axis_off()
     figure.get_layout_engine().set(w_pad=0.09)
-    handles = [pyplot.Rectangle((0, 0), 1, 1, color=color) for color in COLORS.values()]
+    groups = list(dict.fromkeys(panel.group for panel in panels))
+    handles = [pyplot.Rectangle((0, 0), 1, 1, color=COLORS[group]) for group in groups]
     handles += [pyplot.Line2D([], [], color="black"), pyplot.Line2D([], [], color=OWN, linestyle="--")]
-    figure.legend(handles, [*GROUPS, "should be", "without draws"], loc="outside upper center", ncols=8, frameon=False)
+    labels = [*groups, "expected", "without draws"]
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
     save_figure(figure, file)
 
 
 def draw_panel(axis, panel: Panel) -> None:
-    """Draw a histogram without the worlds that keep the robot's own numbers, the ideal density, and the own value."""
+    """Draw the expected density, the own values, and a histogram of the worlds that do not keep these."""
     axis.set(title=panel.title, yticks=[])
     axis.spines[["left", "right", "top"]].set_visible(False)
     for own in np.unique(panel.own):
@@ -230,7 +220,7 @@ def draw_panel(axis, panel: Panel) -> None:
         label(0.5, "not drawn")
         axis.set(xticks=[low], xlim=(low - 1.0, low + 1.0))
         return
-    kept = (panel.values == np.float32(panel.own)).all(axis=1) & (np.size(panel.own) > 1)
+    kept = (panel.values == np.float32(panel.own)).all(axis=1) & panel.may_keep
     if kept.any():
         label(0.88, f"{kept.mean():.0%} keep their own")
     bars, edges = np.histogram(panel.values[~kept], panel.bins, (low, high))

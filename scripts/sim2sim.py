@@ -1,4 +1,4 @@
-"""Let an exported policy walk in plain MuJoCo: ``python scripts/sim2sim.py logs/<experiment>/<run>/exported_<n>``.
+"""Run an exported policy in plain MuJoCo: ``python scripts/sim2sim.py logs/<experiment>/<run>/exported_<n>``.
 
 Needs neither torch nor Warp.
 """
@@ -13,9 +13,6 @@ import argparse
 import contextlib
 import json
 import math
-import os
-import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import mujoco
@@ -23,25 +20,18 @@ import numpy as np
 
 from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
-from legged_torque.deploy.robot import Robot
+from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Events, Simulation
-from legged_torque.utils.cli import prepare_file, run_script
+from legged_torque.utils.cli import Parser, prepare_file, run_script
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS, Estimate, estimates, ratios
-from legged_torque.viewer.video import Recorder
-
-
-class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line; that of ``legged_torque.utils.args`` needs torch."""
-
-    def error(self, message: str) -> None:
-        """Report a mistake in the arguments."""
-        raise UserError(message)
+from legged_torque.viewer.native import simulation_window
+from legged_torque.viewer.video import SimulationRecorder
 
 
 def parse_args() -> argparse.Namespace:
     """Parse and check the command line."""
-    parser = Parser(description=__doc__, allow_abbrev=False)
+    parser = Parser(__doc__)
     parser.add_argument("policy", type=Path, help="policy.yaml, policy.onnx, or the folder of both")
     parser.add_argument("--xml", type=Path, help="MJCF of the robot; default: that of the training")
     parser.add_argument("--steps", type=int, default=2000, help="control steps of each robot; default: %(default)s")
@@ -56,11 +46,11 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--push_velocity", type=float, default=0.0, help="largest velocity of a push per axis [m/s]; default: none"
     )
-    parser.add_argument("--push_probability", type=float, help="of a push, per control step; default: 0.002")
+    parser.add_argument("--push_probability", type=float, help="probability of a push per control step; default: 0.002")
     parser.add_argument("--seed", type=int, default=1, help="random seed; default: %(default)s")
-    parser.add_argument("--video", type=Path, help="mp4 of the first robot to write")
-    parser.add_argument("--viewer", action="store_true", help="watch it in real time in MuJoCo's viewer")
-    parser.add_argument("--json", type=Path, help="file to write")
+    parser.add_argument("--video", type=Path, help="mp4 of the first robot")
+    parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
+    parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
     args = parser.parse_args()
     for name in ("steps", "robots"):
         if getattr(args, name) < 1:
@@ -81,18 +71,18 @@ def parse_args() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Load a policy and a robot, let it walk, print the metrics, write JSON and video if asked to."""
+    """Load a policy and a robot, simulate, print the metrics, and write JSON and video if asked to."""
     args = parse_args()
     policy = Policy(args.policy)
     xml = args.xml or resource_path(policy.description["robot"]["file"])
-    robot = Robot(xml, policy.description)
+    robot = MujocoRobot(xml, policy.description)
     events = Events(args.command, args.push_velocity, args.push_probability)
     if args.json:
         prepare_file(args.json)
     simulation = Simulation(policy, robot, events)
-    recorder = Recorder(simulation) if args.video else None
+    recorder = SimulationRecorder(simulation) if args.video else None
     sums = []
-    with viewer(simulation) if args.viewer else contextlib.nullcontext(lambda: None) as show:
+    with simulation_window(simulation) if args.viewer else contextlib.nullcontext(lambda: None) as show:
         print_heading(policy, robot, xml)
         for number in range(args.robots):
             record = recorder.add_step if recorder and number == 0 else lambda: None
@@ -105,19 +95,19 @@ def main() -> None:
     if args.json:
         write_json(args, policy, robot, metrics)
     if recorder:
-        save_video(recorder, args.video)
+        recorder.save(args.video, NO_RENDERER)
 
 
-def print_heading(policy: Policy, robot: Robot, xml: Path) -> None:
-    """Print what is simulated, and where the MJCF differs from what the policy is for."""
+def print_heading(policy: Policy, robot: MujocoRobot, xml: Path) -> None:
+    """Print what is simulated, and how the MJCF differs from the policy's description."""
     training = policy.description["training"]
     print(f"{policy.description['task']}, {training['checkpoint']} of {training['run']}, in MuJoCo with '{xml}':")
     for note in robot.notes:
         print(f"  note: {note}")
 
 
-def write_json(args: argparse.Namespace, policy: Policy, robot: Robot, metrics: dict[str, Estimate]) -> None:
-    """Write what was run and what came out; null stands for what was not measured."""
+def write_json(args: argparse.Namespace, policy: Policy, robot: MujocoRobot, metrics: dict[str, Estimate]) -> None:
+    """Write arguments and results; null stands for what was not measured."""
     result = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
     result["task"], result["training"] = policy.description["task"], policy.description["training"]
     result["notes"], result["versions"] = robot.notes, {"mujoco": mujoco.__version__, "numpy": np.__version__}
@@ -126,44 +116,6 @@ def write_json(args: argparse.Namespace, policy: Policy, robot: Robot, metrics: 
         for name, value in metrics.items()
     }
     args.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-
-
-def save_video(recorder: Recorder, file: Path) -> None:
-    """Draw and write the video, or say why there is none."""
-    try:
-        if NO_RENDERER:
-            raise UserError(NO_RENDERER)
-        recorder.save(file)
-        print(f"video: {file}")
-    except UserError as error:
-        print(f"no video: {error}")
-
-
-@contextlib.contextmanager
-def viewer(simulation: Simulation) -> Iterator[Callable[[], None]]:
-    """Open MuJoCo's viewer; what is returned shows the state after a control step, in real time."""
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise UserError("--viewer needs a screen; --video writes a film without one")
-    try:
-        import mujoco.viewer
-
-        window = mujoco.viewer.launch_passive(simulation.robot.model, simulation.robot.data)
-    except Exception as error:  # whatever the window system raises
-        raise UserError(f"the viewer does not start: {' '.join(str(error).split())}") from None
-    control_step = 1.0 / simulation.policy.description["timing"]["control_frequency"]
-    due = time.perf_counter()
-
-    def show() -> None:
-        nonlocal due
-        if not window.is_running():
-            raise KeyboardInterrupt
-        window.sync()
-        now = time.perf_counter()
-        due = max(due + control_step, now)
-        time.sleep(due - now)
-
-    with window:
-        yield show
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Export: what a robot computes from the files is what the task computes, and what does not fit is refused."""
 
 import copy
+import dataclasses
 import re
 import shutil
 import sys
@@ -13,7 +14,8 @@ from settings import TASKS, error_of
 from test_scripts import SMALL, assert_told_in_one_line, run_here
 
 from legged_torque.deploy import description as description_module
-from legged_torque.envs import task_registry
+from legged_torque.envs import ObservationTerm, task_registry
+from legged_torque.envs.base.actions import ActionTerm
 
 for package in ("onnx", "onnxruntime", "jsonschema"):
     pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
@@ -264,14 +266,44 @@ def test_other_tasks_are_refused(make_task, exported, tmp_path, monkeypatch):
     folder = shutil.copytree(exported, tmp_path / "out")
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     robot = task_registry.get_task_class("a1_position")
-    for method, message in {"_compute_torques": "torques", "_with_history": "observations"}.items():
+    own_torques, own_terms = robot._compute_torques, robot.observation_terms
+
+    def shifted_terms(task):
+        first, *others = own_terms(task)
+        return [dataclasses.replace(first, value=lambda: task.projected_gravity + 0.1), *others]
+
+    changes = {
+        "torques": ("_compute_torques", lambda task, actions: 1.1 * own_torques(task, actions)),
+        "observations": ("observation_terms", shifted_terms),
+    }
+    for message, change in changes.items():
         with monkeypatch.context() as patch:
-            own = getattr(robot, method)
-            patch.setattr(robot, method, lambda self, values, own=own: 1.1 * own(self, values))
+            patch.setattr(robot, *change)
             error = error_of(export_random, make_task, "a1_position", folder)
         assert re.match(f"the {message} of LeggedRobot are not what policy.yaml can describe: they differ by", error)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     assert list(tmp_path.iterdir()) == [folder]
+
+
+def test_unknown_terms_are_refused(make_task, tmp_path, monkeypatch):
+    """A term that a robot could not compute is refused by name with those that it could, and nothing is written."""
+    robot = task_registry.get_task_class("a1_position")
+    own_terms = robot.observation_terms
+    height = ObservationTerm("height_scan", lambda: torch.zeros(3, 7), None)
+    changes = {
+        "observation term 'height_scan'; it has projected_gravity, angular_velocity, command, joint_position, "
+        "joint_velocity, last_action": ("observation_terms", lambda task: [*own_terms(task), height]),
+        "action term 'impedance'; it has position_residual, torque": (
+            "action_terms",
+            lambda task: [ActionTerm("impedance", task.action_scale, "rad", "")],
+        ),
+    }
+    for message, change in changes.items():
+        with monkeypatch.context() as patch:
+            patch.setattr(robot, *change)
+            error = error_of(export_random, make_task, "a1_position", tmp_path / "out")
+        assert error == f"policy.yaml has no {message}"
+    assert not list(tmp_path.iterdir())
 
 
 def test_replaces_an_export(make_task, exported, tmp_path):

@@ -23,7 +23,7 @@ for package in ("onnx", "onnxruntime", "jsonschema"):
 from test_export import export_random
 
 from legged_torque.deploy.policy import Policy
-from legged_torque.deploy.robot import Robot
+from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Events, Simulation, quaternion
 from legged_torque.viewer import video
 
@@ -66,7 +66,7 @@ def permute(root):
 
 
 def random_state(seed, height=0.3):
-    """Arguments of :meth:`Robot.reset` in the policy's order of joints."""
+    """Arguments of :meth:`MujocoRobot.reset` in the policy's order of joints."""
     rng = np.random.default_rng(seed)
     q = np.tile([0.0, 0.9, -1.8], 4) + rng.uniform(-0.2, 0.2, 12)
     velocities = tuple(rng.uniform(-1, 1, size) for size in (3, 3, 12))
@@ -79,7 +79,7 @@ def random_state(seed, height=0.3):
 def test_imports_neither_torch_nor_warp():
     """What runs on a robot needs none of the packages of training."""
     modules = [*(f"deploy.{name}" for name in ("description", "policy", "robot", "simulation"))]
-    modules += ["utils.metrics", "viewer.video"]
+    modules += ["utils.cli", "utils.metrics", "viewer.native", "viewer.video"]
     code = "import sys\n" + "".join(f"import legged_torque.{name}\n" for name in modules)
     code += "print([name for name in sys.modules if name.split('.')[0] in ('torch', 'warp', 'mujoco_warp', 'rsl_rl')"
     code += " or name.removeprefix('legged_torque.').split('.')[0] in ('envs', 'checks', 'learning', 'sim')])"
@@ -92,7 +92,7 @@ def test_imports_neither_torch_nor_warp():
 
 def test_permuted_joints(policy, tmp_path):
     """With joints and motors in another order in the MJCF, observations, torques and motion are the same."""
-    robots = [Robot(XML, policy.description), Robot(changed_xml(tmp_path, permute), policy.description)]
+    robots = [MujocoRobot(XML, policy.description), MujocoRobot(changed_xml(tmp_path, permute), policy.description)]
     order = [robots[1].model.joint(i).name for i in range(1, 13)]
     assert order[0] == "RL_hip_joint" and order != policy.joint_order
     seen, torques, moved = [], [], []
@@ -109,7 +109,7 @@ def test_permuted_joints(policy, tmp_path):
             assert robot.data.joint(name).qfrc_actuator[0] == pytest.approx(torque)
             assert robot.data.actuator(name.removesuffix("_joint")).force[0] == pytest.approx(torque)
         np.testing.assert_allclose(robot.applied_torques(), torques[-1], rtol=1e-6)
-        moved.append(np.concatenate([robot.joint_positions(), robot.position(), robot.quat()]))
+        moved.append(np.concatenate([robot.joint_positions(), robot.position, robot.quat]))
     for pair in (seen, torques, moved):
         np.testing.assert_allclose(pair[0], pair[1], atol=1e-6)
     assert np.unique(np.abs(torques[0])).size == 12
@@ -120,7 +120,7 @@ def test_physics_is_the_task_s(make_task, policy):
     converged = {"sim.solver_iterations": 100, "sim.ls_iterations": 50}
     task = make_task("a1_torque_multihead", num_envs=3, **converged)
     task.load_state_dict({"total_steps": torch.tensor(20_000_000), "num_diverged": torch.tensor(0)})
-    robots = [Robot(XML, policy.description) for _ in range(task.num_envs)]
+    robots = [MujocoRobot(XML, policy.description) for _ in range(task.num_envs)]
     for i, robot in enumerate(robots):
         q, v = task.sim.qpos[i].numpy(), task.sim.qvel[i].numpy()
         robot.reset(q[:3], q[3:7], q[7:], (v[:3], v[3:6], v[6:]))
@@ -175,13 +175,13 @@ def test_differences_are_told(policy, tmp_path):
         trunk.set("name", "base")
         del trunk.find("geom[@name='trunk']").attrib["name"]
 
-    robot = Robot(changed_xml(tmp_path, edit), policy.description)
+    robot = MujocoRobot(changed_xml(tmp_path, edit), policy.description)
     assert robot.notes == [
         "the MJCF has no floor: a plane at height 0 is added",
         "time step: the MJCF has 0.002 s, policy.yaml's 0.005 s is used",
         "motor limits: the MJCF has -20 to 25 N m, policy.yaml -33.5 to 33.5 N m; the tighter ones act "
         "(FR_thigh_joint)",
-        "no geom is called like trunk: those of 'base' count as it",
+        "no geom's name contains trunk: those of 'base' end an episode",
     ]
     assert robot.model.opt.timestep == 0.005
     robot.reset(*random_state(1, height=0.04))
@@ -191,16 +191,16 @@ def test_differences_are_told(policy, tmp_path):
 
 def test_standing_robot(policy):
     """A robot that stands still weighs on the ground with its weight, and has not fallen."""
-    robot = Robot(XML, policy.description)
+    robot = MujocoRobot(XML, policy.description)
     robot.reset([0.0, 0.0, 0.31], quaternion(0, 0, 1.0), policy.nominal_pose, (np.zeros(3), np.zeros(3), np.zeros(12)))
     for _ in range(400):
         robot.step(60 * (policy.nominal_pose - robot.joint_positions()) - 2 * robot.joint_velocities())
         assert not robot.has_fallen()
     assert robot.weight == pytest.approx(122.2, abs=0.1)
     assert robot.contact_force() == pytest.approx(robot.weight, rel=0.1)
-    assert np.linalg.norm(robot.trunk_velocity()) < 0.02
-    robot.velocity()[:] = [math.cos(1.0), math.sin(1.0), 0.0]
-    np.testing.assert_allclose(robot.trunk_velocity()[:2], [1.0, 0.0], atol=0.1)
+    assert np.linalg.norm(robot.velocity) < 0.02
+    robot.velocity[:] = [math.cos(1.0), math.sin(1.0), 0.0]
+    np.testing.assert_allclose(robot.planar_velocity()[:2], [1.0, 0.0], atol=0.1)
 
 
 # --------------------------------------------------------------------------------------------------- metrics, events
@@ -208,7 +208,7 @@ def test_standing_robot(policy):
 
 def test_random_numbers(policy):
     """A robot's walk depends on its seed alone, and commands are drawn from their ranges or fixed."""
-    robot = Robot(XML, policy.description)
+    robot = MujocoRobot(XML, policy.description)
     simulation = Simulation(policy, robot, Events(push_velocity=1.0, push_probability=0.1))
     runs = [simulation.run(30, seed) for seed in ([1, 0], [1, 1], [1, 0])]
     np.testing.assert_array_equal(runs[0], runs[2])
@@ -231,7 +231,7 @@ def test_torques_are_refreshed(policy, monkeypatch, refresh, computed):
     calls, own = [], policy.torques
     monkeypatch.setattr(policy, "torques", lambda *values: calls.append(values) or own(*values))
     monkeypatch.setitem(policy.description["timing"], "refresh_torques", refresh)
-    Simulation(policy, Robot(XML, policy.description), Events()).run(1, 1)
+    Simulation(policy, MujocoRobot(XML, policy.description), Events()).run(1, 1)
     assert len(calls) == computed
 
 
@@ -239,17 +239,17 @@ def test_recorder(policy, monkeypatch):
     """A video shows the states, commands and velocities that the robot has had."""
     saved, seen = [], []
     monkeypatch.setattr(video, "write_video", lambda *args: saved.append(args))
-    robot = Robot(XML, policy.description)
+    robot = MujocoRobot(XML, policy.description)
     simulation = Simulation(policy, robot, Events(command=(0.5, -0.1, 0.2)))
-    recorder = video.Recorder(simulation)
+    recorder = video.SimulationRecorder(simulation)
 
     def on_step():
         recorder.add_step()
-        velocity = [*robot.trunk_velocity()[:2], robot.trunk_angular_velocity()[2]]
+        velocity = [*robot.planar_velocity()[:2], robot.angular_velocity[2]]
         seen.append((robot.data.qpos.tolist(), [0.5, -0.1, 0.2], velocity))
 
     simulation.run(3, 1, on_step)
-    recorder.save(Path("out.mp4"))
+    recorder.save(Path("out.mp4"), None)
     ((file, model, trunk, steps, control_step),) = saved
     assert (file, model, control_step) == (Path("out.mp4"), robot.model, 0.02) and model.body(trunk).name == "trunk"
     assert [(m.qpos.tolist(), m.command.tolist(), m.velocity.tolist()) for (m,) in steps] == seen
@@ -257,14 +257,14 @@ def test_recorder(policy, monkeypatch):
 
 def test_pushes(policy):
     """Half of the pushes set the trunk's velocity within the limits, half are added to it."""
-    robot = Robot(XML, policy.description)
+    robot = MujocoRobot(XML, policy.description)
     simulation = Simulation(policy, robot, Events(push_velocity=0.5, push_probability=1.0))
     simulation.run(1, 1)
     added = []
     for _ in range(300):
-        robot.velocity()[:] = 10.0
+        robot.velocity[:] = 10.0
         simulation._push()
-        added.append(robot.velocity().copy())
+        added.append(robot.velocity.copy())
     is_added = np.min(added, axis=1) > 5.0
     assert 0.4 < is_added.mean() < 0.6
     assert (np.abs(np.array(added) - 10.0 * is_added[:, None]) <= 0.5).all() and np.std(added, axis=0).min() > 0.2
@@ -272,14 +272,14 @@ def test_pushes(policy):
 
 def test_episodes_end(policy):
     """After 20 s, or with the trunk on the ground, an episode starts anew; such steps count only as falls."""
-    robot = Robot(XML, policy.description)
+    robot = MujocoRobot(XML, policy.description)
     simulation = Simulation(policy, robot, Events())
     assert simulation._max_steps == 1000
     simulation.run(0, 1)
     robot.reset(*random_state(1, height=0.03))
     simulation._control_step()
     assert simulation._finish_step(simulation.command).tolist() == [0.0] * 9 + [1.0]
-    assert robot.position()[2] == 0.4 and simulation._steps == 0 and (policy.last_action == 0).all()
+    assert robot.position[2] == 0.4 and simulation._steps == 0 and (policy.last_action == 0).all()
     simulation._control_step()
     simulation._steps = 1000
     assert simulation._finish_step(simulation.command).tolist() == [0.0] * 10
@@ -313,8 +313,8 @@ MISTAKES = [
     ("--push_probability=0.1", "--push_probability needs --push_velocity"),
     ("--push_velocity=1 --push_probability=2", "--push_probability must be from 0 to 1"),
     ("--push_velocity=nan", "--push_velocity must not be negative"),
-    ("--step=3", "unrecognized arguments: --step=3"),
-    ("--viewer", "--viewer needs a screen"),
+    ("--step=3", "unknown option '--step=3'; did you mean '--steps'?"),
+    ("--viewer", "MuJoCo's window needs a screen; --video works without one"),
     ("--xml=nothing.xml", "there is no MJCF file 'nothing.xml'"),
 ]
 

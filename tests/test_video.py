@@ -11,8 +11,7 @@ import pytest
 pytest.importorskip("PIL", reason="Pillow is not installed: pip install -e .[video]")
 
 from legged_torque.viewer import video
-from legged_torque.viewer.task_recorder import Recorder
-from legged_torque.viewer.video import Moment, add_overlay, write_video
+from legged_torque.viewer.video import Moment, TaskRecorder, add_overlay, write_video
 
 XML = Path(__file__).resolve().parents[1] / "resources" / "robots" / "a1" / "a1.xml"
 
@@ -102,18 +101,18 @@ def test_numbers():
 def test_recorded_worlds(make_task, monkeypatch):
     """One world is the fastest one, more are the first ones; what is kept is the task's state."""
     saved = []
-    monkeypatch.setattr("legged_torque.viewer.task_recorder.write_video", lambda *args: saved.append(args))
+    monkeypatch.setattr(video, "write_video", lambda *args: saved.append(args))
     task = make_task("a1_torque", num_envs=5)
     task.reset()
     task.commands[:] = 0.1
     task.commands[3, 0] = -0.9
-    one, four = Recorder(task), Recorder(task, 4)
+    one, four = TaskRecorder(task), TaskRecorder(task, 4)
     for _ in range(2):
         for recorder in (one, four):
             recorder.add_step()
         task.commands[:, 0] = 0.2  # the robot of the video stays the same
     for recorder, worlds in ((one, [3]), (four, [0, 1, 2, 3])):
-        recorder.save(Path("out.mp4"))
+        recorder.save(Path("out.mp4"), None)
         file, model, trunk, steps, control_step = saved[-1]
         assert (file, model.body(trunk).name, control_step) == (Path("out.mp4"), "trunk", task.dt)
         for number, moments in enumerate(steps):

@@ -1,6 +1,6 @@
 """A session that is watched live: what can be asked of it takes effect between steps, and mistakes do no harm."""
 
-import functools
+import argparse
 import math
 import runpy
 import shutil
@@ -14,8 +14,12 @@ from test_pacer import Clock
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
+from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.runs import checkpoint_file
+from legged_torque.utils.task_registry import LoadedRun
 from legged_torque.viewer import native
+from legged_torque.viewer.reading import watched
 from legged_torque.viewer.session import FASTEST, SCAN_INTERVAL, SLOWEST, Session
 from legged_torque.viewer.state import AS_LOADED
 
@@ -56,11 +60,14 @@ def make_session(runs, make_task, tmp_path):
     """Factory of sessions with checkpoint 2 of a task in a folder of their own, and a clock that does not run."""
 
     def make(name="a1_torque_multihead", **overrides):
-        runner = make_runner(make_task, name, **overrides)
         folder = shutil.copytree(runs[name], tmp_path / "run")
         clock = Clock()
-        make_env = functools.partial(type(runner.env), device="cpu")
-        session = Session(make_env, runner.env.cfg, runner, folder, 2, clock, clock.sleep)
+        env_cfg, train_cfg = task_registry.get_cfgs(name)
+        for path, value in {"env.num_envs": NUM_ENVS, **overrides}.items():
+            set_by_path(env_cfg, path, value)
+        run = LoadedRun(folder, {}, env_cfg, train_cfg, checkpoint_file(folder, 2))
+        torch.manual_seed(1)
+        session = Session(task_registry.get_task_class(name), run, "cpu", clock, clock.sleep)
         return session, clock, folder
 
     return make
@@ -88,9 +95,8 @@ def test_steps_and_readings(make_session):
     np.testing.assert_array_equal(state.reading.qpos, task.sim.qpos.numpy())
     np.testing.assert_array_equal(state.reading.torques, task.torques[0].numpy())
     np.testing.assert_array_equal(state.reading.velocities[:, :2], task.base_lin_vel[:, :2].numpy())
-    past = session.history.read(task.num_dof)
-    assert past["time"] == pytest.approx([task.dt, 2 * task.dt, 3 * task.dt])
-    np.testing.assert_array_equal(past["torques"][-1], state.reading.torques)
+    assert [reading.time for reading in session.history] == pytest.approx([task.dt, 2 * task.dt, 3 * task.dt])
+    assert session.history[-1] is state.reading and state.reading.world == 0
     assert int(task.total_steps) == 20_000_000  # curricula stay where they were
 
 
@@ -110,18 +116,42 @@ def test_reward_terms(make_session):
 
 @pytest.mark.parametrize("name", ["a1_position", "a1_torque", "a1_torque_multihead"])
 def test_torque_parts(make_session, name):
-    """PD part and torque part sum to the torque, and a task with one kind of control has one part only."""
+    """The parts of weighted action terms sum to the torque, and a task without weights has no parts."""
     session, _, _ = make_session(name)
-    session.task.motor_strength.fill_(0.9)
+    task = session.task
+    task.motors.strength.fill_(0.9)
     ticks(session, 3)
-    low, high = session.task.torque_limits.numpy()
-    pd, direct = session.state.reading.torque_parts
-    applied = session.state.reading.torques
-    np.testing.assert_allclose(np.clip(pd + direct, low, high), applied, rtol=1e-5, atol=1e-5)
-    assert np.any(pd) == (name != "a1_torque") and np.any(direct) == (name != "a1_position")
-    past = session.history.read(session.task.num_dof)
-    np.testing.assert_array_equal(past["pd"][-1], pd)
-    np.testing.assert_array_equal(past["direct"][-1], direct)
+    reading = session.state.reading
+    if name != "a1_torque_multihead":
+        assert reading.torque_parts.shape == (0, 12)
+        return
+    low, high = task.torque_limits.numpy()
+    pd, direct = reading.torque_parts
+    np.testing.assert_allclose(np.clip(pd + direct, low, high), reading.torques, rtol=1e-5, atol=1e-5)
+    assert np.any(pd) and np.any(direct)
+    expected = 0.9 * task.mixing[1] * task.torque_scale[0] * task.actions[0, 12:]
+    np.testing.assert_allclose(direct, expected.numpy(), rtol=1e-4, atol=1e-4)
+
+
+NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=NEEDS_GPU)])
+def test_watching_changes_nothing(device):
+    """A watched task does what the task does, bit by bit, and its parts are right in a CUDA graph too."""
+    task_class = task_registry.get_task_class("a1_torque_multihead")
+    env_cfg, _ = task_registry.get_cfgs("a1_torque_multihead")
+    env_cfg.env.num_envs = NUM_ENVS
+    results = []
+    for made_of in (task_class, watched(task_class)):
+        torch.manual_seed(2)
+        task = made_of(env_cfg, device)
+        for step in range(5):
+            obs = task.step(torch.sin(step + torch.arange(NUM_ENVS * 24.0, device=device)).view(NUM_ENVS, 24))[0]
+        results.append(obs["critic"])
+    assert torch.equal(*results)
+    total = task.torque_parts.sum(dim=0).clamp(*task.torque_limits)
+    torch.testing.assert_close(total, task.torques, rtol=1e-5, atol=1e-4)
 
 
 def test_command(make_session):
@@ -134,8 +164,8 @@ def test_command(make_session):
     ticks(session, 2)
     assert session.state.command == (0.5, -0.25, 0.75)
     np.testing.assert_array_equal(session.state.reading.commands, [[0.5, -0.25, 0.75]] * NUM_ENVS)
-    scales = session.task._command_scales
-    observed = session._obs["policy"][:, 6:9] / scales
+    scales = session.task.cfg.normalization.obs_scales
+    observed = session._obs["policy"][:, 6:9] / torch.tensor([scales.lin_vel, scales.lin_vel, scales.ang_vel])
     torch.testing.assert_close(observed, session.task.commands)
     session.set_command(None)
     ticks(session, 4)
@@ -190,32 +220,33 @@ def test_follow_world(make_session):
     session.tick()
     assert session.state.world == NUM_ENVS - 1
     np.testing.assert_array_equal(session.state.reading.torques, session.task.torques[-1].numpy())
-    assert len(session.history.read(session.task.num_dof)["time"]) == 1
+    assert len(session.history) == 1
 
 
 def test_mixing(make_session):
     """Weights can be set and given back to the curriculum, and stay set in a rebuilt task."""
     session, _, _ = make_session()
     trained = session.task.mixing.clone()
-    assert session.state.mixing == pytest.approx(trained.tolist()) and 0.0 < trained[0] < 1.0
+    assert session.state.mixing == pytest.approx({"position_residual": trained[0].item(), "torque": 1.0})
+    assert 0.0 < trained[0] < 1.0
     session.set_mixing((0.25, 0.5))
     session.tick()
     assert session.task.mixing.tolist() == [0.25, 0.5] and session.state.is_mixing_set
     session.set_perturbation("low")
     session.load_checkpoint(1)
     session.tick()
-    assert session.task.mixing.tolist() == [0.25, 0.5] and session.state.mixing == (0.25, 0.5)
+    assert session.task.mixing.tolist() == [0.25, 0.5] and list(session.state.mixing.values()) == [0.25, 0.5]
     session.set_mixing(None)
     session.tick()
     assert session.task.mixing[0] > trained[0] and not session.state.is_mixing_set  # checkpoint 1 is an earlier one
 
 
 def test_no_mixing(make_session):
-    """Other tasks have no weights, and asking for some does nothing."""
+    """Other tasks have no weights."""
     session, _, _ = make_session("a1_torque")
-    session.set_mixing((1.0, 1.0))
+    session.set_mixing(())
     session.tick()
-    assert session.state.mixing is None and not session.state.is_mixing_set
+    assert session.state.mixing == {}
 
 
 def test_checkpoints(make_session):
@@ -287,7 +318,7 @@ def test_perturbation(make_session):
     assert (session.state.perturbation, session.state.task_number) == ("high", 2)
     assert int(task.total_steps) == 20_000_000 and session._runner.env is task
     np.testing.assert_array_equal(session.state.reading.commands, [[0.5, 0.0, 0.0]] * NUM_ENVS)
-    assert len(session.history.read(task.num_dof)["time"]) == 2
+    assert len(session.history) == 2
     session.set_perturbation("hihg")
     session.tick()
     assert session.state.is_error and "did you mean 'high'" in session.state.message
@@ -301,8 +332,8 @@ def test_requests_from_other_threads(make_session):
     """Many threads may ask while another one steps; every request is carried out, in that thread."""
     session, _, _ = make_session("a1_torque")
     threads_seen = set()
-    carry_out = session._push
-    session._push = lambda *args: (threads_seen.add(threading.current_thread().name), carry_out(*args))
+    tell = session._tell
+    session._tell = lambda *args: (threads_seen.add(threading.current_thread().name), tell(*args))
     stepping = threading.Thread(target=session.run, name="stepping")
     stepping.start()
 
@@ -354,13 +385,21 @@ def test_keys(make_session):
     assert session.state.is_paused and session.state.message == "reset"
 
 
+def test_joints_by_leg():
+    """Legs follow from the robot's settings, whatever their number of joints; joints of no leg are "other" ones."""
+    plots = pytest.importorskip("legged_torque.viewer.plots", reason="the extra 'viewer' is not installed")
+    joints = ["R_hip", "R_knee", "waist", "L_hip", "L_knee", "L_ankle"]
+    assert plots.joints_by_leg(joints, [["R", "L"]]) == {"R": [0, 1], "other": [2], "L": [3, 4, 5]}
+    assert plots.joints_by_leg(joints[:2], []) == {"other": [0, 1]}
+
+
 def test_no_display(monkeypatch):
     """Without a screen the native viewer says so."""
     monkeypatch.setattr("sys.platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(UserError, match="needs a display"):
-        native.check_display()
+    with pytest.raises(UserError, match="needs a screen; --viewer web works without one"):
+        native.check_display("--viewer web")
 
 
 def test_missing_extra(monkeypatch):
@@ -370,6 +409,6 @@ def test_missing_extra(monkeypatch):
     for name in ("web", "scene", "controls", "plots"):
         monkeypatch.delitem(sys.modules, f"legged_torque.viewer.{name}", raising=False)
     play = runpy.run_path(str(SCRIPTS_DIR / "play.py"))
+    args = argparse.Namespace(viewer="web", task="a1_torque", host="127.0.0.1", port=8080)
     with pytest.raises(UserError, match=r"pip install -e \.\[viewer\]"):
-        play["import_viewer"]("web")
-    assert play["import_viewer"]("none") is None
+        play["import_viewer"](args)

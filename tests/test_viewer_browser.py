@@ -1,6 +1,5 @@
 """The viewer's page in a real browser: the robot is drawn, a slider changes its speed, and nothing is complained of."""
 
-import functools
 import shutil
 import threading
 import time
@@ -21,6 +20,7 @@ from selenium.webdriver.common.keys import Keys
 from legged_torque import resource_path
 from legged_torque.envs import task_registry
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.task_registry import LoadedRun
 from legged_torque.viewer.session import Session
 from legged_torque.viewer.web import Page, free_port
 
@@ -50,7 +50,8 @@ def session(make_task, tmp_path):
     env = make_task("a1_torque_multihead", num_envs=2)
     runner = task_registry.make_alg_runner(env, "a1_torque_multihead", log_root=None)[0]
     runner.save(str(tmp_path / "model_0.pt"))
-    session = Session(functools.partial(type(env), device="cpu"), env.cfg, runner, tmp_path, 0)
+    run = LoadedRun(tmp_path, {}, env.cfg, task_registry.get_cfgs("a1_torque_multihead")[1], tmp_path / "model_0.pt")
+    session = Session(type(env), run, "cpu")
 
     def glide(obs):
         """Hold the nominal pose, and move and turn the trunk by hand."""
@@ -138,5 +139,5 @@ def test_taken_port(page):
     """The next free port is taken; an address that is not this machine's is told."""
     port = page.server.get_port()
     assert free_port("127.0.0.1", port) == port + 1
-    with pytest.raises(UserError, match="cannot serve at 192.0.2.1:8480"):
+    with pytest.raises(UserError, match=r"cannot serve at 192\.0\.2\.1:8480"):
         free_port("192.0.2.1", 8480)

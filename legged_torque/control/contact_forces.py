@@ -17,7 +17,7 @@ from torch import Tensor
 from legged_torque.utils.errors import UserError
 
 ITERATIONS = 12
-"""Enough for single precision, where forces were seen to be up to 3 N off; in double each more gains about a digit."""
+"""Enough for single precision (errors up to 3 N); in double precision each further one gains about a digit."""
 CENTERING = 0.1
 """Factor by which each iteration is to reduce the complementarity."""
 TO_BOUNDARY = 0.99
@@ -26,7 +26,7 @@ TO_BOUNDARY = 0.99
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """What a contact can bear, on level ground.
+    """Limits of the force of a contact, on level ground.
 
     Attributes:
         friction: Coefficient mu of the friction pyramid |f_x| + |f_y| <= mu f_z, which lies inside the cone.
@@ -40,7 +40,7 @@ class ForceLimits:
 
 
 class ForceDistribution:
-    """Finds contact forces that the contacts can bear and that come nearest to a wanted wrench on the trunk."""
+    """Finds contact forces within the limits that come closest to a wanted wrench on the trunk."""
 
     def __init__(
         self, limits: ForceLimits, arm: float, regularization: float, device: str, dtype: torch.dtype = torch.float32
@@ -48,7 +48,7 @@ class ForceDistribution:
         """Keep the settings and the constants on the device.
 
         Args:
-            limits: What each contact can bear.
+            limits: Limits of each contact.
             arm: Length that makes moments comparable with forces [m].
             regularization: Weight of single forces against the wrench, small against 1.
             device: Name of the device.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -21,7 +22,7 @@ TRUNK_DOFS = 6
 
 
 class RobotDynamics:
-    """What a controller knows of the robot: its nominal model, evaluated at ``num_states`` states at once.
+    """The robot's nominal model, evaluated at ``num_states`` states at once.
 
     It has a MuJoCo Warp ``Data`` of its own, because the simulator's fused step does not fill one, and because the
     controller must not know the randomized parameters of the simulated worlds. Points of contact are the lowest points
@@ -106,7 +107,7 @@ class RobotDynamics:
         torch.sub(self._bias, self.gravity, out=self.coriolis)
 
     def _place_contacts(self) -> None:
-        """Compute contact points and what accelerates them at qacc = 0."""
+        """Compute contact points and their acceleration at qacc = 0."""
         points = self.geom_positions[:, self._geoms]
         points[:, :, 2] -= self._radii
         self.contact_points.copy_(points)
@@ -140,7 +141,7 @@ class RobotDynamics:
         self.contact_bias, self.trunk_jacobian = zeros(n, k, 3), zeros(n, 6, nv)
         points, jacobians = zeros(k, n, 3), zeros(k, n, 3, nv)
         self.contact_points, self.contact_jacobians = points.transpose(0, 1), jacobians.transpose(0, 1)
-        self._jacobian_jobs: list[tuple] = [
+        self._jacobian_jobs: list[tuple[Any, ...]] = [
             (self._body_ids(body), wp.from_torch(point, dtype=wp.vec3), wp.from_torch(jacobian), None)
             for body, point, jacobian in zip(bodies, points, jacobians, strict=True)
         ]
@@ -153,7 +154,7 @@ class RobotDynamics:
 
 
 def _check_model(model: mujoco.MjModel, contact_geoms: list[str], names: list[str]) -> None:
-    """Refuse what the formulas here do not hold for.
+    """Refuse models for which the formulas do not hold.
 
     Raises:
         UserError: See :class:`RobotDynamics`.

@@ -1,4 +1,4 @@
-"""Gravity pre-training (paper, III-A): a torque policy learns to stand from what the whole-body controller does."""
+"""Gravity pre-training (paper, III-A): a torque policy learns to stand by imitating the whole-body controller."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ STANDING_SECONDS = 5.0
 
 @dataclass
 class Pairs:
-    """What the policy sees, and the actions that the controller takes there.
+    """Observations of the policy, and the actions of the controller in the same states.
 
     Attributes:
         observations: Group "policy" of the task's observations. Shape: (pairs, size).
@@ -57,11 +57,11 @@ class Pairs:
 
 @dataclass
 class Collection:
-    """What came of following random configurations.
+    """Pairs from following random configurations.
 
     Attributes:
         training: Pairs to learn from.
-        held_out: Pairs of other configurations, to measure what was learned.
+        held_out: Pairs of other configurations, to measure the error.
         dropped: How many pairs were dropped, by reason.
         mean_torques: Mean absolute torque of every pair, dropped ones included [N m]. Shape: (all pairs,).
         residuals: Wrench residual of every pair, see :func:`residual_share`. Shape: (all pairs,).
@@ -77,7 +77,7 @@ class Collection:
 def pretrain(name: str, env_cfg: Any, train_cfg: Any, device: str) -> tuple[MLPModel, dict[str, Any]]:
     """Make a policy that stands: the ``pretraining.function`` of ``a1_torque_gravity``.
 
-    Its random numbers are its own, so that a training is the same whether it had to make its policy or found one.
+    It has random numbers of its own, so that training is the same whether the policy was made now or loaded.
 
     Args:
         name: Name of the task.
@@ -140,11 +140,11 @@ def check_settings(settings: Any) -> None:
 def learn_to_stand(
     task: LeggedRobot, controller: WholeBodyController, actor: MLPModel, settings: Any
 ) -> tuple[Collection, dict[str, list[float]]]:
-    """Let the actor imitate the controller, first where that goes, then also where the actor itself goes (DAgger).
+    """Let the actor imitate the controller, in states that the controller reaches, then in its own ones (DAgger).
 
     Args:
         task: The task, whose episodes start from random states.
-        controller: What is imitated.
+        controller: The controller to imitate.
         actor: The policy, changed in place.
         settings: ``pretraining`` of the training's settings.
 
@@ -166,7 +166,7 @@ def learn_to_stand(
 
 @dataclass
 class Followed:
-    """Configurations that were followed in closed loop, the controller's opinion at each step, and who was acting.
+    """Configurations that were followed in closed loop, with the controller's torques at each step.
 
     Attributes:
         observations: What the policy sees. Shape: (num_steps, configurations, size).
@@ -191,9 +191,9 @@ def follow(
 
     Args:
         task: The task; its worlds are used again and again.
-        controller: Whose torques are noted.
-        act: Who moves the robot instead of the controller; torques hold for a control step.
-        num_configurations: How many to follow.
+        controller: The controller whose torques are recorded.
+        act: Moves the robot in place of the controller; torques hold for a control step.
+        num_configurations: Number of configurations.
         num_steps: Control steps of each.
     """
     parts: list[list[Tensor]] = []
@@ -214,13 +214,13 @@ def follow(
 
 
 def select(followed: list[Followed], settings: Any) -> Collection:
-    """Keep the pairs that are worth learning, and hold back those of some configurations, of the same ones every time.
+    """Keep the useful pairs, and hold out those of some configurations, which are the same every time.
 
-    As in the paper, pairs of large torques are dropped, and so are those whose contacts cannot bear what the controller
-    wants by far, and what comes after a fall.
+    As in the paper, pairs with large torques are dropped; so are pairs whose contact limits are far from what the
+    controller wants, and those after a fall.
 
     Args:
-        followed: What was followed.
+        followed: The followed configurations.
         settings: ``pretraining`` of the training's settings.
     """
     names = [field.name for field in dataclasses.fields(Followed)]
@@ -246,9 +246,9 @@ def select(followed: list[Followed], settings: Any) -> Collection:
 
 
 def residual_share(controller: WholeBodyController, decided: WholeBodyTorques) -> Tensor:
-    """Return what the limits of the contacts leave out of the wanted wrench, as a share of the weight. Shape: (n,).
+    """Return the part of the wanted wrench that the contacts cannot give, as a share of the weight. Shape: (n,).
 
-    Moments count by the arm of the controller's settings.
+    Moments are divided by the arm of the controller's settings.
     """
     model = controller.dynamics.mj_model
     weight = float(model.body_mass.sum() * abs(model.opt.gravity[2]))
@@ -257,7 +257,7 @@ def residual_share(controller: WholeBodyController, decided: WholeBodyTorques) -
 
 
 def supervise(task: LeggedRobot, actor: MLPModel, collection: Collection, settings: Any) -> dict[str, list[float]]:
-    """Train the actor's mean on the pairs and on their mirror images by their mean square error.
+    """Train the actor's mean on the pairs and their mirror images with the mean square error.
 
     Last actions are shuffled; otherwise the policy would copy them and could not correct its own mistakes.
 
@@ -317,12 +317,12 @@ def make_controller(task: LeggedRobot, settings: WholeBodySettings | None = None
 
 
 def act_by_controller(controller: WholeBodyController) -> Act:
-    """Return the function that asks the controller for the torques of a task's state [N m]."""
+    """Return a function that gives the controller's torques for a task's state [N m]."""
     return lambda task: controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0).total
 
 
 def act_by_policy(actor: MLPModel) -> Act:
-    """Return the function that asks a policy for its mean torques [N m]."""
+    """Return a function that gives a policy's mean torques [N m]."""
 
     def torques(task: LeggedRobot) -> Tensor:
         with torch.no_grad():
@@ -341,6 +341,6 @@ def standing_shares(task: LeggedRobot, controller: WholeBodyController, actor: M
 
 
 def histogram(values: Tensor, highest: float, bins: int = 50) -> dict[str, list[float]]:
-    """Return how many values fall into equal bins from 0; those beyond the highest count in the last one."""
+    """Return the counts of values in equal bins from 0; the last bin includes larger values."""
     counts = torch.histc(values.clamp(max=highest), bins, 0.0, highest)
     return {"edges": torch.linspace(0.0, highest, bins + 1).tolist(), "counts": counts.tolist()}

@@ -28,7 +28,7 @@ TRUNK_DOFS = 6
 
 @dataclass
 class ContactSpace:
-    """The space of contacts, and the motions that leave it alone.
+    """The space of contacts, and the motions that do not disturb them.
 
     Attributes:
         jacobian: J_c (eq. 9) with rows of zeros where nothing touches. Shape: (n, 3 k, nv).
@@ -83,7 +83,7 @@ def inverse_triangle(factor: Tensor) -> Tensor:
 
 
 def contact_space(inertia: Tensor, jacobians: Tensor, bias: Tensor, mask: Tensor) -> ContactSpace:
-    """Compute what the contacts in ``mask`` demand and leave free (eq. 9).
+    """Compute the constraints of the contacts in ``mask`` and the motions that remain free (eq. 9).
 
     Args:
         inertia: Joint space inertia A. Shape: (n, nv, nv).

@@ -1,4 +1,4 @@
-"""Standing up from random states: where such trials start, what counts as standing, and how often it works."""
+"""Standing up from random states: initial states, the criterion, and the success rate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from legged_torque.utils.options import apply_perturbation
 START_CLEARANCE = (0.0, 0.02)
 """Lowest and highest clearance of the lowest foot at the start [m]."""
 MAX_DRAWS = 20
-"""How often states are drawn until no other part of the robot is below the ground."""
+"""Maximum number of draws until no other part of the robot is below the ground."""
 LOWEST_HEIGHT = 0.2
 """Lowest height of a standing robot's trunk [m]."""
 HIGHEST_GRAVITY_Z = -0.9
@@ -31,7 +31,7 @@ HIGHEST_SPEED = 0.3
 
 @dataclass
 class StandingResult:
-    """How a trial went.
+    """Result of a trial.
 
     Attributes:
         standing: Which worlds stand at the end and have not fallen before. Shape: (num_envs,), bool.
@@ -47,7 +47,7 @@ class StandingResult:
 def use_standing_trials(cfg: LeggedRobotCfg, decimation: int = 1) -> None:
     """Change a task's settings such that episodes start from the random states of ``--perturbation low``.
 
-    Parameters are not random, nobody pushes and sensors have no noise.
+    There are no random parameters, pushes or sensor noise.
 
     Args:
         cfg: Settings of a task that is to be made.
@@ -111,7 +111,7 @@ def is_standing(task: LeggedRobot) -> Tensor:
 
 
 def measure_standing(task: LeggedRobot, torques: Callable[[LeggedRobot], Tensor], duration: float) -> StandingResult:
-    """Let a controller or policy act from the present state on, and see who stands in the end.
+    """Let a controller or policy act from the present state, and measure which worlds stand at the end.
 
     Worlds that the task resets, because the trunk touched the ground or the state diverged, have fallen.
 

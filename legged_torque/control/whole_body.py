@@ -18,7 +18,7 @@ from legged_torque.utils.threads import single_threaded
 
 @dataclass(frozen=True)
 class WholeBodySettings:
-    """What the controller wants and may do; the defaults are for the A1 at 200 Hz."""
+    """Gains and limits of the controller; the defaults suit the A1 at 200 Hz."""
 
     height: float = 0.303  # [m] of the trunk's origin above the ground
     position_stiffness: float = 30.0  # [1/s^2] of the trunk towards its height and the middle of its feet
@@ -40,7 +40,7 @@ class WholeBodySettings:
 
 @dataclass
 class WholeBodyTorques:
-    """What the controller decides: torques in N m; forces by the ground on the robot, in N in the world frame.
+    """Results of the controller: torques [N m], and forces by the ground on the robot in the world frame [N].
 
     Attributes:
         task: Gamma_task (eq. 4). Shape: (n, joints).

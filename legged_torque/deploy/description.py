@@ -1,4 +1,4 @@
-"""Reading, checking and writing ``policy.yaml``: what a robot must know to run a policy."""
+"""Reading, checking and writing ``policy.yaml``, which describes how to run a policy on a robot."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ COMMENTS = {
     "joint positions are nominal_pose times joint_position_scale, then inside the joint limits",
     "episode": "length [s]; parts of names of geoms whose contact with the ground ends an episode",
 }
-"""What stands above each section of the file."""
+"""Comment above each section of the file."""
 
 
 def read(path: str | Path) -> tuple[dict[str, Any], Path]:
@@ -84,14 +84,14 @@ def to_yaml(description: dict[str, Any]) -> str:
 
 
 def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
-    """Check a description by the schema, and that its parts fit each other.
+    """Check a description against the schema, and whether its parts fit together.
 
     Args:
         description: As read from YAML.
         where: Name of its file, for messages.
 
     Raises:
-        UserError: Naming the first entry that is wrong.
+        UserError: If an entry is wrong; the message names the first one.
     """
     _check_schema(description, where)
     for path, value in _numbers(description):
@@ -105,13 +105,23 @@ def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
         raise UserError(f"{where}: timing.physics_frequency is not control_frequency times decimation")
 
 
+def term_names(kind: str) -> list[str]:
+    """Return the names of the terms that a description may have; ``kind`` is "observation" or "action"."""
+    return _schema()["$defs"][f"{kind}_term"]["properties"]["name"]["enum"]
+
+
+def _schema() -> dict[str, Any]:
+    """Return the schema of descriptions."""
+    return json.loads(SCHEMA_FILE.read_text(encoding="utf-8"))
+
+
 def _check_schema(description: Any, where: str) -> None:
     """Check structure, types and single values."""
     try:
         import jsonschema
     except ImportError:
         raise missing_extra("jsonschema") from None
-    validator = jsonschema.Draft202012Validator(json.loads(SCHEMA_FILE.read_text(encoding="utf-8")))
+    validator = jsonschema.Draft202012Validator(_schema())
     error = jsonschema.exceptions.best_match(validator.iter_errors(description))
     if error is not None:
         path = ".".join(str(key) for key in error.absolute_path) or "the file"
@@ -120,7 +130,7 @@ def _check_schema(description: Any, where: str) -> None:
 
 
 def _check_joints(description: dict[str, Any], where: str) -> None:
-    """Check that what is given by joint has all joints and no others."""
+    """Check that values by joint cover all joints and no others."""
     joints = description["joint_order"]
     by_joint = {
         "nominal_pose": description["nominal_pose"],
@@ -161,7 +171,7 @@ def _check_terms(description: dict[str, Any], where: str) -> None:
 
 
 def _check_ranges(description: dict[str, Any], where: str) -> None:
-    """Check that no range has its ends exchanged."""
+    """Check that no range has its ends swapped."""
     ranges = {f"torque_limits.{joint}": limits for joint, limits in description["torque_limits"].items()}
     ranges |= {f"commands.{key}": limits for key, limits in description["commands"].items()}
     ranges |= {f"initial_state.{key}": limits for key, limits in description["initial_state"].items()}

@@ -1,4 +1,4 @@
-"""From a checkpoint to the files that a robot needs: ``policy.onnx``, ``policy.pt`` and ``policy.yaml``."""
+"""Writes the files that a robot needs from a checkpoint: ``policy.onnx``, ``policy.pt`` and ``policy.yaml``."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from legged_torque.deploy.description import (
     NETWORK_FILE,
     check,
     missing_extra,
+    term_names,
     to_yaml,
 )
 from legged_torque.deploy.policy import Policy, State
@@ -35,11 +36,11 @@ TORCHSCRIPT_FILE = "policy.pt"
 NUM_SAMPLES = 256
 """Random observations on which the exported networks are compared."""
 TOLERANCE = 1e-5
-"""Largest difference between an exported number and the task's, relative to the number where it is larger than 1."""
+"""Largest difference between an exported number and the task's; relative for numbers larger than 1."""
 
 
 def nominal_cfg(cfg: Any) -> Any:
-    """Change a task's settings, in place, to those of a robot that is not randomized, for :func:`export_policy`."""
+    """Turn off all randomization in a task's settings, in place, for :func:`export_policy`."""
     cfg.env.num_envs = 4
     cfg.domain_rand.randomize_parameters = cfg.domain_rand.push_robots = cfg.noise.add_noise = False
     cfg.domain_rand.action_delay = [0, 0]
@@ -47,26 +48,27 @@ def nominal_cfg(cfg: Any) -> Any:
 
 
 def export_policy(task: LeggedRobot, model: MLPModel, folder: Path, name: str, training: dict[str, Any]) -> float:
-    """Write a policy with everything that is needed to run it, and check what was written.
+    """Write a policy with everything that is needed to run it, and check the files.
 
     Args:
         task: The task, with settings of :func:`nominal_cfg` and the counters of the checkpoint. Its state is changed.
         model: The policy's network.
         folder: Where to write; files of an earlier export there are replaced, ``policy.yaml`` last.
         name: Name of the task.
-        training: "run", "checkpoint", "iterations" and "total_steps" of where the policy is from.
+        training: "run", "checkpoint", "iterations" and "total_steps" of the policy.
 
     Returns:
         Largest difference between the exported networks and the model.
 
     Raises:
-        UserError: If the policy is not one that ``policy.yaml`` can describe, or a package is missing.
+        UserError: If ``policy.yaml`` cannot describe the policy, or a package is missing.
     """
     for package in ("onnx", "onnxruntime", "jsonschema"):
         if importlib.util.find_spec(package) is None:
             raise missing_extra(package)
     if model.is_recurrent or list(model.obs_groups) != ["policy"]:
         raise UserError("only policies without memory that read the observation group 'policy' can be exported")
+    check_terms(task)
     description = describe(task, name, training)
     folder.parent.mkdir(parents=True, exist_ok=True)
     if folder.exists() and not folder.is_dir():
@@ -84,6 +86,21 @@ def export_policy(task: LeggedRobot, model: MLPModel, folder: Path, name: str, t
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return difference
+
+
+def check_terms(task: LeggedRobot) -> None:
+    """Refuse terms of observations and actions that :class:`~legged_torque.deploy.policy.Policy` cannot compute.
+
+    Raises:
+        UserError: Naming the first one.
+    """
+    observations = [term.name for term in task.observations.policy_terms()]
+    actions = [term.name for term in task.action_terms()]
+    for kind, names in (("observation", observations), ("action", actions)):
+        known = term_names(kind)
+        for name in names:
+            if name not in known:
+                raise UserError(f"{DESCRIPTION_FILE} has no {kind} term '{name}'; it has {', '.join(known)}")
 
 
 def write_networks(model: MLPModel, folder: Path) -> None:
@@ -181,7 +198,7 @@ def _observation_terms(task: LeggedRobot) -> list[dict[str, Any]]:
 
 
 def _action_terms(task: LeggedRobot) -> list[dict[str, Any]]:
-    """Return what actions mean, in their order, mixed as at the task's counters; :func:`check_task` checks it."""
+    """Return the terms of the actions in their order, with the weights of the task's present counters."""
     return [
         {
             "name": term.name,
@@ -216,23 +233,21 @@ def check_task(task: LeggedRobot, policy: Policy) -> None:
     """Compare observations and torques of the task with those of the exported policy in random states.
 
     Raises:
-        UserError: If the task computes them in another way than ``policy.yaml`` says.
+        UserError: If they differ.
     """
     generator = torch.Generator().manual_seed(0)
 
-    def draw(like: Tensor, scale: float) -> None:
-        """Fill a tensor with normal random numbers."""
-        like.copy_(scale * torch.randn(like.shape, generator=generator))
+    def draw(like: Tensor, scale: float) -> Tensor:
+        """Return normal random numbers in the shape of a tensor."""
+        return scale * torch.randn(like.shape, generator=generator)
 
-    draw(task.sim.qpos, 1.0)
-    task.base_quat.div_(task.base_quat.norm(dim=1, keepdim=True))
-    for tensor in (task.sim.qvel, task.commands, task.actions):
-        draw(tensor, 3.0)
+    qpos = draw(task.sim.qpos, 1.0)
+    qpos[:, 3:7] /= qpos[:, 3:7].norm(dim=1, keepdim=True)
+    task.commands.copy_(draw(task.commands, 3.0))
+    task.actions.copy_(draw(task.actions, 3.0))
     task.reset_buf.fill_(True)  # the history starts with copies
-    task._update_state()
-    task.compute_observations()
+    task.set_state(qpos, draw(task.sim.qvel, 3.0))
     task.motors.apply(task._compute_torques(task.actions), task.dof_vel, out=task.torques)
-    expected = task.torques
     for world in range(task.num_envs):
         parts = (task.base_ang_vel, task.dof_pos, task.dof_vel, task.projected_gravity)
         state = State(*(part[world].cpu().numpy() for part in parts))
@@ -240,7 +255,7 @@ def check_task(task: LeggedRobot, policy: Policy) -> None:
         policy.last_action = actions = task.actions[world].cpu().numpy()
         obs = policy.observation(state, task.commands[world].cpu().numpy())
         got = policy.torques(actions, state.joint_positions, state.joint_velocities)
-        pairs = {"observations": (obs, task.obs_buf["policy"][world]), "torques": (got, expected[world])}
+        pairs = {"observations": (obs, task.obs_buf["policy"][world]), "torques": (got, task.torques[world])}
         for what, (ours, theirs) in pairs.items():
             difference = _difference(ours, theirs.cpu().numpy()) if ours.shape == theirs.shape else float("inf")
             if not difference <= TOLERANCE:
@@ -256,7 +271,7 @@ def _difference(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 
 def _move(part: Path, folder: Path) -> None:
-    """Put a finished folder in its place; in one that exists, replace file by file, the description last."""
+    """Move a finished folder to its place, or its files into an existing folder, the description last."""
     part.chmod(0o755)
     if not folder.exists():
         os.replace(part, folder)
@@ -266,12 +281,12 @@ def _move(part: Path, folder: Path) -> None:
 
 
 def _by_joint(task: LeggedRobot, values: Tensor) -> dict[str, Any]:
-    """Return values by name of the joint."""
+    """Return values by joint name."""
     return dict(zip(task.dof_names, _plain(values), strict=True))
 
 
 def _both_ways(limit: float) -> list[float]:
-    """Return the range of a symmetric limit."""
+    """Return a symmetric range."""
     return [-float(limit), float(limit)]
 
 

@@ -15,14 +15,14 @@ from legged_torque.utils.errors import UserError
 
 @dataclass
 class State:
-    """What a robot measures; joints in the policy's order.
+    """Measurements of a robot; joints in the policy's order.
 
     Attributes:
         angular_velocity: Of the trunk, in its own frame [rad/s]. Shape: (3,).
         joint_positions: Shape: (joints,) [rad].
         joint_velocities: Shape: (joints,) [rad/s].
         projected_gravity: Unit gravity vector in the trunk's frame; upright it is (0, 0, -1). Shape: (3,).
-        quaternion: Orientation of the trunk (w, x, y, z), needed if there is no gravity vector. Shape: (4,).
+        quaternion: Orientation of the trunk (w, x, y, z), in place of the gravity vector. Shape: (4,).
     """
 
     angular_velocity: np.ndarray
@@ -42,8 +42,10 @@ class State:
 
 
 class Policy:
-    """Runs an exported policy for one robot: once per control step :meth:`observation`, then :meth:`act`, and for
-    every physics step (or, without ``refresh_torques``, once) :meth:`torques`.
+    """Runs an exported policy for one robot.
+
+    Call :meth:`observation` and :meth:`act` once per control step, and :meth:`torques` at every physics step, or once
+    if ``refresh_torques`` is false.
 
     Attributes:
         description: Contents of ``policy.yaml``.
@@ -77,7 +79,9 @@ class Policy:
         self._terms = [term["name"] for term in terms]
         sizes = [term["size"] for term in terms]
         self._scale = np.concatenate([np.full(n, term["scale"], dtype) for n, term in zip(sizes, terms, strict=True)])
-        clips = [np.tile(np.array(term["clip"], dtype), (n, 1)) for n, term in zip(sizes, terms, strict=True)]
+        clips: list[np.ndarray] = [
+            np.tile(np.array(term["clip"], dtype), (n, 1)) for n, term in zip(sizes, terms, strict=True)
+        ]
         self._low, self._high = np.concatenate(clips).T
         self.session = load_network(network, self.description["network"])
         self.reset()
@@ -88,10 +92,10 @@ class Policy:
         self._history: np.ndarray | None = None
 
     def observation(self, state: State, command: np.ndarray) -> np.ndarray:
-        """Return what the network sees; to be called once per control step, since it keeps the history.
+        """Return the network's observations. Call it once per control step, since it keeps the history.
 
         Args:
-            state: What the robot measures.
+            state: Measurements.
             command: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (3,).
 
         Returns:
@@ -116,7 +120,7 @@ class Policy:
         return self._history.copy()
 
     def act(self, obs: np.ndarray) -> np.ndarray:
-        """Return the mean actions for observations, clipped, and keep them as the last ones.
+        """Return the clipped mean actions for observations, and keep them as the last actions.
 
         Args:
             obs: Shape: (observations,).
@@ -125,7 +129,7 @@ class Policy:
             Shape: (actions,).
 
         Raises:
-            UserError: If an action is not finite, which must not reach a robot.
+            UserError: If an action is not finite; it must not reach a robot.
         """
         (actions,) = self.session.run(["actions"], {"obs": np.asarray(obs, np.float32)[np.newaxis]})
         if not np.isfinite(actions).all():
@@ -145,9 +149,9 @@ class Policy:
             Shape: (joints,) [N m].
         """
         actions = np.asarray(actions, self.dtype).reshape(len(self._action_terms), len(self.joint_order))
-        total = np.zeros(len(self.joint_order), self.dtype)
-        for term, action in zip(self._action_terms, actions, strict=True):
-            torque = self.dtype(term["scale"]) * action
+        total = np.zeros_like(self.nominal_pose)
+        for i, term in enumerate(self._action_terms):
+            torque = self.dtype(term["scale"]) * actions[i]
             if term["name"] == "position_residual":
                 error = self.nominal_pose + torque - self._joints(joint_positions)
                 torque = self._stiffness * error - self._damping * self._joints(joint_velocities)

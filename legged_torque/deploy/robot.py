@@ -1,4 +1,4 @@
-"""The robot of a MJCF file: its joints and motors found by name, its ground, and where it differs from policy.yaml."""
+"""The robot of an MJCF file: finds joints, motors and ground, and compares them with ``policy.yaml``."""
 
 from __future__ import annotations
 
@@ -15,13 +15,19 @@ _WARNINGS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL,
 _JOINTS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
-class Robot:
-    """One robot in MuJoCo; vectors of joints are in the policy's order, whatever the file's is.
+class MujocoRobot:
+    """One robot in MuJoCo; vectors of joints are in the policy's order, not the file's.
 
     Attributes:
         model: The compiled MJCF, with the policy's time step.
         data: Its state.
-        notes: What in the MJCF differs from ``policy.yaml``, a line each.
+        notes: Differences of the MJCF from ``policy.yaml``, a line each.
+        trunk: Number of the trunk's body.
+        position: The trunk's position in the world, a view of the state like the next ones [m]. Shape: (3,).
+        quat: The trunk's orientation (w, x, y, z). Shape: (4,).
+        velocity: The trunk's linear velocity in the world [m/s]. Shape: (3,).
+        angular_velocity: The trunk's angular velocity in its own frame [rad/s]. Shape: (3,).
+        weight: m g of the whole robot [N].
     """
 
     def __init__(self, xml: str | Path, description: dict[str, Any]) -> None:
@@ -44,11 +50,12 @@ class Robot:
         self._find_geoms(description["episode"]["ends_on_contact_of"])
         self.weight = float(self.model.body_mass.sum() * np.linalg.norm(self.model.opt.gravity))
 
-    # ---- what a controller reads and writes --------------------------------------------------------------------------
+    # ---- sensors and motors ------------------------------------------------------------------------------------------
 
     def state(self) -> State:
-        """Return what the robot's sensors would measure, without errors."""
-        return State(self.trunk_angular_velocity(), self.joint_positions(), self.joint_velocities(), None, self.quat())
+        """Return the measurements of perfect sensors."""
+        angular_velocity, quat = self.angular_velocity.copy(), self.quat.copy()
+        return State(angular_velocity, self.joint_positions(), self.joint_velocities(), quaternion=quat)
 
     def joint_positions(self) -> np.ndarray:
         """Return joint positions. Shape: (joints,) [rad]."""
@@ -71,29 +78,11 @@ class Robot:
         self.data.ctrl[self._motors] = torques / self._torque_per_ctrl
         mujoco.mj_step(self.model, self.data)
 
-    # ---- the trunk ---------------------------------------------------------------------------------------------------
-
-    def position(self) -> np.ndarray:
-        """Return the trunk's position in the world. Shape: (3,) [m]."""
-        return self.data.qpos[self._root_qpos : self._root_qpos + 3]
-
-    def quat(self) -> np.ndarray:
-        """Return the trunk's orientation (w, x, y, z). Shape: (4,)."""
-        return self.data.qpos[self._root_qpos + 3 : self._root_qpos + 7]
-
-    def velocity(self) -> np.ndarray:
-        """Return the trunk's linear velocity in the world, writable. Shape: (3,) [m/s]."""
-        return self.data.qvel[self._root_dof : self._root_dof + 3]
-
-    def trunk_velocity(self) -> np.ndarray:
-        """Return the trunk's linear velocity in its own frame. Shape: (3,) [m/s]."""
+    def planar_velocity(self) -> np.ndarray:
+        """Return v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame, as commands are. Shape: (3,)."""
         matrix = np.zeros(9)
-        mujoco.mju_quat2Mat(matrix, self.quat())
-        return matrix.reshape(3, 3).T @ self.velocity()
-
-    def trunk_angular_velocity(self) -> np.ndarray:
-        """Return the trunk's angular velocity in its own frame. Shape: (3,) [rad/s]."""
-        return self.data.qvel[self._root_dof + 3 : self._root_dof + 6]
+        mujoco.mju_quat2Mat(matrix, self.quat)
+        return np.append((matrix.reshape(3, 3).T @ self.velocity)[:2], self.angular_velocity[2])
 
     def reset(
         self, position: np.ndarray, quat: np.ndarray, joint_positions: np.ndarray, velocities: tuple[np.ndarray, ...]
@@ -107,21 +96,21 @@ class Robot:
             velocities: Linear (world) [m/s] and angular (trunk) [rad/s], shapes (3,), and joint velocities (joints,).
         """
         mujoco.mj_resetData(self.model, self.data)
-        self.position()[:], self.quat()[:] = position, quat
+        self.position[:], self.quat[:] = position, quat
         self.data.qpos[self._qpos] = np.clip(joint_positions, *self._joint_limits)
-        self.velocity()[:], self.trunk_angular_velocity()[:] = velocities[:2]
+        self.velocity[:], self.angular_velocity[:] = velocities[:2]
         self.data.qvel[self._dofs] = velocities[2]
 
     # ---- contacts ----------------------------------------------------------------------------------------------------
 
     def has_fallen(self) -> bool:
-        """Return whether a geom that ends an episode touched the ground in the last physics step, or MuJoCo gave up."""
+        """Return whether a geom that ends an episode touched the ground in the last step, or the state diverged."""
         if any(self.data.warning[kind].number for kind in _WARNINGS):
             return True
         return any(self._is_ending[geom] for _, geom, _ in self._ground_contacts())
 
     def contact_force(self) -> float:
-        """Return the sum over the robot's geoms of the norm of the ground's net force in the last physics step [N]."""
+        """Return the sum over geoms of the norm of the ground's net force in the last physics step [N]."""
         forces = np.zeros((self.model.ngeom, 3))
         force = np.zeros(6)
         for number, geom, sign in self._ground_contacts():
@@ -142,7 +131,7 @@ class Robot:
     # ---- reading the MJCF --------------------------------------------------------------------------------------------
 
     def _load(self, file: Path) -> mujoco.MjModel:
-        """Compile the file, with a floor if it has nothing to stand on."""
+        """Compile the file, and add a floor if it has none."""
         if not file.is_file():
             raise UserError(f"there is no MJCF file '{file}'")
         try:
@@ -164,13 +153,14 @@ class Robot:
         self.model.opt.timestep = step
 
     def _find_root(self) -> None:
-        """Find the joint that lets the trunk move freely."""
+        """Find the free joint of the trunk."""
         (free,) = np.nonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
         if len(free) != 1:
             raise UserError(f"the MJCF must have one free joint, that of the trunk; it has {len(free)}")
         self.trunk = int(self.model.jnt_bodyid[free[0]])
-        self._root_qpos = int(self.model.jnt_qposadr[free[0]])
-        self._root_dof = int(self.model.jnt_dofadr[free[0]])
+        qpos, qvel = self.data.joint(int(free[0])).qpos, self.data.joint(int(free[0])).qvel
+        self.position, self.quat = qpos[:3], qpos[3:]
+        self.velocity, self.angular_velocity = qvel[:3], qvel[3:]
 
     def _find_joints(self, joint_order: list[str]) -> None:
         """Find the policy's joints by name."""
@@ -186,7 +176,8 @@ class Robot:
 
     def _find_motors(self, description: dict[str, Any]) -> None:
         """Find the motor of each joint, and compare its limits with the policy's."""
-        model, motors, scales, different = self.model, [], [], {}
+        model, motors, scales = self.model, [], []
+        different: dict[tuple[tuple[float, float], tuple[float, float]], list[str]] = {}
         for name, joint in zip(description["joint_order"], self._joint_ids, strict=True):
             on_joint = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
             (found,) = np.nonzero(on_joint)
@@ -207,17 +198,19 @@ class Robot:
                 f"{expected[1]:g} N m; the tighter ones act ({', '.join(names)})"
             )
         if model.nu > len(motors):
-            self.notes.append(f"{model.nu - len(motors)} motors of the MJCF are not the policy's and get 0")
+            self.notes.append(f"{model.nu - len(motors)} motors of the MJCF are not driven by the policy and get 0")
 
     def _find_geoms(self, ends_on_contact_of: list[str]) -> None:
-        """Find the ground, and the geoms whose contact with it ends an episode: by name, or else those of the trunk."""
+        """Find the ground, and the geoms whose contact with it ends an episode: by name, or those of the trunk."""
         model = self.model
         self._is_ground = model.body_weldid[model.geom_bodyid] == 0
         names = [model.geom(i).name or model.body(model.geom_bodyid[i]).name for i in range(model.ngeom)]
         is_ending = np.array([any(part in name for part in ends_on_contact_of) for name in names]) & ~self._is_ground
         if ends_on_contact_of and not is_ending.any():
             trunk = model.body(self.trunk).name
-            self.notes.append(f"no geom is called like {', '.join(ends_on_contact_of)}: those of '{trunk}' count as it")
+            self.notes.append(
+                f"no geom's name contains {', '.join(ends_on_contact_of)}: those of '{trunk}' end an episode"
+            )
             is_ending = model.geom_bodyid == self.trunk
         self._is_ending = is_ending
 

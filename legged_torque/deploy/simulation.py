@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from legged_torque.deploy.policy import Policy
-from legged_torque.deploy.robot import Robot
+from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.utils.metrics import NUM_SUMS, step_sums
 
 PUSH_ADDED = 0.5
@@ -20,12 +20,12 @@ PUSH_ADDED = 0.5
 
 @dataclass
 class Events:
-    """What happens to the robots.
+    """Commands and pushes.
 
     Attributes:
         command: Fixed v_x, v_y [m/s] and yaw rate [rad/s]; None draws them as in training. Shape: (3,).
         push_velocity: Pushes draw each axis of the trunk's velocity from -this to this [m/s].
-        push_probability: Of a push, per control step.
+        push_probability: Probability of a push per control step.
     """
 
     command: tuple[float, float, float] | None = None
@@ -34,19 +34,19 @@ class Events:
 
 
 class Simulation:
-    """Lets a policy walk as in evaluation: random initial states and commands, pushes, new episodes.
+    """Runs a policy as in evaluation: random initial states and commands, pushes, new episodes.
 
     Attributes:
-        command: The one that the robot follows now. Shape: (3,).
+        command: The present command. Shape: (3,).
     """
 
-    def __init__(self, policy: Policy, robot: Robot, events: Events) -> None:
+    def __init__(self, policy: Policy, robot: MujocoRobot, events: Events) -> None:
         """Prepare; :meth:`run` starts an episode.
 
         Args:
-            policy: What acts.
-            robot: What it moves.
-            events: What happens to it.
+            policy: The policy.
+            robot: The robot.
+            events: Commands and pushes.
         """
         self.policy, self.robot, self.events = policy, robot, events
         description = policy.description
@@ -58,13 +58,15 @@ class Simulation:
             ranges = [[value, value] for value in events.command]
         self._command_range = np.array(ranges, float).T
         self._resampling_probability = commands["resampling_probability"]
+        self.command = np.zeros(3)
+        self._steps = 0
 
     def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:
-        """Let one robot walk.
+        """Run one robot.
 
         Args:
             num_steps: Control steps.
-            seed: Of its random numbers, for ``np.random.default_rng``.
+            seed: Seed of its random numbers, for ``np.random.default_rng``.
             on_step: Called after every control step, e.g. to record it.
 
         Returns:
@@ -81,7 +83,7 @@ class Simulation:
         return sums
 
     def _control_step(self) -> None:
-        """Observe, act, and apply torques for as many physics steps as actions hold."""
+        """Observe, act, and apply torques in all physics steps of a control step."""
         policy, robot = self.policy, self.robot
         actions = policy.act(policy.observation(robot.state(), self.command))
         for i in range(self._timing["decimation"]):
@@ -91,7 +93,7 @@ class Simulation:
         self._steps += 1
 
     def _finish_step(self, command: np.ndarray) -> np.ndarray:
-        """Do what follows the physics, in the order of training, and return the step's share of the metrics."""
+        """End the step in the order of training, and return what it adds to the metrics."""
         robot = self.robot
         fell = robot.has_fallen()
         ended = fell or self._steps >= self._max_steps
@@ -103,30 +105,32 @@ class Simulation:
             self.command = self._rng.uniform(*self._command_range)
         if self._rng.random() < self.events.push_probability:
             self._push()
-        velocity = np.append(robot.trunk_velocity()[:2], robot.trunk_angular_velocity()[2])
-        numbers = (np.linalg.norm(velocity[:2]), force, power, robot.position()[2], fell, ended)
+        velocity = robot.planar_velocity()
+        numbers = (np.linalg.norm(velocity[:2]), force, power, robot.position[2], fell, ended)
         return step_sums(np, command[None], velocity[None], *(np.array([number]) for number in numbers))[:, 0]
 
     def _push(self) -> None:
-        """Push the trunk: half of the pushes set its velocity, half are added to it."""
-        velocity = self.robot.velocity()
+        """Push the trunk: half of the pushes set its velocity, the others add to it."""
+        velocity = self.robot.velocity
         drawn = self._rng.uniform(-self.events.push_velocity, self.events.push_velocity, 3)
         velocity[:] = drawn + velocity if self._rng.random() < PUSH_ADDED else drawn
 
     def _new_episode(self) -> None:
-        """Draw an initial state and a command, and let the policy forget."""
+        """Draw an initial state and a command, and reset the policy."""
         rng, start, num_joints = self._rng, self._start, len(self.policy.joint_order)
         angles = [rng.uniform(*start[name]) for name in ("roll", "pitch", "yaw")]
-        pose = self.policy.nominal_pose * rng.uniform(*start["joint_position_scale"], num_joints)
-        velocities = (
-            rng.uniform(*start["trunk_linear_velocity"], 3),
-            rng.uniform(*start["trunk_angular_velocity"], 3),
-            rng.uniform(*start["joint_velocity"], num_joints),
-        )
+        pose = self.policy.nominal_pose * self._draw("joint_position_scale", num_joints)
+        sizes = {"trunk_linear_velocity": 3, "trunk_angular_velocity": 3, "joint_velocity": num_joints}
+        velocities = tuple(self._draw(name, size) for name, size in sizes.items())
         self.robot.reset(start["trunk_position"], quaternion(*angles), pose, velocities)
         self.policy.reset()
         self.command = rng.uniform(*self._command_range)
         self._steps = 0
+
+    def _draw(self, name: str, size: int) -> np.ndarray:
+        """Draw numbers from a range of the initial state. Shape: (size,)."""
+        low, high = self._start[name]
+        return self._rng.uniform(low, high, size)
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:

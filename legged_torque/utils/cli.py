@@ -1,14 +1,40 @@
-"""Ending a script as a user expects it, without torch."""
+"""What every script needs: a parser of its command line, and an end that a user expects. Needs no torch."""
 
 from __future__ import annotations
 
+import argparse
 import gc
 import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, unknown_name
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line with the nearest valid name."""
+
+    def __init__(self, description: str) -> None:
+        """Create a parser; abbreviations of options are not accepted."""
+        super().__init__(description=description, allow_abbrev=False)
+
+    def error(self, message: str) -> NoReturn:
+        """Report a mistake in the arguments."""
+        raise UserError(message)
+
+    def parse_args(self, args: list[str] | None = None, namespace: argparse.Namespace | None = None):
+        """Parse the command line.
+
+        Raises:
+            UserError: If it cannot be parsed.
+        """
+        namespace, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            options = [option for action in self._actions for option in action.option_strings]
+            raise unknown_name("option", unknown[0], options)
+        return namespace
 
 
 def run_script(main: Callable[[], None]) -> None:

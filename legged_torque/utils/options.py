@@ -13,45 +13,48 @@ DEFAULT_TASK = "a1_torque_multihead"
 DEFAULT_PRESET = "parallel"
 
 
+def _option(default: Any, help: str, **how: Any) -> Any:  # noqa: A002 (argparse's word)
+    """Return a field that is also an argument of the command line; ``how`` is what ``add_argument`` takes."""
+    return field(default=default, metadata={"help": help, **how})
+
+
 @dataclass
 class Options:
-    """The options that scripts share; None leaves a setting as it is.
+    """The options that scripts share; None leaves a setting as it is. Fields tell what they mean by their help."""
 
-    Attributes:
-        task: Name of the task.
-        device: "auto", "cpu" or "cuda:N".
-        num_envs: Number of worlds of each process.
-        seed: Random seed.
-        preset: Named training settings, see ``presets`` of the training's settings.
-        perturbation: Named random events, see ``perturbations`` of the task's settings.
-        ranges: Named ranges of random parameters, see ``parameter_ranges`` of the task's settings.
-        set: Single settings, each as "key.by.dotted.path=value".
-        log_root: Folder of all experiments.
-        experiment_name: Folder of the runs below that.
-        run_name: Added to the name of the run's folder.
-        logger: "tensorboard", "wandb" or "none".
-        load_run: Run to load: name of its folder or a path; None is the last one.
-        checkpoint: Checkpoint to load; None is the last one.
-        resume: Whether training goes on from that.
-        max_iterations: Iterations of the training in all.
-    """
-
-    task: str = DEFAULT_TASK
-    device: str = "auto"
-    num_envs: int | None = None
-    seed: int | None = None
-    preset: str | None = None
-    perturbation: str | None = None
-    ranges: str | None = None
-    set: list[str] = field(default_factory=list)
-    log_root: str | None = None
-    experiment_name: str | None = None
-    run_name: str | None = None
-    logger: str | None = None
-    load_run: str | None = None
-    checkpoint: int | None = None
-    resume: bool = False
-    max_iterations: int | None = None
+    task: str = _option(DEFAULT_TASK, "name of the task, see train.py --list; default: %(default)s")
+    device: str = _option(
+        "auto", "auto, cpu or cuda:N; auto takes the GPU if there is one, with torchrun one for each process"
+    )
+    num_envs: int | None = _option(
+        None, "number of worlds, with torchrun those of each process; default: that of the task", type=int
+    )
+    seed: int | None = _option(None, "random seed; default: that of the training settings", type=int)
+    preset: str | None = _option(None, "training settings: parallel (the default) or paper (Table II)")
+    perturbation: str | None = _option(
+        None,
+        "random parameters, pushes and noise: none, low, high, high_frequency or doubled; default: none, or what a "
+        "loaded run has",
+    )
+    ranges: str | None = _option(
+        None, "how far random parameters go: wide or narrow; default: wide, or what a loaded run has"
+    )
+    set: list[str] = field(
+        default_factory=list,
+        metadata={
+            "action": "append",
+            "metavar": "KEY=VALUE",
+            "help": "change a setting by its dotted path, e.g. rewards.scales.torques=-1e-4; may be repeated",
+        },
+    )
+    log_root: str | None = _option(None, "folder that keeps all experiments; default: ./logs")
+    experiment_name: str | None = _option(None, "folder of the runs below that; default: name of the task")
+    run_name: str | None = _option(None, "added to the name of the run's folder")
+    logger: str | None = _option(None, "where curves are written: tensorboard, wandb or none")
+    load_run: str | None = _option(None, "run to load: name of its folder or a path; default: the last one")
+    checkpoint: int | None = _option(None, "checkpoint to load; default: the last one", type=int)
+    resume: bool = _option(False, "continue a run, with its settings", action="store_true")
+    max_iterations: int | None = _option(None, "iterations in all; default: 110e6 environment steps", type=int)
 
 
 def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: dict[str, Any] | None = None) -> None:

@@ -1,1 +1,1 @@
-"""Watching and steering a trained robot live; needs the extra ``viewer`` for the page, nothing else needs this."""
+"""Watching and steering a trained robot live, and videos. The web page needs the extra ``viewer``."""

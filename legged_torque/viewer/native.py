@@ -1,23 +1,33 @@
-"""A session in MuJoCo's own window: ``play.py --viewer native``."""
+"""MuJoCo's own window, for a session (``play.py --viewer native``) or a simulation (``sim2sim.py --viewer``).
+
+Needs neither torch nor Warp.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import threading
 import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mujoco
 
+from legged_torque.deploy.simulation import Simulation
 from legged_torque.utils.errors import UserError
-from legged_torque.viewer.session import Session, stopping_on_ctrl_c
-from legged_torque.viewer.state import State
+from legged_torque.viewer.pacing import Pacer, stopping_on_ctrl_c
+from legged_torque.viewer.state import SessionState
+
+if TYPE_CHECKING:
+    from legged_torque.viewer.session import Session
 
 KEYS = """Keys: arrows up/down  v_x    arrows left/right  yaw rate    comma/period  v_y    0  stand still
       space  pause           R  reset                       P  push         Esc or Ctrl-C  end"""
 STEP = 0.1
-"""By how much a key changes a command [m/s or rad/s]."""
+"""Change of a command per key press [m/s or rad/s]."""
 FRAME_INTERVAL = 1.0 / 60.0
 """Seconds between drawings."""
 PUSH_SPEED, PUSH_ANGLE = 0.8, 1.5708
@@ -33,55 +43,61 @@ _COMMAND_KEYS = {
     _LEFT: (2, STEP),
     _RIGHT: (2, -STEP),
 }
-"""Key codes of GLFW: which command they change, and by how much."""
+"""Which command a key of GLFW changes, and by how much."""
 
 
-def check_display() -> None:
+def check_display(instead: str) -> None:
     """Make sure that there is a screen to open a window on.
+
+    Args:
+        instead: What works without a screen, for the message.
 
     Raises:
         UserError: If there is none.
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise UserError("--viewer native needs a display; --viewer web works without one")
+        raise UserError(f"MuJoCo's window needs a screen; {instead} works without one")
     if sys.platform == "darwin" and not sys.argv[0].endswith("mjpython"):
-        raise UserError("--viewer native needs mjpython in place of python on macOS; --viewer web does not")
+        raise UserError(f"MuJoCo's window needs mjpython in place of python on macOS; {instead} does not")
     if sys.platform != "darwin":
         import glfw
 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            if not glfw.init():  # MuJoCo would wait for its window for ever
-                raise UserError("--viewer native cannot open a window on this display; --viewer web works without one")
+            if not glfw.init():  # MuJoCo would wait for its window forever
+                raise UserError(f"MuJoCo's window cannot be opened on this screen; {instead} works without one")
         glfw.terminate()
 
 
 class Keyboard:
-    """What keys ask a session for. Keys come from the window's thread, so it only leaves requests."""
+    """Turns keys into requests. Keys come from the window's thread."""
 
     def __init__(self, session: Session) -> None:
         """Start with the command 0 in place of random ones."""
         self._session = session
-        self._command = [0.0, 0.0, 0.0]
         self._is_paused = False
         ranges = session.task.cfg.commands.ranges
         self._limits = [ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw]
-        session.set_command((0.0, 0.0, 0.0))
+        self._set_command(0.0, 0.0, 0.0)
+
+    def _set_command(self, x: float, y: float, yaw: float) -> None:
+        """Ask for a command."""
+        self._command = [x, y, yaw]
+        self._session.set_command((x, y, yaw))
 
     def press(self, key: int) -> None:
-        """Do what a key stands for.
+        """Ask for what a key means.
 
         Args:
-            key: GLFW's code.
+            key: Key code of GLFW.
         """
         if key in _COMMAND_KEYS:
             index, change = _COMMAND_KEYS[key]
             low, high = self._limits[index]
             self._command[index] = round(min(max(self._command[index] + change, low), high), 3)
-            self._session.set_command(tuple(self._command))
+            self._set_command(*self._command)
         elif key == _ZERO:
-            self._command = [0.0, 0.0, 0.0]
-            self._session.set_command((0.0, 0.0, 0.0))
+            self._set_command(0.0, 0.0, 0.0)
         elif key == _SPACE:
             self._is_paused = not self._is_paused
             self._session.set_paused(self._is_paused)
@@ -92,13 +108,13 @@ class Keyboard:
 
 
 def watch(session: Session, robot: Path) -> None:
-    """Show the first world in a window, until it is closed or Ctrl-C.
+    """Show the first world in a window until it is closed, or until Ctrl-C.
 
     Args:
-        session: What is watched; steps in a thread of its own.
-        robot: MJCF of the robot, with what is to be seen.
+        session: The session; it steps in a thread of its own.
+        robot: MJCF of the robot, visual geoms included.
     """
-    import mujoco.viewer  # only where there is a screen
+    import mujoco.viewer  # needs a screen
 
     model = mujoco.MjModel.from_xml_path(str(robot))
     data = mujoco.MjData(model)
@@ -115,35 +131,59 @@ def watch(session: Session, robot: Path) -> None:
         window.cam.distance, window.cam.azimuth, window.cam.elevation = 1.8, 130.0, -18.0
         stepping = threading.Thread(target=session.run, name="session")  # drawing must not hold up the steps
         stepping.start()
-        with stopping_on_ctrl_c(session):
+        with stopping_on_ctrl_c(session.stop):
             while window.is_running() and stepping.is_alive():
                 draw(session.state, window, model, data)
                 stepping.join(FRAME_INTERVAL)
             session.stop()
             stepping.join()
     for thread in drawing:
-        thread.join(timeout=5.0)  # ending Python while it still draws would be a crash
+        thread.join(timeout=5.0)  # Python would crash if it ended while the window still draws
 
 
-def draw(state: State, window: mujoco.viewer.Handle, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Show the first world, and in words what is commanded and done.
+def draw(state: SessionState, window: mujoco.viewer.Handle, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Show the first world, and its command and velocity as text.
 
     Args:
         state: The session's newest state.
-        window: Where.
-        model: The robot with what is to be seen.
+        window: The window.
+        model: The robot.
         data: Its state, which the window draws.
     """
     if state.reading is None:
         return
     with window.lock():
-        window.opt.geomgroup[0] = 1  # MuJoCo's own key 0 hides this group, which has the floor
+        window.opt.geomgroup[0] = 1  # MuJoCo's own key 0 hides this group, which contains the floor
         data.qpos[:] = state.reading.qpos[0]
         mujoco.mj_forward(model, data)
     command, velocity = state.reading.commands[0], state.reading.velocities[0]
     names = ("v_x [m/s]", "v_y [m/s]", "yaw [rad/s]")
-    rows = [f"{told:+.2f}   {done:+.2f}" for told, done in zip(command, velocity, strict=True)]
+    rows = [f"{wanted:+.2f}   {actual:+.2f}" for wanted, actual in zip(command, velocity, strict=True)]
     running = "paused" if state.is_paused else f"{state.real_time:.2f} x real time"
     labels, values = ["", *names, f"model_{state.checkpoint}"], ["commanded, actual", *rows, running]
     window.set_texts((None, None, "\n".join(labels), "\n".join(values)))
     window.sync()
+
+
+@contextlib.contextmanager
+def simulation_window(simulation: Simulation) -> Iterator[Callable[[], None]]:
+    """Open a window on a simulation; what is returned shows the state after a control step, in real time.
+
+    Closing the window counts as Ctrl-C.
+
+    Raises:
+        UserError: If there is no screen.
+    """
+    check_display("--video")
+    import mujoco.viewer  # needs a screen
+
+    pacer = Pacer(1.0 / simulation.policy.description["timing"]["control_frequency"])
+    with mujoco.viewer.launch_passive(simulation.robot.model, simulation.robot.data) as window:
+
+        def show() -> None:
+            if not window.is_running():
+                raise KeyboardInterrupt
+            window.sync()
+            pacer.wait()
+
+        yield show

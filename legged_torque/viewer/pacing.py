@@ -1,20 +1,22 @@
-"""Keeping steps in time with a clock."""
+"""Keeping steps in time with a clock, until Ctrl-C."""
 
 from __future__ import annotations
 
+import contextlib
+import signal
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 MAX_LAG = 0.25
-"""Seconds behind its schedule after which a :class:`Pacer` forgets what it has missed instead of catching up."""
+"""Seconds behind schedule after which a :class:`Pacer` starts a new schedule instead of catching up."""
 
 
 class Pacer:
-    """Lets control steps begin when they are due, and measures how fast they really come.
+    """Starts control steps when they are due, and measures their actual rate.
 
     Attributes:
-        speed: Simulated seconds per second that are asked for: 1 is real time.
+        speed: Wanted simulated seconds per second; 1 is real time.
     """
 
     def __init__(
@@ -36,7 +38,7 @@ class Pacer:
         self._begun: deque[float] = deque(maxlen=51)
 
     def wait(self) -> None:
-        """Return when the next step is due. After a longer delay the schedule starts anew, without a rush."""
+        """Wait until the next step is due. After a delay of more than :data:`MAX_LAG` the schedule starts anew."""
         now = self._clock()
         if self._due is None or now - self._due > MAX_LAG:
             self._due = now
@@ -55,3 +57,19 @@ class Pacer:
         if len(self._begun) < 2:
             return 0.0
         return (len(self._begun) - 1) * self._dt / max(self._begun[-1] - self._begun[0], 1e-9)
+
+
+@contextlib.contextmanager
+def stopping_on_ctrl_c(stop: Callable[[], None]) -> Iterator[None]:
+    """While this context is open, Ctrl-C or SIGTERM calls a function; a second Ctrl-C ends the program at once."""
+
+    def handle(number: int, frame: object) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        stop()
+
+    old = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Sequence
 
 import numpy as np
 import viser
 
-from legged_torque.viewer.recording import HISTORY_STEPS
-from legged_torque.viewer.session import Session
-from legged_torque.viewer.state import State
+from legged_torque.viewer.reading import Reading
+from legged_torque.viewer.session import HISTORY_STEPS, Session
+from legged_torque.viewer.state import SessionState
 
-COMMAND, ACTUAL, PD, DIRECT, TOTAL = "#1faa55", "#2f7df6", "#f08c00", "#2f7df6", "#343a40"
+COMMAND, ACTUAL, APPLIED = "#1faa55", "#2f7df6", "#343a40"
+PARTS = ("#f08c00", "#2f7df6", "#ae3ec9", "#1faa55")
+"""Colors of the parts of torques."""
+REWARD, PENALTY = "#1faa55", "#e03131"
 VELOCITIES = ("v_x, forward [m/s]", "v_y, to the left [m/s]", "yaw rate, to the left [rad/s]")
 STRIDE = 2
-"""Every how many control steps there is a point in a plot."""
+"""Plots show every second control step."""
 WIDTH = 380
 """Of the panel [pixels]."""
 
@@ -27,13 +31,14 @@ class Plots:
 
         Args:
             server: The page.
-            session: What is watched.
+            session: The session.
         """
-        gui, self._session = server.gui, session
-        self._joints = [name.removesuffix("_joint") for name in session.task.dof_names]
-        self._limits = session.task.torque_limits[1].tolist()
-        self._is_mixed = session.state.mixing is not None
-        empty = np.zeros(2, np.float32)
+        gui, task, self._session = server.gui, session.task, session
+        self._joints = [name.removesuffix("_joint") for name in task.dof_names]
+        self._legs = joints_by_leg(self._joints, task.cfg.asset.mirrored_legs)
+        self._limits = task.torque_limits[1].tolist()
+        parts = [name.replace("_", " ") for name in session.state.mixing]
+        self._parts = [(name, PARTS[i % len(PARTS)]) for i, name in enumerate(parts)]
         panel = gui.add_panel()
         with panel.add_tab("Walking", viser.Icon.ACTIVITY):
             legend = [("commanded", COMMAND), ("actual", ACTUAL)]
@@ -41,23 +46,19 @@ class Plots:
             self._velocities = [add_plot(gui, title, legend, (-1.6, 1.6)) for title in VELOCITIES]
             self._bars = gui.add_html("")
         with panel.add_tab("Joints", viser.Icon.ROBOT):
-            self._leg = gui.add_dropdown("leg", tuple(dict.fromkeys(name.split("_")[0] for name in self._joints)))
-            series = self._torque_series()
+            self._leg = gui.add_dropdown("leg", tuple(self._legs))
+            series = [*self._parts, ("applied", APPLIED)]
             gui.add_html(legend_html(series))
-            names = ("hip", "thigh", "calf")
-            self._torques = [add_plot(gui, f"torque of the {name} [N m]", series) for name in names]
+            most = max(len(joints) for joints in self._legs.values())
+            self._torques = [add_plot(gui, "torque", series) for _ in range(most)]
+            self._leg.on_update(lambda event: self._choose_leg())
+            self._choose_leg()
         with panel.add_tab("Rewards", viser.Icon.TROPHY):
             self._rewards = gui.add_html("")
         panel.dock_left()
         panel.set_width(WIDTH)
-        self._empty = empty
 
-    def _torque_series(self) -> list[tuple[str, str]]:
-        """Return names and colors of the torques that are plotted."""
-        parts = [("PD part", PD), ("torque part", DIRECT)] if self._is_mixed else []
-        return [*parts, ("applied", TOTAL)]
-
-    def update(self, state: State) -> None:
+    def update(self, state: SessionState) -> None:
         """Draw everything anew.
 
         Args:
@@ -65,35 +66,63 @@ class Plots:
         """
         if state.reading is None:
             return
-        past = self._session.history.read(len(self._joints))
-        chosen = slice(
-            len(past["time"]) % STRIDE, None, STRIDE
-        )  # the same steps every time, so that curves do not jitter
-        time = past["time"][chosen]
-        if len(time) > 1:
-            time = (time - state.time).astype(np.float32)
-            for i, plot in enumerate(self._velocities):
-                plot.data = (time, *(past[name][chosen, i].astype(np.float32) for name in ("commands", "velocities")))
-            names = ("pd", "direct", "torques") if self._is_mixed else ("torques",)
-            joints = [i for i, name in enumerate(self._joints) if name.split("_")[0] == self._leg.value]
-            for joint, plot in zip(joints, self._torques, strict=False):
-                plot.data = (time, *(past[name][chosen, joint].astype(np.float32) for name in names))
-        self._bars.content = self._torque_bars(state)
+        self._update_curves(state.time)
+        self._bars.content = self._torque_bars(state.reading, state.mixing)
         self._rewards.content = reward_bars(state.rewards)
 
-    def _torque_bars(self, state: State) -> str:
-        """Return all torques of this moment as bars; those of the multi-head task in two parts."""
-        pd, direct = state.reading.torque_parts
+    def _choose_leg(self) -> None:
+        """Write the chosen leg's joints above the plots of torques."""
+        leg = self._leg.value
+        self._chosen = self._legs[leg]
+        for i, plot in enumerate(self._torques):
+            plot.visible = i < len(self._chosen)
+            if plot.visible:
+                plot.title = f"torque of {self._joints[self._chosen[i]].replace('_', ' ')} [N m]"
+
+    def _update_curves(self, now: float) -> None:
+        """Draw the last seconds before a simulated time [s]."""
+        past = list(self._session.history)
+        past = past[len(past) % STRIDE :: STRIDE]  # the same steps every time, so that curves do not jitter
+        if len(past) < 2:
+            return
+        time = np.array([reading.time - now for reading in past], np.float32)
+        velocities = np.array(
+            [[reading.commands[reading.world], reading.velocities[reading.world]] for reading in past]
+        )
+        for i, plot in enumerate(self._velocities):
+            plot.data = (time, *velocities[:, :, i].T)
+        torques = np.array([[*reading.torque_parts, reading.torques] for reading in past])
+        for plot, joint in zip(self._torques, self._chosen, strict=False):
+            plot.data = (time, *torques[:, :, joint].T)
+
+    def _torque_bars(self, reading: Reading, mixing: dict[str, float]) -> str:
+        """Return all torques of this moment as bars, in parts if the task mixes action terms."""
         rows = []
         for i, name in enumerate(self._joints):
-            parts = [(pd[i], PD), (direct[i], DIRECT)] if self._is_mixed else [(state.reading.torques[i], DIRECT)]
-            bars = [(value / self._limits[i], color) for value, color in parts]
-            rows.append(row_html(name.replace("_", " "), bars, f"{state.reading.torques[i]:+.1f}"))
-        title = f"Torques [N m], up to {self._limits[0]:.1f}"
-        if self._is_mixed:
-            theta = state.mixing
-            title += legend_html([(f"PD part x {theta[0]:.2f}", PD), (f"torque part x {theta[1]:.2f}", DIRECT)])
+            colors = [color for _, color in self._parts] or [ACTUAL]
+            values = reading.torque_parts[:, i] if self._parts else reading.torques[i : i + 1]
+            bars = [(value / self._limits[i], color) for value, color in zip(values, colors, strict=True)]
+            rows.append(row_html(name.replace("_", " "), bars, f"{reading.torques[i]:+.1f}"))
+        title = f"Torques [N m], up to {max(self._limits):.1f}"
+        if self._parts:
+            weights = zip(self._parts, mixing.values(), strict=True)
+            title += legend_html([(f"{name} x {weight:.2f}", color) for (name, color), weight in weights])
         return block_html(title, rows)
+
+
+def joints_by_leg(joints: Sequence[str], mirrored_legs: Sequence[Sequence[str]]) -> dict[str, list[int]]:
+    """Return the places of the joints of each leg, and those of no leg as "other".
+
+    Args:
+        joints: Names of the joints.
+        mirrored_legs: ``asset.mirrored_legs``.
+    """
+    legs = [leg for pair in mirrored_legs for leg in pair]
+    result: dict[str, list[int]] = {}
+    for place, name in enumerate(joints):
+        leg = next((leg for leg in legs if name.startswith(leg)), "other")
+        result.setdefault(leg, []).append(place)
+    return result
 
 
 def add_plot(
@@ -102,10 +131,10 @@ def add_plot(
     """Add a plot over the last seconds.
 
     Args:
-        gui: Where.
+        gui: The page's controls.
         title: What is plotted, with its unit.
         series: Name and color of each curve.
-        limits: Lowest and highest value; None are those that occur.
+        limits: Lowest and highest value; None takes those of the data.
     """
     lines = [{"label": name, "stroke": color, "width": 1.5, "points": {"show": False}} for name, color in series]
     seconds = HISTORY_STEPS // 50
@@ -124,12 +153,10 @@ def add_plot(
 def reward_bars(rewards: dict[str, float]) -> str:
     """Return weighted reward terms as bars, rewards in green and penalties in red."""
     largest = max(map(abs, rewards.values()), default=1.0) or 1.0
-    rows = [
-        row_html(
-            name.replace("_", " "), [(value / largest, "#1faa55" if value > 0 else "#e03131")], f"{value:+.3f}", 116
-        )
-        for name, value in rewards.items()
-    ]
+    rows = []
+    for name, value in rewards.items():
+        bar = (value / largest, REWARD if value > 0 else PENALTY)
+        rows.append(row_html(name.replace("_", " "), [bar], f"{value:+.3f}", 116))
     return block_html(f"Weighted terms [1/s]; their sum: {sum(rewards.values()):+.3f}", rows)
 
 

@@ -12,9 +12,9 @@ from viser import transforms
 
 COMMAND_COLOR, VELOCITY_COLOR = (10, 150, 50), (20, 90, 230)
 VISUAL_GROUPS = (0, 1, 2)
-"""Groups of geoms that are seen; the others are what collides."""
+"""Groups of visual geoms; the others only collide."""
 SPACING = 2.0
-"""Distance between the places where worlds start [m]."""
+"""Distance between neighbouring worlds [m]."""
 ARROW_LENGTH = 0.5
 """Length of the arrow of a velocity of 1 m/s [m]."""
 
@@ -22,8 +22,8 @@ ARROW_LENGTH = 0.5
 class Scene:
     """The robots of all worlds, their ground and light.
 
-    Worlds lie side by side, though they all start at the same place in the simulator. What is drawn is moved so that
-    the followed robot stays where the page's camera looks, which a user can then turn and zoom freely.
+    Worlds are drawn side by side, though all start at the same place in the simulator. Everything is moved such that
+    the followed robot stays where the page's camera looks; so users can turn and zoom freely.
 
     Attributes:
         is_following: Whether the camera follows.
@@ -35,7 +35,7 @@ class Scene:
 
         Args:
             server: The page.
-            robot: MJCF of the robot, with what is to be seen.
+            robot: MJCF of the robot, visual geoms included.
             num_envs: Number of worlds.
         """
         self._server = server
@@ -64,7 +64,7 @@ class Scene:
         Args:
             qpos: Positions of all worlds. Shape: (num_envs, nq).
             command: Command of the followed world [m/s, m/s, rad/s]. Shape: (3,).
-            velocity: What its trunk does, in its own frame. Shape: (3,).
+            velocity: Actual velocity of its trunk, in its own frame. Shape: (3,).
             world: The followed world.
         """
         positions, quats = self._poses(qpos)
@@ -79,7 +79,7 @@ class Scene:
                 handle.batched_positions = positions[shown, body]
                 handle.batched_wxyzs = quats[shown, body]
             for handle, vector, height in zip(self._arrows, (command, velocity), (0.22, 0.17), strict=True):
-                start = trunk + [0.0, 0.0, height]
+                start = trunk + np.array([0.0, 0.0, height])
                 end = start + ARROW_LENGTH * rotation @ [vector[0], vector[1], 0.0]
                 handle.points = np.stack([start, end])[None].astype(np.float32)
                 handle.visible = bool(np.hypot(vector[0], vector[1]) > 0.05)
@@ -96,7 +96,7 @@ class Scene:
         return positions, quats
 
     def _add_surroundings(self) -> viser.GridHandle:
-        """Add the light and the ground, say from where the robot is seen at first, and return the ground."""
+        """Add light and ground, place the camera, and return the ground."""
         scene = self._server.scene
         ground = scene.add_grid(
             "/ground",
@@ -120,14 +120,14 @@ class Scene:
 def places(num_envs: int) -> np.ndarray:
     """Return where worlds are drawn: on a square grid, the first one in its middle. Shape: (num_envs, 3)."""
     side = int(np.ceil(np.sqrt(num_envs)))
-    rows = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), axis=-1).reshape(-1, 2)
-    rows = SPACING * (rows - (side - 1) // 2)
-    order = np.argsort(np.linalg.norm(rows, axis=1), kind="stable")
-    return np.pad(rows[order][:num_envs], ((0, 0), (0, 1)))
+    cells = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), axis=-1).reshape(-1, 2)
+    centers = SPACING * (cells - (side - 1) // 2)
+    order = np.argsort(np.linalg.norm(centers, axis=1), kind="stable")
+    return np.pad(centers[order][:num_envs], ((0, 0), (0, 1)))
 
 
 def body_glb(model: mujoco.MjModel, body: int) -> bytes | None:
-    """Return what is seen of a body as a binary glTF in its own frame, one mesh per material; None for nothing."""
+    """Return a body's visual geoms as a binary glTF in its frame, one mesh per material; None if it has none."""
     by_material: dict[int, list[trimesh.Trimesh]] = {}
     for geom in range(model.ngeom):
         if model.geom_bodyid[geom] == body and model.geom_group[geom] in VISUAL_GROUPS:
@@ -168,11 +168,11 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
 
 
 def pbr_material(model: mujoco.MjModel, material: int) -> trimesh.visual.material.PBRMaterial:
-    """Return a material of the model as glTF knows it; -1 is a geom's without one."""
+    """Return a material of the model for glTF; -1 stands for none."""
     if material < 0:
         return trimesh.visual.material.PBRMaterial(baseColorFactor=(0.5, 0.5, 0.5, 1.0), roughnessFactor=0.7)
     color, shininess = model.mat_rgba[material].copy(), float(model.mat_shininess[material])
-    color[:3] **= 2.2  # glTF's are linear
+    color[:3] **= 2.2  # colors of glTF are linear
     return trimesh.visual.material.PBRMaterial(
         baseColorFactor=tuple(color),
         emissiveFactor=tuple(color[:3] * model.mat_emission[material]),

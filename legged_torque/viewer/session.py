@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
+import dataclasses
+import functools
 import math
-import signal
+import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 import torch
 
-from legged_torque.learning.runner import OnPolicyRunner
+from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import apply_perturbation
-from legged_torque.utils.runs import checkpoint_numbers
+from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers
+from legged_torque.utils.task_registry import LoadedRun, task_registry
 from legged_torque.viewer.pacing import Pacer
-from legged_torque.viewer.recording import History, Recorder
-from legged_torque.viewer.requests import Requests
-from legged_torque.viewer.state import AS_LOADED, State
+from legged_torque.viewer.reading import Reading, TaskReader, WatchedRobot, watched, weighted_terms
+from legged_torque.viewer.state import AS_LOADED, Command, SessionState
 
+HISTORY_STEPS = 500
+"""Control steps that are kept for plots: 10 s."""
 SCAN_INTERVAL = 1.0
 """Seconds between looks for new checkpoints."""
 IDLE = 0.02
@@ -33,60 +36,76 @@ SLOWEST, FASTEST = 0.1, 1.0
 SMOOTHING = 0.06
 """Weight of the newest step in the shown reward terms: they are means over about a third of a second."""
 
+Arguments = ParamSpec("Arguments")
 
-class Session(Requests):
-    """Steps a task with a policy's mean actions in one thread, which also carries out what others ask for.
 
-    Requests may come from any thread: they only leave a note. The thread in :meth:`run` reads the notes between two
-    steps, so that nothing changes in the middle of one. :attr:`state` and :attr:`history` may be read from any thread.
+def request(method: Callable[Concatenate[Session, Arguments], None]) -> Callable[Concatenate[Session, Arguments], None]:
+    """Make a method of :class:`Session` a request: a call is only queued, and :meth:`Session.tick` carries it out."""
+
+    @functools.wraps(method)
+    def ask(self: Session, *args: Arguments.args, **kwargs: Arguments.kwargs) -> None:
+        self.requests.put(functools.partial(method, self, *args, **kwargs))
+
+    return ask
+
+
+class Session:
+    """Steps a task with a policy's mean actions in one thread, which also carries out requests.
+
+    Requests may come from any thread. The thread in :meth:`run` carries them out between two steps, so that nothing
+    changes in the middle of one. :attr:`state` and :attr:`history` may be read from any thread.
+
+    Attributes:
+        requests: Requests that have not been carried out yet.
+        state: What is shown.
+        history: The last steps of the followed world; copy it before iterating in another thread.
+        task: The task; only the stepping thread may touch its tensors.
     """
 
     def __init__(
         self,
-        make_task: Callable[[Any], Any],
-        env_cfg: Any,
-        runner: OnPolicyRunner,
-        run_dir: Path,
-        checkpoint: int,
+        task_class: type[LeggedRobot],
+        run: LoadedRun,
+        device: str,
         clock: Callable[[], float] = time.perf_counter,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Load a checkpoint and be ready to step.
+        """Build the task, load the checkpoint and be ready to step.
 
         Args:
-            make_task: Builds a task from settings.
-            env_cfg: Settings of the runner's task.
-            runner: The runner, with its task.
-            run_dir: Folder of the run, in which checkpoints are looked for.
-            checkpoint: The first one to load.
+            task_class: Class of the run's task.
+            run: The run; its folder is searched for new checkpoints.
+            device: "cpu" or "cuda:N".
             clock: Returns the time [s].
             sleep: Waits for some seconds.
 
         Raises:
             UserError: If the checkpoint cannot be loaded.
         """
-        super().__init__()
-        self._make_task, self._cfg, self._runner, self._run_dir = make_task, env_cfg, runner, run_dir
+        self._make_task = functools.partial(watched(task_class), device=device)
+        self._cfg, self._run_dir = run.env_cfg, run.folder
         self._clock, self._sleep = clock, sleep
+        self.requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._refused: dict[int, float] = {}
         self._next_scan = -math.inf
-        self._falls, self._rewards = 0, np.zeros(0)
-        self.history = History()
-        self.state = State()
-        self.task = runner.env
+        self.history: deque[Reading] = deque(maxlen=HISTORY_STEPS)
+        self.state = SessionState()
+        self.task = self._make_task(self._cfg)
+        self._obs = self.task.get_observations()
+        self._runner, _ = task_registry.make_alg_runner(self.task, train_cfg=run.train_cfg, log_root=None)
         self._pacer = Pacer(self.task.dt, clock, sleep)
-        self._load(checkpoint)
-        self._policy = runner.get_inference_policy(self.task.device)
+        self._load(run.iterations)
+        self._policy = self._runner.get_inference_policy(device)
         self._adopt(self.task)
         self._scan()
 
     def stop(self) -> None:
-        """Let :meth:`run` return after the current step; from any thread."""
+        """Let :meth:`run` return after the current step; may be called from any thread."""
         self._stop.set()
 
     def perturbations(self) -> list[str]:
-        """Return what :meth:`set_perturbation` takes."""
+        """Return the names that :meth:`set_perturbation` accepts."""
         return [AS_LOADED, *self._cfg.perturbations()]
 
     # ---- the stepping thread -----------------------------------------------------------------------------------------
@@ -98,9 +117,9 @@ class Session(Requests):
 
     def tick(self) -> None:
         """Carry out the requests, then make one step when it is due, or none while paused."""
-        while not self._requests.empty():
+        while not self.requests.empty():
             try:
-                self._requests.get()()
+                self.requests.get()()
             except UserError as error:
                 self._tell(str(error), is_error=True)
         if self._clock() >= self._next_scan:
@@ -114,96 +133,138 @@ class Session(Requests):
     @torch.no_grad()
     def _step(self) -> None:
         """Make one control step and show it."""
-        self._recorder.before_step()
+        self._reader.before_step()
         self._obs = self.task.step(self._policy(self._obs))[0]
         self.task.total_steps.copy_(self._trained_steps)  # curricula stay where the checkpoint was saved
-        world, simulated = self.state.world, self.state.time + self.task.dt
-        reading = self._recorder.read(world)
-        self.history.add(reading, world, simulated)
+        reading = self._reader.read(self.state.time + self.task.dt, self.state.world)
+        self.history.append(reading)
         self._rewards += SMOOTHING * (reading.rewards - self._rewards)
         self._falls += int(reading.resets[0])
         self._show(
             reading=reading,
             rewards=dict(zip(self.task.reward_names, self._rewards.tolist(), strict=True)),
-            time=simulated,
+            time=reading.time,
             real_time=self._pacer.achieved(),
             falls=self._falls,
         )
 
     def _show(self, **changes: Any) -> None:
         """Replace the state by one with some changes."""
-        self.state = State(**{**self.state.__dict__, **changes})
+        self.state = dataclasses.replace(self.state, **changes)
 
     def _tell(self, message: str, is_error: bool = False) -> None:
         """Show a line."""
         self._show(message=message, is_error=is_error, message_number=self.state.message_number + 1)
 
     @torch.no_grad()
-    def _adopt(self, task: Any) -> None:
-        """Go on with a task: the runner's first one, or one that was built with other perturbations."""
+    def _adopt(self, task: WatchedRobot) -> None:
+        """Go on with a task: the first one, or one that was built with another perturbation."""
         self.task = self._runner.env = task
-        self._recorder = Recorder(task)
+        self._reader = TaskReader(task)
         self._rewards, self._falls = np.zeros(len(task.reward_names)), 0
         self.history.clear()
         self._show(task_number=self.state.task_number + 1, reading=None, falls=0, rewards={})
-        self._set_command(self.state.command)
-        self._set_mixing(self.state.mixing if self.state.is_mixing_set else None)
+        self._apply_command()
+        self._apply_mixing()
         self._obs = task.reset()
         self._pacer.restart()
 
-    # ---- what requests do --------------------------------------------------------------------------------------------
+    def _apply_command(self) -> None:
+        """Give all worlds the chosen command, or one of their own each."""
+        self.task.command_generator.hold(self.state.command)
+        self.task.command_generator.resample(torch.ones_like(self.task.reset_buf))
 
-    def _set_command(self, command: tuple[float, float, float] | None) -> None:
-        """Let the task draw commands from a range of one command, or from its own ranges."""
-        task = self.task
-        task.command_generator.hold(command)
-        task.command_generator.resample(torch.ones_like(task.reset_buf))
+    def _apply_mixing(self) -> None:
+        """Set the chosen weights, or those of the curriculum. They stay, since only rollouts change them."""
+        self.task.update_curriculum()
+        weights = weighted_terms(self.task)
+        if self.state.is_mixing_set:
+            for name, weight in weights.items():
+                weight.fill_(self.state.mixing[name])
+        self._show(mixing={name: weight.item() for name, weight in weights.items()})
+
+    # ---- requests: a call from any thread is carried out by the stepping thread --------------------------------------
+
+    @request
+    def set_command(self, command: Command | None) -> None:
+        """Command v_x, v_y [m/s] and a yaw rate [rad/s] in all worlds; None draws commands as in training."""
         self._show(command=command)
+        self._apply_command()
 
-    def _push(self, angle: float, speed: float) -> None:
-        """Add the velocity, along the horizontal direction in which each trunk looks."""
+    @request
+    def push(self, angle: float, speed: float) -> None:
+        """Add a horizontal velocity to every trunk at once.
+
+        Args:
+            angle: Direction from the robot's front, to its left [rad].
+            speed: [m/s].
+        """
         w, x, y, z = self.task.base_quat.unbind(dim=1)
         heading = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) + angle
-        self.task.sim.qvel[:, 0] += speed * heading.cos()
-        self.task.sim.qvel[:, 1] += speed * heading.sin()
+        velocity = speed * torch.stack([heading.cos(), heading.sin(), torch.zeros_like(heading)], dim=1)
+        everywhere = torch.ones_like(self.task.reset_buf)
+        self.task.sim.push(everywhere, velocity, everywhere)
         self._tell(f"pushed with {speed:.1f} m/s")
 
-    def _set_paused(self, is_paused: bool) -> None:
-        """Stop or go on, without catching up."""
+    @request
+    def set_paused(self, is_paused: bool) -> None:
+        """Pause, or go on without catching up."""
         self._pacer.restart()
         self._show(is_paused=is_paused, real_time=0.0)
 
-    def _reset(self) -> None:
-        """Start new episodes."""
+    @request
+    def reset(self) -> None:
+        """Start a new episode in every world."""
         with torch.no_grad():
             self._obs = self.task.reset()
         self._tell("reset")
 
-    def _set_speed(self, speed: float) -> None:
-        """Set the speed, within its limits."""
+    @request
+    def set_speed(self, speed: float) -> None:
+        """Set the simulated seconds per second, from :data:`SLOWEST` to :data:`FASTEST`."""
         self._pacer.speed = min(max(speed, SLOWEST), FASTEST)
         self._pacer.restart()
         self._show(speed=self._pacer.speed)
 
-    def _follow_world(self, world: int) -> None:
-        """Follow another world."""
+    @request
+    def follow_world(self, world: int) -> None:
+        """Choose the world of history, torques and reward terms."""
         self.history.clear()
         self._rewards[:] = 0.0
         self._show(world=min(max(world, 0), self.task.num_envs - 1))
 
-    def _set_mixing(self, mixing: tuple[float, float] | None) -> None:
-        """Write the weights, or let the curriculum write them; they stay, since only rollouts change them."""
-        task = self.task
-        if not hasattr(task, "mixing"):
-            return
-        if mixing is None:
-            task.update_curriculum()
-        else:
-            task.mixing.copy_(torch.tensor(mixing, dtype=torch.float32))
-        self._show(mixing=tuple(task.mixing.tolist()), is_mixing_set=mixing is not None)
+    @request
+    def set_mixing(self, weights: Sequence[float] | None) -> None:
+        """Set the weights of the action terms in ``state.mixing``, in their order; None sets them as in training."""
+        mixing = self.state.mixing if weights is None else dict(zip(self.state.mixing, weights, strict=True))
+        self._show(mixing=mixing, is_mixing_set=weights is not None)
+        self._apply_mixing()
 
-    def _set_perturbation(self, name: str) -> None:
-        """Rebuild the task; if that is not possible, the old one goes on."""
+    @request
+    def load_checkpoint(self, number: int) -> None:
+        """Let another checkpoint of the run act while the robots walk on; if it is broken, the old one goes on."""
+        actor = self._runner.alg.actor
+        weights, counters = copy.deepcopy(actor.state_dict()), self.task.state_dict()
+        try:
+            self._load(number)
+        except UserError:
+            actor.load_state_dict(weights)
+            self.task.load_state_dict(counters)
+            raise
+        finally:
+            self._apply_mixing()
+        self._tell(f"model_{number} acts now")
+
+    @request
+    def follow_newest(self, is_on: bool) -> None:
+        """Load each new checkpoint as soon as it is saved, or stop doing so."""
+        self._refused.clear()
+        self._next_scan = -math.inf  # at once
+        self._show(follows_newest=is_on)
+
+    @request
+    def set_perturbation(self, name: str) -> None:
+        """Rebuild the task with one of its perturbations, or :data:`AS_LOADED`; if that fails, the old one goes on."""
         cfg = copy.deepcopy(self._cfg)
         if name != AS_LOADED:
             apply_perturbation(cfg, name)
@@ -219,7 +280,7 @@ class Session(Requests):
     # ---- checkpoints -------------------------------------------------------------------------------------------------
 
     def _scan(self) -> None:
-        """Look for checkpoints that have appeared, and load the newest one if that is wanted."""
+        """Look for new checkpoints, and load the newest one if that is wanted."""
         self._next_scan = self._clock() + SCAN_INTERVAL
         numbers = tuple(checkpoint_numbers(self._run_dir))
         if numbers != self.state.checkpoints:
@@ -227,59 +288,19 @@ class Session(Requests):
         if self.state.follows_newest and numbers and numbers[-1] != self.state.checkpoint:
             changed = self._modified(numbers[-1])
             if self._refused.get(numbers[-1]) != changed:
-                self._refused[numbers[-1]] = changed  # not tried again before it changes, should it be broken
-                self._ask(self._switch_checkpoint, numbers[-1])
-
-    def _file(self, number: int) -> Path:
-        """Return the file of a checkpoint."""
-        return self._run_dir / f"model_{number}.pt"
+                self._refused[numbers[-1]] = changed  # a broken one is not tried again before it changes
+                self.load_checkpoint(numbers[-1])
 
     def _modified(self, number: int) -> float:
-        """Return when a checkpoint was written last [s]; -1 if it is gone."""
+        """Return when a checkpoint was last written [s]; -1 if it is gone."""
         try:
-            return self._file(number).stat().st_mtime
+            return checkpoint_file(self._run_dir, number).stat().st_mtime
         except OSError:
             return -1.0
-
-    def _follow_newest(self, is_on: bool) -> None:
-        """Load what is newest at the next look, which is due now."""
-        self._refused.clear()
-        self._next_scan = -math.inf
-        self._show(follows_newest=is_on)
-
-    def _switch_checkpoint(self, number: int) -> None:
-        """Load another checkpoint while the robots walk on; if it is broken, the old one goes on."""
-        actor = self._runner.alg.actor
-        weights, counters = copy.deepcopy(actor.state_dict()), self.task.state_dict()
-        try:
-            self._load(number)
-        except UserError:
-            actor.load_state_dict(weights)
-            self.task.load_state_dict(counters)
-            raise
-        finally:
-            self._set_mixing(self.state.mixing if self.state.is_mixing_set else None)
-        self._tell(f"model_{number} acts now")
 
     def _load(self, number: int) -> None:
         """Load a checkpoint into the networks and its counters into the task."""
         with torch.no_grad():
-            infos = self._runner.load(str(self._file(number)))
+            infos = self._runner.load(str(checkpoint_file(self._run_dir, number)))
         self._trained_steps = self.task.total_steps.clone()
         self._show(checkpoint=number, trained_steps=int(infos["total_timesteps"]))
-
-
-@contextlib.contextmanager
-def stopping_on_ctrl_c(session: Session) -> Iterator[None]:
-    """While this context is open, Ctrl-C or SIGTERM stops a session; a second Ctrl-C ends the program at once."""
-
-    def stop(number: int, frame: object) -> None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        session.stop()
-
-    old = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)

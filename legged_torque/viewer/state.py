@@ -1,30 +1,37 @@
-"""What a session shows to whoever watches it."""
+"""What a session shows to a window or a page."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from legged_torque.viewer.recording import Reading
+if TYPE_CHECKING:
+    from legged_torque.viewer.reading import Reading
 
 AS_LOADED = "as loaded"
-"""The perturbation that the run or the command line has chosen."""
+"""The perturbation of the run or of the command line."""
+
+Command = tuple[float, float, float]
+"""Commanded v_x, v_y [m/s] and yaw rate [rad/s]."""
 
 
 @dataclass(frozen=True)
-class State:
-    """What a session shows; a new one replaces the old one after every step and request.
+class SessionState:
+    """A snapshot of a session; a new one replaces it after every step and request.
 
     Attributes:
         reading: The last step; None before the first.
         rewards: Weighted reward terms of the followed world per second, smoothed.
         time: Simulated time since the start [s].
-        real_time: Simulated seconds per second of late.
-        message: What happened last, in one line, and whether it is an error; ``message_number`` counts them.
+        real_time: Simulated seconds per second over the last steps.
+        message: The last event in one line; ``is_error`` says whether it is an error, ``message_number`` counts them.
+        world: The followed world.
+        command: The command in all worlds; None if commands are drawn as in training.
         checkpoint: Iterations of the checkpoint that acts; ``trained_steps`` are its environment steps.
         checkpoints: All checkpoints of the run.
-        mixing: Weights of PD control and torque actions; None for a task without them.
+        mixing: Weights of the action terms that have one, by name; ``is_mixing_set`` says whether a user has set them.
         task_number: Counts the tasks that were built.
-        falls: Resets that were not time-outs since the task was built.
+        falls: Resets other than time-outs since the task was built.
     """
 
     reading: Reading | None = None
@@ -37,13 +44,13 @@ class State:
     is_paused: bool = False
     speed: float = 1.0
     world: int = 0
-    command: tuple[float, float, float] | None = None
+    command: Command | None = None
     perturbation: str = AS_LOADED
     checkpoint: int = 0
     trained_steps: int = 0
     checkpoints: tuple[int, ...] = ()
     follows_newest: bool = False
-    mixing: tuple[float, float] | None = None
+    mixing: dict[str, float] = field(default_factory=dict)
     is_mixing_set: bool = False
     task_number: int = 0
     falls: int = 0

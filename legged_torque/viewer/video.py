@@ -1,4 +1,4 @@
-"""Drawing recorded robots as a video: one of them, or several as tiles of a grid. Needs neither torch nor Warp."""
+"""Videos of one robot, or of several as tiles of a grid. Needs neither torch nor Warp."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
+from legged_torque import resource_path
 from legged_torque.deploy.simulation import Simulation
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.rendering import INSTALL_HINT
+
+if TYPE_CHECKING:
+    from legged_torque.envs.base.legged_robot import LeggedRobot
 
 SIZE = (960, 540)
 """Width and height of a video of one robot [pixels]."""
@@ -20,6 +25,8 @@ GRID_SIZE = (1280, 720)
 """About the width and height of a video of several robots [pixels]."""
 COMMAND_COLOR = (0.1, 0.8, 0.2, 0.9)
 VELOCITY_COLOR = (0.1, 0.4, 1.0, 0.9)
+TRUNK = 1
+"""The trunk's body in the MJCF of a task."""
 _TEXT_COLORS = {"plain": (255, 255, 255), "command": (110, 240, 130), "velocity": (130, 190, 255)}
 _BOX_COLOR = (20, 24, 30, 190)
 
@@ -39,39 +46,82 @@ class Moment:
     velocity: np.ndarray
 
 
-class Recorder:
-    """Keeps what the robot of :mod:`legged_torque.deploy.simulation` does, to draw it as a video."""
+class VideoRecorder:
+    """Keeps what robots do, to draw them as a video."""
+
+    def __init__(self, model: mujoco.MjModel, trunk: int, control_step: float) -> None:
+        """Start without any steps; arguments as of :func:`write_video`."""
+        self._model, self._trunk, self._control_step = model, trunk, control_step
+        self._steps: list[list[Moment]] = []
+
+    def save(self, file: Path, no_renderer: str | None) -> None:
+        """Draw and write the video and print where it is, or why there is none.
+
+        Args:
+            file: The mp4.
+            no_renderer: Why nothing can be drawn, see :func:`~legged_torque.utils.rendering.choose_offscreen_renderer`.
+        """
+        try:
+            if no_renderer:
+                raise UserError(no_renderer)
+            write_video(file, self._model, self._trunk, self._steps, self._control_step)
+            print(f"video: {file}")
+        except UserError as error:
+            print(f"no video: {error}")
+
+
+class SimulationRecorder(VideoRecorder):
+    """Records the robot of :mod:`legged_torque.deploy.simulation`."""
 
     def __init__(self, simulation: Simulation) -> None:
-        """Record the robot of a simulation."""
+        """Prepare to record a simulation."""
+        robot, timing = simulation.robot, simulation.policy.description["timing"]
+        super().__init__(robot.model, robot.trunk, 1.0 / timing["control_frequency"])
         self._simulation = simulation
-        self._steps: list[list[Moment]] = []
 
     def add_step(self) -> None:
         """Keep the state after a control step."""
-        robot = self._simulation.robot
-        velocity = np.append(robot.trunk_velocity()[:2], robot.trunk_angular_velocity()[2])
-        self._steps.append([Moment(robot.data.qpos.copy(), self._simulation.command.copy(), velocity)])
+        simulation, robot = self._simulation, self._simulation.robot
+        self._steps.append([Moment(robot.data.qpos.copy(), simulation.command.copy(), robot.planar_velocity())])
 
-    def save(self, file: Path) -> None:
-        """Draw what was recorded, see :func:`write_video`."""
-        robot, timing = self._simulation.robot, self._simulation.policy.description["timing"]
-        write_video(file, robot.model, robot.trunk, self._steps, 1.0 / timing["control_frequency"])
+
+class TaskRecorder(VideoRecorder):
+    """Records worlds of a task."""
+
+    def __init__(self, task: LeggedRobot, num_worlds: int = 1) -> None:
+        """Prepare to record a task.
+
+        Args:
+            task: The task.
+            num_worlds: How many worlds, from the first one on; 1 is the one with the fastest command at the start.
+        """
+        super().__init__(mujoco.MjModel.from_xml_path(str(resource_path(task.cfg.asset.file))), TRUNK, task.dt)
+        self._task = task
+        self._worlds = list(range(num_worlds)) if num_worlds > 1 else []
+
+    def add_step(self) -> None:
+        """Keep the state after a control step."""
+        task = self._task
+        self._worlds = self._worlds or [int(task.commands[:, :2].norm(dim=1).argmax())]
+        parts = [
+            part[self._worlds].double().cpu().numpy() for part in (task.sim.qpos, task.commands, task.planar_velocity())
+        ]
+        self._steps.append([Moment(*moment) for moment in zip(*parts, strict=True)])
 
 
 def write_video(
     file: Path, model: mujoco.MjModel, trunk: int, steps: Sequence[Sequence[Moment]], control_step: float
 ) -> None:
-    """Draw robots close up and write them as mp4, in real time, every second control step.
+    """Write an mp4 of robots seen close up, in real time, with a frame for every second control step.
 
-    A green arrow is the commanded velocity, a blue one the actual velocity; numbers tell both. Several robots are the
+    A green arrow is the commanded velocity, a blue one the actual velocity; numbers show both. Several robots are the
     tiles of a grid, row by row.
 
     Args:
         file: The mp4.
         model: One robot with its ground. The size of its off-screen buffer is changed.
-        trunk: The robot's body that the camera follows.
-        steps: For each control step, what each robot does; the number of robots is a square number.
+        trunk: Body that the camera follows.
+        steps: What each robot does in each control step; the number of robots is a square number.
         control_step: Time between two steps [s].
 
     Raises:
@@ -92,7 +142,8 @@ def write_video(
     except Exception as error:  # whatever the graphics driver raises
         raise UserError(f"the renderer does not start: {error} ({INSTALL_HINT})") from None
     file.parent.mkdir(parents=True, exist_ok=True)
-    with renderer, imageio.get_writer(file, fps=round(0.5 / control_step), macro_block_size=1) as writer:
+    writer = imageio.get_writer(file, fps=round(0.5 / control_step), macro_block_size=1)
+    with renderer, writer:
         for number, moments in list(enumerate(steps, start=1))[::2]:
             tiles = []
             for moment in moments:
@@ -113,13 +164,13 @@ def _draw(
     renderer.update_scene(data, camera=_follow(position))
     arrows = ((moment.command, COMMAND_COLOR, 0.24), (moment.velocity, VELOCITY_COLOR, 0.2))
     for vector, color, height in arrows:
-        start = position + [0.0, 0.0, height]
+        start = position + np.array([0.0, 0.0, height])
         _add_arrow(renderer.scene, start, rotation @ [vector[0], vector[1], 0.0], color)
     return renderer.render()
 
 
 def _follow(position: np.ndarray) -> mujoco.MjvCamera:
-    """Return a camera that looks at the robot from the side and keeps its direction."""
+    """Return a camera that looks at the robot from a fixed direction."""
     camera = mujoco.MjvCamera()
     camera.lookat[:] = (position[0], position[1], 0.25)
     camera.distance, camera.azimuth, camera.elevation = 1.6, 130.0, -18.0
@@ -131,7 +182,9 @@ def _add_arrow(scene: mujoco.MjvScene, start: np.ndarray, vector: np.ndarray, co
     if np.linalg.norm(vector) < 1e-3 or scene.ngeom >= scene.maxgeom:
         return
     geom = scene.geoms[scene.ngeom]
-    mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.zeros(9), np.float32(color))
+    mujoco.mjv_initGeom(
+        geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.zeros(9), np.array(color, np.float32)
+    )
     mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.012, start, start + 0.5 * vector)
     scene.ngeom += 1
 
@@ -156,16 +209,17 @@ def _line(moment: Moment) -> list[tuple[str, list[str]]]:
 
 
 def _number(value: float) -> str:
-    """Return a number with two digits and a sign, that of zero being +."""
+    """Return a number with a sign and two decimals; zero is +0.00."""
     return f"{round(float(value), 2) + 0.0:+.2f}"
 
 
 def add_overlay(image: np.ndarray, rows: list[tuple[str, list[str]]]) -> np.ndarray:
-    """Write rows of text into the upper left corner, bright on a dark box that lets the image shine through.
+    """Write rows of text into the upper left corner, bright on a translucent dark box.
 
     Args:
         image: Shape: (height, width, 3), 8 bits.
-        rows: Color ("plain", "command" or "velocity") and words of each; the first word is set left, the others right.
+        rows: Color ("plain", "command" or "velocity") and words of each; the first word is left-aligned, the others
+            are right-aligned.
 
     Returns:
         A new image.

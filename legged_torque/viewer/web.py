@@ -13,10 +13,11 @@ import viser
 
 from legged_torque.utils.errors import UserError
 from legged_torque.viewer.controls import Controls
+from legged_torque.viewer.pacing import stopping_on_ctrl_c
 from legged_torque.viewer.plots import Plots
 from legged_torque.viewer.scene import Scene
-from legged_torque.viewer.session import Session, stopping_on_ctrl_c
-from legged_torque.viewer.state import State
+from legged_torque.viewer.session import Session
+from legged_torque.viewer.state import SessionState
 
 FRAME_INTERVAL = 1.0 / 30.0
 """Seconds between drawings of the robots."""
@@ -25,22 +26,22 @@ PLOT_INTERVAL = 0.2
 
 
 class Page:
-    """Draws a session, in a thread of its own that never touches the task.
+    """Draws a session in a thread of its own, which never touches the task's tensors.
 
     Attributes:
-        server: The page's server.
-        controls: The panel with controls.
+        server: Server of the page.
+        controls: Panel with controls.
     """
 
     def __init__(self, session: Session, robot: Path, title: str, host: str, port: int) -> None:
         """Serve the page.
 
         Args:
-            session: What is watched.
-            robot: MJCF of the robot, with what is to be seen.
-            title: What is watched, in a few words.
+            session: The session.
+            robot: MJCF of the robot, visual geoms included.
+            title: Title of the page.
             host: Address to serve at.
-            port: Port to serve at; if it is taken, the next free one is.
+            port: Port to serve at, or the next free one.
 
         Raises:
             UserError: If there is no such address.
@@ -59,7 +60,7 @@ class Page:
 
     @property
     def url(self) -> str:
-        """Where a browser on this machine finds the page."""
+        """Address of the page for a browser on this machine."""
         host = self.server.get_host()
         return f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{self.server.get_port()}"
 
@@ -85,8 +86,8 @@ class Page:
                     self.controls.update(state)
                     self._notify(state)
 
-    def _notify(self, state: State) -> None:
-        """Let what went wrong pop up on the page."""
+    def _notify(self, state: SessionState) -> None:
+        """Show an error as a notification on the page."""
         if state.message_number == self._message_shown:
             return
         self._message_shown = state.message_number
@@ -96,7 +97,7 @@ class Page:
 
 
 def free_port(host: str, port: int) -> int:
-    """Return the first free port from ``port`` on; viser itself would wait for ever at a wrong address.
+    """Return the first free port from ``port`` on; viser itself would wait forever at a wrong address.
 
     Raises:
         UserError: If nothing can be served at that address, or no port is free.
@@ -114,12 +115,9 @@ def free_port(host: str, port: int) -> int:
     raise UserError(f"no port from {port} on is free")
 
 
-def status_html(state: State) -> str:
-    """Return what is going on, in three lines."""
-    if state.is_paused:
-        running = "paused"
-    else:
-        running = f"{state.real_time:.2f} x real time"
+def status_html(state: SessionState) -> str:
+    """Return the status in three lines: checkpoint, time, last message."""
+    running = "paused" if state.is_paused else f"{state.real_time:.2f} x real time"
     color = "#e03131" if state.is_error else "inherit"
     lines = [
         f"<b>model_{state.checkpoint}</b>, after {state.trained_steps / 1e6:,.1f} million steps",
@@ -133,11 +131,11 @@ def watch(session: Session, robot: Path, title: str, host: str, port: int) -> No
     """Serve a page and step until Ctrl-C.
 
     Args:
-        session: What is watched.
-        robot: MJCF of the robot, with what is to be seen.
-        title: What is watched, in a few words.
+        session: The session.
+        robot: MJCF of the robot, visual geoms included.
+        title: Title of the page.
         host: Address to serve at.
-        port: Port to serve at, or a later one.
+        port: Port to serve at, or the next free one.
     """
     page = Page(session, robot, title, host, port)
     if page.server.get_port() != port:
@@ -145,7 +143,7 @@ def watch(session: Session, robot: Path, title: str, host: str, port: int) -> No
     print(f"See it walk: {page.url} (Ctrl-C ends)", flush=True)
 
     try:
-        with stopping_on_ctrl_c(session):
+        with stopping_on_ctrl_c(session.stop):
             session.run()
     finally:
         page.close()

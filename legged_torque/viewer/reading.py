@@ -1,0 +1,114 @@
+"""What a viewer reads from a running task after each step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from legged_torque.envs.base.legged_robot import LeggedRobot
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A task after one control step, in the host's memory.
+
+    Attributes:
+        time: Simulated time since the session's start [s].
+        world: The followed world.
+        qpos: Positions of all worlds, as ``sim.qpos``. Shape: (num_envs, nq).
+        commands: Commands of all worlds during the step [m/s, m/s, rad/s]. Shape: (num_envs, 3).
+        velocities: Actual v_x, v_y and yaw rates, in the trunks' frames. Shape: (num_envs, 3).
+        torques: Applied torques of the followed world in its last physics step [N m]. Shape: (num_dof,).
+        torque_parts: See :attr:`WatchedRobot.torque_parts`, of the followed world. Shape: (parts, num_dof).
+        rewards: Its weighted reward terms of this step, per second. Shape: (terms,).
+        resets: Number of worlds whose episode ended: [fallen or diverged, timed out].
+    """
+
+    time: float
+    world: int
+    qpos: np.ndarray
+    commands: np.ndarray
+    velocities: np.ndarray
+    torques: np.ndarray
+    torque_parts: np.ndarray
+    rewards: np.ndarray
+    resets: np.ndarray
+
+
+class WatchedRobot(LeggedRobot):
+    """A task that keeps how much each weighted action term adds to the torques; made by :func:`watched`.
+
+    Attributes:
+        torque_parts: Torques of each action term that has a weight, times the motors' strength, before the limits
+            [N m]. Shape: (parts, num_envs, num_dof).
+    """
+
+    def _init_actions(self) -> None:
+        """Allocate the parts as well."""
+        super()._init_actions()
+        self.torque_parts = torch.zeros(len(weighted_terms(self)), self.num_envs, self.num_dof, device=self.device)
+
+    def _compute_torques(self, actions: Tensor) -> Tensor:
+        """Return the task's torques. The part of a term is what its weight of 0 would take away."""
+        torques = super()._compute_torques(actions)
+        for part, weight in zip(self.torque_parts, weighted_terms(self).values(), strict=True):
+            kept = weight.clone()
+            weight.zero_()
+            part.copy_((torques - super()._compute_torques(actions)) * self.motors.strength)
+            weight.copy_(kept)
+        return torques
+
+
+def watched(task_class: type[LeggedRobot]) -> type[WatchedRobot]:
+    """Return a task class that behaves like the given one and keeps the parts of its torques."""
+    return cast(type[WatchedRobot], type(task_class.__name__, (WatchedRobot, task_class), {}))
+
+
+def weighted_terms(task: LeggedRobot) -> dict[str, Tensor]:
+    """Return the weights of the action terms that have one, by the terms' names. Writing to them changes the task."""
+    return {term.name: term.weight for term in task.action_terms() if term.weight is not None}
+
+
+class TaskReader:
+    """Reads a task after each of its steps, in one transfer from the device."""
+
+    def __init__(self, task: WatchedRobot) -> None:
+        """Prepare, before the first step."""
+        self._task = task
+        self._sums = task.episode_sums.clone()
+        self._commands = task.commands.clone()
+
+    def before_step(self) -> None:
+        """Keep what the step will overwrite."""
+        self._commands.copy_(self._task.commands)
+        self._sums.copy_(self._task.episode_sums)
+
+    def read(self, time: float, world: int) -> Reading:
+        """Return what the last step did.
+
+        Args:
+            time: Simulated time since the session's start [s].
+            world: The followed world.
+        """
+        task = self._task
+        before = torch.where(task.reset_buf, 0.0, self._sums)
+        rewards = (task.episode_sums - before)[:, world] / task.dt
+        timeouts = task.time_out_buf.sum()
+        parts = [
+            task.sim.qpos,
+            self._commands,
+            task.planar_velocity(),
+            task.torques[world],
+            task.torque_parts[:, world],
+            rewards,
+            torch.stack([task.reset_buf.sum() - timeouts, timeouts]),
+        ]
+        flat = torch.cat([part.reshape(-1).float() for part in parts]).cpu().numpy()
+        ends = np.cumsum([part.numel() for part in parts])
+        arrays = np.split(flat, ends[:-1])
+        shaped = [array.reshape(tuple(part.shape)) for array, part in zip(arrays, parts, strict=True)]
+        return Reading(time, world, *shaped)
