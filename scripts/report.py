@@ -1,4 +1,4 @@
-"""Report on an experiment: ``python scripts/report.py logs/experiments/paper --out docs/results/paper``."""
+"""Report on an experiment: ``python scripts/report.py logs/experiments/paper --out my_report``."""
 
 from legged_torque.utils.rendering import without_renderer
 

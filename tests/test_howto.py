@@ -134,11 +134,10 @@ def test_approach(run_page):
 
 
 def test_robot(run_page):
-    """The page's robot stands in its nominal pose under PD control, as in MuJoCo's own simulation, and can be trained."""
+    """The page's robot stands under PD control as in MuJoCo's own simulation, and can be trained."""
     (xml,) = blocks("docs/howto/robot.md", "xml")
     Path("minidog.xml").write_text(xml)
     run_page("docs/howto/robot.md")
-    Path("minidog.xml").write_text(xml)  # the page's program runs in a folder of its own
     task = make("minidog_position")
     assert task.num_dof == 8 and task.foot_names == ["FR_foot", "FL_foot", "RR_foot", "RL_foot"]
     assert task.p_gains[0].tolist() == [15.0, 10.0] * 4

@@ -24,7 +24,7 @@ class Parser(argparse.ArgumentParser):
         """Report a mistake in the arguments."""
         raise UserError(message)
 
-    def parse_args(self, args: list[str] | None = None, namespace: argparse.Namespace | None = None):
+    def parse_args(self, args=None, namespace=None):
         """Parse the command line.
 
         Raises:

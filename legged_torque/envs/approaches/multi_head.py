@@ -82,6 +82,6 @@ class MultiHeadCfgPPO(LeggedRobotCfgPPO):
     """Training of multi-head control."""
 
     class actor:
-        class_name = "legged_torque.learning.multi_head:MultiHeadModel"
+        class_name = "legged_torque.learning.multi_head:MultiHeadModel"  # Figure 2
         hidden_dims = [512, 256]  # shared by both heads
-        head_hidden_dims: list[int] = [128]
+        head_hidden_dims: list[int] = [128]  # of either head

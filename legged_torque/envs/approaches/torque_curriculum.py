@@ -27,7 +27,7 @@ class TorqueCurriculumCfg(TorqueCfg):
         nominal_position_temperature: float = 0.5  # gamma of the term
 
         class scales:
-            nominal_position: float = 1.0
+            nominal_position: float = 1.0  # standing in the nominal pose
 
         class curriculum:
             class nominal_position(LinearChange):

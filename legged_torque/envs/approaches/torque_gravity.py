@@ -12,7 +12,7 @@ class TorqueGravityCfgPPO(TorqueCfgPPO):
     class pretraining:
         function = "legged_torque.control.gravity_pretraining:pretrain"
         critic_warmup_iterations = 10
-        seed: int = 1
+        seed: int = 1  # of the pre-training alone
         num_configurations: int = 20_000  # random initial states, each followed for
         num_steps: int = 50  # control steps,
         num_rounds: int = 4  # round 1: the controller acts; later rounds: the current policy (DAgger)
@@ -20,15 +20,15 @@ class TorqueGravityCfgPPO(TorqueCfgPPO):
         max_residual: float = 3.0  # likewise: what contacts cannot give of the wanted wrench, as a share of the weight
         held_out: float = 0.1  # share of the configurations that only measure the learned policy
         num_epochs: int = 4  # per round, through all pairs so far
-        batch_size: int = 4096
-        learning_rate: float = 1e-3
+        batch_size: int = 4096  # pairs per gradient step
+        learning_rate: float = 1e-3  # the first one, of Adam; it falls to 0
 
         class controller(Section):
             """Where the imitated controller differs from the one that stands most often: it is softer."""
 
-            joint_damping = 0.5
-            foot_stiffness = 0.0
-            attitude_stiffness = 100.0
-            attitude_damping = 15.0
-            position_stiffness = 20.0
-            position_damping = 6.0
+            joint_damping = 0.5  # [N m s/rad] of the posture
+            foot_stiffness = 0.0  # [N/m] of feet in the air
+            attitude_stiffness = 100.0  # [1/s^2] of the trunk towards level
+            attitude_damping = 15.0  # [1/s] of its angular velocity
+            position_stiffness = 20.0  # [1/s^2] of the trunk towards its height
+            position_damping = 6.0  # [1/s] of its linear velocity

@@ -11,8 +11,8 @@ from legged_torque.utils.config import BaseConfig, Section
 class LinearChange(Section):
     """A value that changes linearly with the total number of environment steps (paper, eq. 1)."""
 
-    start = 1.0
-    end = 1.0
+    start = 1.0  # value up to t_start
+    end = 1.0  # value from t_end on
     t_start = 0  # [total steps]
     t_end = 1  # [total steps]
 
@@ -23,11 +23,11 @@ class LeggedRobotCfg(BaseConfig):
     class env:
         """Worlds and episodes."""
 
-        num_envs = 4096
+        num_envs = 4096  # worlds of each process
         num_envs_cpu = 64  # default on a CPU, where a world-step costs about a millisecond
         num_actions: int | None = None  # None: those of the approach for each joint of the robot
         history_length = 1  # control steps whose observations the policy sees, the newest first
-        episode_length_s = 20.0
+        episode_length_s = 20.0  # [s]
 
     class asset:
         """The robot, and which of its geoms mean what."""
@@ -50,7 +50,7 @@ class LeggedRobotCfg(BaseConfig):
     class terrain:
         """The ground."""
 
-        mesh_type = "plane"
+        mesh_type = "plane"  # the only one so far
 
     class motors:
         """What joints get of the torques that actions ask for."""
@@ -83,7 +83,7 @@ class LeggedRobotCfg(BaseConfig):
         action_delay_unit = "physics_steps"  # or "control_steps"
 
         # parameters, resampled at resets and at random; one value per world unless noted
-        randomize_parameters = False
+        randomize_parameters = False  # whether parameters are drawn at all
         keep_fixed: list[str] = []  # names of ranges below that are not drawn after all
         resampling_probability = 0.002  # per control step and world
         trunk_mass_offset = [0.0, 0.0]  # [kg], then
@@ -109,14 +109,14 @@ class LeggedRobotCfg(BaseConfig):
         damping_scale = [0.75, 1.25]  # times Kd
 
         # pushes: half of them set the trunk's velocity, half are added to it
-        push_robots = False
+        push_robots = False  # whether robots are pushed
         push_probability = 0.002  # per control step and world
         push_velocity = [-0.3, 0.3]  # [m/s] on each axis
 
     class noise:
         """Errors of the policy's sensors: uniform, at most this much either way."""
 
-        add_noise = False
+        add_noise = False  # whether sensors have errors
 
         class noise_scales:
             """By group of observations."""
@@ -124,7 +124,7 @@ class LeggedRobotCfg(BaseConfig):
             dof_pos = 0.01  # [rad]
             dof_vel = 1.5  # [rad/s]
             ang_vel = 0.2  # [rad/s]
-            gravity = 0.05
+            gravity = 0.05  # of the unit vector
 
     class commands:
         """Commanded velocities, in the trunk's frame."""
@@ -160,48 +160,48 @@ class LeggedRobotCfg(BaseConfig):
         class scales:
             """Weights of Table III; each is multiplied by the control step and by its factor of ``curriculum``."""
 
-            tracking_lin_vel = 1.0
-            tracking_ang_vel = 1.0
-            lin_vel_z = -2.0
-            ang_vel_xy = -0.05
-            orientation = -0.2
-            dof_pos_limits = -10.0
-            dof_acc = -2.5e-7
-            torques = -2e-4
-            action_rate = -1e-6
-            collision = -1.0
-            base_height = -30.0
-            feet_air_time = 0.1
-            symmetry = -0.5
+            tracking_lin_vel = 1.0  # following commanded v_x and v_y
+            tracking_ang_vel = 1.0  # following the commanded yaw rate
+            lin_vel_z = -2.0  # vertical velocity of the trunk
+            ang_vel_xy = -0.05  # roll and pitch rates
+            orientation = -0.2  # tilt
+            dof_pos_limits = -10.0  # joints beyond their soft limits
+            dof_acc = -2.5e-7  # joint accelerations
+            torques = -2e-4  # applied torques
+            action_rate = -1e-6  # changes of actions
+            collision = -1.0  # contacts of asset.penalize_contacts_on
+            base_height = -30.0  # distance from base_height_target
+            feet_air_time = 0.1  # long swings
+            symmetry = -0.5  # right and left foot of a pair both in the air
 
         class curriculum:
             """Factors on the scales: linear from start to end between two total step counts (eq. 1)."""
 
             class tracking_lin_vel(LinearChange):
-                start = 4.0
-                end = 2.0
-                t_start = 0
-                t_end = 10_000_000
+                start = 4.0  # factor up to t_start
+                end = 2.0  # factor from t_end on
+                t_start = 0  # [total steps]
+                t_end = 10_000_000  # [total steps]
 
             class tracking_ang_vel(LinearChange):
-                start = 0.1
-                end = 1.0
-                t_start = 0
-                t_end = 10_000_000
+                start = 0.1  # factor up to t_start
+                end = 1.0  # factor from t_end on
+                t_start = 0  # [total steps]
+                t_end = 10_000_000  # [total steps]
 
     class normalization:
         """Scales and limits of what the networks see and say."""
 
-        clip_observations = 100.0
-        clip_actions = 100.0
+        clip_observations = 100.0  # largest absolute value, after scaling
+        clip_actions = 100.0  # largest absolute value
 
         class obs_scales:
             """Factors on observations."""
 
-            lin_vel = 2.0
-            ang_vel = 0.25
-            dof_pos = 1.0
-            dof_vel = 0.05
+            lin_vel = 2.0  # of velocities in m/s, commands included
+            ang_vel = 0.25  # of angular velocities in rad/s, commands included
+            dof_pos = 1.0  # of joint angles in rad
+            dof_vel = 0.05  # of joint velocities in rad/s
 
     def perturbations(self) -> dict[str, dict]:
         """Return the named changes that ``--perturbation`` chooses from (paper, IV-A)."""
@@ -242,20 +242,20 @@ class LeggedRobotCfg(BaseConfig):
 class LeggedRobotCfgPPO(BaseConfig):
     """Settings of the training: the ``parallel`` preset, made for thousands of worlds."""
 
-    seed = 1
+    seed = 1  # of all random numbers of a training
 
     class runner:
         """Rollouts, checkpoints and logs."""
 
-        class_name = "legged_torque.learning.runner:OnPolicyRunner"
+        class_name = "legged_torque.learning.runner:OnPolicyRunner"  # what trains
         capture = True  # on a GPU, replay steps, rollouts and updates as CUDA graphs; False runs the same without
-        num_steps_per_env = 24
+        num_steps_per_env = 24  # control steps of a rollout
         total_steps = 110_000_000  # over all worlds of all processes; --max_iterations overrides it
         save_interval = 50  # iterations between checkpoints
         experiment_name = ""  # folder of the runs; empty: the name of the task
-        run_name = ""
-        logger = "tensorboard"
-        wandb_project = "legged_torque"
+        run_name = ""  # added to the name of the run's folder
+        logger = "tensorboard"  # or "wandb" or "none"
+        wandb_project = "legged_torque"  # where wandb keeps the runs
 
     class evaluation:
         """Measuring the policy while it learns: mean actions, in worlds of their own, between rollouts."""
@@ -275,55 +275,55 @@ class LeggedRobotCfgPPO(BaseConfig):
     class obs_groups:
         """Which observations which network reads."""
 
-        actor = ["policy"]
-        critic = ["critic"]
+        actor = ["policy"]  # groups of the policy
+        critic = ["critic"]  # groups of the value function
 
     class actor:
         """The policy's network, an rsl_rl model."""
 
-        class_name = "MLPModel"
-        hidden_dims = [512, 256, 128]
-        activation = "elu"
+        class_name = "MLPModel"  # an rsl_rl model
+        hidden_dims = [512, 256, 128]  # sizes of the hidden layers
+        activation = "elu"  # after every hidden layer
 
         class distribution_cfg:
             """The distribution of its actions."""
 
-            class_name = "legged_torque.learning.distribution:GaussianDistribution"
-            init_std = 1.0
-            std_type = "log"
+            class_name = "legged_torque.learning.distribution:GaussianDistribution"  # rsl_rl's, made for graphs
+            init_std = 1.0  # standard deviation of actions at the start
+            std_type = "log"  # what is learned: its logarithm, or "scalar"
 
     class critic:
         """The value function's network."""
 
-        class_name = "MLPModel"
-        hidden_dims = [512, 256, 128]
-        activation = "elu"
+        class_name = "MLPModel"  # an rsl_rl model
+        hidden_dims = [512, 256, 128]  # sizes of the hidden layers
+        activation = "elu"  # after every hidden layer
 
     class algorithm:
         """PPO, with rsl_rl's names."""
 
-        class_name = "legged_torque.learning.ppo:OnDevicePPO"
-        num_learning_epochs = 5
-        num_mini_batches = 4
-        clip_param = 0.2
-        gamma = 0.98
-        lam = 0.95
-        value_loss_coef = 1.0
-        entropy_coef = 5e-4
-        learning_rate = 1e-3
-        max_grad_norm = 1.0
-        schedule = "adaptive"
-        desired_kl = 0.01
-        max_learning_rate = 1e-2
-        use_clipped_value_loss = True
+        class_name = "legged_torque.learning.ppo:OnDevicePPO"  # rsl_rl's PPO without waiting for the host
+        num_learning_epochs = 5  # times that each rollout is learned from
+        num_mini_batches = 4  # gradient steps per epoch
+        clip_param = 0.2  # range of the probability ratio around 1, and of value changes
+        gamma = 0.98  # discount per control step
+        lam = 0.95  # lambda of GAE
+        value_loss_coef = 1.0  # weight of the value loss
+        entropy_coef = 5e-4  # weight of the entropy bonus
+        learning_rate = 1e-3  # of Adam; the first one if it adapts
+        max_grad_norm = 1.0  # gradients of actor and critic are clipped to this norm
+        schedule = "adaptive"  # steers the learning rate by the KL divergence; or "fixed"
+        desired_kl = 0.01  # of the policy before and after an update
+        max_learning_rate = 1e-2  # upper bound of an adaptive learning rate
+        use_clipped_value_loss = True  # whether value changes are clipped too
 
         class symmetry_cfg:
             """Learning from mirror images as well, with rsl_rl's names."""
 
-            use_data_augmentation = False
-            use_mirror_loss = False
-            mirror_loss_coeff = 0.1
-            data_augmentation_func = "legged_torque.envs.base.symmetry:with_mirror_images"
+            use_data_augmentation = False  # whether minibatches hold mirror images as well
+            use_mirror_loss = False  # whether actions that are not mirror images cost
+            mirror_loss_coeff = 0.1  # weight of that loss
+            data_augmentation_func = "legged_torque.envs.base.symmetry:with_mirror_images"  # what makes them
 
     def presets(self) -> dict[str, dict]:
         """Return the named changes to the settings of task and training that ``--preset`` chooses from."""

@@ -1,0 +1,128 @@
+"""Write settings.md and scripts.md beside this file from the code: ``python docs/reference/generate.py``."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import inspect
+import io
+import os
+import re
+import runpy
+import sys
+import tokenize
+from pathlib import Path
+from types import ModuleType
+
+os.environ["MUJOCO_GL"] = "disable"
+
+from legged_torque import SCRIPTS_DIR
+from legged_torque.envs.approaches import multi_head, torque, torque_curriculum, torque_gravity
+from legged_torque.envs.base import legged_robot_config
+from legged_torque.envs.robots import a1
+
+HERE = Path(__file__).parent
+CONFIGS = (
+    (legged_robot_config, "LinearChange"),
+    (legged_robot_config, "LeggedRobotCfg"),
+    (legged_robot_config, "LeggedRobotCfgPPO"),
+    (a1, "A1Cfg"),
+    (a1, "A1CfgPPO"),
+    (torque, "TorqueCfgPPO"),
+    (torque_curriculum, "TorqueCurriculumCfg"),
+    (torque_gravity, "TorqueGravityCfgPPO"),
+    (multi_head, "TorqueMultiHeadCfg"),
+    (multi_head, "MultiHeadCfg"),
+    (multi_head, "MultiHeadCfgPPO"),
+)
+"""Config classes in the order of the page."""
+
+SETTINGS_HEAD = """# Settings
+
+Made by `python docs/reference/generate.py` from the config classes. `--set section.setting=value` changes a setting for
+one run, a subclass changes it for a task. Units are in brackets; a comment without a unit means a number without one.
+
+A class that is listed with few settings inherits all others from its base. A run's `config.yaml` holds every value that
+it was trained with.
+"""
+SCRIPTS_HEAD = """# Scripts
+
+Made by `python docs/reference/generate.py` from the scripts. In an installed package without a clone, use
+`python -m legged_torque.scripts.train` in place of `python scripts/train.py`, and so on.
+"""
+
+
+def comments(source: str) -> dict[int, str]:
+    """Return the comment at the end of each line, by number of the line."""
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    return {token.start[0]: token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT}
+
+
+def rows(node: ast.ClassDef, path: str, source: str, notes: dict[int, str], known: dict[str, str]) -> list[str]:
+    """Return the rows of a table: settings of a class and of the classes inside it.
+
+    Args:
+        node: The class.
+        path: Dotted path of its section, with a dot at the end.
+        source: Source of its module.
+        notes: Comments of the module by number of the line.
+        known: Meanings of settings by path, from the classes before; new ones are added.
+    """
+    result = []
+    for statement in node.body:
+        if isinstance(statement, ast.ClassDef):
+            text = (ast.get_docstring(statement) or "").replace("``", "`")
+            if text:
+                result.append(f"| **`{path}{statement.name}`** | | {text.splitlines()[0]} |")
+            result += rows(statement, f"{path}{statement.name}.", source, notes, known)
+        elif isinstance(statement, (ast.Assign, ast.AnnAssign)) and statement.value is not None:
+            target = statement.targets[0] if isinstance(statement, ast.Assign) else statement.target
+            value = " ".join((ast.get_source_segment(source, statement.value) or "").split())
+            value = value if len(value) <= 60 else f"{value[:57]}..."
+            key = f"{path}{ast.unparse(target)}"
+            before = known.get(key, known.get(ast.unparse(target), ""))
+            known[key] = note = notes.get(statement.end_lineno or 0, before).replace("|", "\\|")
+            result.append(f"| `{key}` | `{value}` | {note} |")
+    return result
+
+
+def settings_table(module: ModuleType, name: str, known: dict[str, str]) -> str:
+    """Return the section of the page on one config class; for ``known`` see :func:`rows`."""
+    source = inspect.getsource(module)
+    (node,) = (part for part in ast.parse(source).body if isinstance(part, ast.ClassDef) and part.name == name)
+    bases = ", ".join(f"`{ast.unparse(base)}`" for base in node.bases)
+    text = " ".join(re.sub(r":\w+:`~?[\w.]*?(\w+)`", r"`\1`", ast.get_docstring(node) or "").replace("``", "`").split())
+    table = ["| setting | default | meaning |", "|---|---|---|", *rows(node, "", source, comments(source), known)]
+    return "\n".join([f"## {name}", "", f"{text} Base: {bases}.", "", *table, ""])
+
+
+def settings_page() -> str:
+    """Return settings.md."""
+    known: dict[str, str] = {}
+    return "\n".join([SETTINGS_HEAD, *(settings_table(module, name, known) for module, name in CONFIGS)])
+
+
+def help_text(script: Path) -> str:
+    """Return what a script prints for --help."""
+    output, arguments, path = io.StringIO(), sys.argv, list(sys.path)
+    os.environ["COLUMNS"] = "110"
+    sys.argv = [f"scripts/{script.name}", "--help"]
+    try:
+        with contextlib.redirect_stdout(output), contextlib.suppress(SystemExit):
+            runpy.run_path(str(script), run_name="__main__")
+    finally:
+        sys.argv, sys.path[:] = arguments, path
+    return output.getvalue().rstrip()
+
+
+def scripts_page() -> str:
+    """Return scripts.md."""
+    scripts = [script for script in sorted(SCRIPTS_DIR.glob("*.py")) if script.stem != "__init__"]
+    parts = [f"## {script.name}\n\n```text\n{help_text(script)}\n```\n" for script in scripts]
+    return "\n".join([SCRIPTS_HEAD, *parts])
+
+
+if __name__ == "__main__":
+    for name, text in {"settings.md": settings_page(), "scripts.md": scripts_page()}.items():
+        (HERE / name).write_text(text, encoding="utf-8")
+        print(HERE / name)

@@ -1,0 +1,63 @@
+"""The reference pages say what the code says."""
+
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from legged_torque.envs import task_registry
+from legged_torque.utils.config import to_dict
+from legged_torque.utils.options import Options
+
+REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "reference"
+
+
+@pytest.fixture(scope="module")
+def generator():
+    """The program that writes the pages."""
+    return runpy.run_path(str(REFERENCE / "generate.py"))
+
+
+def flat(values, path=""):
+    """Dotted paths of nested settings; dictionaries of joints are one setting."""
+    for key, value in values.items():
+        is_section = isinstance(value, dict) and key != "default_joint_angles"
+        yield from flat(value, f"{path}{key}.") if is_section else [f"{path}{key}"]
+
+
+@pytest.mark.parametrize("page", ["settings", "scripts"])
+def test_pages_are_up_to_date(generator, page):
+    """To mend it: ``python docs/reference/generate.py``."""
+    written, made = (REFERENCE / f"{page}.md").read_text(), generator[f"{page}_page"]()
+    assert written.split() == made.split()  # line breaks of --help depend on the version of Python
+
+
+def test_every_setting_is_explained():
+    """Each setting of each task has a row, and each row a meaning."""
+    lines = (REFERENCE / "settings.md").read_text().splitlines()
+    rows = dict(re.match(r"\| `(\S+)` \| .* \| (.*) \|$", line).groups() for line in lines if line.startswith("| `"))
+    assert all(rows.values()), [name for name, meaning in rows.items() if not meaning]
+    for name in task_registry.names():
+        for cfg in task_registry.get_cfgs(name):
+            assert set(flat(to_dict(cfg))) <= rows.keys()
+
+
+def test_every_logged_number_is_explained(tmp_path, make_task):
+    """What a training writes has a row."""
+    text = (REFERENCE / "logs.md").read_text()
+    settings = ["runner.num_steps_per_env=4", "evaluation.interval=32", "evaluation.num_samples=8"]
+    _, train_cfg = task_registry.get_cfgs("a1_torque_multihead", Options(device="cpu", set=settings))
+    task = make_task("a1_torque_multihead", 4, **{"env.episode_length_s": 0.1})
+    runner, _ = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=tmp_path)
+    runner.claim_log_dir()
+    runner.learn(4)
+    (run,) = tmp_path.iterdir()
+    events = EventAccumulator(str(run))
+    events.Reload()
+    tags = events.Tags()["scalars"]
+    assert len(tags) > 40
+    for tag in tags:
+        general = re.sub(r"(Episode_Reward/|Curriculum/weight_)\w+", r"\1<term>", tag)
+        assert f"`{general}`" in text, tag
