@@ -17,8 +17,7 @@ from legged_torque.utils.runs import load_config
 
 MILLION = 1e6
 """Steps in a million, the unit of axes and texts."""
-CRITIC_GRADIENT_NORM = Metric("critic_gradient_norm", "", "Gradient norm of the critic", None)
-CURVE_METRICS = (*METRICS, CRITIC_GRADIENT_NORM)
+CURVE_METRICS = (*METRICS, Metric("critic_gradient_norm", "", "Gradient norm of the critic", None))
 """The metrics of an evaluation during training."""
 
 Row = dict[str, float]
@@ -97,11 +96,7 @@ def read_rows(file: Path, notes: list[str]) -> list[Row]:
 
 
 def to_row(entry: Mapping[str, Any]) -> Row:
-    """Return an evaluation from the cells of a line or the entries of a JSON object."""
-    values = {metric.name: to_number(entry.get(metric.name)) for metric in CURVE_METRICS}
+    """Return an evaluation from the cells of a line or the entries of a JSON object; empty ones are NaN."""
+    cells = {metric.name: entry.get(metric.name) for metric in CURVE_METRICS}
+    values = {name: math.nan if cell in (None, "") else float(cell) for name, cell in cells.items()}
     return {"steps": int(float(entry["steps"])), **values}
-
-
-def to_number(cell: Any) -> float:
-    """Return a cell's number; NaN if it is empty."""
-    return math.nan if cell in (None, "") else float(cell)
