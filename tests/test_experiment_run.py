@@ -193,7 +193,7 @@ def test_two_experiments_share_a_folder(stage, tmp_path):
     for thread in threads:
         thread.join()
     assert statuses == [0, 0]
-    assert sorted(order(stage)) == sorted(cell.name for cell in matrix.cells())
+    assert sorted(order(stage)) == sorted(cell.name for cell in matrix.cells(out))
 
 
 @pytest.mark.parametrize(

@@ -33,44 +33,32 @@ _PR_SET_PDEATHSIG = 1  # Linux
 
 @dataclass
 class Worker:
-    """A device that runs one process at a time.
+    """A device that runs one process at a time."""
 
-    Attributes:
-        name: The user's name for it, "cpu" or "cuda:1".
-        device: The ``--device`` of its processes.
-        variables: Additional environment variables of its processes.
-        job: Its current job.
-    """
-
-    name: str
-    device: str
-    variables: dict[str, str]
+    name: str  # the user's: "cpu", "cuda:1"
+    device: str  # the --device of its processes
+    variables: dict[str, str]  # additional environment variables of its processes
     job: Job | None = None
 
 
 class Job:
-    """A step of a cell in its own process.
-
-    Attributes:
-        cell: The cell.
-        state: The cell's progress when the step began.
-        lock: The cell's open lock file; the process holds it too.
-        cell_start: When the work on the cell began, by ``time.monotonic()`` [s].
-        start: When the step began [s].
-        log: File that the process writes to.
-        process: The process.
-    """
+    """A step of a cell in its own process, which writes to ``log``."""
 
     def __init__(
         self, cell: Cell, state: CellState, lock: BinaryIO, cell_start: float, command: list[str], worker: Worker
     ) -> None:
-        """Start the process. It holds the cell's lock too, and gets SIGTERM if this process ends.
+        """Start the process, which gets SIGTERM if this process ends.
 
-        The arguments are those of the attributes, and the command line of the process and the worker that runs it. The
-        lock file lies in the cell's folder; the process id is written to it.
+        Args:
+            cell: The cell.
+            state: The cell's progress.
+            lock: The cell's open lock file. The process holds it too, and its id is written to it.
+            cell_start: When the work on the cell began, by ``time.monotonic()`` [s].
+            command: Command line of the process.
+            worker: Where it runs.
         """
         self.cell, self.state, self.lock, self.cell_start = cell, state, lock, cell_start
-        self.log = Path(lock.name).with_name("evaluate.log" if state.step == "evaluate" else "train.log")
+        self.log = cell.folder / ("evaluate.log" if state.step == "evaluate" else "train.log")
         with open(self.log, "ab") as file:
             file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {shlex.join(command)}\n".encode())
             file.flush()
@@ -145,11 +133,7 @@ def try_lock(file: Path) -> BinaryIO | None:
 
 
 def find_workers(device: str, jobs: int | None) -> list[Worker]:
-    """Return the workers: one per GPU, or as many as asked for on the CPU.
-
-    Args:
-        device: "auto" (all GPUs if there are any), "cpu", "cuda" or "cuda:N".
-        jobs: Processes at a time on the CPU; None is 1.
+    """Return the workers: one per GPU ("auto": all GPUs if there are any), or ``jobs`` on the CPU (None: 1).
 
     Raises:
         UserError: If there is no such device, or the number of processes is not valid.
