@@ -50,13 +50,11 @@ def main() -> None:
         return act_by_controller(make_controller(task))
 
     print(f"{'':12} {'frequency':>9} {'after':>6} {'standing':>9} {'mean torque':>12}")
+    decimation = env_cfg.control.decimation
+    trials = [("controller", controlled, 1, 3.0), ("controller", controlled, decimation, 5.0)]
+    trials.append(("policy", learned, decimation, 5.0))
     with CompileProgress():
-        decimation = env_cfg.control.decimation
-        for name, actor, steps, seconds in (
-            ("controller", controlled, 1, 3.0),
-            ("controller", controlled, decimation, 5.0),
-            ("policy", learned, decimation, 5.0),
-        ):
+        for name, actor, steps, seconds in trials:
             result = trial(options, env_cfg, actor, steps, seconds)
             frequency = 1.0 / (env_cfg.sim.dt * steps)
             row = f"{name:12} {frequency:6.0f} Hz {seconds:4.0f} s {result.share:9.1%}"

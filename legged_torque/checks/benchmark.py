@@ -88,7 +88,12 @@ class MemoryMeter:
 
 
 def measure(
-    task_name: str, cfgs: tuple[Any, Any], memory: MemoryMeter, rounds: int, endurance: int = 0, trace: Path | None = None
+    task_name: str,
+    cfgs: tuple[Any, Any],
+    memory: MemoryMeter,
+    rounds: int,
+    endurance: int = 0,
+    trace: Path | None = None,
 ) -> dict[str, Any]:
     """Measure one task of one size.
 
@@ -257,17 +262,23 @@ def measure_endurance(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -
     Returns:
         Mean milliseconds of an iteration in both tenths, and the memory at the end of both [MiB].
     """
-    tenth, used = max(1, count // 10), []
-    times = time_iterations(runner, count, lambda number: used.append(memory.used()))["iteration"]
+    tenth = max(1, count // 10)
+    used: list[float] = []  # at the end of both tenths
+
+    def look(number: int) -> None:
+        if number in (tenth, count):
+            used.append(memory.used())
+
+    times = time_iterations(runner, count, look)["iteration"]
     first, last = mean(times[:tenth]), mean(times[-tenth:])
     return {
         "iterations": count,
         "first_ms": first,
         "last_ms": last,
         "slowdown": last / first - 1.0,
-        "first_memory_mib": used[tenth],
-        "last_memory_mib": used[count],
-        "growth_mib": used[count] - used[tenth],
+        "first_memory_mib": used[0],
+        "last_memory_mib": used[-1],
+        "growth_mib": used[-1] - used[0],
     }
 
 

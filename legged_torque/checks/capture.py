@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.utils import parameters_to_vector
 
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.task_registry import set_seed
@@ -49,7 +50,7 @@ def compare_capture(plain: OnPolicyRunner, captured: OnPolicyRunner, seed: int) 
 
     Args:
         plain: A runner with ``runner.capture`` off, after :func:`warm_up`.
-        captured: A runner with ``runner.capture`` on, after :func:`warm_up`.
+        captured: The same with ``runner.capture`` on.
         seed: Seed of the random numbers.
 
     Returns:
@@ -81,22 +82,10 @@ def _state(runner: OnPolicyRunner) -> list[Tensor]:
     return [*networks, *moments, alg.learning_rate, runner.env.total_steps]
 
 
-def _networks(runner: OnPolicyRunner) -> dict[str, Tensor]:
-    """Return all parameters of actor and critic. Shapes: (number of parameters,)."""
-    models = {"actor": runner.alg.actor, "critic": runner.alg.critic}
-    return {name: torch.cat([p.detach().flatten() for p in model.parameters()]) for name, model in models.items()}
-
-
 def _iterate(
     runner: OnPolicyRunner, start: list[Tensor], seed: int, rollout: list[Tensor] | None = None
 ) -> tuple[dict[str, Tensor], list[Tensor]]:
-    """Run one iteration.
-
-    Args:
-        runner: The runner.
-        start: Values of :func:`_state` to start from.
-        seed: Seed of the random numbers.
-        rollout: Data to learn from; None is the runner's own rollout.
+    """Run one iteration from the values ``start`` of :func:`_state`, and learn from a rollout; None is its own.
 
     Returns:
         The quantities that :func:`compare_capture` compares, and the data learned from.
@@ -111,14 +100,15 @@ def _iterate(
     result = {f"observations {group}": value.clone() for group, value in storage.observations.items()}
     result |= {name: getattr(storage, name).clone() for name in ("actions", "rewards", "returns")}
     learned_from = [getattr(storage, name) for name in _LEARNED_FROM] + list(storage.distribution_params)
-    if rollout is None:
-        rollout = [tensor.clone() for tensor in learned_from]
+    rollout = rollout or [tensor.clone() for tensor in learned_from]
     for tensor, value in zip(learned_from, rollout, strict=True):
         tensor.copy_(value)
-    before = _networks(runner)
+    networks = {"actor": runner.alg.actor, "critic": runner.alg.critic}
+    before = {name: parameters_to_vector(network.parameters()).detach() for name, network in networks.items()}
     set_seed(seed)
     losses = runner.alg.update()
-    result |= {f"change of {name}": value - before[name] for name, value in _networks(runner).items()}
+    for name, network in networks.items():
+        result[f"change of {name}"] = parameters_to_vector(network.parameters()).detach() - before[name]
     result |= {f"loss {name}": torch.tensor([value]) for name, value in losses.items()}
     return result, rollout
 
@@ -132,10 +122,10 @@ def _compare(actual: Tensor, expected: Tensor, repeated: Tensor) -> Difference:
     def rms(tensor: Tensor) -> Tensor:
         return tensor.double().square().mean().sqrt()
 
-    error = (actual - expected).abs()
+    largest = (actual - expected).abs().max()
     return Difference(
-        largest=float(error.max()),
-        relative=ratio(error.max(), expected.abs().max()),
-        rms=ratio(rms(error), rms(expected)),
+        float(largest),
+        relative=ratio(largest, expected.abs().max()),
+        rms=ratio(rms(actual - expected), rms(expected)),
         repeated=ratio(rms(repeated - expected), rms(expected)),
     )

@@ -12,8 +12,6 @@ from legged_torque.utils.errors import UserError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-DPI = 130
-
 
 def load_pyplot() -> ModuleType:
     """Return ``matplotlib.pyplot``, set up to write files and open no windows.
@@ -32,12 +30,7 @@ def load_pyplot() -> ModuleType:
 
 
 def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
-    """Return the JSON object that a script has written.
-
-    Args:
-        file: The file.
-        keys: Keys that the object must have.
-        script: Name of the script, for the message.
+    """Return the JSON object with these keys, or more, that a script has written.
 
     Raises:
         UserError: If the file cannot be read or was not written by ``script``.
@@ -59,6 +52,6 @@ def save_figure(figure: Figure, file: Path) -> None:
     """
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(file, dpi=DPI)
+        figure.savefig(file, dpi=130)
     except (OSError, ValueError) as error:  # ValueError: unknown format
         raise UserError(f"cannot write '{file}': {error}") from None
