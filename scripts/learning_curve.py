@@ -18,8 +18,7 @@ from legged_torque.utils.paths import without_machine
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import set_seed
 
-SEED_OFFSET = 1000
-"""Added to the training's seed: worlds other than in training, but the same for every checkpoint."""
+SEED_OFFSET = 1000  # added to the training's seed: worlds other than in training, but the same for every checkpoint
 
 
 def main() -> None:

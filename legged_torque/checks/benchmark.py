@@ -26,22 +26,22 @@ from legged_torque.sim.graph import CudaGraph, prepare_device
 from legged_torque.utils.progress import CompileProgress
 from legged_torque.utils.task_registry import set_seed
 
-WARM_UP = 2
-"""Iterations before timing begins: the first one compiles, the second one captures the rollout."""
-TRACED = 2
-"""Iterations in a trace."""
+WARM_UP = 2  # iterations before timing begins: the first one compiles, the second one captures the rollout
+TRACED = 2  # iterations in a trace
 PHYSICS_STEPS = 5
 """Control steps of physics timed in a row: enough to hide the cost of the reset before them, and no robot falls yet."""
-GPU_CALLS = 20
-"""Calls per timing on a GPU, where a single one is short; on the CPU one call is timed."""
-ACTION_SCALE = 0.5
-"""Standard deviation of the random actions while ``env.step`` is timed."""
-TOP_KERNELS = 10
-"""Kernels listed from a trace."""
+GPU_CALLS = 20  # calls per timing on a GPU, where a single one is short; on the CPU one call is timed
+ACTION_SCALE = 0.5  # standard deviation of the random actions while env.step is timed
+TOP_KERNELS = 10  # kernels listed from a trace
 OUT_OF_MEMORY = ("out of memory", "Failed to allocate", "can't allocate memory")
 """Parts of the messages of CUDA, Warp and torch on the CPU when memory has run out."""
 _MIB = 2**20
 _MS = 1e3
+
+Times = dict[str, list[float]]
+"""Milliseconds of iterations in a row, one entry each. "rollout": curriculum, and the rollout with its returns.
+"update": the update of the networks. "log": reading numbers of the task, printing and writing them, and saving
+checkpoints that are due. "iteration": their sum, from the start of one iteration to the start of the next."""
 
 
 class MemoryMeter:
@@ -71,10 +71,10 @@ class MemoryMeter:
 
     def shares(self) -> dict[str, float]:
         """Return the peak of torch's allocator and the present use of Warp's pool; nothing on the CPU [MiB]."""
-        result = {}
-        if self.is_gpu:
-            result["torch_memory_mib"] = torch.cuda.max_memory_reserved(self.device) / _MIB
-        if self.is_gpu and wp.is_mempool_supported(self.device):
+        if not self.is_gpu:
+            return {}
+        result = {"torch_memory_mib": torch.cuda.max_memory_reserved(self.device) / _MIB}
+        if wp.is_mempool_supported(self.device):
             result["warp_memory_mib"] = wp.get_mempool_used_mem_current(self.device) / _MIB
         return result
 
@@ -139,22 +139,11 @@ def measure(
     return row
 
 
-def time_iterations(
-    runner: OnPolicyRunner, count: int, at_start: Callable[[int], object] = lambda number: None
-) -> dict[str, list[float]]:
-    """Train for whole iterations as ``train.py`` does, with all logging, and time them.
+def time_iterations(runner: OnPolicyRunner, count: int, at_start: Callable[[int], object] | None = None) -> Times:
+    """Train for whole iterations as ``train.py`` does, with all logging, and time ``count`` of them.
 
-    One more iteration is run than timed, to show when the last timed one ended. Nothing is printed.
-
-    Args:
-        runner: The runner.
-        count: How many iterations are timed.
-        at_start: Called at the start of each iteration with its number from 0 to ``count``.
-
-    Returns:
-        Milliseconds of iterations in a row, one entry each. "rollout": curriculum, and the rollout with its returns.
-        "update": the update of the networks. "log": reading numbers of the task, printing and writing them, and saving
-        checkpoints that are due. "iteration": their sum, from the start of one iteration to the start of the next.
+    One more iteration is run than timed, to show when the last timed one ended. Nothing is printed. ``at_start`` is
+    called at the start of each iteration with its number from 0 to ``count``.
 
     Raises:
         KeyboardInterrupt: If Ctrl-C was pressed, which the runner takes as a request to stop early.
@@ -163,7 +152,8 @@ def time_iterations(
     marks: list[float] = []  # of each iteration: start of the rollout, start and end of the update
 
     def timed_collect() -> None:
-        at_start(len(marks) // 3)
+        if at_start:
+            at_start(len(marks) // 3)
         marks.append(time.perf_counter())
         with torch.profiler.record_function("rollout"):
             collect()
@@ -175,22 +165,19 @@ def time_iterations(
         marks.append(time.perf_counter())
         return losses
 
+    rollouts = patch.object(runner, "collect_rollout", timed_collect)
+    updates = patch.object(runner.alg, "update", timed_update)
     try:
-        with (
-            patch.object(runner, "collect_rollout", timed_collect),
-            patch.object(runner.alg, "update", timed_update),
-            open(os.devnull, "w") as nothing,
-            contextlib.redirect_stdout(nothing),
-        ):
+        with rollouts, updates, open(os.devnull, "w") as nothing, contextlib.redirect_stdout(nothing):
             runner.learn(count + 1)
     finally:
         if hasattr(runner.logger.writer, "close"):  # rsl_rl leaves tensorboard's open
             runner.logger.writer.close()
     if len(marks) <= 3 * count:
         raise KeyboardInterrupt
-    rollout, update_times, log = _MS * np.diff(marks[: 3 * count + 1]).reshape(count, 3).T
-    parts = {"rollout": rollout, "update": update_times, "log": log, "iteration": rollout + update_times + log}
-    return {name: values.tolist() for name, values in parts.items()}
+    parts = _MS * np.diff(marks[: 3 * count + 1]).reshape(count, 3).T
+    columns = zip(("rollout", "update", "log", "iteration"), [*parts, parts.sum(axis=0)], strict=True)
+    return {name: values.tolist() for name, values in columns}
 
 
 def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
@@ -230,9 +217,7 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
     return median(of_physics) / PHYSICS_STEPS, median(of_step)
 
 
-def summarize(
-    times: dict[str, list[float]], physics: float, step: float, num_envs: int, num_steps: int
-) -> dict[str, Any]:
+def summarize(times: Times, physics: float, step: float, num_envs: int, num_steps: int) -> dict[str, Any]:
     """Return medians, and the steps per second and ratios to physics alone that follow from them.
 
     Args:
@@ -283,11 +268,7 @@ def measure_endurance(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -
 
 
 def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]:
-    """Write a trace of :data:`TRACED` whole iterations of a warm runner for Perfetto or Chrome.
-
-    Args:
-        runner: The runner.
-        file: The file to write, compressed if its name ends in ".gz".
+    """Write a trace of :data:`TRACED` iterations of a warm runner for Perfetto or Chrome, compressed if named so (.gz).
 
     Returns:
         The list of :func:`most_expensive`.

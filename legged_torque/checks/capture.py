@@ -11,12 +11,9 @@ from torch.nn.utils import parameters_to_vector
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.task_registry import set_seed
 
-WARM_UP_ITERATIONS = 2
-"""Iterations before everything is replayed: the first runs as it is, the second captures."""
-
+WARM_UP_ITERATIONS = 2  # iterations before everything is replayed: the first runs as it is, the second captures
 NOISE_FACTOR = 3.0
 """Accepted difference, in differences of two runs without graphs, where only the order of additions differs."""
-
 _LEARNED_FROM = ("observations", "actions", "values", "actions_log_prob", "returns", "advantages")
 
 
@@ -24,18 +21,14 @@ _LEARNED_FROM = ("observations", "actions", "values", "actions_log_prob", "retur
 class Difference:
     """The difference of a quantity with and without graphs.
 
-    Attributes:
-        largest: Largest absolute difference.
-        relative: Largest difference, relative to the largest absolute value.
-        rms: Root mean square of the differences, relative to that of the values; NaN if any of them is not finite.
-        repeated: ``rms`` of two runs without graphs. On a GPU threads add in any order, and rounding errors grow where
-            feet touch the ground: errors of 1e-7 per step make rewards differ by 2% (rms) over 24 steps.
+    On a GPU threads add in any order, and rounding errors grow where feet touch the ground: errors of 1e-7 per step
+    make rewards differ by 2% (rms) over 24 steps.
     """
 
-    largest: float
-    relative: float
-    rms: float
-    repeated: float
+    largest: float  # largest absolute difference
+    relative: float  # the same, relative to the largest absolute value
+    rms: float  # of the differences, relative to that of the values; NaN if any of them is not finite
+    repeated: float  # rms of two runs without graphs
 
     def within(self, tolerance: float) -> bool:
         """Return whether ``rms`` is within the tolerance or close to ``repeated``. NaN is not."""

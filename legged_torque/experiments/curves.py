@@ -15,8 +15,7 @@ from legged_torque.utils.metrics import METRICS, Metric
 from legged_torque.utils.plotting import read_data
 from legged_torque.utils.runs import load_config
 
-MILLION = 1e6
-"""Steps in a million, the unit of axes and texts."""
+MILLION = 1e6  # steps in a million, the unit of axes and texts
 CURVE_METRICS = (*METRICS, Metric("critic_gradient_norm", "", "Gradient norm of the critic", None))
 """The metrics of an evaluation during training."""
 

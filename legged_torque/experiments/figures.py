@@ -36,24 +36,20 @@ STYLES = {  # colours of Okabe and Ito, which colour-blind readers can tell apar
 }
 """Colour, line style and hatch of each task."""
 OTHER_STYLES = (("#000000", "-", "++"), ("#777777", "--", "oo"), ("#999933", "-.", "**"))
-SEED_LINES = ("-.", "-", "--", ":")
-"""Line styles by seed modulo four, where single trainings are shown."""
+SEED_LINES = ("-.", "-", "--", ":")  # line styles by seed modulo four, where single trainings are shown
 CURVES = {
     "Figure 3": ("track_percentage", "linear"),
     "Figure 5a": ("height", "linear"),
     "Figure 5b": ("critic_gradient_norm", "log"),
 }
 """Metric and scale of its axis, by title."""
-BARS = {"Figure 6": ("low", "high"), "Figure 7": ("high_frequency", "doubled")}
-"""Columns of Table I, by title."""
+BARS = {"Figure 6": ("low", "high"), "Figure 7": ("high_frequency", "doubled")}  # columns of Table I, by title
 FIGURES = (*CURVES, *BARS)
-SINGLE_CURVES = ("track_percentage", "track_xy", "cost_of_transport")
-"""Metrics that are shown of single trainings."""
+SINGLE_CURVES = ("track_percentage", "track_xy", "cost_of_transport")  # metrics that are shown of single trainings
 STEPS_LABEL = "environment steps [millions]"
 METRICS_BY_NAME = {metric.name: metric for metric in CURVE_METRICS}
 UNFINISHED_ALPHA = 0.45
-CUT_AT = 3.0
-"""Largest height of a panel of bars, in medians of the values that it shows."""
+CUT_AT = 3.0  # largest height of a panel of bars, in medians of the values that it shows
 PAPER_MARKER: dict[str, Any] = {"marker": "D", "color": "none", "markerfacecolor": "white", "markeredgecolor": "black"}
 SETTINGS = {"font.size": 10, "hatch.linewidth": 0.6, "axes.axisbelow": True, "savefig.dpi": 150}
 
@@ -105,8 +101,7 @@ def draw_single_curves(runs: list[LearningCurve]) -> Figure:
     for axis, name in zip(axes, SINGLE_CURVES, strict=True):
         for run in runs:
             color, _, hatch = style(tasks, run.task)
-            curve = metric_curve(run.rows, name)
-            if curve.steps.size:
+            for curve in metric_curves(run.rows, name):
                 draw_curve(axis, [curve], str(run), (color, SEED_LINES[run.seed % len(SEED_LINES)], hatch))
         axis.set(title=METRICS_BY_NAME[name].label, xlabel=STEPS_LABEL, xlim=(0, None), ylim=(0, None))
         axis.grid(alpha=0.3)
@@ -120,9 +115,12 @@ def draw_curves(experiment: Experiment, title: str) -> Figure | None:
     plan, panels = experiment.plan, {}
     order = [*ENVIRONMENTS, *plan.environments]  # those of Table I first
     for environment in sorted(plan.environments, key=order.index):
-        curves = {task: task_curves(experiment, task, environment, name) for task in plan.tasks}
-        if any(curves.values()):
-            panels[environment] = {task: seeds for task, seeds in curves.items() if seeds}
+        curves: dict[str, list[Curve]] = {}
+        for run in (run for task in plan.tasks for run in experiment.runs_of(task, environment)):
+            for curve in metric_curves(run.rows, name, run.is_finished(run.steps)):
+                curves.setdefault(run.cell.task, []).append(curve)
+        if curves:
+            panels[environment] = curves
     if not panels:
         return None
     width = max(7.0, 5.5 * len(panels))
@@ -133,8 +131,8 @@ def draw_curves(experiment: Experiment, title: str) -> Figure | None:
         for task, seeds in curves.items():
             label = f"{MODELS.get(task, task)}{progress_note(seeds, len(plan.seeds))}"
             draw_curve(axis, seeds, label, style(plan.tasks, task))
-        title_text = ENVIRONMENTS.get(environment, environment)
-        axis.set(title=title_text, xlabel=STEPS_LABEL, xlim=(0, 1.02 * end), yscale=scale)
+        axis.set(xlabel=STEPS_LABEL, xlim=(0, 1.02 * end), yscale=scale)
+        axis.set_title(ENVIRONMENTS.get(environment, environment))
         axis.grid(alpha=0.3)
         # below the axis: labels of unfinished curves are long and would hide others
         axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), fontsize=9, handlelength=4, frameon=False)
@@ -148,18 +146,10 @@ def draw_curves(experiment: Experiment, title: str) -> Figure | None:
     return figure
 
 
-def task_curves(experiment: Experiment, task: str, environment: str, name: str) -> list[Curve]:
-    """Return a metric of every training of a task in an environment that has values of it."""
-    runs = experiment.runs_of(task, environment)
-    curves = [metric_curve(run.rows, name, run.is_finished(run.steps)) for run in runs]
-    return [curve for curve in curves if curve.steps.size]
-
-
-def metric_curve(rows: list[Row], name: str, is_finished: bool = True) -> Curve:
-    """Return the finite values of a metric in the evaluations of a training."""
+def metric_curves(rows: list[Row], name: str, is_finished: bool = True) -> list[Curve]:
+    """Return the curve of a metric in the evaluations of a training; none without finite values."""
     points = [(row["steps"], row[name]) for row in rows if math.isfinite(row[name])]
-    steps, values = np.array(points, dtype=float).reshape(-1, 2).T
-    return Curve(steps, values, is_finished)
+    return [Curve(*np.array(points, dtype=float).T, is_finished)] if points else []
 
 
 def progress_note(seeds: list[Curve], num_planned: int) -> str:
@@ -209,9 +199,12 @@ def draw_panel(axis: Axes, plan: Matrix, cells: Cells, column: str, metric: Metr
     heights, papers, notes = [], [], []
     for place, task in enumerate(plan.tasks):
         summary, paper = cells[task].get(metric.name), paper_value(task, column, metric.name)
-        heights.append(summary.mean if summary else 0.0)
-        notes.append(bar_note(summary, len(plan.seeds)))
-        if summary:
+        if summary is None:
+            heights.append(0.0)
+            notes.append("no\ndata")
+        else:
+            heights.append(summary.mean)
+            notes.append("" if summary.is_final else f"{len(summary.values)} of\n{len(plan.seeds)} *")
             draw_bar(axis, summary, metric.digits, style(plan.tasks, task), place)
         if paper is not None:  # beside the middle, where the error bar is
             papers.append(paper)
@@ -223,13 +216,6 @@ def draw_panel(axis: Axes, plan: Matrix, cells: Cells, column: str, metric: Metr
     axis.tick_params(axis="x", length=0)
     axis.set(title=metric.label, xlim=(-0.6, len(notes) - 0.4), ylim=(0, top))
     axis.grid(axis="y", alpha=0.3)
-
-
-def bar_note(summary: Summary | None, num_planned: int) -> str:
-    """Return the note below a bar that is not final; nothing below other bars."""
-    if summary is None:
-        return "no\ndata"
-    return "" if summary.is_final else f"{len(summary.values)} of\n{num_planned} *"
 
 
 def draw_bar(axis: Axes, summary: Summary, digits: int, styles: Style, place: int) -> None:

@@ -23,8 +23,7 @@ from legged_torque.experiments.matrix import Cell, CellState
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 
-LAST_LINES = 10
-"""Lines that are shown of a failed step's log."""
+LAST_LINES = 10  # lines that are shown of a failed step's log
 _TAIL = 65536  # bytes that are read from the end of a log
 _ITERATION = re.compile(rb"Learning iteration (\d+)/(\d+)")
 _LIBC = ctypes.CDLL(None)
@@ -101,15 +100,14 @@ class Job:
 
     def step_text(self) -> str:
         """Describe the step."""
-        if self.state.step == "evaluate":
-            return f"evaluation in {self.state.missing[0]}"
-        return "training" if self.state.step == "train" else f"training from iteration {self.state.iterations} on"
+        resumed = f"training from iteration {self.state.iterations} on"
+        return {"evaluate": f"evaluation in {self.state.missing[0]}", "resume": resumed}.get(
+            self.state.step, "training"
+        )
 
     def __str__(self) -> str:
         """Describe the step in a few words, with its progress."""
-        if self.state.step == "evaluate":
-            return f"{self.cell.name} evaluation"
-        return f"{self.cell.name} {100 * self.fraction():.0f}%"
+        return f"{self.cell.name} {'evaluation' if self.state.step == 'evaluate' else f'{self.fraction():.0%}'}"
 
 
 def end_with_parent() -> None:

@@ -16,8 +16,7 @@ from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
 from legged_torque.utils.runs import checkpoint_numbers, load_config
 
-SETTINGS_FILE = "experiment.yaml"
-"""Copy of the description, in the folder of the results."""
+SETTINGS_FILE = "experiment.yaml"  # copy of the description, in the folder of the results
 CELL_SETTINGS = {"seed": "seeds", "runner.experiment_name": "tasks, environments and seeds"}
 """Settings that ``train`` must not change, and the keys that they come from."""
 EVALUATION = {"num_envs": 256, "num_steps": 2000}
@@ -26,21 +25,13 @@ EVALUATION = {"num_envs": 256, "num_steps": 2000}
 
 @dataclass(frozen=True)
 class Cell:
-    """One training and the evaluations of its last checkpoint.
-
-    Attributes:
-        folder: Folder of its files.
-        task: Name of the task.
-        environment: Perturbation during training.
-        seed: Random seed.
-        evaluated_in: Perturbations in which the last checkpoint is evaluated.
-    """
+    """One training and the evaluations of its last checkpoint."""
 
     folder: Path
     task: str
-    environment: str
+    environment: str  # perturbation during training
     seed: int
-    evaluated_in: tuple[str, ...]
+    evaluated_in: tuple[str, ...]  # perturbations
 
     @property
     def name(self) -> str:
@@ -62,30 +53,17 @@ class Cell:
 
 @dataclass(frozen=True)
 class Matrix:
-    """The trainings and evaluations of an experiment.
-
-    Attributes:
-        tasks: Names of tasks.
-        environments: For each perturbation during training, those in which the last checkpoint is evaluated.
-        seeds: Random seeds.
-        ranges: Ranges of random parameters, as ``--ranges`` takes them; empty: the tasks' own.
-        train: Changed settings of the trainings, by dotted path.
-        evaluation: Worlds and control steps of an evaluation, as in :data:`EVALUATION`.
-    """
+    """The trainings and evaluations of an experiment."""
 
     tasks: list[str]
-    environments: dict[str, list[str]]
+    environments: dict[str, list[str]]  # for each perturbation during training, those of the evaluations
     seeds: list[int]
-    ranges: str = ""
-    train: dict[str, Any] = field(default_factory=dict)
-    evaluation: dict[str, int] = field(default_factory=dict)
+    ranges: str = ""  # of random parameters, as --ranges takes them; empty: the tasks' own
+    train: dict[str, Any] = field(default_factory=dict)  # changed settings, by dotted path
+    evaluation: dict[str, int] = field(default_factory=dict)  # as EVALUATION
 
     def cells(self, out: Path) -> list[Cell]:
-        """Return all cells, seed by seed, so that tasks can be compared before all seeds are done.
-
-        Args:
-            out: Folder of all results.
-        """
+        """Return all cells in a folder, seed by seed, so that tasks can be compared before all seeds are done."""
         return [
             Cell(out / f"{task}-{environment}-s{seed}", task, environment, seed, tuple(evaluated_in))
             for seed in self.seeds
@@ -105,17 +83,11 @@ class Matrix:
 
 @dataclass(frozen=True)
 class CellState:
-    """The progress of a cell.
+    """The progress of a cell."""
 
-    Attributes:
-        iterations: Iterations of training before its last checkpoint.
-        total: Iterations of the whole training; None if it has no checkpoint.
-        missing: Perturbations without a readable result.
-    """
-
-    iterations: int
-    total: int | None
-    missing: list[str]
+    iterations: int  # of training before its last checkpoint
+    total: int | None  # of the whole training; None if it has no checkpoint
+    missing: list[str]  # perturbations without a readable result
 
     @property
     def step(self) -> str:

@@ -14,8 +14,7 @@ from __future__ import annotations
 
 from legged_torque.utils.metrics import METRICS
 
-PAPER_METRICS = tuple(metric for metric in METRICS if metric.in_paper)
-"""The metrics of Table I, in its order."""
+PAPER_METRICS = tuple(metric for metric in METRICS if metric.in_paper)  # the metrics of Table I, in its order
 ENVIRONMENTS = {
     "low": "Low perturbation",
     "high": "High perturbation",

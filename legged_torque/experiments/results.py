@@ -28,23 +28,14 @@ EVALUATIONS_FILE = "evaluations.csv.gz"
 
 @dataclass
 class CellResult:
-    """What there is of a training that has begun.
-
-    Attributes:
-        cell: The training as planned.
-        rows: Evaluations during training, merged over its runs.
-        results: Evaluations of the last checkpoint, by environment.
-        configs: The ``config.yaml`` of its runs.
-        devices: Where it was trained and evaluated.
-        notes: Problems with its files.
-    """
+    """What there is of a training that has begun."""
 
     cell: Cell
-    rows: list[Row] = field(default_factory=list)
-    results: dict[str, Row] = field(default_factory=dict)
-    configs: list[dict[str, Any]] = field(default_factory=list)
-    devices: set[str] = field(default_factory=set)
-    notes: list[str] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)  # evaluations during training, merged over its runs
+    results: dict[str, Row] = field(default_factory=dict)  # evaluations of the last checkpoint, by environment
+    configs: list[dict[str, Any]] = field(default_factory=list)  # config.yaml of its runs
+    devices: set[str] = field(default_factory=set)  # where it was trained and evaluated
+    notes: list[str] = field(default_factory=list)  # problems with its files
 
     @property
     def steps(self) -> float:
@@ -201,9 +192,7 @@ def compare(cells: Cells, metric: str, pairs: list[tuple[str, str]]) -> list[flo
 
 
 def welch(first: list[float], second: list[float]) -> float | None:
-    """Return the two-sided p value of Welch's t-test.
-
-    None if it is undefined: with fewer than two values on a side, or without any variance.
+    """Return the two-sided p value of Welch's t-test; None with fewer than two values on a side, or no variance.
 
     Raises:
         UserError: If scipy is missing.
@@ -238,10 +227,9 @@ def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
         numbers = [found.mean, found.standard_error, len(found.values)] if found else [None, None, 0]
         summaries.append([task, column, name, *numbers, paper_value(task, column, name)])
     evaluations: list[list[Any]] = [["task", "environment", "seed", "steps", *names]]
-    for run in experiment.runs:
-        for row in run.rows:
-            values = [row[name] if math.isfinite(row[name]) else None for name in names]
-            evaluations.append([run.cell.task, run.cell.environment, run.cell.seed, row["steps"], *values])
+    for cell, row in ((run.cell, row) for run in experiment.runs for row in run.rows):
+        values = [row[name] if math.isfinite(row[name]) else None for name in names]
+        evaluations.append([cell.task, cell.environment, cell.seed, row["steps"], *values])
     (out / TABLE_FILE).write_bytes(csv_bytes(summaries))
     (out / EVALUATIONS_FILE).write_bytes(gzip.compress(csv_bytes(evaluations), mtime=0))  # the same bytes every time
 

@@ -19,10 +19,8 @@ from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, cell_s
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
 
-POLL = 0.2
-"""Seconds between checks of the processes."""
-SHOW_EVERY = 1.0
-"""Seconds between updates of the live line."""
+POLL = 0.2  # seconds between checks of the processes
+SHOW_EVERY = 1.0  # seconds between updates of the live line
 
 
 class CountedStop(StopRequest):
@@ -40,13 +38,7 @@ class ExperimentRun:
     """Trains and evaluates all cells of a matrix."""
 
     def __init__(self, matrix: Matrix, out: Path, workers: list[Worker]) -> None:
-        """Find the cells that are not done; nothing is written or started yet.
-
-        Args:
-            matrix: The trainings and evaluations.
-            out: Folder of all results, as an absolute path.
-            workers: Where processes run.
-        """
+        """Find the cells that are not done; nothing is written or started yet. ``out`` is an absolute path."""
         self.matrix, self.out, self.workers = matrix, out, workers
         cells = matrix.cells(out)
         self.queue = [cell for cell in cells if cell.missing()]
@@ -58,10 +50,7 @@ class ExperimentRun:
         self._shown = 0.0  # when the live line was last updated [s]
 
     def run(self) -> int:
-        """Work until all cells are done or have failed, or the user asks to stop.
-
-        Returns:
-            Exit status: 0 if all cells are done, 1 if one has failed.
+        """Work until all cells are done or have failed, or the user asks to stop; return the exit status.
 
         Raises:
             KeyboardInterrupt: If the user asked to stop. No process is left running.

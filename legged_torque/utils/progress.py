@@ -13,12 +13,9 @@ from typing import TextIO
 
 import warp as wp
 
-SHOW_AFTER = 2.0
-"""Seconds of compilation before a line is shown. Shorter compilations are not reported."""
-QUIET_AFTER = 5.0
-"""Seconds without compilation after which the line is finished."""
-END_AFTER = 120.0
-"""Seconds without compilation after which watching ends, so that it costs a long training nothing."""
+SHOW_AFTER = 2.0  # seconds of compilation before a line is shown; shorter compilations are not reported
+QUIET_AFTER = 5.0  # seconds without compilation after which the line is finished
+END_AFTER = 120.0  # seconds without compilation after which watching ends, so that it costs a long training nothing
 _POLL = 0.25
 _BUILD = re.compile(r"_p(\d+)_t\d+$")  # end of the name of a build folder: process id, thread
 
