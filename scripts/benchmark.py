@@ -92,11 +92,7 @@ def main() -> None:
 
 
 def parse_args() -> argparse.Namespace:
-    """Parse and check the command line.
-
-    Raises:
-        UserError: If an option is not valid.
-    """
+    """Parse and check the command line."""
     parser = Parser(__doc__)
     add_settings_args(parser)
     parser.add_argument("--num_envs", type=int, nargs="+", help="numbers of worlds; default: that of the task")

@@ -20,14 +20,9 @@ def copy_state(sim: Simulator) -> PhysicsState:
 
 
 def reference_velocities(model: mujoco.MjModel, states: list[PhysicsState]) -> np.ndarray:
-    """Return the velocities after one ``mj_step`` in float64, with a converged solver, from every state.
+    """Return the velocities after one ``mj_step`` in float64, with a converged solver, from every state of a simulator.
 
-    Args:
-        model: The model of the simulator that the states come from.
-        states: The states.
-
-    Returns:
-        Velocities in MuJoCo's layout. Shape: (len(states), num_envs, nv).
+    Velocities are in MuJoCo's layout. Shape: (len(states), num_envs, nv).
     """
     model = copy.copy(model)
     model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12

@@ -184,10 +184,7 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
     """Time the physics steps of one control step alone, which bound the speed of everything else, and ``env.step``.
 
     Physics restarts from the state that training has left every :data:`PHYSICS_STEPS` control steps: nothing resets
-    fallen robots here, and they have more contacts.
-
-    Returns:
-        Medians over the rounds of the milliseconds of the physics steps and of ``env.step``.
+    fallen robots here, and they have more contacts. Returned are the medians over the rounds [ms].
     """
     actions = ACTION_SCALE * torch.randn(task.num_envs, task.num_actions, device=task.device)
     state = (task.sim.qpos, task.sim.qvel, task.sim.qacc_warmstart)
@@ -220,12 +217,7 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
 def summarize(times: Times, physics: float, step: float, num_envs: int, num_steps: int) -> dict[str, Any]:
     """Return medians, and the steps per second and ratios to physics alone that follow from them.
 
-    Args:
-        times: From :func:`time_iterations`.
-        physics: Milliseconds of the physics steps of one control step.
-        step: Milliseconds of ``env.step``.
-        num_envs: Number of worlds.
-        num_steps: Control steps of a rollout.
+    ``physics`` and ``step`` are those of :func:`time_physics` [ms], ``num_steps`` the control steps of a rollout.
     """
     medians = {"physics": physics, "step": step} | {name: median(values) for name, values in times.items()}
     steps = {"physics": 1, "step": 1, "rollout": num_steps, "iteration": num_steps}
@@ -242,11 +234,7 @@ def summarize(times: Times, physics: float, step: float, num_envs: int, num_step
 
 
 def measure_endurance(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -> dict[str, float]:
-    """Run many iterations in a row and compare the first tenth with the last.
-
-    Returns:
-        Mean milliseconds of an iteration in both tenths, and the memory at the end of both [MiB].
-    """
+    """Run many iterations in a row and compare the first tenth with the last, in mean time and in memory at its end."""
     tenth = max(1, count // 10)
     used: list[float] = []  # at the end of both tenths
 
@@ -268,11 +256,7 @@ def measure_endurance(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -
 
 
 def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]:
-    """Write a trace of :data:`TRACED` iterations of a warm runner for Perfetto or Chrome, compressed if named so (.gz).
-
-    Returns:
-        The list of :func:`most_expensive`.
-    """
+    """Write a trace of :data:`TRACED` iterations for Perfetto or Chrome (.json or .json.gz); list the dearest."""
     cuda, activity = torch.device(runner.device).type == "cuda", torch.profiler.ProfilerActivity
     activities = [activity.CPU, activity.CUDA] if cuda else [activity.CPU]
     schedule = torch.profiler.schedule(wait=0, warmup=1, active=TRACED, repeat=1)
@@ -285,10 +269,7 @@ def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]
 def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict[str, Any]]:
     """Return the most expensive of the profiler's averages: kernels and copies of a GPU, or torch's operators on a CPU.
 
-    torch's profiler sees Warp's kernels on a GPU only.
-
-    Returns:
-        Names, numbers of calls and total milliseconds without those of nested calls, the most expensive first.
+    On the CPU, the profiler does not see Warp's kernels. Milliseconds are without those of nested calls.
     """
     kind, total = ("CUDA", "self_device_time_total") if cuda else ("CPU", "self_cpu_time_total")
     rows = [
@@ -302,9 +283,8 @@ def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict[str, Any]]:
 def is_out_of_memory(error: BaseException | None) -> bool:
     """Return whether an error, or one that led to it, says that memory has run out."""
     while error is not None:
-        if isinstance(error, MemoryError | torch.OutOfMemoryError):
-            return True
-        if isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY):
+        is_told = isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY)
+        if is_told or isinstance(error, MemoryError):
             return True
         error = error.__cause__ or error.__context__
     return False

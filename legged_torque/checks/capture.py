@@ -47,8 +47,7 @@ def compare_capture(plain: OnPolicyRunner, captured: OnPolicyRunner, seed: int) 
         seed: Seed of the random numbers.
 
     Returns:
-        By quantity: the rollout's observations by group, actions, rewards and returns, the changes of actor and critic,
-        and all losses.
+        By quantity: observations by group, actions, rewards, returns, the changes of actor and critic, and all losses.
     """
     start = [tensor.clone() for tensor in _state(plain)]
     expected, rollout = _iterate(plain, start, seed)
@@ -78,11 +77,7 @@ def _state(runner: OnPolicyRunner) -> list[Tensor]:
 def _iterate(
     runner: OnPolicyRunner, start: list[Tensor], seed: int, rollout: list[Tensor] | None = None
 ) -> tuple[dict[str, Tensor], list[Tensor]]:
-    """Run one iteration from the values ``start`` of :func:`_state`, and learn from a rollout; None is its own.
-
-    Returns:
-        The quantities that :func:`compare_capture` compares, and the data learned from.
-    """
+    """Run one iteration from ``start`` (see :func:`_state`); return all quantities, and the rollout learned from."""
     env, storage = runner.env, runner.alg.storage
     for tensor, value in zip(_state(runner), start, strict=True):
         tensor.copy_(value)

@@ -38,11 +38,7 @@ class LearningCurve:
 
 
 def read_curves(file: Path) -> list[LearningCurve]:
-    """Read learning curves.
-
-    Args:
-        file: JSON of ``learning_curve.py``, the ``evaluations.csv`` in a run's folder, or the ``evaluations.csv.gz`` of
-            a report, which holds many trainings.
+    """Read a JSON of ``learning_curve.py``, the ``evaluations.csv`` in a run's folder, or that of a report (.gz).
 
     Raises:
         UserError: If the file cannot be read or holds something else.
@@ -68,11 +64,7 @@ def read_curves(file: Path) -> list[LearningCurve]:
 
 
 def read_csv(file: Path) -> list[dict[str, Any]]:
-    """Read a CSV file, compressed or not. A last line without its end was cut off by a kill and is left out.
-
-    Raises:
-        UserError: If the file cannot be read.
-    """
+    """Read a CSV file, compressed or not. A last line without its end was cut off by a kill and is left out."""
     try:
         content = file.read_bytes()
         text = (gzip.decompress(content) if file.suffix == ".gz" else content).decode("utf-8", errors="replace")

@@ -72,11 +72,7 @@ def file_name(title: str) -> str:
 
 
 def draw_all(experiment: Experiment, table: Table, out: Path) -> list[str]:
-    """Draw every figure that there are data for, as PNG, and return the titles of these figures.
-
-    Raises:
-        UserError: If matplotlib is missing.
-    """
+    """Draw every figure that there are data for, as PNG, and return their titles; UserError without matplotlib."""
     pyplot, drawn = load_pyplot(), []
     with pyplot.rc_context(SETTINGS):
         for title in FIGURES:
@@ -149,7 +145,10 @@ def draw_curves(experiment: Experiment, title: str) -> Figure | None:
 def metric_curves(rows: list[Row], name: str, is_finished: bool = True) -> list[Curve]:
     """Return the curve of a metric in the evaluations of a training; none without finite values."""
     points = [(row["steps"], row[name]) for row in rows if math.isfinite(row[name])]
-    return [Curve(*np.array(points, dtype=float).T, is_finished)] if points else []
+    if not points:
+        return []
+    steps, values = np.array(points, dtype=float).T
+    return [Curve(steps, values, is_finished)]
 
 
 def progress_note(seeds: list[Curve], num_planned: int) -> str:

@@ -48,13 +48,8 @@ class Job:
     ) -> None:
         """Start the process, which gets SIGTERM if this process ends.
 
-        Args:
-            cell: The cell.
-            state: The cell's progress.
-            lock: The cell's open lock file. The process holds it too, and its id is written to it.
-            cell_start: When the work on the cell began, by ``time.monotonic()`` [s].
-            command: Command line of the process.
-            worker: Where it runs.
+        ``lock`` is the cell's open lock file: the process holds it too, and its id is written to it. ``cell_start`` is
+        when the work on the cell began, by ``time.monotonic()`` [s].
         """
         self.cell, self.state, self.lock, self.cell_start = cell, state, lock, cell_start
         self.log = cell.folder / ("evaluate.log" if state.step == "evaluate" else "train.log")

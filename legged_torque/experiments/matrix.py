@@ -100,13 +100,9 @@ class CellState:
 
     def __str__(self) -> str:
         """Describe all that is left to do."""
-        evaluations = f"evaluate in {', '.join(self.missing)}"
-        return {
-            "": "done",
-            "train": f"train, {evaluations}",
-            "resume": f"resume after {self.iterations} of {self.total} iterations, {evaluations}",
-            "evaluate": evaluations,
-        }[self.step]
+        resume = f"resume after {self.iterations} of {self.total} iterations, "
+        training = {"train": "train, ", "resume": resume}.get(self.step, "")
+        return f"{training}evaluate in {', '.join(self.missing)}" if self.missing else "done"
 
 
 def read_matrix(file: Path) -> Matrix:
@@ -131,11 +127,7 @@ def read_matrix(file: Path) -> Matrix:
 
 
 def read_plan(file: Path) -> Matrix:
-    """Read the description of a matrix, whose tasks and settings may be those of another version.
-
-    Raises:
-        UserError: If it cannot be read, or its keys or lists are not valid.
-    """
+    """Read a matrix whose tasks and settings may be those of another version; UserError if it is not well formed."""
     if not file.is_file():
         raise UserError(f"there is no file '{file}'")
     values = parse_yaml(file.read_text(encoding="utf-8", errors="replace"), f"'{file}'")
@@ -184,11 +176,7 @@ def step_command(matrix: Matrix, cell: Cell, state: CellState, device: str) -> l
 
 
 def cell_state(cell: Cell) -> CellState:
-    """Return the progress of a cell.
-
-    Raises:
-        UserError: If the settings of its newest run with a checkpoint lack the number of iterations.
-    """
+    """Return the progress of a cell; UserError if its newest run with a checkpoint does not say how long it is."""
     for run_dir in sorted(cell.folder.glob("*/"), reverse=True):
         numbers = checkpoint_numbers(run_dir)
         if numbers:
@@ -208,11 +196,7 @@ def is_json(file: Path) -> bool:
 
 
 def check_same(matrix: Matrix, out: Path) -> None:
-    """Check that the results of a folder were made with the same settings. A matrix may have more cells, but not fewer.
-
-    Raises:
-        UserError: Naming the first setting that differs.
-    """
+    """Refuse a folder with results of other settings, by UserError. A matrix may have more cells, but not fewer."""
     if not (out / SETTINGS_FILE).is_file():
         return
     old, differs = read_plan(out / SETTINGS_FILE), f"'{out}' was made with other settings"

@@ -30,15 +30,7 @@ BASELINES = ("a1_position", "a1_torque")
 
 
 def report(experiment: Experiment, table: Table, from_step: float, figures: list[str], out: Path) -> str:
-    """Return the report.
-
-    Args:
-        experiment: The experiment.
-        table: Its summaries.
-        from_step: Step from which evaluations count.
-        figures: Titles of the figures that were drawn.
-        out: The report's folder.
-    """
+    """Return the report that ``out`` is to hold, beside the figures with the given titles."""
     missing = missing_lines(experiment, from_step)
     sections = {
         "What is missing": missing or ["Nothing: all trainings and evaluations are complete."],
@@ -129,19 +121,21 @@ def is_best(cells: Cells, task: str, metric: Metric) -> bool:
     return means[task] == best and bool(own) and all(p is not None and p < SIGNIFICANT for p in own)
 
 
-def metric_table(table: Table, columns: list[str], with_paper: bool) -> list[str]:
-    """Return the lines of a table with a row per metric and task, if wished with the paper's values beside ours."""
+def metric_table(table: Table, columns: list[str]) -> list[str]:
+    """Return the lines of a table with a row per metric and task, and the paper's values beside ours if it has any."""
+    header = ["metric", "task"]
+    for column in columns:
+        header += [column, "paper"] if is_of_paper(column) else [column]
     rows = []
     for metric, task in ((metric, task) for metric in PAPER_METRICS for task in table[columns[0]]):
         row = [metric.label, f"`{task}` ({MODELS[task]})" if task in MODELS else f"`{task}`"]
         for column in columns:
             row.append(number(table[column], task, metric))
-            if with_paper:
+            if is_of_paper(column):
                 paper = paper_value(task, column, metric.name)
                 row.append("–" if paper is None else f"{paper:.{metric.digits}f}")
         rows.append(row)
-    header = [cell for name in columns for cell in ([name, "paper"] if with_paper else [name])]
-    return markdown_table(["metric", "task", *header], rows)
+    return markdown_table(header, rows)
 
 
 def table_one(experiment: Experiment, table: Table, from_step: float) -> list[str]:
@@ -157,7 +151,7 @@ def table_one(experiment: Experiment, table: Table, from_step: float) -> list[st
         "or trainings are not finished, so the number will change. Tracking % is better when higher, all else when",
         "lower. The paper's means are of four seeds; it prints no errors, and no numbers of default torque control.",
         "",
-        *metric_table(table, [name for name in table if is_of_paper(name)], with_paper=True),
+        *metric_table(table, [name for name in table if is_of_paper(name)]),
     ]
 
 
@@ -167,7 +161,7 @@ def other_table(table: Table) -> list[str]:
     if not columns:
         return ["None were planned."]
     text = "Trained -> evaluated: metrics of the last checkpoint, over seeds as above. The paper has no such numbers."
-    return [text, "", *metric_table(table, columns, with_paper=False)]
+    return [text, "", *metric_table(table, columns)]
 
 
 def differences(table: Table) -> list[str]:
@@ -183,9 +177,8 @@ def differences(table: Table) -> list[str]:
         lines += ["", f"### {column}"]
         tasks = [task for task in cells if cells[task]]
         families = {"All pairs": list(combinations(tasks, 2))}
-        for baseline in BASELINES:
-            if baseline in tasks:
-                families[f"Against `{baseline}`"] = [(task, baseline) for task in tasks if task != baseline]
+        for baseline in (task for task in BASELINES if task in tasks):
+            families[f"Against `{baseline}`"] = [(task, baseline) for task in tasks if task != baseline]
         for title, pairs in families.items():
             if all(p is None for metric in PAPER_METRICS for p in compare(cells, metric.name, pairs)):
                 lines += ["", f"{title}: no test is possible; it takes at least two seeds of two tasks."]

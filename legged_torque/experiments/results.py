@@ -124,11 +124,7 @@ def is_of_paper(column: str) -> bool:
 
 
 def read_experiment(folder: Path) -> Experiment:
-    """Read the folder of an experiment.
-
-    Raises:
-        UserError: If there is none, or its plan cannot be read.
-    """
+    """Read the folder of an experiment; UserError if there is none, or its plan cannot be read."""
     if not folder.is_dir():
         raise UserError(f"there is no folder '{folder}'")
     plan = read_plan(folder / SETTINGS_FILE)

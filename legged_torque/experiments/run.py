@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from statistics import fmean
 from types import FrameType
@@ -133,7 +133,7 @@ class ExperimentRun:
             self._num_done += 1
             self._durations.append(time.monotonic() - job.cell_start)
         if not problem:
-            took = duration_text(time.monotonic() - job.start)
+            took = duration(time.monotonic() - job.start)
             self._print(f"{job.cell.name}: {job.step_text()} on {worker.name} took {took} | {self._progress()}")
         if is_done or stopping:
             job.lock.close()
@@ -175,8 +175,8 @@ class ExperimentRun:
         """Describe the progress of all cells and the time left; cells in training count in part."""
         cells = self._num_cells - self._num_done - len(self._failures) - sum(job.fraction() for job in self._jobs())
         left = time_left(self._durations, cells, len(self.workers))
-        text = "time left unknown yet" if left is None else f"{duration_text(left)} left"
-        elapsed = duration_text(time.monotonic() - self._start)
+        text = "time left unknown yet" if left is None else f"{duration(left)} left"
+        elapsed = duration(time.monotonic() - self._start)
         return f"{self._num_done} of {self._num_cells} cells done, {elapsed}, {text}"
 
     def _print(self, text: str) -> None:
@@ -193,11 +193,7 @@ class ExperimentRun:
 
 
 def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
-    """Create the folder of the results, and copy the matrix's file into it.
-
-    Raises:
-        UserError: If the folder was made with other settings.
-    """
+    """Create the folder of the results, and copy the matrix's file into it; UserError if it has other settings."""
     check_same(matrix, out)  # before anything is created
     out.mkdir(parents=True, exist_ok=True)
     with open(out / "lock", "a") as lock:
@@ -217,13 +213,9 @@ def time_left(durations: list[float], cells: float, num_workers: int) -> float |
     return fmean(durations) * max(cells / num_workers, min(cells, 1.0)) if durations else None
 
 
-def duration_text(seconds: float) -> str:
-    """Return a duration as text, in its two largest units."""
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes:02d} min"
-    return f"{minutes} min {seconds:02d} s" if minutes else f"{seconds} s"
+def duration(seconds: float) -> timedelta:
+    """Return a duration to be printed, in whole seconds."""
+    return timedelta(seconds=round(seconds))
 
 
 def columns() -> int:
