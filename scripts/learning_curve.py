@@ -46,18 +46,14 @@ def main() -> None:
         points.append({"steps": infos["total_timesteps"], "seconds": infos["seconds"], **means})
         texts = [f"{name} {mean:.4f}" for name, mean in means.items()]
         print(f"{infos['total_timesteps']:>12,} steps", *texts, sep="  ")
+    settings = {"num_envs": env.num_envs, "num_steps": args.steps, "actions": "mean", "env": to_dict(run.env_cfg)}
     result = {
         "task": args.task,
         "seed": run.train_cfg.seed,
         "trained_with": run.config["train"],
         "trained_env": run.config["env"],
         "device": device_name(env.device),
-        "evaluation": {
-            "num_envs": env.num_envs,
-            "num_steps": args.steps,
-            "actions": "mean",
-            "env": to_dict(run.env_cfg),
-        },
+        "evaluation": settings,
         "versions": package_versions(),
         "points": points,
     }

@@ -88,22 +88,12 @@ class MemoryMeter:
 
 
 def measure(
-    task_name: str,
-    cfgs: tuple[Any, Any],
-    memory: MemoryMeter,
-    rounds: int,
-    endurance: int = 0,
-    trace: Path | None = None,
+    task_name: str, cfgs: tuple, memory: MemoryMeter, rounds: int, endurance: int, trace: Path | None
 ) -> dict[str, Any]:
-    """Measure one task of one size.
+    """Measure one task of one size; ``cfgs`` are the settings of the task and of its training.
 
-    Args:
-        task_name: Name of the task.
-        cfgs: Its settings, and those of its training.
-        memory: The meter of the device.
-        rounds: How many iterations are timed, and how often physics and step are.
-        endurance: Iterations in a row to look for slow-down and growth; 0 leaves this out.
-        trace: File for a trace of :data:`TRACED` iterations; None leaves this out.
+    Timed are ``rounds`` iterations, and physics and step as often. ``endurance`` is the number of iterations in a row
+    to look for slow-down and growth, ``trace`` a file for :data:`TRACED` iterations; 0 and None leave them out.
 
     Returns:
         The numbers, by names that end in their units. "build_s" is the time for task and runner, "log_s" that for

@@ -39,12 +39,8 @@ def compare_capture(plain: OnPolicyRunner, captured: OnPolicyRunner, seed: int) 
     """Run the same iteration with both runners, and with ``plain`` twice.
 
     All three start from the networks and counters of ``plain``, with new episodes and the same random numbers. They
-    learn from the rollout of ``plain``, so that differences between rollouts do not hide those of the update.
-
-    Args:
-        plain: A runner with ``runner.capture`` off, after :func:`warm_up`.
-        captured: The same with ``runner.capture`` on.
-        seed: Seed of the random numbers.
+    learn from the rollout of ``plain``, so that differences between rollouts do not hide those of the update. The
+    runners, with ``runner.capture`` off and on, come from :func:`warm_up`.
 
     Returns:
         By quantity: observations by group, actions, rewards, returns, the changes of actor and critic, and all losses.
@@ -110,10 +106,6 @@ def _compare(actual: Tensor, expected: Tensor, repeated: Tensor) -> Difference:
     def rms(tensor: Tensor) -> Tensor:
         return tensor.double().square().mean().sqrt()
 
-    largest = (actual - expected).abs().max()
-    return Difference(
-        float(largest),
-        relative=ratio(largest, expected.abs().max()),
-        rms=ratio(rms(actual - expected), rms(expected)),
-        repeated=ratio(rms(repeated - expected), rms(expected)),
-    )
+    largest, size = (actual - expected).abs().max(), rms(expected)
+    relative, repeated_rms = ratio(largest, expected.abs().max()), ratio(rms(repeated - expected), size)
+    return Difference(float(largest), relative, ratio(rms(actual - expected), size), repeated_rms)

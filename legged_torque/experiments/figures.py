@@ -233,12 +233,9 @@ def draw_legend(figure: Figure, plan: Matrix) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles: list[Any] = []
-    for task in plan.tasks:
-        color, _, hatch = style(plan.tasks, task)
-        handles.append(Patch(facecolor=color, hatch=hatch, edgecolor="black", label=MODELS.get(task, task)))
+    bars = [(MODELS.get(task, task), *style(plan.tasks, task)) for task in plan.tasks]
+    handles: list[Any] = [Patch(facecolor=c, hatch=h, edgecolor="black", label=label) for label, c, _, h in bars]
     handles.append(Line2D([], [], label="paper", **PAPER_MARKER))
     pale = f"pale, *: not all {len(plan.seeds)} seeds are there, or trainings are not finished"
-    for label in (pale, "cut: far beyond the others"):
-        handles.append(Patch(facecolor="none", edgecolor="none", label=label))
+    handles += [Patch(color="none", label=label) for label in (pale, "cut: far beyond the others")]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, handlelength=3, frameon=False)

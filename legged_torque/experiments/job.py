@@ -23,9 +23,8 @@ from legged_torque.experiments.matrix import Cell, CellState
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 
-LAST_LINES = 10  # lines that are shown of a failed step's log
 _TAIL = 65536  # bytes that are read from the end of a log
-_ITERATION = re.compile(rb"Learning iteration (\d+)/(\d+)")
+_ITERATION = re.compile(r"Learning iteration (\d+)/(\d+)")
 _LIBC = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1  # Linux
 
@@ -73,12 +72,12 @@ class Job:
             lock.write(f"{self.process.pid}\n".encode())
             lock.flush()
 
-    def output(self) -> bytes:
+    def output(self) -> str:
         """Return the end of the log that the process has written so far."""
         with open(self.log, "rb") as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(self._log_start, size - _TAIL))
-            return file.read()
+            return file.read().decode(errors="replace")
 
     def fraction(self) -> float:
         """Return the fraction of the training's iterations that is done; 1 for an evaluation."""
@@ -89,16 +88,11 @@ class Job:
             return (int(found[-1][0]) + 1) / max(int(found[-1][1]), 1)
         return self.state.iterations / (self.state.total or 1)
 
-    def last_lines(self) -> list[str]:
-        """Return the last lines of the log."""
-        return self.output().decode(errors="replace").splitlines()[-LAST_LINES:]
-
     def step_text(self) -> str:
         """Describe the step."""
-        resumed = f"training from iteration {self.state.iterations} on"
-        return {"evaluate": f"evaluation in {self.state.missing[0]}", "resume": resumed}.get(
-            self.state.step, "training"
-        )
+        if self.state.step == "evaluate":
+            return f"evaluation in {self.state.missing[0]}"
+        return "training" if self.state.step == "train" else f"training from iteration {self.state.iterations} on"
 
     def __str__(self) -> str:
         """Describe the step in a few words, with its progress."""
@@ -111,10 +105,7 @@ def end_with_parent() -> None:
 
 
 def try_lock(file: Path) -> BinaryIO | None:
-    """Create and lock a file; return None if another process holds it.
-
-    The lock lasts until the file is closed here and in all processes that inherited it.
-    """
+    """Lock a new or old file until it is closed here and in all processes that inherit it; None if another holds it."""
     file.parent.mkdir(parents=True, exist_ok=True)
     lock = file.open("ab")
     try:

@@ -188,11 +188,7 @@ def compare(cells: Cells, metric: str, pairs: list[tuple[str, str]]) -> list[flo
 
 
 def welch(first: list[float], second: list[float]) -> float | None:
-    """Return the two-sided p value of Welch's t-test; None with fewer than two values on a side, or no variance.
-
-    Raises:
-        UserError: If scipy is missing.
-    """
+    """Return the two-sided p value of Welch's t-test; None with fewer than two values on a side, or no variance."""
     try:
         from scipy.stats import ttest_ind_from_stats
     except ImportError:

@@ -158,9 +158,9 @@ class ExperimentRun:
         return ""
 
     def _fail(self, cell: Cell, lock: BinaryIO, reason: str, job: Job | None = None) -> None:
-        """Give up a cell; the last lines of the job's log are printed at the end."""
+        """Give up a cell; the last ten lines of the job's log are printed at the end."""
         lock.close()
-        lines = [f"the last lines of {job.log}:", *job.last_lines()] if job else []
+        lines = [f"the last lines of {job.log}:", *job.output().splitlines()[-10:]] if job else []
         self._failures.append("\n    ".join([f"{cell.name}: {reason}", *lines]))
         self._print(f"{cell.name}: {reason} | {self._progress()}")
 
