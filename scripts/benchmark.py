@@ -86,7 +86,9 @@ def main() -> None:
         result["rows"].append(row | {"left_memory_mib": memory.used()})
         print_row(row)
         if "kernels" in row:
-            print_kernels(row["kernels"], memory.is_gpu, args.profile)
+            kind = "kernels" if memory.is_gpu else "torch operators (Warp's kernels show on a GPU only)"
+            print(f"  most expensive {kind} of {TRACED} iterations, see {args.profile}:")
+            print_kernels(row["kernels"])
         if args.json:
             args.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 
@@ -123,10 +125,8 @@ def print_row(row: dict[str, Any]) -> None:
         print(ENDURANCE.format(**row["endurance"]))
 
 
-def print_kernels(kernels: list[dict[str, Any]], is_gpu: bool, trace: Path) -> None:
+def print_kernels(kernels: list[dict[str, Any]]) -> None:
     """Print the most expensive entries of a trace."""
-    kind = "kernels" if is_gpu else "torch operators (Warp's kernels show on a GPU only)"
-    print(f"  most expensive {kind} of {TRACED} iterations, see {trace}:")
     print(f"  {'calls':>8}  {'total ms':>9}  name")
     if not kernels:
         print("  none: torch's profiler needs CUPTI and the permission to use it")

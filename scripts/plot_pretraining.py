@@ -49,8 +49,7 @@ def draw(axes: Sequence[Axes], report: dict[str, Any]) -> None:
 
 def draw_histogram(axis: Axes, report: dict[str, Any], name: str, title: str, label: str) -> None:
     """Draw counts on a logarithmic axis, and the limit beyond which pairs are dropped."""
-    limit = report["settings"][f"max_{name}"]
-    histogram = report["histograms"][name]
+    histogram, limit = report["histograms"][name], report["settings"][f"max_{name}"]
     axis.stairs(histogram["counts"], histogram["edges"], fill=True, color=BLUE)
     axis.axvline(limit, color=ORANGE, linestyle="--", label=f"dropped beyond {limit:g}")
     axis.set(title=title, xlabel=label, ylabel="pairs", yscale="log")

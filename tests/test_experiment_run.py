@@ -19,7 +19,7 @@ from legged_torque.experiments import matrix as experiment
 from legged_torque.experiments import run as experiment_run
 from legged_torque.experiments.job import find_workers
 from legged_torque.experiments.matrix import read_matrix
-from legged_torque.experiments.run import ExperimentRun, duration, time_left
+from legged_torque.experiments.run import ExperimentRun, time_left
 
 STAND_IN_TRAIN = """
 import os, signal, sys, time
@@ -306,4 +306,3 @@ def test_time_left():
     assert time_left([10.0, 20.0], 4, 2) == 30.0
     assert time_left([10.0], 1.5, 4) == 10.0 and time_left([10.0], 0.5, 4) == 5.0
     assert time_left([10.0], 0, 4) == 0.0
-    assert [str(duration(seconds)) for seconds in (0.4, 61, 7265)] == ["0:00:00", "0:01:01", "2:01:05"]

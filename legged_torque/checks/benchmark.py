@@ -133,10 +133,8 @@ def time_iterations(runner: OnPolicyRunner, count: int, at_start: Callable[[int]
     """Train for whole iterations as ``train.py`` does, with all logging, and time ``count`` of them.
 
     One more iteration is run than timed, to show when the last timed one ended. Nothing is printed. ``at_start`` is
-    called at the start of each iteration with its number from 0 to ``count``.
-
-    Raises:
-        KeyboardInterrupt: If Ctrl-C was pressed, which the runner takes as a request to stop early.
+    called at the start of each iteration with its number from 0 to ``count``. Ctrl-C, which the runner takes as a
+    request to stop early, raises KeyboardInterrupt.
     """
     collect, update = runner.collect_rollout, runner.alg.update
     marks: list[float] = []  # of each iteration: start of the rollout, start and end of the update

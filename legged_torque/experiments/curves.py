@@ -40,8 +40,7 @@ class LearningCurve:
 def read_curves(file: Path) -> list[LearningCurve]:
     """Read a JSON of ``learning_curve.py``, the ``evaluations.csv`` in a run's folder, or that of a report (.gz).
 
-    Raises:
-        UserError: If the file cannot be read or holds something else.
+    A report's file holds many trainings. UserError if the file cannot be read or holds something else.
     """
     training: dict[str, Any] = {}
     if file.suffix == ".json":

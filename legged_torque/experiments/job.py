@@ -117,11 +117,7 @@ def try_lock(file: Path) -> BinaryIO | None:
 
 
 def find_workers(device: str, jobs: int | None) -> list[Worker]:
-    """Return the workers: one per GPU ("auto": all GPUs if there are any), or ``jobs`` on the CPU (None: 1).
-
-    Raises:
-        UserError: If there is no such device, or the number of processes is not valid.
-    """
+    """Return the workers: one per GPU ("auto": all GPUs if any), or ``jobs`` on the CPU; UserError if not possible."""
     first = resolve_device(device)  # does not create a CUDA context
     if jobs is not None and jobs < 1:
         raise UserError(f"--jobs must be at least 1, not {jobs}")

@@ -67,17 +67,16 @@ class CellResult:
 
 @dataclass
 class Experiment:
-    """The folder of an experiment: its plan, the trainings that have begun, and folders that the plan does not name."""
+    """The folder of an experiment."""
 
     folder: Path
     plan: Matrix
-    runs: list[CellResult]
-    unplanned: list[str]
+    runs: list[CellResult]  # trainings that have begun, in the plan's order
+    unplanned: list[str]  # folders of trainings that the plan does not name
 
     def runs_of(self, task: str, environment: str) -> list[CellResult]:
-        """Return the trainings of a task in an environment that have begun, in the plan's order of seeds."""
-        runs = [run for run in self.runs if (run.cell.task, run.cell.environment) == (task, environment)]
-        return sorted(runs, key=lambda run: self.plan.seeds.index(run.cell.seed))
+        """Return the trainings of a task in an environment that have begun."""
+        return [run for run in self.runs if (run.cell.task, run.cell.environment) == (task, environment)]
 
     def columns(self) -> dict[str, tuple[str, str]]:
         """Return the environments of training and evaluation by column, those of Table I first."""
@@ -128,11 +127,10 @@ def read_experiment(folder: Path) -> Experiment:
     if not folder.is_dir():
         raise UserError(f"there is no folder '{folder}'")
     plan = read_plan(folder / SETTINGS_FILE)
-    cells = {cell.name: cell for cell in plan.cells(folder)}
-    names = sorted(path.name for path in folder.iterdir() if path.is_dir())
-    runs = [read_cell(cells[name]) for name in names if name in cells]
-    unplanned = [name for name in names if name not in cells and re.fullmatch(r".+-.+-s\d+", name)]
-    return Experiment(folder, plan, runs, unplanned)
+    cells = plan.cells(folder)
+    others = {path.name for path in folder.iterdir() if path.is_dir()} - {cell.name for cell in cells}
+    unplanned = sorted(name for name in others if re.fullmatch(r".+-.+-s\d+", name))
+    return Experiment(folder, plan, [read_cell(cell) for cell in cells if cell.folder.is_dir()], unplanned)
 
 
 def read_cell(cell: Cell) -> CellResult:
@@ -219,7 +217,8 @@ def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
         numbers = [found.mean, found.standard_error, len(found.values)] if found else [None, None, 0]
         summaries.append([task, column, name, *numbers, paper_value(task, column, name)])
     evaluations: list[list[Any]] = [["task", "environment", "seed", "steps", *names]]
-    for cell, row in ((run.cell, row) for run in experiment.runs for row in run.rows):
+    runs = sorted(experiment.runs, key=lambda run: run.cell.name)
+    for cell, row in ((run.cell, row) for run in runs for row in run.rows):
         values = [row[name] if math.isfinite(row[name]) else None for name in names]
         evaluations.append([cell.task, cell.environment, cell.seed, row["steps"], *values])
     (out / TABLE_FILE).write_bytes(csv_bytes(summaries))

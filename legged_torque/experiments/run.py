@@ -133,7 +133,7 @@ class ExperimentRun:
             self._num_done += 1
             self._durations.append(time.monotonic() - job.cell_start)
         if not problem:
-            took = duration(time.monotonic() - job.start)
+            took = timedelta(seconds=round(time.monotonic() - job.start))
             self._print(f"{job.cell.name}: {job.step_text()} on {worker.name} took {took} | {self._progress()}")
         if is_done or stopping:
             job.lock.close()
@@ -175,8 +175,8 @@ class ExperimentRun:
         """Describe the progress of all cells and the time left; cells in training count in part."""
         cells = self._num_cells - self._num_done - len(self._failures) - sum(job.fraction() for job in self._jobs())
         left = time_left(self._durations, cells, len(self.workers))
-        text = "time left unknown yet" if left is None else f"{duration(left)} left"
-        elapsed = duration(time.monotonic() - self._start)
+        text = "time left unknown yet" if left is None else f"{timedelta(seconds=round(left))} left"
+        elapsed = timedelta(seconds=round(time.monotonic() - self._start))
         return f"{self._num_done} of {self._num_cells} cells done, {elapsed}, {text}"
 
     def _print(self, text: str) -> None:
@@ -211,11 +211,6 @@ def time_left(durations: list[float], cells: float, num_workers: int) -> float |
     if cells <= 0:
         return 0.0
     return fmean(durations) * max(cells / num_workers, min(cells, 1.0)) if durations else None
-
-
-def duration(seconds: float) -> timedelta:
-    """Return a duration to be printed, in whole seconds."""
-    return timedelta(seconds=round(seconds))
 
 
 def columns() -> int:

@@ -11,8 +11,7 @@ from types import FrameType
 class StopRequest:
     """While this context is open, the first Ctrl-C or SIGTERM only asks to stop; the second one stops at once."""
 
-    requested = False
-    """Whether a signal has asked to stop."""
+    requested = False  # whether a signal has asked to stop
 
     def __enter__(self) -> StopRequest:
         """Take over the signals; only a process's main thread can do so."""
