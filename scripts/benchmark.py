@@ -13,7 +13,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from legged_torque.checks.benchmark import TRACED, MemoryMeter, Plan, measure
+from legged_torque.checks.benchmark import TRACED, MemoryMeter, is_out_of_memory, measure
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.args import Parser, add_settings_args, options_of
@@ -24,47 +24,46 @@ from legged_torque.utils.paths import without_machine
 from legged_torque.utils.runs import package_versions
 
 COLUMNS = {
-    "num_envs": ("worlds", 0),
+    "num_envs": (" worlds", 0),
     "physics_ms": ("physics ms", 2),
     "step_ms": ("step ms", 2),
     "rollout_ms": ("rollout ms", 1),
     "update_ms": ("update ms", 1),
-    "log_ms": ("log ms", 1),
+    "log_ms": (" log ms", 1),
     "iteration_ms": ("iteration ms", 1),
     "iteration_over_physics": ("x floor", 2),
     "iteration_steps_per_s": ("steps/s", 0),
     "peak_memory_mib": ("peak MiB", 0),
     "startup_s": ("start-up s", 1),
 }
-"""Heading of each column and its number of decimals."""
-
+"""Heading of each column, as wide as the column, and its number of decimals."""
 LEGEND = """\
   physics: only the physics steps of one control step; step: env.step; iteration: a whole iteration, with logging
   x floor: iteration / (physics x control steps of a rollout); steps/s: over whole iterations
   peak: {memory}
   start-up: from building the task to the end of the second iteration, when everything is compiled and captured"""
-MEMORY = {
-    "cuda": "GPU memory of torch and Warp together, without the CUDA context",
-    "cpu": "peak resident memory of this process",
-}
-MIN_WIDTH = 7
-"""Least width of a column."""
-MAX_NAME = 110
-"""Characters of a kernel's name that are printed."""
+ENDURANCE = """\
+  {iterations} iterations in a row: {first_ms:.1f} ms in the first tenth, {last_ms:.1f} ms in the last \
+({slowdown:+.1%}); memory {first_memory_mib:.0f} MiB, then {growth_mib:+.1f} MiB"""
 
 
 def main() -> None:
-    """Measure every size and print a table."""
+    """Measure every size, print a table, write JSON."""
     args = parse_args()
     device = resolve_device(args.device)
     changes = ["evaluation.interval=0", *args.set]  # without evaluations iterations are alike
-    settings = [size_settings(args, num_envs, changes) for num_envs in args.num_envs or [None]]
+    sizes = []
+    for num_envs in args.num_envs or [None]:
+        options = dataclasses.replace(options_of(args), num_envs=num_envs, set=changes)
+        sizes.append(task_registry.get_cfgs(args.task, options))
+        check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
     for file in filter(None, (args.json, args.profile)):
         prepare_file(file)
-    print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")
-    print(LEGEND.format(memory=MEMORY[device.split(":")[0]]))
-    print(" | ".join(f"{title:>{width(title)}}" for title, _ in COLUMNS.values()), flush=True)
     memory = MemoryMeter(device)
+    of_gpu = "GPU memory of torch and Warp together, without the CUDA context"
+    print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")
+    print(LEGEND.format(memory=of_gpu if memory.is_gpu else "peak resident memory of this process"))
+    print(" | ".join(title for title, _ in COLUMNS.values()), flush=True)
     result = {
         "task": args.task,
         "device": device_name(device),
@@ -76,32 +75,34 @@ def main() -> None:
         "rounds": args.rounds,
         "rows": [],
     }
-    for env_cfg, train_cfg in settings:
-        row = measure(args.task, env_cfg, train_cfg, Plan(args.rounds, args.endurance, args.profile), memory, device)
+    for cfgs in sizes:
+        try:
+            row = measure(args.task, cfgs, memory, args.rounds, args.endurance, args.profile)
+        except Exception as error:
+            if not is_out_of_memory(error):
+                raise
+            row = {"num_envs": cfgs[0].env.num_envs, "error": "does not fit in memory"}
         memory.clear()
         result["rows"].append(row | {"left_memory_mib": memory.used()})
         print_row(row)
         if "kernels" in row:
-            print_kernels(row["kernels"], device, args.profile)
+            kind = "kernels" if memory.is_gpu else "torch operators (Warp's kernels show on a GPU only)"
+            print(f"  most expensive {kind} of {TRACED} iterations, see {args.profile}:")
+            print_kernels(row["kernels"])
         if args.json:
             args.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 
 
 def parse_args() -> argparse.Namespace:
-    """Parse and check the command line.
-
-    Raises:
-        UserError: If an option is not valid.
-    """
+    """Parse and check the command line."""
     parser = Parser(__doc__)
     add_settings_args(parser)
     parser.add_argument("--num_envs", type=int, nargs="+", help="numbers of worlds; default: that of the task")
     parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
     parser.add_argument("--json", type=Path, help="file to write")
-    parser.add_argument(
-        "--profile", type=Path, help=f"write a trace of {TRACED} iterations for ui.perfetto.dev, as .json or .json.gz"
-    )
+    help_text = f"write a trace of {TRACED} iterations for ui.perfetto.dev, as .json or .json.gz"
+    parser.add_argument("--profile", type=Path, help=help_text)
     help_text = "also run N iterations and compare the first tenth with the last"
     parser.add_argument("--endurance", type=int, default=0, metavar="N", help=help_text)
     args = parser.parse_args()
@@ -114,48 +115,23 @@ def parse_args() -> argparse.Namespace:
     return args
 
 
-def size_settings(args: argparse.Namespace, num_envs: int | None, changes: list[str]) -> tuple[Any, Any]:
-    """Return the settings of the task and of its training, as train.py would have them, for a number of worlds.
-
-    Raises:
-        UserError: If a setting is not valid.
-    """
-    options = dataclasses.replace(options_of(args), num_envs=num_envs, set=changes)
-    env_cfg, train_cfg = task_registry.get_cfgs(args.task, options)
-    check_env_cfg(env_cfg)  # report mistakes in any size before the first one is measured
-    return env_cfg, train_cfg
-
-
 def print_row(row: dict[str, Any]) -> None:
     """Print the numbers of one size."""
+    cells = [f"{row[key]:>{len(title)},.{digits}f}" for key, (title, digits) in COLUMNS.items() if key in row]
     if "error" in row:
-        print(f"{row['num_envs']:>{width('worlds')},} | {row['error']}", flush=True)
-        return
-    cells = [f"{row[key]:>{width(title)},.{digits}f}" for key, (title, digits) in COLUMNS.items()]
+        cells.append(row["error"])
     print(" | ".join(cells), flush=True)
     if "endurance" in row:
-        numbers = row["endurance"]
-        print(
-            f"  {numbers['iterations']} iterations in a row: {numbers['first_ms']:.1f} ms in the first tenth, "
-            f"{numbers['last_ms']:.1f} ms in the last ({100 * numbers['slowdown']:+.1f}%); "
-            f"memory {numbers['first_memory_mib']:.0f} MiB, then {numbers['growth_mib']:+.1f} MiB"
-        )
+        print(ENDURANCE.format(**row["endurance"]))
 
 
-def print_kernels(kernels: list[dict[str, Any]], device: str, trace: Path) -> None:
+def print_kernels(kernels: list[dict[str, Any]]) -> None:
     """Print the most expensive entries of a trace."""
-    kind = "torch operators (Warp's kernels show on a GPU only)" if device == "cpu" else "kernels"
-    print(f"  most expensive {kind} of {TRACED} iterations, see {trace}:")
     print(f"  {'calls':>8}  {'total ms':>9}  name")
     if not kernels:
         print("  none: torch's profiler needs CUPTI and the permission to use it")
     for kernel in kernels:
-        print(f"  {kernel['calls']:>8}  {kernel['total_ms']:>9.2f}  {kernel['name'][:MAX_NAME]}")
-
-
-def width(title: str) -> int:
-    """Return the width of a column."""
-    return max(len(title), MIN_WIDTH)
+        print(f"  {kernel['calls']:>8}  {kernel['total_ms']:>9.2f}  {kernel['name'][:110]}")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from legged_torque.utils.rendering import without_renderer
 without_renderer()  # before anything imports mujoco
 
 import sys
+from dataclasses import astuple
 
 from legged_torque.checks.capture import compare_capture, warm_up
 from legged_torque.envs import task_registry
@@ -22,13 +23,9 @@ def main() -> None:
     parser = Parser(__doc__)
     add_build_args(parser)
     parser.add_argument("--iterations", type=int, default=1, help="iterations to compare; default: %(default)s")
-    parser.add_argument(
-        "--tolerance",
-        type=float,
-        default=1e-2,
-        help="how far a quantity may be off (root mean square, in parts of its own), unless two runs without graphs "
-        "are as far apart; default: %(default)s",
-    )
+    help_text = "how far a quantity may be off (root mean square, in parts of its own), unless two runs without graphs "
+    help_text += "are as far apart; default: %(default)s"
+    parser.add_argument("--tolerance", type=float, default=1e-2, help=help_text)
     args = parser.parse_args()
     if args.iterations < 1:
         raise UserError(f"--iterations must be at least 1, not {args.iterations}")
@@ -43,8 +40,7 @@ def main() -> None:
     for iteration in range(args.iterations):
         print(f"{f'iteration {iteration}':<24} largest |  relative |       rms | rms of two without")
         for name, difference in compare_capture(plain, captured, seed=iteration).items():
-            numbers = (difference.largest, difference.relative, difference.rms, difference.repeated)
-            print(f"{name:<22}", " | ".join(f"{number:9.2e}" for number in numbers))
+            print(f"{name:<22}", " | ".join(f"{number:9.2e}" for number in astuple(difference)))
             if not difference.within(args.tolerance):
                 too_far.append(f"{name} of iteration {iteration}")
     captured.close()

@@ -22,9 +22,8 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("file", type=Path, help="description of the matrix, see experiments/")
     parser.add_argument("--out", type=Path, help="folder of the results; default: logs/experiments/<name of the file>")
-    parser.add_argument(
-        "--device", default="auto", help="auto, cpu or cuda:N; auto uses all GPUs with one run on each, or else the CPU"
-    )
+    help_text = "auto, cpu or cuda:N; auto uses all GPUs with one run on each, or else the CPU"
+    parser.add_argument("--device", default="auto", help=help_text)
     parser.add_argument("--jobs", type=int, help="runs at a time on the CPU; default: 1")
     parser.add_argument("--dry-run", action="store_true", help="only list what is left to do")
     args = parser.parse_args()
@@ -33,13 +32,11 @@ def main() -> None:
     workers = find_workers(args.device, args.jobs)
     if args.dry_run:
         check_same(matrix, out)
-        for cell in matrix.cells():
-            print(f"{cell.name}: {cell_state(out, cell)}")
+        for cell in matrix.cells(out):
+            print(f"{cell.name}: {cell_state(cell)}")
         return
     claim_folder(matrix, args.file, out)
-    status = ExperimentRun(matrix, out, workers).run()
-    if status:
-        sys.exit(status)
+    sys.exit(ExperimentRun(matrix, out, workers).run())
 
 
 if __name__ == "__main__":

@@ -18,8 +18,7 @@ from legged_torque.utils.paths import without_machine
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import set_seed
 
-SEED_OFFSET = 1000
-"""Added to the training's seed: worlds other than in training, but the same for every checkpoint."""
+SEED_OFFSET = 1000  # added to the training's seed: worlds other than in training, but the same for every checkpoint
 
 
 def main() -> None:
@@ -27,36 +26,34 @@ def main() -> None:
     parser = Parser(__doc__)
     add_task_args(parser)
     parser.set_defaults(num_envs=256)
-    parser.add_argument(
-        "--steps", type=int, default=1000, help="control steps per checkpoint; default: %(default)s, an episode"
-    )
+    help_text = "control steps per checkpoint; default: %(default)s, an episode"
+    parser.add_argument("--steps", type=int, default=1000, help=help_text)
     parser.add_argument("--json", type=Path, help="file to write; default: curve.json in the run's folder")
     args = parser.parse_args()
     if args.steps < 1:
         raise UserError(f"--steps must be at least 1, not {args.steps}")
     options = options_of(args)
     run = task_registry.load_run(options)
-    run_dir, env_cfg, train_cfg = run.folder, run.env_cfg, run.train_cfg
-    file = args.json or run_dir / "curve.json"
+    file = args.json or run.folder / "curve.json"
     prepare_file(file)
-    env, _ = task_registry.make_env(args.task, options, env_cfg)
-    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=None)
+    env, _ = task_registry.make_env(args.task, options, run.env_cfg)
+    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=run.train_cfg, log_root=None)
     points = []
-    for number in checkpoint_numbers(run_dir):
-        infos = runner.load(str(find_checkpoint(run_dir, number)))
-        set_seed(train_cfg.seed + SEED_OFFSET)
+    for number in checkpoint_numbers(run.folder):
+        infos = runner.load(str(find_checkpoint(run.folder, number)))
+        set_seed(run.train_cfg.seed + SEED_OFFSET)
         means = measure(env, runner.get_inference_policy(env.device), args.steps).means()
         points.append({"steps": infos["total_timesteps"], "seconds": infos["seconds"], **means})
-        print(
-            f"{infos['total_timesteps']:>12,} steps", *(f"{name} {mean:.4f}" for name, mean in means.items()), sep="  "
-        )
+        texts = [f"{name} {mean:.4f}" for name, mean in means.items()]
+        print(f"{infos['total_timesteps']:>12,} steps", *texts, sep="  ")
+    settings = {"num_envs": env.num_envs, "num_steps": args.steps, "actions": "mean", "env": to_dict(run.env_cfg)}
     result = {
         "task": args.task,
-        "seed": train_cfg.seed,
+        "seed": run.train_cfg.seed,
         "trained_with": run.config["train"],
         "trained_env": run.config["env"],
         "device": device_name(env.device),
-        "evaluation": {"num_envs": env.num_envs, "num_steps": args.steps, "actions": "mean", "env": to_dict(env_cfg)},
+        "evaluation": settings,
         "versions": package_versions(),
         "points": points,
     }

@@ -13,14 +13,8 @@ from legged_torque.utils.args import Parser, add_task_args, options_of
 from legged_torque.utils.cli import run_script
 from legged_torque.utils.task_registry import set_seed
 
-SETTINGS = (
-    ("fused", 10, 20),
-    ("fused", 5, 8),
-    ("fused", 3, 6),
-    ("mujoco_warp", 10, 20),
-    ("mujoco_warp", 5, 8),
-    ("mujoco_warp", 3, 6),
-)
+SETTINGS = [(engine, *numbers) for engine in ("fused", "mujoco_warp") for numbers in ((10, 20), (5, 8), (3, 6))]
+"""Engine, solver iterations and line search iterations."""
 
 
 def main() -> None:
@@ -28,17 +22,15 @@ def main() -> None:
     parser = Parser(__doc__)
     add_task_args(parser)
     parser.set_defaults(num_envs=32, seed=1)
-    parser.add_argument(
-        "--steps", type=int, default=100, help="control steps to walk; one physics step of each is compared"
-    )
+    help_text = "control steps to walk; one physics step of each is compared"
+    parser.add_argument("--steps", type=int, default=100, help=help_text)
     args = parser.parse_args()
     options = options_of(args)
     run = task_registry.load_run(options)
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options)
     policy = runner.get_inference_policy(env.device)
-    states = []
-    obs = env.get_observations()
+    states, obs = [], env.get_observations()
     with torch.inference_mode():
         for _ in range(args.steps):
             obs = env.step(policy(obs))[0]
@@ -47,11 +39,8 @@ def main() -> None:
     print("engine      | iterations | line search | rms error | 99.9% | max | rms change in a step   [m/s, rad/s]")
     for engine, iterations, ls_iterations in SETTINGS:
         sim = Simulator(env.sim.mj_model, env.num_envs, env.device, engine, iterations, ls_iterations)
-        errors = velocity_errors(sim, states, reference)
-        print(
-            f"{engine:<11} | {iterations:>10} | {ls_iterations:>11} |",
-            " | ".join(f"{value:.2e}" for value in errors.values()),
-        )
+        errors = " | ".join(f"{value:.2e}" for value in velocity_errors(sim, states, reference).values())
+        print(f"{engine:<11} | {iterations:>10} | {ls_iterations:>11} | {errors}")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BLUE, ORANGE = "#0072B2", "#D55E00"  # colour-blind readers can tell them apart
-PARTS = {"histograms", "settings", "rms_error", "standing"}
 
 
 def main() -> None:
@@ -24,9 +23,8 @@ def main() -> None:
     parser.add_argument("file", type=Path, help="report of pretrain_gravity.py --json")
     parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
     args = parser.parse_args()
-    pyplot = load_pyplot()
-    report = read_data(args.file, PARTS, "pretrain_gravity.py")
-    figure, axes = pyplot.subplots(1, 4, figsize=(17, 4), layout="constrained")
+    figure, axes = load_pyplot().subplots(1, 4, figsize=(17, 4), layout="constrained")
+    report = read_data(args.file, {"histograms", "settings", "rms_error", "standing"}, "pretrain_gravity.py")
     try:
         draw(axes, report)
     except (LookupError, TypeError, ValueError, AttributeError) as error:
@@ -36,31 +34,25 @@ def main() -> None:
 
 def draw(axes: Sequence[Axes], report: dict[str, Any]) -> None:
     """Draw four panels: torques, residuals, learning and standing."""
-    settings = report["settings"]
-    draw_histogram(axes[0], report["histograms"]["mean_torque"], settings["max_mean_torque"])
-    axes[0].set(title="torques", xlabel="mean absolute torque [N m]", ylabel="pairs")
-    draw_histogram(axes[1], report["histograms"]["residual"], settings["max_residual"])
-    axes[1].set(title="contact residuals", xlabel="wrench residual [weight]", ylabel="pairs")
-    draw_errors(axes[2], report["rms_error"])
-    names = list(report["standing"])
-    bars = axes[3].bar(names, [100 * report["standing"][name] for name in names], color=[ORANGE, BLUE], width=0.6)
+    draw_histogram(axes[0], report, "mean_torque", "torques", "mean absolute torque [N m]")
+    draw_histogram(axes[1], report, "residual", "contact residuals", "wrench residual [weight]")
+    errors, styles = report["rms_error"].items(), ((BLUE, "-"), (ORANGE, "--"))
+    for (name, values), (color, line) in zip(errors, styles, strict=True):
+        axes[2].plot(range(1, len(values) + 1), values, line, color=color, label=name.replace("_", " "))
+    axes[2].set(title="learned torques", xlabel="epoch", ylabel="root mean square error [N m]", ylim=(0, None))
+    axes[2].legend()
+    shares = [100 * share for share in report["standing"].values()]
+    bars = axes[3].bar(list(report["standing"]), shares, color=[ORANGE, BLUE], width=0.6)
     axes[3].bar_label(bars, fmt="%.1f %%")
     axes[3].set(title="standing after 5 s", ylabel="worlds [%]", ylim=(0, 110))
 
 
-def draw_histogram(axis: Axes, histogram: dict[str, list[float]], limit: float) -> None:
+def draw_histogram(axis: Axes, report: dict[str, Any], name: str, title: str, label: str) -> None:
     """Draw counts on a logarithmic axis, and the limit beyond which pairs are dropped."""
+    histogram, limit = report["histograms"][name], report["settings"][f"max_{name}"]
     axis.stairs(histogram["counts"], histogram["edges"], fill=True, color=BLUE)
     axis.axvline(limit, color=ORANGE, linestyle="--", label=f"dropped beyond {limit:g}")
-    axis.set_yscale("log")
-    axis.legend()
-
-
-def draw_errors(axis: Axes, errors: dict[str, list[float]]) -> None:
-    """Draw the error of the learned torques by epoch."""
-    for (name, values), color, line in zip(errors.items(), (BLUE, ORANGE), ("-", "--"), strict=True):
-        axis.plot(range(1, len(values) + 1), values, line, color=color, label=name.replace("_", " "))
-    axis.set(title="learned torques", xlabel="epoch", ylabel="root mean square error [N m]", ylim=(0, None))
+    axis.set(title=title, xlabel=label, ylabel="pairs", yscale="log")
     axis.legend()
 
 

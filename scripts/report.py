@@ -10,11 +10,8 @@ from legged_torque.experiments.figures import draw_all
 from legged_torque.experiments.report import missing_lines, report
 from legged_torque.experiments.results import read_experiment, summarize, write_tables
 from legged_torque.utils.args import Parser
-from legged_torque.utils.cli import run_script
+from legged_torque.utils.cli import prepare_file, run_script
 from legged_torque.utils.errors import UserError
-
-FROM_STEP = 90e6
-"""Where the paper's Table I begins to average."""
 
 
 def main() -> None:
@@ -22,27 +19,20 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("experiment", type=Path, help="folder of results that experiment.py has made")
     parser.add_argument("--out", type=Path, required=True, help="folder for the report, its tables and figures")
-    parser.add_argument(
-        "--from_step", type=float, default=FROM_STEP, help="step from which evaluations count; default: %(default).0f"
-    )
+    help_text = "step from which evaluations count; default: %(default).0f, where the paper's Table I begins to average"
+    parser.add_argument("--from_step", type=float, default=90e6, help=help_text)
     args = parser.parse_args()
     if not args.from_step >= 0:
         raise UserError(f"--from_step must be at least 0, not {args.from_step}")
     experiment = read_experiment(args.experiment)
     table = summarize(experiment, args.from_step)
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot make the folder '{args.out}': {error.strerror}") from None
+    file = args.out / "report.md"
+    prepare_file(file)
+    figures = draw_all(experiment, table, args.out)
+    file.write_text(report(experiment, table, args.from_step, figures, args.out), encoding="utf-8")
     write_tables(experiment, table, args.out)
-    try:
-        figures, no_figures = draw_all(experiment, table, args.out), ""
-    except UserError as error:
-        figures, no_figures = [], str(error)
-    text = report(experiment, table, args.from_step, figures, no_figures, args.out)
-    (args.out / "report.md").write_text(text, encoding="utf-8")
     missing = len(missing_lines(experiment, args.from_step))
-    print(f"{args.out / 'report.md'}, {len(figures)} figures; missing or not finished: {missing} lines")
+    print(f"{file}, {len(figures)} figures; missing or not finished: {missing} lines")
 
 
 if __name__ == "__main__":

@@ -14,11 +14,10 @@ import yaml
 
 from legged_torque.experiments import figures
 from legged_torque.experiments.curves import CURVE_METRICS, read_rows
+from legged_torque.experiments.matrix import Cell
 from legged_torque.experiments.paper_values import ENVIRONMENTS, PAPER_METRICS, TABLE_I, paper_value
 from legged_torque.experiments.report import run_problems
-from legged_torque.experiments.results import CellResult, compare, read_experiment, summarize
-from legged_torque.experiments.significance import holm, welch
-from legged_torque.utils.errors import UserError
+from legged_torque.experiments.results import CellResult, compare, holm, read_experiment, summarize, welch
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "report.py"
 HEADER = (
@@ -27,6 +26,7 @@ HEADER = (
 )
 ALL_METRICS = [metric.name for metric in CURVE_METRICS]
 TASKS = ["a1_position", "a1_torque", "a1_multihead"]
+CELL = Cell(Path("a1_torque-low-s1"), "a1_torque", "low", 1, ("low",))
 SETTINGS = {
     "env": {"env": {"num_envs": 1000}},
     "train": {"runner": {"num_steps_per_env": 1000}},  # a million steps per iteration
@@ -53,7 +53,7 @@ def write_part(folder, lines, end="\n", **settings):
 
 def write_result(cell, environment, tracking, steps=110_000_000):
     """Write what evaluate.py has measured in an environment."""
-    metrics = {name: {"mean": tracking, "standard_error": 0.01} for name in TABLE_I}
+    metrics = {name: {"mean": tracking, "standard_error": 0.01} for name, _ in TABLE_I}
     result = {"task": "any", "steps": steps, "device": "NVIDIA H200", "metrics": metrics}
     (cell / f"result_{environment}.json").write_text(json.dumps(result))
 
@@ -118,9 +118,9 @@ def report(folder, tmp_path, monkeypatch):
 
 def test_values_of_the_paper():
     """Table I is whole: five metrics of four models in four environments, at the places where they are printed."""
-    assert list(TABLE_I) == [metric.name for metric in PAPER_METRICS]
-    assert all(len(values) == len(ENVIRONMENTS) == 4 for models in TABLE_I.values() for values in models.values())
-    assert all(len(models) == 4 for models in TABLE_I.values())
+    models = dict.fromkeys(task for _, task in TABLE_I)
+    assert list(TABLE_I) == [(metric.name, task) for metric in PAPER_METRICS for task in models] and len(models) == 4
+    assert all(len(values) == len(ENVIRONMENTS) == 4 for values in TABLE_I.values())
     assert paper_value("a1_torque_curriculum", "low", "track_percentage") == 0.7866
     assert paper_value("a1_multihead", "doubled", "cost_of_transport") == 0.8611
     assert paper_value("a1_torque_multihead", "high_frequency", "collision_force") == 157.3
@@ -158,7 +158,7 @@ def test_parts_are_merged(tmp_path):
     write_part(cell / "2026-01-02_00-00-00", [line(3, 0.33), line(4, 0.44)])
     write_part(cell / "2026-01-01_00-00-00", [line(i, i / 10) for i in (1, 2, 3, 4, 5)])
     write_part(cell / "2026-01-03_00-00-00", [], max_iterations=4)
-    run = read_experiment(tmp_path).runs["a1_torque", "low", 3]
+    (run,) = read_experiment(tmp_path).runs
     assert [(row["steps"] / 1e6, row["track_percentage"]) for row in run.rows] == [
         (1, 0.1),
         (2, 0.2),
@@ -170,7 +170,7 @@ def test_parts_are_merged(tmp_path):
 
 def test_what_counts_of_a_run():
     """Evaluations from step 90 million on; of a shorter run the last 18 percent; elsewhere the result."""
-    run = CellResult("a1_torque", "low", 1, rows=[{"steps": 1e6 * million} for million in range(1, 111)])
+    run = CellResult(CELL, rows=[{"steps": 1e6 * million} for million in range(1, 111)])
     run.results["high"] = {"steps": 5e6}
     assert [row["steps"] / 1e6 for row in run.counted_rows("low", 90e6)] == list(range(90, 111))
     assert [row["steps"] / 1e6 for row in run.counted_rows("low", 109e6)] == [109, 110]
@@ -181,13 +181,13 @@ def test_what_counts_of_a_run():
 
 def test_finished_runs():
     """A run is finished if less than an interval between evaluations is left; without settings it has 110 million."""
-    run = CellResult("a1_torque", "low", 1, rows=[{"steps": 99e6}, {"steps": 104e6}], configs=[])
+    run = CellResult(CELL, rows=[{"steps": 99e6}, {"steps": 104e6}], configs=[])
     assert run.total_steps == 110_000_000 and not run.is_finished(104e6)
     run.configs.append(SETTINGS | {"max_iterations": 108})
     assert run.total_steps == 108_000_000 and run.is_finished(104e6) and not run.is_finished(103e6)
     run.configs.append(SETTINGS | {"max_iterations": 108, "processes": 2})
     assert run.total_steps == 216_000_000
-    assert not CellResult("a1_torque", "low", 1).is_finished(0)
+    assert not CellResult(CELL).is_finished(0)
 
 
 def test_broken_files_are_told(folder, tmp_path):
@@ -231,13 +231,13 @@ def test_evaluations_without_a_value(folder):
     assert cell["track_percentage"].values == pytest.approx([0.7, 0.6])
     assert len(cell["height"].values) == 1 and not cell["height"].is_final
     assert cell["track_xy"].values == pytest.approx([7.0, 4.0]) and cell["track_xy"].is_final
-    problems = run_problems(read_experiment(folder).runs["a1_position", "low", 2], [], 90e6)
-    assert problems == ["1 of the 3 evaluations that count have no track_percentage"]
+    problems = run_problems(read_experiment(folder).runs_of("a1_position", "low")[1], 90e6)
+    assert problems[0] == "1 of the 3 evaluations that count have no track_percentage"
 
 
 def test_compare(tmp_path):
     """The tests of a metric in a column are one family; those with one seed are not counted in it."""
-    write_experiment(tmp_path, {"low": []}, seeds=[1, 2, 3])
+    write_experiment(tmp_path, {"low": ["low"]}, seeds=[1, 2, 3])
     trackings = {"a1_position": (0.7, 0.71, 0.72), "a1_torque": (0.5, 0.52, 0.54), "a1_multihead": (0.8,)}
     for task, values in trackings.items():
         for seed, tracking in enumerate(values, start=1):
@@ -375,26 +375,23 @@ def test_notes_of_curves():
     assert figures.progress_note([curve(110, True), curve(57, False)], 2) == " (2 of 2 seeds, up to 57–110e6 steps)"
 
 
-def test_without_matplotlib(folder, tmp_path, monkeypatch):
-    """Tables and report are written all the same, and the report says what the figures need."""
-
-    def refuse(*_):
-        raise UserError("plots need the extra: pip install -e .[plots]")
-
-    monkeypatch.setattr(figures, "draw_all", refuse)
-    assert run_script(folder, "--out", tmp_path / "out") == 0
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.md", "table.csv", "evaluations.csv.gz"}
-    assert "plots need the extra: pip install -e .[plots]" in (tmp_path / "out" / "report.md").read_text()
+@pytest.mark.parametrize("package", ["matplotlib", "scipy.stats"])
+def test_without_the_extra(folder, tmp_path, monkeypatch, capsys, package):
+    """One line says what a report needs, and neither report nor tables are written."""
+    monkeypatch.setitem(sys.modules, package, None)
+    assert run_script(folder, "--out", tmp_path / "out") == 2
+    assert capsys.readouterr().err.endswith(" need the extra: pip install -e .[plots]\n")
+    assert not list((tmp_path / "out").glob("*.[mc]*"))
 
 
 @pytest.mark.parametrize(
     ("plan", "words", "message"),
     [
         (None, [], "there is no folder"),
-        ("", [], "it has no experiment.yaml"),
+        ("", [], "e/experiment.yaml'"),
         ("tasks: [", [], "experiment.yaml' is not valid YAML"),
-        ("tasks: [a1_torque]", [], "lacks the lists tasks and seeds, or environments"),
-        ("tasks: [a]\nseeds: [1]\nenvironments: [low]", [], "lacks the lists tasks and seeds, or environments"),
+        ("tasks: [a1_torque]", [], "lacks the key 'environments'"),
+        ("tasks: [a]\nseeds: [1]\nenvironments: [low]", [], "'environments' must hold entries 'name: value'"),
         ("good", ["--from_step=-1"], "--from_step must be at least 0, not -1.0"),
         ("good", ["--from_steps=1"], "unknown option '--from_steps=1'; did you mean '--from_step'?"),
     ],

@@ -13,10 +13,6 @@ from legged_torque.sim.simulator import Simulator
 PhysicsState = dict[str, torch.Tensor]
 """A batch of states: "qpos", "qvel", "qacc_warmstart", "ctrl", each (num_envs, size)."""
 
-CONVERGED_ITERATIONS = 100
-CONVERGED_LS_ITERATIONS = 50
-CONVERGED_TOLERANCE = 1e-12
-
 
 def copy_state(sim: Simulator) -> PhysicsState:
     """Return a copy of the arrays that the next physics step depends on."""
@@ -24,18 +20,12 @@ def copy_state(sim: Simulator) -> PhysicsState:
 
 
 def reference_velocities(model: mujoco.MjModel, states: list[PhysicsState]) -> np.ndarray:
-    """Return the velocities after one ``mj_step`` in float64, with a converged solver, from every state.
+    """Return the velocities after one ``mj_step`` in float64, with a converged solver, from every state of a simulator.
 
-    Args:
-        model: The model of the simulator that the states come from.
-        states: The states.
-
-    Returns:
-        Velocities in MuJoCo's layout. Shape: (len(states), num_envs, nv).
+    Velocities are in MuJoCo's layout. Shape: (len(states), num_envs, nv).
     """
     model = copy.copy(model)
-    model.opt.iterations, model.opt.ls_iterations = CONVERGED_ITERATIONS, CONVERGED_LS_ITERATIONS
-    model.opt.tolerance = CONVERGED_TOLERANCE
+    model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
     data = mujoco.MjData(model)
     result = np.zeros((len(states), len(states[0]["qpos"]), model.nv))
     for i, state in enumerate(states):
@@ -49,12 +39,7 @@ def reference_velocities(model: mujoco.MjModel, states: list[PhysicsState]) -> n
 
 
 def velocity_errors(sim: Simulator, states: list[PhysicsState], reference: np.ndarray) -> dict[str, float]:
-    """Compare one step of a simulator with the reference.
-
-    Args:
-        sim: The simulator whose settings are judged.
-        states: States with as many worlds as the simulator has.
-        reference: From :func:`reference_velocities`.
+    """Compare one step of a simulator from each of the states with the :func:`reference_velocities`.
 
     Returns:
         "rms", "p999" (the 99.9th percentile) and "max" of the absolute error of all velocities [m/s, rad/s], and

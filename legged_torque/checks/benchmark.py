@@ -10,7 +10,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
@@ -27,18 +26,13 @@ from legged_torque.sim.graph import CudaGraph, prepare_device
 from legged_torque.utils.progress import CompileProgress
 from legged_torque.utils.task_registry import set_seed
 
-WARM_UP = 2
-"""Iterations before timing begins: the first one compiles, the second one captures the rollout."""
-TRACED = 2
-"""Iterations in a trace."""
+WARM_UP = 2  # iterations before timing begins: the first one compiles, the second one captures the rollout
+TRACED = 2  # iterations in a trace
 PHYSICS_STEPS = 5
 """Control steps of physics timed in a row: enough to hide the cost of the reset before them, and no robot falls yet."""
-GPU_CALLS = 20
-"""Calls per timing on a GPU, where a single one is short; on the CPU one call is timed."""
-ACTION_SCALE = 0.5
-"""Standard deviation of the random actions while ``env.step`` is timed."""
-TOP_KERNELS = 10
-"""Kernels listed from a trace."""
+GPU_CALLS = 20  # calls per timing on a GPU, where a single one is short; on the CPU one call is timed
+ACTION_SCALE = 0.5  # standard deviation of the random actions while env.step is timed
+TOP_KERNELS = 10  # kernels listed from a trace
 OUT_OF_MEMORY = ("out of memory", "Failed to allocate", "can't allocate memory")
 """Parts of the messages of CUDA, Warp and torch on the CPU when memory has run out."""
 _MIB = 2**20
@@ -48,21 +42,6 @@ Times = dict[str, list[float]]
 """Milliseconds of iterations in a row, one entry each. "rollout": curriculum, and the rollout with its returns.
 "update": the update of the networks. "log": reading numbers of the task, printing and writing them, and saving
 checkpoints that are due. "iteration": their sum, from the start of one iteration to the start of the next."""
-
-
-@dataclass
-class Plan:
-    """The measurements to take.
-
-    Attributes:
-        rounds: How many iterations are timed, and how often physics and step are.
-        endurance: Iterations in a row to look for slow-down and growth; 0 leaves this out.
-        trace: File for a trace of :data:`TRACED` iterations; None leaves this out.
-    """
-
-    rounds: int
-    endurance: int = 0
-    trace: Path | None = None
 
 
 class MemoryMeter:
@@ -78,65 +57,50 @@ class MemoryMeter:
 
     def __init__(self, device: str) -> None:
         """Note the free memory before any work on the device."""
-        self._device = torch.device(device)
-        self._free = 0
-        if self._device.type == "cuda":
+        self.device, self.is_gpu = device, torch.device(device).type == "cuda"
+        if self.is_gpu:
             prepare_device(device)
-            self._free = torch.cuda.mem_get_info(self._device)[0]
+            self._free, _ = torch.cuda.mem_get_info(device)
 
     def used(self) -> float:
         """Return the memory in use [MiB]."""
-        if self._device.type == "cuda":
-            return (self._free - torch.cuda.mem_get_info(self._device)[0]) / _MIB
+        if self.is_gpu:
+            return (self._free - torch.cuda.mem_get_info(self.device)[0]) / _MIB
         unit = 1 if sys.platform == "darwin" else 1024
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / _MIB
 
     def shares(self) -> dict[str, float]:
         """Return the peak of torch's allocator and the present use of Warp's pool; nothing on the CPU [MiB]."""
-        if self._device.type != "cuda":
+        if not self.is_gpu:
             return {}
-        result = {"torch_memory_mib": torch.cuda.max_memory_reserved(self._device) / _MIB}
-        if wp.is_mempool_supported(str(self._device)):
-            result["warp_memory_mib"] = wp.get_mempool_used_mem_current(str(self._device)) / _MIB
+        result = {"torch_memory_mib": torch.cuda.max_memory_reserved(self.device) / _MIB}
+        if wp.is_mempool_supported(self.device):
+            result["warp_memory_mib"] = wp.get_mempool_used_mem_current(self.device) / _MIB
         return result
 
     def clear(self) -> None:
         """Give back the memory that is not in use any more."""
         gc.collect()
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
+        if self.is_gpu:
+            torch.cuda.synchronize(self.device)
             torch.cuda.empty_cache()
-            torch.cuda.reset_peak_memory_stats(self._device)
+            torch.cuda.reset_peak_memory_stats(self.device)
 
 
 def measure(
-    task_name: str, env_cfg: Any, train_cfg: Any, plan: Plan, memory: MemoryMeter, device: str
+    task_name: str, cfgs: tuple, memory: MemoryMeter, rounds: int, endurance: int, trace: Path | None
 ) -> dict[str, Any]:
-    """Measure one task of one size.
+    """Measure one task of one size; ``cfgs`` are the settings of the task and of its training.
 
-    Args:
-        task_name: Name of the task.
-        env_cfg: Its settings.
-        train_cfg: Settings of its training.
-        plan: The measurements to take.
-        memory: The meter of the device.
-        device: "cpu" or "cuda:N".
+    Timed are ``rounds`` iterations, and physics and step as often. ``endurance`` is the number of iterations in a row
+    to look for slow-down and growth, ``trace`` a file for :data:`TRACED` iterations; 0 and None leave them out.
 
     Returns:
-        The numbers, by names that end in their units; only "num_envs" and "error" if it does not fit in memory.
+        The numbers, by names that end in their units. "build_s" is the time for task and runner, "log_s" that for
+        opening the log; the first iteration loads and compiles kernels, which only the first size of a process pays
+        for, and the second one captures. "startup_s": all together.
     """
-    try:
-        return _measure(task_name, env_cfg, train_cfg, plan, memory, device)
-    except Exception as error:
-        if not is_out_of_memory(error):
-            raise
-    return {"num_envs": env_cfg.env.num_envs, "error": "does not fit in memory"}
-
-
-def _measure(
-    task_name: str, env_cfg: Any, train_cfg: Any, plan: Plan, memory: MemoryMeter, device: str
-) -> dict[str, Any]:
-    """Measure a size that fits in memory, as :func:`measure` describes."""
+    env_cfg, train_cfg = cfgs
     marks, used = [time.perf_counter()], []
 
     def mark(number: int = 0) -> None:
@@ -146,44 +110,38 @@ def _measure(
     with tempfile.TemporaryDirectory() as folder:
         with CompileProgress() as compilation:
             set_seed(train_cfg.seed)
-            task = task_registry.get_task_class(task_name)(env_cfg, device)
+            task = task_registry.get_task_class(task_name)(env_cfg, memory.device)
             runner, _ = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=folder)
             runner.claim_log_dir()
-            _wait(task)
+            wp.synchronize_device(memory.device)
             mark()
             time_iterations(runner, WARM_UP, mark)
-        times = time_iterations(runner, plan.rounds)
+        times = time_iterations(runner, rounds)
         peak = {"peak_memory_mib": max(*used, memory.used()), **memory.shares()}
-        physics, step = time_physics(task, plan.rounds)
-        row = summarize(times, physics, step, task.num_envs, train_cfg.runner.num_steps_per_env)
-        row |= {**peak, **summarize_startup(marks), "compiled_modules": compilation.modules}
-        if plan.endurance:
-            row["endurance"] = measure_endurance(runner, plan.endurance, memory)
-        if plan.trace:
-            row["kernels"] = trace_iterations(runner, plan.trace)
+        physics, step = time_physics(task, rounds)
+        row = summarize(times, physics, step, task.num_envs, train_cfg.runner.num_steps_per_env) | peak
+        row |= zip(("build_s", "log_s", "first_iteration_s", "capture_s"), np.diff(marks).tolist(), strict=True)
+        row |= {"startup_s": marks[-1] - marks[0], "compiled_modules": compilation.modules}
+        if endurance:
+            row["endurance"] = measure_endurance(runner, endurance, memory)
+        if trace:
+            row["kernels"] = trace_iterations(runner, trace)
     return row
 
 
-def time_iterations(
-    runner: OnPolicyRunner, count: int, at_start: Callable[[int], object] = lambda number: None
-) -> Times:
-    """Train for whole iterations as ``train.py`` does, with all logging, and time them.
+def time_iterations(runner: OnPolicyRunner, count: int, at_start: Callable[[int], object] | None = None) -> Times:
+    """Train for whole iterations as ``train.py`` does, with all logging, and time ``count`` of them.
 
-    One more iteration is run than timed, to show when the last timed one ended. Nothing is printed.
-
-    Args:
-        runner: The runner.
-        count: How many iterations are timed.
-        at_start: Called at the start of each iteration with its number from 0 to ``count``.
-
-    Raises:
-        KeyboardInterrupt: If Ctrl-C was pressed, which the runner takes as a request to stop early.
+    One more iteration is run than timed, to show when the last timed one ended. Nothing is printed. ``at_start`` is
+    called at the start of each iteration with its number from 0 to ``count``. Ctrl-C, which the runner takes as a
+    request to stop early, raises KeyboardInterrupt.
     """
     collect, update = runner.collect_rollout, runner.alg.update
     marks: list[float] = []  # of each iteration: start of the rollout, start and end of the update
 
     def timed_collect() -> None:
-        at_start(len(marks) // 3)
+        if at_start:
+            at_start(len(marks) // 3)
         marks.append(time.perf_counter())
         with torch.profiler.record_function("rollout"):
             collect()
@@ -195,40 +153,31 @@ def time_iterations(
         marks.append(time.perf_counter())
         return losses
 
+    rollouts = patch.object(runner, "collect_rollout", timed_collect)
+    updates = patch.object(runner.alg, "update", timed_update)
     try:
-        with (
-            patch.object(runner, "collect_rollout", timed_collect),
-            patch.object(runner.alg, "update", timed_update),
-            open(os.devnull, "w") as nothing,
-            contextlib.redirect_stdout(nothing),
-        ):
+        with rollouts, updates, open(os.devnull, "w") as nothing, contextlib.redirect_stdout(nothing):
             runner.learn(count + 1)
     finally:
         if hasattr(runner.logger.writer, "close"):  # rsl_rl leaves tensorboard's open
             runner.logger.writer.close()
     if len(marks) <= 3 * count:
         raise KeyboardInterrupt
-    parts = _MS * np.diff(marks[: 3 * count + 1]).reshape(count, 3)
-    columns = {"rollout": parts[:, 0], "update": parts[:, 1], "log": parts[:, 2], "iteration": parts.sum(axis=1)}
-    return {name: values.tolist() for name, values in columns.items()}
+    parts = _MS * np.diff(marks[: 3 * count + 1]).reshape(count, 3).T
+    columns = zip(("rollout", "update", "log", "iteration"), [*parts, parts.sum(axis=0)], strict=True)
+    return {name: values.tolist() for name, values in columns}
 
 
 def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
     """Time the physics steps of one control step alone, which bound the speed of everything else, and ``env.step``.
 
     Physics restarts from the state that training has left every :data:`PHYSICS_STEPS` control steps: nothing resets
-    fallen robots here, and they have more contacts.
-
-    Args:
-        task: The task.
-        rounds: How often each is timed.
-
-    Returns:
-        Medians of the milliseconds of the physics steps and of ``env.step``.
+    fallen robots here, and they have more contacts. Returned are the medians over the rounds [ms].
     """
     actions = ACTION_SCALE * torch.randn(task.num_envs, task.num_actions, device=task.device)
     state = (task.sim.qpos, task.sim.qvel, task.sim.qacc_warmstart)
     kept = [tensor.clone() for tensor in state]
+    calls = GPU_CALLS if torch.device(task.device).type == "cuda" else 1
 
     def physics() -> None:
         for tensor, values in zip(state, kept, strict=True):
@@ -237,10 +186,18 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
         for i in range(PHYSICS_STEPS * decimation):
             task.sim.step(sense=(i + 1) % decimation == 0)
 
+    def milliseconds(function: Callable[[], object]) -> float:
+        wp.synchronize_device(task.device)
+        start = time.perf_counter()
+        for _ in range(calls):
+            function()
+        wp.synchronize_device(task.device)
+        return _MS * (time.perf_counter() - start) / calls
+
     graph = CudaGraph(physics, task.device)
     for _ in range(WARM_UP):
         graph()
-    times = [(_milliseconds(graph, task), _milliseconds(lambda: task.step(actions), task)) for _ in range(rounds)]
+    times = [(milliseconds(graph), milliseconds(lambda: task.step(actions))) for _ in range(rounds)]
     of_physics, of_step = zip(*times, strict=True)
     return median(of_physics) / PHYSICS_STEPS, median(of_step)
 
@@ -248,59 +205,30 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
 def summarize(times: Times, physics: float, step: float, num_envs: int, num_steps: int) -> dict[str, Any]:
     """Return medians, and the steps per second and ratios to physics alone that follow from them.
 
-    Args:
-        times: Of whole iterations.
-        physics: Milliseconds of the physics steps of one control step.
-        step: Milliseconds of ``env.step``.
-        num_envs: Number of worlds.
-        num_steps: Control steps of a rollout.
+    ``physics`` and ``step`` are those of :func:`time_physics` [ms], ``num_steps`` the control steps of a rollout.
     """
-    medians = {name: median(values) for name, values in times.items()}
+    medians = {"physics": physics, "step": step} | {name: median(values) for name, values in times.items()}
+    steps = {"physics": 1, "step": 1, "rollout": num_steps, "iteration": num_steps}
     return {
         "num_envs": num_envs,
         "num_steps_per_env": num_steps,
-        "physics_ms": physics,
-        "step_ms": step,
         **{f"{name}_ms": value for name, value in medians.items()},
         "iteration_min_ms": min(times["iteration"]),
         "iteration_max_ms": max(times["iteration"]),
         "step_over_physics": step / physics,
         "iteration_over_physics": medians["iteration"] / (physics * num_steps),
-        "physics_steps_per_s": _MS * num_envs / physics,
-        "step_steps_per_s": _MS * num_envs / step,
-        "rollout_steps_per_s": _MS * num_envs * num_steps / medians["rollout"],
-        "iteration_steps_per_s": _MS * num_envs * num_steps / medians["iteration"],
+        **{f"{name}_steps_per_s": _MS * num_envs * count / medians[name] for name, count in steps.items()},
     }
 
 
-def summarize_startup(marks: list[float]) -> dict[str, float]:
-    """Return the seconds that pass before training runs at full speed.
-
-    Args:
-        marks: When building began, when it ended, and when each iteration began [s]. The first iteration loads and
-            compiles kernels; where a process measures several sizes, only the first size pays for this.
-
-    Returns:
-        "build_s": task and runner. "log_s": opening the log. "first_iteration_s", and "capture_s" of the second one.
-        "startup_s": all together.
-    """
-    names = ("build_s", "log_s", "first_iteration_s", "capture_s")
-    parts = dict(zip(names, np.diff(marks).tolist(), strict=True))
-    return {**parts, "startup_s": marks[-1] - marks[0]}
-
-
 def measure_endurance(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -> dict[str, float]:
-    """Run many iterations in a row and compare the first tenth with the last.
-
-    Returns:
-        Mean milliseconds of an iteration in both tenths, and the memory at the end of both [MiB].
-    """
+    """Run many iterations in a row and compare the first tenth with the last, in mean time and in memory at its end."""
     tenth = max(1, count // 10)
-    used: dict[int, float] = {}
+    used: list[float] = []  # at the end of both tenths
 
     def look(number: int) -> None:
         if number in (tenth, count):
-            used[number] = memory.used()
+            used.append(memory.used())
 
     times = time_iterations(runner, count, look)["iteration"]
     first, last = mean(times[:tenth]), mean(times[-tenth:])
@@ -309,24 +237,15 @@ def measure_endurance(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -
         "first_ms": first,
         "last_ms": last,
         "slowdown": last / first - 1.0,
-        "first_memory_mib": used[tenth],
-        "last_memory_mib": used[count],
-        "growth_mib": used[count] - used[tenth],
+        "first_memory_mib": used[0],
+        "last_memory_mib": used[-1],
+        "growth_mib": used[-1] - used[0],
     }
 
 
 def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]:
-    """Write a trace of :data:`TRACED` whole iterations for Perfetto or Chrome.
-
-    Args:
-        runner: The runner, warmed up.
-        file: The file to write, compressed if its name ends in ".gz".
-
-    Returns:
-        The list of :func:`most_expensive`.
-    """
-    cuda = torch.device(runner.device).type == "cuda"
-    activity = torch.profiler.ProfilerActivity
+    """Write a trace of :data:`TRACED` iterations for Perfetto or Chrome (.json or .json.gz); list the dearest."""
+    cuda, activity = torch.device(runner.device).type == "cuda", torch.profiler.ProfilerActivity
     activities = [activity.CPU, activity.CUDA] if cuda else [activity.CPU]
     schedule = torch.profiler.schedule(wait=0, warmup=1, active=TRACED, repeat=1)
     with torch.profiler.profile(activities=activities, schedule=schedule) as profiler:
@@ -336,16 +255,9 @@ def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]
 
 
 def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict[str, Any]]:
-    """Return the most expensive entries of a trace: kernels and copies of a GPU, or torch's operators on the CPU.
+    """Return the most expensive of the profiler's averages: kernels and copies of a GPU, or torch's operators on a CPU.
 
-    torch's profiler sees Warp's kernels on a GPU only.
-
-    Args:
-        entries: The profiler's averages by name.
-        cuda: Whether the work ran on a GPU.
-
-    Returns:
-        Names, numbers of calls and total milliseconds without those of nested calls, the most expensive first.
+    On the CPU, the profiler does not see Warp's kernels. Milliseconds are without those of nested calls.
     """
     kind, total = ("CUDA", "self_device_time_total") if cuda else ("CPU", "self_cpu_time_total")
     rows = [
@@ -359,26 +271,8 @@ def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict[str, Any]]:
 def is_out_of_memory(error: BaseException | None) -> bool:
     """Return whether an error, or one that led to it, says that memory has run out."""
     while error is not None:
-        if isinstance(error, MemoryError | torch.OutOfMemoryError):
-            return True
-        if isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY):
+        is_told = isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY)
+        if is_told or isinstance(error, MemoryError):
             return True
         error = error.__cause__ or error.__context__
     return False
-
-
-def _milliseconds(function: Callable[[], object], task: LeggedRobot) -> float:
-    """Return the mean time of a call."""
-    count = GPU_CALLS if torch.device(task.device).type == "cuda" else 1
-    _wait(task)
-    start = time.perf_counter()
-    for _ in range(count):
-        function()
-    _wait(task)
-    return _MS * (time.perf_counter() - start) / count
-
-
-def _wait(task: LeggedRobot) -> None:
-    """Wait for the device."""
-    if torch.device(task.device).type == "cuda":
-        torch.cuda.synchronize(task.device)

@@ -6,16 +6,14 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.utils import parameters_to_vector
 
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.task_registry import set_seed
 
-WARM_UP_ITERATIONS = 2
-"""Iterations before everything is replayed: the first runs as it is, the second captures."""
-
+WARM_UP_ITERATIONS = 2  # iterations before everything is replayed: the first runs as it is, the second captures
 NOISE_FACTOR = 3.0
 """Accepted difference, in differences of two runs without graphs, where only the order of additions differs."""
-
 _LEARNED_FROM = ("observations", "actions", "values", "actions_log_prob", "returns", "advantages")
 
 
@@ -23,18 +21,14 @@ _LEARNED_FROM = ("observations", "actions", "values", "actions_log_prob", "retur
 class Difference:
     """The difference of a quantity with and without graphs.
 
-    Attributes:
-        largest: Largest absolute difference.
-        relative: Largest difference, relative to the largest absolute value.
-        rms: Root mean square of the differences, relative to that of the values; NaN if any of them is not finite.
-        repeated: ``rms`` of two runs without graphs. On a GPU threads add in any order, and rounding errors grow where
-            feet touch the ground: errors of 1e-7 per step make rewards differ by 2% (rms) over 24 steps.
+    On a GPU threads add in any order, and rounding errors grow where feet touch the ground: errors of 1e-7 per step
+    make rewards differ by 2% (rms) over 24 steps.
     """
 
-    largest: float
-    relative: float
-    rms: float
-    repeated: float
+    largest: float  # largest absolute difference
+    relative: float  # the same, relative to the largest absolute value
+    rms: float  # of the differences, relative to that of the values; NaN if any of them is not finite
+    repeated: float  # rms of two runs without graphs
 
     def within(self, tolerance: float) -> bool:
         """Return whether ``rms`` is within the tolerance or close to ``repeated``. NaN is not."""
@@ -45,16 +39,11 @@ def compare_capture(plain: OnPolicyRunner, captured: OnPolicyRunner, seed: int) 
     """Run the same iteration with both runners, and with ``plain`` twice.
 
     All three start from the networks and counters of ``plain``, with new episodes and the same random numbers. They
-    learn from the rollout of ``plain``, so that differences between rollouts do not hide those of the update.
-
-    Args:
-        plain: A runner with ``runner.capture`` off, after :func:`warm_up`.
-        captured: A runner with ``runner.capture`` on, after :func:`warm_up`.
-        seed: Seed of the random numbers.
+    learn from the rollout of ``plain``, so that differences between rollouts do not hide those of the update. The
+    runners, with ``runner.capture`` off and on, come from :func:`warm_up`.
 
     Returns:
-        By quantity: the rollout's observations by group, actions, rewards and returns, the changes of actor and critic,
-        and all losses.
+        By quantity: observations by group, actions, rewards, returns, the changes of actor and critic, and all losses.
     """
     start = [tensor.clone() for tensor in _state(plain)]
     expected, rollout = _iterate(plain, start, seed)
@@ -81,26 +70,10 @@ def _state(runner: OnPolicyRunner) -> list[Tensor]:
     return [*networks, *moments, alg.learning_rate, runner.env.total_steps]
 
 
-def _networks(runner: OnPolicyRunner) -> dict[str, Tensor]:
-    """Return all parameters of actor and critic. Shapes: (number of parameters,)."""
-    models = {"actor": runner.alg.actor, "critic": runner.alg.critic}
-    return {name: torch.cat([p.detach().flatten() for p in model.parameters()]) for name, model in models.items()}
-
-
 def _iterate(
     runner: OnPolicyRunner, start: list[Tensor], seed: int, rollout: list[Tensor] | None = None
 ) -> tuple[dict[str, Tensor], list[Tensor]]:
-    """Run one iteration.
-
-    Args:
-        runner: The runner.
-        start: Values of :func:`_state` to start from.
-        seed: Seed of the random numbers.
-        rollout: Data to learn from; None is the runner's own rollout.
-
-    Returns:
-        The quantities that :func:`compare_capture` compares, and the data learned from.
-    """
+    """Run one iteration from ``start`` (see :func:`_state`); return all quantities, and the rollout learned from."""
     env, storage = runner.env, runner.alg.storage
     for tensor, value in zip(_state(runner), start, strict=True):
         tensor.copy_(value)
@@ -111,14 +84,15 @@ def _iterate(
     result = {f"observations {group}": value.clone() for group, value in storage.observations.items()}
     result |= {name: getattr(storage, name).clone() for name in ("actions", "rewards", "returns")}
     learned_from = [getattr(storage, name) for name in _LEARNED_FROM] + list(storage.distribution_params)
-    if rollout is None:
-        rollout = [tensor.clone() for tensor in learned_from]
+    rollout = rollout or [tensor.clone() for tensor in learned_from]
     for tensor, value in zip(learned_from, rollout, strict=True):
         tensor.copy_(value)
-    before = _networks(runner)
+    networks = {"actor": runner.alg.actor, "critic": runner.alg.critic}
+    before = {name: parameters_to_vector(network.parameters()).detach() for name, network in networks.items()}
     set_seed(seed)
     losses = runner.alg.update()
-    result |= {f"change of {name}": value - before[name] for name, value in _networks(runner).items()}
+    for name, network in networks.items():
+        result[f"change of {name}"] = parameters_to_vector(network.parameters()).detach() - before[name]
     result |= {f"loss {name}": torch.tensor([value]) for name, value in losses.items()}
     return result, rollout
 
@@ -132,10 +106,6 @@ def _compare(actual: Tensor, expected: Tensor, repeated: Tensor) -> Difference:
     def rms(tensor: Tensor) -> Tensor:
         return tensor.double().square().mean().sqrt()
 
-    error = (actual - expected).abs()
-    return Difference(
-        largest=float(error.max()),
-        relative=ratio(error.max(), expected.abs().max()),
-        rms=ratio(rms(error), rms(expected)),
-        repeated=ratio(rms(repeated - expected), rms(expected)),
-    )
+    largest, size = (actual - expected).abs().max(), rms(expected)
+    relative, repeated_rms = ratio(largest, expected.abs().max()), ratio(rms(repeated - expected), size)
+    return Difference(float(largest), relative, ratio(rms(actual - expected), size), repeated_rms)

@@ -15,10 +15,8 @@ from legged_torque.utils.metrics import METRICS, Metric
 from legged_torque.utils.plotting import read_data
 from legged_torque.utils.runs import load_config
 
-MILLION = 1e6
-"""Steps in a million, the unit of axes and texts."""
-CRITIC_GRADIENT_NORM = Metric("critic_gradient_norm", "", "Gradient norm of the critic", None)
-CURVE_METRICS = (*METRICS, CRITIC_GRADIENT_NORM)
+MILLION = 1e6  # steps in a million, the unit of axes and texts
+CURVE_METRICS = (*METRICS, Metric("critic_gradient_norm", "", "Gradient norm of the critic", None))
 """The metrics of an evaluation during training."""
 
 Row = dict[str, float]
@@ -40,14 +38,9 @@ class LearningCurve:
 
 
 def read_curves(file: Path) -> list[LearningCurve]:
-    """Read learning curves.
+    """Read a JSON of ``learning_curve.py``, the ``evaluations.csv`` in a run's folder, or that of a report (.gz).
 
-    Args:
-        file: JSON of ``learning_curve.py``, the ``evaluations.csv`` in a run's folder, or the ``evaluations.csv.gz`` of
-            a report, which holds many trainings.
-
-    Raises:
-        UserError: If the file cannot be read or holds something else.
+    A report's file holds many trainings. UserError if the file cannot be read or holds something else.
     """
     training: dict[str, Any] = {}
     if file.suffix == ".json":
@@ -70,11 +63,7 @@ def read_curves(file: Path) -> list[LearningCurve]:
 
 
 def read_csv(file: Path) -> list[dict[str, Any]]:
-    """Read a CSV file, compressed or not. A last line without its end was cut off by a kill and is left out.
-
-    Raises:
-        UserError: If the file cannot be read.
-    """
+    """Read a CSV file, compressed or not. A last line without its end was cut off by a kill and is left out."""
     try:
         content = file.read_bytes()
         text = (gzip.decompress(content) if file.suffix == ".gz" else content).decode("utf-8", errors="replace")
@@ -97,11 +86,7 @@ def read_rows(file: Path, notes: list[str]) -> list[Row]:
 
 
 def to_row(entry: Mapping[str, Any]) -> Row:
-    """Return an evaluation from the cells of a line or the entries of a JSON object."""
-    values = {metric.name: to_number(entry.get(metric.name)) for metric in CURVE_METRICS}
+    """Return an evaluation from the cells of a line or the entries of a JSON object; empty ones are NaN."""
+    cells = {metric.name: entry.get(metric.name) for metric in CURVE_METRICS}
+    values = {name: math.nan if cell in (None, "") else float(cell) for name, cell in cells.items()}
     return {"steps": int(float(entry["steps"])), **values}
-
-
-def to_number(cell: Any) -> float:
-    """Return a cell's number; NaN if it is empty."""
-    return math.nan if cell in (None, "") else float(cell)

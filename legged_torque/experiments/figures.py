@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from legged_torque.experiments.curves import CURVE_METRICS, MILLION, LearningCurve, Row
+from legged_torque.experiments.matrix import Matrix
 from legged_torque.experiments.paper_values import ENVIRONMENTS, MODELS, PAPER_METRICS, paper_value
-from legged_torque.experiments.results import Experiment, Summary, Table
+from legged_torque.experiments.results import Cells, Experiment, Summary, Table
 from legged_torque.utils.metrics import Metric
 from legged_torque.utils.plotting import load_pyplot
 
@@ -35,27 +36,22 @@ STYLES = {  # colours of Okabe and Ito, which colour-blind readers can tell apar
 }
 """Colour, line style and hatch of each task."""
 OTHER_STYLES = (("#000000", "-", "++"), ("#777777", "--", "oo"), ("#999933", "-.", "**"))
-SEED_LINES = ("-", "--", ":", "-.")
-"""Line styles by seed, where single trainings are shown."""
+SEED_LINES = ("-.", "-", "--", ":")  # line styles by seed modulo four, where single trainings are shown
 CURVES = {
     "Figure 3": ("track_percentage", "linear"),
     "Figure 5a": ("height", "linear"),
     "Figure 5b": ("critic_gradient_norm", "log"),
 }
 """Metric and scale of its axis, by title."""
-BARS = {"Figure 6": ("low", "high"), "Figure 7": ("high_frequency", "doubled")}
-"""Columns of Table I, by title."""
+BARS = {"Figure 6": ("low", "high"), "Figure 7": ("high_frequency", "doubled")}  # columns of Table I, by title
 FIGURES = (*CURVES, *BARS)
-SINGLE_CURVES = ("track_percentage", "track_xy", "cost_of_transport")
-"""Metrics that are shown of single trainings."""
+SINGLE_CURVES = ("track_percentage", "track_xy", "cost_of_transport")  # metrics that are shown of single trainings
+STEPS_LABEL = "environment steps [millions]"
 METRICS_BY_NAME = {metric.name: metric for metric in CURVE_METRICS}
-BAND_ALPHA = 0.2
 UNFINISHED_ALPHA = 0.45
-CUT_AT = 3.0
-"""Largest height of a panel of bars, in medians of the values that it shows."""
+CUT_AT = 3.0  # largest height of a panel of bars, in medians of the values that it shows
 PAPER_MARKER: dict[str, Any] = {"marker": "D", "color": "none", "markerfacecolor": "white", "markeredgecolor": "black"}
-SETTINGS = {"font.size": 10, "hatch.linewidth": 0.6, "axes.axisbelow": True}
-DPI = 150
+SETTINGS = {"font.size": 10, "hatch.linewidth": 0.6, "axes.axisbelow": True, "savefig.dpi": 150}
 
 Style = tuple[str, Any, str]
 """Colour, line style and hatch."""
@@ -63,13 +59,7 @@ Style = tuple[str, Any, str]
 
 @dataclass
 class Curve:
-    """A metric of one training.
-
-    Attributes:
-        steps: Steps of the evaluations with a finite value. Shape: (points,).
-        values: The values. Shape: (points,).
-        is_finished: Whether the training is finished.
-    """
+    """The finite values of a metric of one training, and the steps of their evaluations. Shapes: (points,)."""
 
     steps: np.ndarray
     values: np.ndarray
@@ -82,20 +72,13 @@ def file_name(title: str) -> str:
 
 
 def draw_all(experiment: Experiment, table: Table, out: Path) -> list[str]:
-    """Draw every figure that there are data for, as PNG.
-
-    Returns:
-        The titles of the figures.
-
-    Raises:
-        UserError: If matplotlib is missing.
-    """
+    """Draw every figure that there are data for, as PNG, and return their titles; UserError without matplotlib."""
     pyplot, drawn = load_pyplot(), []
     with pyplot.rc_context(SETTINGS):
         for title in FIGURES:
             figure = draw_curves(experiment, title) if title in CURVES else draw_bars(experiment, table, title)
             if figure is not None:
-                figure.savefig(out / file_name(title), dpi=DPI)
+                figure.savefig(out / file_name(title))
                 pyplot.close(figure)
                 drawn.append(title)
     return drawn
@@ -114,12 +97,10 @@ def draw_single_curves(runs: list[LearningCurve]) -> Figure:
     for axis, name in zip(axes, SINGLE_CURVES, strict=True):
         for run in runs:
             color, _, hatch = style(tasks, run.task)
-            line = SEED_LINES[(run.seed - 1) % len(SEED_LINES)]
-            curve = metric_curve(run.rows, name)
-            if curve.steps.size:
-                draw_curve(axis, [curve], str(run), (color, line, hatch))
-        set_axis(axis, METRICS_BY_NAME[name].label)
-        axis.set(xlim=(0, None), ylim=(0, None))
+            for curve in metric_curves(run.rows, name):
+                draw_curve(axis, [curve], str(run), (color, SEED_LINES[run.seed % len(SEED_LINES)], hatch))
+        axis.set(title=METRICS_BY_NAME[name].label, xlabel=STEPS_LABEL, xlim=(0, None), ylim=(0, None))
+        axis.grid(alpha=0.3)
     axes[0].legend(fontsize="small")
     return figure
 
@@ -127,25 +108,28 @@ def draw_single_curves(runs: list[LearningCurve]) -> Figure:
 def draw_curves(experiment: Experiment, title: str) -> Figure | None:
     """Draw a metric over the steps of training, a panel per environment; return None without data."""
     name, scale = CURVES[title]
-    panels: dict[str, dict[str, list[Curve]]] = {}
-    order = [*ENVIRONMENTS, *experiment.environments]  # those of Table I first
-    for environment in sorted(experiment.environments, key=order.index):
-        curves = {task: task_curves(experiment, task, environment, name) for task in experiment.tasks}
-        if any(curves.values()):
-            panels[environment] = {task: seeds for task, seeds in curves.items() if seeds}
+    plan, panels = experiment.plan, {}
+    order = [*ENVIRONMENTS, *plan.environments]  # those of Table I first
+    for environment in sorted(plan.environments, key=order.index):
+        curves: dict[str, list[Curve]] = {}
+        for run in (run for task in plan.tasks for run in experiment.runs_of(task, environment)):
+            for curve in metric_curves(run.rows, name, run.is_finished(run.steps)):
+                curves.setdefault(run.cell.task, []).append(curve)
+        if curves:
+            panels[environment] = curves
     if not panels:
         return None
-    size = (max(7.0, 5.5 * len(panels)), 5.6)
-    figure, axes = load_pyplot().subplots(
-        1, len(panels), figsize=size, sharey=True, squeeze=False, layout="constrained"
-    )
-    end = max(run.total_steps for run in experiment.runs.values()) / MILLION
+    width = max(7.0, 5.5 * len(panels))
+    grid = {"figsize": (width, 5.6), "sharey": True, "squeeze": False, "layout": "constrained"}
+    figure, axes = load_pyplot().subplots(1, len(panels), **grid)
+    end = max(run.total_steps for run in experiment.runs) / MILLION
     for axis, (environment, curves) in zip(axes[0], panels.items(), strict=True):
         for task, seeds in curves.items():
-            label = f"{MODELS.get(task, task)}{progress_note(seeds, len(experiment.seeds))}"
-            draw_curve(axis, seeds, label, style(experiment.tasks, task))
-        set_axis(axis, ENVIRONMENTS.get(environment, environment))
-        axis.set(xlim=(0, 1.02 * end), yscale=scale)
+            label = f"{MODELS.get(task, task)}{progress_note(seeds, len(plan.seeds))}"
+            draw_curve(axis, seeds, label, style(plan.tasks, task))
+        axis.set(xlabel=STEPS_LABEL, xlim=(0, 1.02 * end), yscale=scale)
+        axis.set_title(ENVIRONMENTS.get(environment, environment))
+        axis.grid(alpha=0.3)
         # below the axis: labels of unfinished curves are long and would hide others
         axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), fontsize=9, handlelength=4, frameon=False)
     if scale == "linear":
@@ -154,28 +138,17 @@ def draw_curves(experiment: Experiment, title: str) -> Figure | None:
     text = "mean over seeds, with a band of one standard error to each side"
     if not all(curve.is_finished for curves in panels.values() for seeds in curves.values() for curve in seeds):
         text += "; cross: a training that is not finished"
-    figure.suptitle(textwrap.fill(f"{title}: {text}", int(12 * size[0])), fontsize=11)
+    figure.suptitle(textwrap.fill(f"{title}: {text}", int(12 * width)), fontsize=11)
     return figure
 
 
-def set_axis(axis: Axes, title: str) -> None:
-    """Set title, label and grid of a panel of learning curves."""
-    axis.set(title=title, xlabel="environment steps [millions]")
-    axis.grid(alpha=0.3)
-
-
-def task_curves(experiment: Experiment, task: str, environment: str, name: str) -> list[Curve]:
-    """Return a metric of every training of a task in an environment that has values of it."""
-    runs = experiment.runs_of(task, environment)
-    curves = [metric_curve(run.rows, name, run.is_finished(run.steps)) for run in runs]
-    return [curve for curve in curves if curve.steps.size]
-
-
-def metric_curve(rows: list[Row], name: str, is_finished: bool = True) -> Curve:
-    """Return the finite values of a metric in the evaluations of a training."""
+def metric_curves(rows: list[Row], name: str, is_finished: bool = True) -> list[Curve]:
+    """Return the curve of a metric in the evaluations of a training; none without finite values."""
     points = [(row["steps"], row[name]) for row in rows if math.isfinite(row[name])]
-    steps, values = np.array(points, dtype=float).reshape(-1, 2).T
-    return Curve(steps, values, is_finished)
+    if not points:
+        return []
+    steps, values = np.array(points, dtype=float).T
+    return [Curve(steps, values, is_finished)]
 
 
 def progress_note(seeds: list[Curve], num_planned: int) -> str:
@@ -198,7 +171,7 @@ def draw_curve(axis: Axes, seeds: list[Curve], label: str, styles: Style) -> Non
     if len(seeds) > 1:
         error = np.sqrt(np.nansum((values - mean) ** 2, axis=0) / np.maximum(count - 1, 1) / count)
         error[count < 2] = np.nan
-        axis.fill_between(steps / MILLION, mean - error, mean + error, color=color, alpha=BAND_ALPHA, linewidth=0)
+        axis.fill_between(steps / MILLION, mean - error, mean + error, color=color, alpha=0.2, linewidth=0)
     ends = np.array([curve.steps[-1] for curve in seeds if not curve.is_finished])
     axis.plot(ends / MILLION, np.interp(ends, steps, mean), "x", color=color, markersize=7, markeredgewidth=1.8)
 
@@ -208,29 +181,30 @@ def draw_bars(experiment: Experiment, table: Table, title: str) -> Figure | None
     columns = [name for name in BARS[title] if any(table.get(name, {}).values())]
     if not columns:
         return None
-    size = (15.0, 3.6 * len(columns) + 0.9)
-    figure, axes = load_pyplot().subplots(
-        len(columns), len(PAPER_METRICS), figsize=size, squeeze=False, layout="constrained"
-    )
+    grid = {"figsize": (15.0, 3.6 * len(columns) + 0.9), "squeeze": False, "layout": "constrained"}
+    figure, axes = load_pyplot().subplots(len(columns), len(PAPER_METRICS), **grid)
     for row, column in zip(axes, columns, strict=True):
         for axis, metric in zip(row, PAPER_METRICS, strict=True):
-            draw_panel(axis, experiment, table, column, metric)
+            draw_panel(axis, experiment.plan, table[column], column, metric)
         row[0].set_ylabel(ENVIRONMENTS[column])
-    draw_legend(figure, experiment)
+    draw_legend(figure, experiment.plan)
     text = "means over seeds with standard errors; tracking: high is good, forces and cost: low is good"
     figure.suptitle(f"{title}: {text}", fontsize=11)
     return figure
 
 
-def draw_panel(axis: Axes, experiment: Experiment, table: Table, column: str, metric: Metric) -> None:
+def draw_panel(axis: Axes, plan: Matrix, cells: Cells, column: str, metric: Metric) -> None:
     """Draw a metric in a column of Table I. Bars far beyond the others are cut off, so that the others stay legible."""
     heights, papers, notes = [], [], []
-    for place, task in enumerate(experiment.tasks):
-        summary, paper = table[column].get(task, {}).get(metric.name), paper_value(task, column, metric.name)
-        notes.append(bar_note(summary, len(experiment.seeds)))
-        heights.append(summary.mean if summary else 0.0)
-        if summary:
-            draw_bar(axis, summary, f"{summary.mean:.{metric.digits}f}", style(experiment.tasks, task), place)
+    for place, task in enumerate(plan.tasks):
+        summary, paper = cells[task].get(metric.name), paper_value(task, column, metric.name)
+        if summary is None:
+            heights.append(0.0)
+            notes.append("no\ndata")
+        else:
+            heights.append(summary.mean)
+            notes.append("" if summary.is_final else f"{len(summary.values)} of\n{len(plan.seeds)} *")
+            draw_bar(axis, summary, metric.digits, style(plan.tasks, task), place)
         if paper is not None:  # beside the middle, where the error bar is
             papers.append(paper)
             axis.plot(place + 0.26, paper, markersize=5.5, markeredgewidth=1.4, zorder=5, **PAPER_MARKER)
@@ -243,36 +217,25 @@ def draw_panel(axis: Axes, experiment: Experiment, table: Table, column: str, me
     axis.grid(axis="y", alpha=0.3)
 
 
-def bar_note(summary: Summary | None, num_planned: int) -> str:
-    """Return the note below a bar that is not final; nothing below other bars."""
-    if summary is None:
-        return "no\ndata"
-    return "" if summary.is_final else f"{len(summary.values)} of\n{num_planned} *"
-
-
-def draw_bar(axis: Axes, summary: Summary, text: str, styles: Style, place: int) -> None:
+def draw_bar(axis: Axes, summary: Summary, digits: int, styles: Style, place: int) -> None:
     """Draw a bar with its error and its number; pale if it is not final."""
     color, _, hatch = styles
     mean, alpha = summary.mean, 1.0 if summary.is_final else UNFINISHED_ALPHA
     axis.bar(place, mean, width=0.8, color=color, hatch=hatch, edgecolor="black", linewidth=0.8, alpha=alpha)
     axis.errorbar(place, mean, yerr=summary.standard_error, color="black", capsize=5, linewidth=1.5, zorder=4)
     box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
-    bottom = axis.get_xaxis_transform()
-    axis.text(place, 0.04, text, transform=bottom, rotation=90, ha="center", va="bottom", fontsize=9, bbox=box)
+    layout: dict[str, Any] = {"rotation": 90, "ha": "center", "va": "bottom", "fontsize": 9, "bbox": box}
+    axis.text(place, 0.04, f"{mean:.{digits}f}", transform=axis.get_xaxis_transform(), **layout)
 
 
-def draw_legend(figure: Figure, experiment: Experiment) -> None:
+def draw_legend(figure: Figure, plan: Matrix) -> None:
     """Draw the legend of a figure of bars below it."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles: list[Any] = []
-    for task in experiment.tasks:
-        color, _, hatch = style(experiment.tasks, task)
-        handles.append(Patch(facecolor=color, hatch=hatch, edgecolor="black", label=MODELS.get(task, task)))
+    bars = [(MODELS.get(task, task), *style(plan.tasks, task)) for task in plan.tasks]
+    handles: list[Any] = [Patch(facecolor=c, hatch=h, edgecolor="black", label=label) for label, c, _, h in bars]
     handles.append(Line2D([], [], label="paper", **PAPER_MARKER))
-    pale = f"pale, *: not all {len(experiment.seeds)} seeds are there, or trainings are not finished"
-    handles += [
-        Patch(facecolor="none", edgecolor="none", label=label) for label in (pale, "cut: far beyond the others")
-    ]
+    pale = f"pale, *: not all {len(plan.seeds)} seeds are there, or trainings are not finished"
+    handles += [Patch(color="none", label=label) for label in (pale, "cut: far beyond the others")]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, handlelength=3, frameon=False)

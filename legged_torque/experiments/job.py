@@ -23,54 +23,35 @@ from legged_torque.experiments.matrix import Cell, CellState
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 
-LAST_LINES = 10
-"""Lines that are shown of a failed step's log."""
 _TAIL = 65536  # bytes that are read from the end of a log
-_ITERATION = re.compile(rb"Learning iteration (\d+)/(\d+)")
+_ITERATION = re.compile(r"Learning iteration (\d+)/(\d+)")
 _LIBC = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1  # Linux
 
 
 @dataclass
 class Worker:
-    """A device that runs one process at a time.
+    """A device that runs one process at a time."""
 
-    Attributes:
-        name: The user's name for it, "cpu" or "cuda:1".
-        device: The ``--device`` of its processes.
-        variables: Additional environment variables of its processes.
-        job: Its current job.
-    """
-
-    name: str
-    device: str
-    variables: dict[str, str]
+    name: str  # the user's: "cpu", "cuda:1"
+    device: str  # the --device of its processes
+    variables: dict[str, str]  # additional environment variables of its processes
     job: Job | None = None
 
 
 class Job:
-    """A step of a cell in its own process.
-
-    Attributes:
-        cell: The cell.
-        state: The cell's progress when the step began.
-        lock: The cell's open lock file; the process holds it too.
-        cell_start: When the work on the cell began, by ``time.monotonic()`` [s].
-        start: When the step began [s].
-        log: File that the process writes to.
-        process: The process.
-    """
+    """A step of a cell in its own process, which writes to ``log``."""
 
     def __init__(
         self, cell: Cell, state: CellState, lock: BinaryIO, cell_start: float, command: list[str], worker: Worker
     ) -> None:
-        """Start the process. It holds the cell's lock too, and gets SIGTERM if this process ends.
+        """Start the process, which gets SIGTERM if this process ends.
 
-        The arguments are those of the attributes, and the command line of the process and the worker that runs it. The
-        lock file lies in the cell's folder; the process id is written to it.
+        ``lock`` is the cell's open lock file: the process holds it too, and its id is written to it. ``cell_start`` is
+        when the work on the cell began, by ``time.monotonic()`` [s].
         """
         self.cell, self.state, self.lock, self.cell_start = cell, state, lock, cell_start
-        self.log = Path(lock.name).with_name("evaluate.log" if state.step == "evaluate" else "train.log")
+        self.log = cell.folder / ("evaluate.log" if state.step == "evaluate" else "train.log")
         with open(self.log, "ab") as file:
             file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {shlex.join(command)}\n".encode())
             file.flush()
@@ -91,12 +72,12 @@ class Job:
             lock.write(f"{self.process.pid}\n".encode())
             lock.flush()
 
-    def output(self) -> bytes:
+    def output(self) -> str:
         """Return the end of the log that the process has written so far."""
         with open(self.log, "rb") as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(self._log_start, size - _TAIL))
-            return file.read()
+            return file.read().decode(errors="replace")
 
     def fraction(self) -> float:
         """Return the fraction of the training's iterations that is done; 1 for an evaluation."""
@@ -107,10 +88,6 @@ class Job:
             return (int(found[-1][0]) + 1) / max(int(found[-1][1]), 1)
         return self.state.iterations / (self.state.total or 1)
 
-    def last_lines(self) -> list[str]:
-        """Return the last lines of the log."""
-        return self.output().decode(errors="replace").splitlines()[-LAST_LINES:]
-
     def step_text(self) -> str:
         """Describe the step."""
         if self.state.step == "evaluate":
@@ -119,9 +96,7 @@ class Job:
 
     def __str__(self) -> str:
         """Describe the step in a few words, with its progress."""
-        if self.state.step == "evaluate":
-            return f"{self.cell.name} evaluation"
-        return f"{self.cell.name} {100 * self.fraction():.0f}%"
+        return f"{self.cell.name} {'evaluation' if self.state.step == 'evaluate' else f'{self.fraction():.0%}'}"
 
 
 def end_with_parent() -> None:
@@ -130,10 +105,7 @@ def end_with_parent() -> None:
 
 
 def try_lock(file: Path) -> BinaryIO | None:
-    """Create and lock a file; return None if another process holds it.
-
-    The lock lasts until the file is closed here and in all processes that inherited it.
-    """
+    """Lock a new or old file until it is closed here and in all processes that inherit it; None if another holds it."""
     file.parent.mkdir(parents=True, exist_ok=True)
     lock = file.open("ab")
     try:
@@ -145,15 +117,7 @@ def try_lock(file: Path) -> BinaryIO | None:
 
 
 def find_workers(device: str, jobs: int | None) -> list[Worker]:
-    """Return the workers: one per GPU, or as many as asked for on the CPU.
-
-    Args:
-        device: "auto" (all GPUs if there are any), "cpu", "cuda" or "cuda:N".
-        jobs: Processes at a time on the CPU; None is 1.
-
-    Raises:
-        UserError: If there is no such device, or the number of processes is not valid.
-    """
+    """Return the workers: one per GPU ("auto": all GPUs if any), or ``jobs`` on the CPU; UserError if not possible."""
     first = resolve_device(device)  # does not create a CUDA context
     if jobs is not None and jobs < 1:
         raise UserError(f"--jobs must be at least 1, not {jobs}")

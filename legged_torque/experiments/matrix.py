@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,7 @@ from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
 from legged_torque.utils.runs import checkpoint_numbers, load_config
 
-SETTINGS_FILE = "experiment.yaml"
-"""Copy of the description, in the folder of the results."""
+SETTINGS_FILE = "experiment.yaml"  # copy of the description, in the folder of the results
 CELL_SETTINGS = {"seed": "seeds", "runner.experiment_name": "tasks, environments and seeds"}
 """Settings that ``train`` must not change, and the keys that they come from."""
 EVALUATION = {"num_envs": 256, "num_steps": 2000}
@@ -26,69 +25,69 @@ EVALUATION = {"num_envs": 256, "num_steps": 2000}
 
 @dataclass(frozen=True)
 class Cell:
-    """One training and the evaluations of its last checkpoint.
+    """One training and the evaluations of its last checkpoint."""
 
-    Attributes:
-        task: Name of the task.
-        environment: Perturbation during training.
-        seed: Random seed.
-        evaluated_in: Perturbations in which the last checkpoint is evaluated.
-    """
-
+    folder: Path
     task: str
-    environment: str
+    environment: str  # perturbation during training
     seed: int
-    evaluated_in: tuple[str, ...]
+    evaluated_in: tuple[str, ...]  # perturbations
 
     @property
     def name(self) -> str:
         """Name of the cell and of its folder."""
-        return f"{self.task}-{self.environment}-s{self.seed}"
+        return self.folder.name
+
+    def result_file(self, environment: str) -> Path:
+        """Return the file with the numbers of an evaluation."""
+        return self.folder / f"result_{environment}.json"
+
+    def part_file(self, environment: str) -> Path:
+        """Return the file that an evaluation writes; it becomes the result when the evaluation is complete."""
+        return self.folder / f"result_{environment}.json.part"
+
+    def missing(self) -> list[str]:
+        """Return the perturbations without a readable result."""
+        return [name for name in self.evaluated_in if not is_json(self.result_file(name))]
 
 
 @dataclass(frozen=True)
 class Matrix:
-    """The trainings and evaluations of an experiment.
-
-    Attributes:
-        tasks: Names of tasks.
-        environments: For each perturbation during training, those in which the last checkpoint is evaluated.
-        seeds: Random seeds.
-        ranges: Ranges of random parameters, as ``--ranges`` takes them; empty: the tasks' own.
-        train: Changed settings of the trainings, by dotted path.
-        evaluation: Worlds and control steps of an evaluation, as in :data:`EVALUATION`.
-    """
+    """The trainings and evaluations of an experiment."""
 
     tasks: list[str]
-    environments: dict[str, list[str]]
+    environments: dict[str, list[str]]  # for each perturbation during training, those of the evaluations
     seeds: list[int]
-    ranges: str = ""
-    train: dict[str, Any] = field(default_factory=dict)
-    evaluation: dict[str, int] = field(default_factory=dict)
+    ranges: str = ""  # of random parameters, as --ranges takes them; empty: the tasks' own
+    train: dict[str, Any] = field(default_factory=dict)  # changed settings, by dotted path
+    evaluation: dict[str, int] = field(default_factory=dict)  # as EVALUATION
 
-    def cells(self) -> list[Cell]:
-        """Return all cells, seed by seed, so that tasks can be compared before all seeds are done."""
+    def cells(self, out: Path) -> list[Cell]:
+        """Return all cells in a folder, seed by seed, so that tasks can be compared before all seeds are done."""
         return [
-            Cell(task, environment, seed, tuple(evaluated_in))
+            Cell(out / f"{task}-{environment}-s{seed}", task, environment, seed, tuple(evaluated_in))
             for seed in self.seeds
             for environment, evaluated_in in self.environments.items()
             for task in self.tasks
         ]
 
+    def lists(self) -> dict[str, list[Any]]:
+        """Return the lists that make up the cells, by their keys."""
+        evaluated = {f"environments.{name}": names for name, names in self.environments.items()}
+        return {"tasks": self.tasks, "seeds": self.seeds, "environments": list(self.environments), **evaluated}
+
+    def set_words(self) -> list[str]:
+        """Return the changed settings of the trainings as ``--set`` takes them."""
+        return [f"{key}={v if isinstance(v, str) else json.dumps(v, default=str)}" for key, v in self.train.items()]
+
 
 @dataclass(frozen=True)
 class CellState:
-    """The progress of a cell.
+    """The progress of a cell."""
 
-    Attributes:
-        iterations: Iterations of training before its last checkpoint.
-        total: Iterations of the whole training; None if it has no checkpoint.
-        missing: Perturbations without a readable result.
-    """
-
-    iterations: int
-    total: int | None
-    missing: tuple[str, ...]
+    iterations: int  # of training before its last checkpoint
+    total: int | None  # of the whole training; None if it has no checkpoint
+    missing: list[str]  # perturbations without a readable result
 
     @property
     def step(self) -> str:
@@ -101,25 +100,38 @@ class CellState:
 
     def __str__(self) -> str:
         """Describe all that is left to do."""
-        evaluations = f"evaluate in {', '.join(self.missing)}"
-        return {
-            "": "done",
-            "train": f"train, {evaluations}",
-            "resume": f"resume after {self.iterations} of {self.total} iterations, {evaluations}",
-            "evaluate": evaluations,
-        }[self.step]
+        resume = f"resume after {self.iterations} of {self.total} iterations, "
+        training = {"train": "train, ", "resume": resume}.get(self.step, "")
+        return f"{training}evaluate in {', '.join(self.missing)}" if self.missing else "done"
 
 
 def read_matrix(file: Path) -> Matrix:
-    """Read and check the description of a matrix.
+    """Read the description of a matrix, and check what train.py and evaluate.py would check only hours later.
 
     Raises:
-        UserError: If it cannot be read or is not valid.
+        UserError: If it cannot be read, or a task, a perturbation or a setting is not valid.
     """
+    matrix = read_plan(file)
+    for key, source in CELL_SETTINGS.items():
+        if key in matrix.train:
+            raise UserError(f"train.{key} cannot be set: it comes from {source}")
+    ranges, words = str(matrix.ranges) if matrix.ranges else None, matrix.set_words()
+    for cell in matrix.cells(Path()):
+        options = Options(device="cpu", seed=cell.seed, perturbation=cell.environment, ranges=ranges, set=words)
+        env_cfg, _ = task_registry.get_cfgs(cell.task, options)
+        check_env_cfg(env_cfg)
+        for name in cell.evaluated_in:
+            if name not in env_cfg.perturbations():
+                raise unknown_name("perturbation", name, env_cfg.perturbations())
+    return matrix
+
+
+def read_plan(file: Path) -> Matrix:
+    """Read a matrix whose tasks and settings may be those of another version; UserError if it is not well formed."""
     if not file.is_file():
         raise UserError(f"there is no file '{file}'")
     values = parse_yaml(file.read_text(encoding="utf-8", errors="replace"), f"'{file}'")
-    keys = list(Matrix.__dataclass_fields__)
+    keys = [entry.name for entry in fields(Matrix)]
     if not isinstance(values, dict):
         raise UserError(f"'{file}' must hold the keys {', '.join(keys)}")
     for key in values:
@@ -131,126 +143,48 @@ def read_matrix(file: Path) -> Matrix:
     for key in ("environments", "train", "evaluation"):
         if not isinstance(values.setdefault(key, {}), dict):
             raise UserError(f"experiment key '{key}' must hold entries 'name: value', not {values[key]!r}")
-    check_list("tasks", values["tasks"], str)
-    check_list("seeds", values["seeds"], int)
-    check_list("environments", list(values["environments"]), str)
-    for name, evaluated_in in values["environments"].items():
-        check_list(f"environments.{name}", evaluated_in, str)
-    check_evaluation(values["evaluation"])
-    values["evaluation"] = EVALUATION | values["evaluation"]
-    matrix = Matrix(**values)
-    check_settings(matrix)
-    return matrix
-
-
-def check_list(key: str, values: Any, kind: type) -> None:
-    """Check that an entry is a list of one value or more, of one type and all different.
-
-    Raises:
-        UserError: Naming the key.
-    """
-    if not isinstance(values, list) or not values or any(type(value) is not kind for value in values):
-        example = "[1, 2]" if kind is int else "[a, b]"
-        raise UserError(f"experiment key '{key}' must be a list like {example}, not {values!r}")
-    if len(set(values)) < len(values):
-        raise UserError(f"experiment key '{key}' holds something twice: {values}")
-
-
-def check_evaluation(values: dict[str, Any]) -> None:
-    """Check the numbers of an evaluation.
-
-    Raises:
-        UserError: If a key is unknown or a number is not valid.
-    """
-    for key, value in values.items():
+    for key, value in values["evaluation"].items():
         if key not in EVALUATION:
             raise unknown_name("evaluation key", str(key), EVALUATION)
         if type(value) is not int or value < 1:
             raise UserError(f"evaluation.{key} must be a whole number of at least 1, not {value!r}")
+    matrix = Matrix(**values | {"evaluation": EVALUATION | values["evaluation"]})
+    for key, entries in matrix.lists().items():
+        kind, example = (int, "[1, 2]") if key == "seeds" else (str, "[a, b]")
+        if not isinstance(entries, list) or not entries or any(type(entry) is not kind for entry in entries):
+            raise UserError(f"experiment key '{key}' must be a list like {example}, not {entries!r}")
+        if len(set(entries)) < len(entries):
+            raise UserError(f"experiment key '{key}' holds something twice: {entries}")
+    return matrix
 
 
-def check_settings(matrix: Matrix) -> None:
-    """Check what train.py and evaluate.py would check only hours later: tasks, perturbations and settings.
-
-    Raises:
-        UserError: Naming the first invalid one, with the nearest valid name.
-    """
-    for key, source in CELL_SETTINGS.items():
-        if key in matrix.train:
-            raise UserError(f"train.{key} cannot be set: it comes from {source}")
-    for cell in matrix.cells():
-        env_cfg = task_settings(matrix, cell)
-        check_env_cfg(env_cfg)
-        for name in cell.evaluated_in:
-            if name not in env_cfg.perturbations():
-                raise unknown_name("perturbation", name, env_cfg.perturbations())
-
-
-def task_settings(matrix: Matrix, cell: Cell) -> Any:
-    """Return the settings of a cell's task in a new run.
-
-    Raises:
-        UserError: If the task or one of its settings is unknown or not valid.
-    """
-    ranges = str(matrix.ranges) if matrix.ranges else None
-    options = Options(device="cpu", seed=cell.seed, perturbation=cell.environment, ranges=ranges, set=set_words(matrix))
-    return task_registry.get_cfgs(cell.task, options)[0]
-
-
-def set_words(matrix: Matrix) -> list[str]:
-    """Return the changed settings of the trainings as ``--set`` takes them."""
-    return [f"{key}={v if isinstance(v, str) else json.dumps(v, default=str)}" for key, v in matrix.train.items()]
-
-
-def step_command(matrix: Matrix, out: Path, cell: Cell, state: CellState, device: str) -> list[str]:
-    """Return the command line of a cell's next step.
-
-    Args:
-        matrix: The trainings and evaluations.
-        out: Folder of all results.
-        cell: The cell.
-        state: Its progress.
-        device: Device of the step, as ``--device`` takes it.
-    """
-    words = [f"--task={cell.task}", f"--log_root={out}", f"--experiment_name={cell.name}", f"--device={device}"]
+def step_command(matrix: Matrix, cell: Cell, state: CellState, device: str) -> list[str]:
+    """Return the command line of a cell's next step on a device, named as ``--device`` takes it."""
+    words = [f"--task={cell.task}", f"--log_root={cell.folder.parent}", f"--experiment_name={cell.name}"]
+    words.append(f"--device={device}")
     if state.step == "evaluate":
         name, numbers = state.missing[0], matrix.evaluation
         words += [f"--perturbation={name}", f"--num_envs={numbers['num_envs']}", f"--steps={numbers['num_steps']}"]
-        return [sys.executable, str(SCRIPTS_DIR / "evaluate.py"), *words, f"--json={part_file(out, cell, name)}"]
+        return [sys.executable, str(SCRIPTS_DIR / "evaluate.py"), *words, f"--json={cell.part_file(name)}"]
     if state.step == "resume":
         words.append("--resume")
     else:
         words += [f"--seed={cell.seed}", f"--perturbation={cell.environment}"]
-        words += [f"--set={word}" for word in set_words(matrix)]
+        words += [f"--set={word}" for word in matrix.set_words()]
         words += [f"--ranges={matrix.ranges}"] if matrix.ranges else []
     return [sys.executable, str(SCRIPTS_DIR / "train.py"), *words]
 
 
-def cell_state(out: Path, cell: Cell) -> CellState:
-    """Return the progress of a cell.
-
-    Raises:
-        UserError: If the settings of its newest run with a checkpoint lack the number of iterations.
-    """
-    missing = tuple(name for name in cell.evaluated_in if not is_json(result_file(out, cell, name)))
-    for run_dir in sorted((out / cell.name).glob("*/"), reverse=True):
+def cell_state(cell: Cell) -> CellState:
+    """Return the progress of a cell; UserError if its newest run with a checkpoint does not say how long it is."""
+    for run_dir in sorted(cell.folder.glob("*/"), reverse=True):
         numbers = checkpoint_numbers(run_dir)
         if numbers:
             total = load_config(run_dir).get("max_iterations")
             if type(total) is not int:
                 raise UserError(f"the settings of the run '{run_dir}' lack max_iterations")
-            return CellState(numbers[-1], total, missing)
-    return CellState(0, None, missing)
-
-
-def result_file(out: Path, cell: Cell, environment: str) -> Path:
-    """Return the file with the numbers of an evaluation."""
-    return out / cell.name / f"result_{environment}.json"
-
-
-def part_file(out: Path, cell: Cell, environment: str) -> Path:
-    """Return the file that an evaluation writes; it becomes the result when the evaluation is complete."""
-    return result_file(out, cell, environment).with_suffix(".json.part")
+            return CellState(numbers[-1], total, cell.missing())
+    return CellState(0, None, cell.missing())
 
 
 def is_json(file: Path) -> bool:
@@ -262,28 +196,17 @@ def is_json(file: Path) -> bool:
 
 
 def check_same(matrix: Matrix, out: Path) -> None:
-    """Check that the results of a folder were made with the same settings. A matrix may have more cells, but not fewer.
-
-    Raises:
-        UserError: Naming the first setting that differs.
-    """
-    file = out / SETTINGS_FILE
-    if not file.is_file():
+    """Refuse a folder with results of other settings, by UserError. A matrix may have more cells, but not fewer."""
+    if not (out / SETTINGS_FILE).is_file():
         return
-    old, differs = read_matrix(file), f"'{out}' was made with other settings"
+    old, differs = read_plan(out / SETTINGS_FILE), f"'{out}' was made with other settings"
     for section in ("train", "evaluation"):
         was, now = getattr(old, section), getattr(matrix, section)
         for key in sorted(was.keys() | now.keys()):
             if was.get(key) != now.get(key):
-                texts = [str(values.get(key, "not set")) for values in (now, was)]
-                raise UserError(f"{differs}: {section}.{key} is {texts[0]}, was {texts[1]}; give another --out")
-    for key, old_values in lists(old).items():
-        lost = [str(value) for value in old_values if value not in lists(matrix).get(key, [])]
+                texts = f"{now.get(key, 'not set')}, was {was.get(key, 'not set')}"
+                raise UserError(f"{differs}: {section}.{key} is {texts}; give another --out")
+    for key, values in old.lists().items():
+        lost = [str(value) for value in values if value not in matrix.lists().get(key, [])]
         if lost:
             raise UserError(f"{differs}: {key} had {', '.join(lost)} as well; give another --out")
-
-
-def lists(matrix: Matrix) -> dict[str, list[Any]]:
-    """Return the lists that make up the cells of a matrix, by their keys."""
-    evaluated = {f"environments.{name}": names for name, names in matrix.environments.items()}
-    return {"tasks": matrix.tasks, "environments": list(matrix.environments), "seeds": matrix.seeds, **evaluated}

@@ -14,8 +14,7 @@ from __future__ import annotations
 
 from legged_torque.utils.metrics import METRICS
 
-PAPER_METRICS = tuple(metric for metric in METRICS if metric.in_paper)
-"""The metrics of Table I, in its order."""
+PAPER_METRICS = tuple(metric for metric in METRICS if metric.in_paper)  # the metrics of Table I, in its order
 ENVIRONMENTS = {
     "low": "Low perturbation",
     "high": "High perturbation",
@@ -33,43 +32,30 @@ MODELS = {
 }
 """The paper's names of our tasks. Default torque occurs only in its Figures 3 and 5."""
 TABLE_I = {
-    "track_percentage": {
-        "a1_position": (0.7642, 0.7518, 0.7163, 0.6765),
-        "a1_torque_multihead": (0.7624, 0.7534, 0.7159, 0.6699),
-        "a1_multihead": (0.7669, 0.7511, 0.7181, 0.6739),
-        "a1_torque_curriculum": (0.7866, 0.7700, 0.7197, 0.6764),
-    },
-    "track_xy": {
-        "a1_position": (0.0324, 0.0511, 0.0933, 0.1602),
-        "a1_torque_multihead": (0.0350, 0.0556, 0.0997, 0.1685),
-        "a1_multihead": (0.0344, 0.0544, 0.0970, 0.1698),
-        "a1_torque_curriculum": (0.0316, 0.0534, 0.0972, 0.1697),
-    },
-    "track_angular": {
-        "a1_position": (0.0124, 0.0122, 0.0152, 0.0171),
-        "a1_torque_multihead": (0.0110, 0.0113, 0.0138, 0.0158),
-        "a1_multihead": (0.0102, 0.0113, 0.0133, 0.0156),
-        "a1_torque_curriculum": (0.0097, 0.0111, 0.0143, 0.0177),
-    },
-    "collision_force": {
-        "a1_position": (135.1, 131.7, 138.5, 148.7),
-        "a1_torque_multihead": (140.9, 145.5, 157.3, 166.8),
-        "a1_multihead": (139.0, 142.0, 153.5, 160.1),
-        "a1_torque_curriculum": (136.0, 134.7, 150.5, 151.9),
-    },
-    "cost_of_transport": {
-        "a1_position": (0.8316, 0.8518, 0.9728, 1.0340),
-        "a1_torque_multihead": (0.7187, 0.7307, 0.8380, 0.8808),
-        "a1_multihead": (0.6977, 0.7209, 0.8029, 0.8611),
-        "a1_torque_curriculum": (0.8590, 0.9112, 0.9572, 1.0373),
-    },
+    ("track_percentage", "a1_position"): (0.7642, 0.7518, 0.7163, 0.6765),
+    ("track_percentage", "a1_torque_multihead"): (0.7624, 0.7534, 0.7159, 0.6699),
+    ("track_percentage", "a1_multihead"): (0.7669, 0.7511, 0.7181, 0.6739),
+    ("track_percentage", "a1_torque_curriculum"): (0.7866, 0.7700, 0.7197, 0.6764),
+    ("track_xy", "a1_position"): (0.0324, 0.0511, 0.0933, 0.1602),
+    ("track_xy", "a1_torque_multihead"): (0.0350, 0.0556, 0.0997, 0.1685),
+    ("track_xy", "a1_multihead"): (0.0344, 0.0544, 0.0970, 0.1698),
+    ("track_xy", "a1_torque_curriculum"): (0.0316, 0.0534, 0.0972, 0.1697),
+    ("track_angular", "a1_position"): (0.0124, 0.0122, 0.0152, 0.0171),
+    ("track_angular", "a1_torque_multihead"): (0.0110, 0.0113, 0.0138, 0.0158),
+    ("track_angular", "a1_multihead"): (0.0102, 0.0113, 0.0133, 0.0156),
+    ("track_angular", "a1_torque_curriculum"): (0.0097, 0.0111, 0.0143, 0.0177),
+    ("collision_force", "a1_position"): (135.1, 131.7, 138.5, 148.7),
+    ("collision_force", "a1_torque_multihead"): (140.9, 145.5, 157.3, 166.8),
+    ("collision_force", "a1_multihead"): (139.0, 142.0, 153.5, 160.1),
+    ("collision_force", "a1_torque_curriculum"): (136.0, 134.7, 150.5, 151.9),
+    ("cost_of_transport", "a1_position"): (0.8316, 0.8518, 0.9728, 1.0340),
+    ("cost_of_transport", "a1_torque_multihead"): (0.7187, 0.7307, 0.8380, 0.8808),
+    ("cost_of_transport", "a1_multihead"): (0.6977, 0.7209, 0.8029, 0.8611),
+    ("cost_of_transport", "a1_torque_curriculum"): (0.8590, 0.9112, 0.9572, 1.0373),
 }
 """Means by metric and task, one for each of :data:`ENVIRONMENTS`."""
 
 
 def paper_value(task: str, environment: str, metric: str) -> float | None:
     """Return a mean of Table I; None if the paper has none."""
-    values = TABLE_I.get(metric, {}).get(task)
-    if values is None or environment not in ENVIRONMENTS:
-        return None
-    return values[list(ENVIRONMENTS).index(environment)]
+    return dict(zip(ENVIRONMENTS, TABLE_I.get((metric, task), ()), strict=False)).get(environment)

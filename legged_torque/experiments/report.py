@@ -8,6 +8,7 @@ from pathlib import Path
 
 from legged_torque.experiments.curves import MILLION
 from legged_torque.experiments.figures import FIGURES, file_name
+from legged_torque.experiments.matrix import SETTINGS_FILE
 from legged_torque.experiments.paper_values import MODELS, PAPER_METRICS, paper_value
 from legged_torque.experiments.results import (
     EVALUATIONS_FILE,
@@ -16,6 +17,7 @@ from legged_torque.experiments.results import (
     CellResult,
     Cells,
     Experiment,
+    Summary,
     Table,
     compare,
     is_of_paper,
@@ -27,26 +29,15 @@ SIGNIFICANT = 0.05
 BASELINES = ("a1_position", "a1_torque")
 
 
-def report(
-    experiment: Experiment, table: Table, from_step: float, figures: list[str], no_figures: str, out: Path
-) -> str:
-    """Return the report.
-
-    Args:
-        experiment: The experiment.
-        table: Its summaries.
-        from_step: Step from which evaluations count.
-        figures: Titles of the figures that were drawn.
-        no_figures: Why the others were not; empty if there was no data for them.
-        out: The report's folder.
-    """
+def report(experiment: Experiment, table: Table, from_step: float, figures: list[str], out: Path) -> str:
+    """Return the report that ``out`` is to hold, beside the figures with the given titles."""
     missing = missing_lines(experiment, from_step)
     sections = {
         "What is missing": missing or ["Nothing: all trainings and evaluations are complete."],
         "Table I": table_one(experiment, table, from_step),
-        "In other environments than those of training": other_table(experiment, table),
-        "Differences": differences(experiment, table),
-        "Figures": figure_lines(figures, no_figures),
+        "In other environments than those of training": other_table(table),
+        "Differences": differences(table),
+        "Figures": figure_lines(figures),
         "How it was made": setup_lines(experiment, from_step, out),
     }
     lines = [f"# Results of {experiment.folder.resolve().name}"]
@@ -62,25 +53,23 @@ def markdown_table(header: list[str], rows: list[list[str]]) -> list[str]:
 
 def missing_lines(experiment: Experiment, from_step: float) -> list[str]:
     """Return a line for everything planned that is missing, unfinished or unreadable."""
-    lines = []
-    for environment, evaluated in experiment.environments.items():
-        for task in experiment.tasks:
-            place = f"- `{task}` in {environment}"
-            runs = experiment.runs_of(task, environment)
-            absent = [str(seed) for seed in experiment.seeds if (task, environment, seed) not in experiment.runs]
-            if not runs:
-                lines.append(f"{place}: no data, no training has begun.")
-            elif absent:
-                lines.append(f"{place}: no training has begun with seed {', '.join(absent)}.")
-            for run in runs:
-                problems = run_problems(run, evaluated, from_step)
-                lines += [f"{place}, seed {run.seed}: {'; '.join(problems)}."] if problems else []
+    lines, plan = [], experiment.plan
+    for task, environment in ((task, environment) for environment in plan.environments for task in plan.tasks):
+        place, runs = f"- `{task}` in {environment}", experiment.runs_of(task, environment)
+        begun = [run.cell.seed for run in runs]
+        if not runs:
+            lines.append(f"{place}: no data, no training has begun.")
+        elif len(begun) < len(plan.seeds):
+            absent = ", ".join(str(seed) for seed in plan.seeds if seed not in begun)
+            lines.append(f"{place}: no training has begun with seed {absent}.")
+        problems = {run.cell.seed: "; ".join(run_problems(run, from_step)) for run in runs}
+        lines += [f"{place}, seed {seed}: {text}." for seed, text in problems.items() if text]
     if experiment.unplanned:
         lines.append(f"- Left out, as experiment.yaml does not name them: {', '.join(experiment.unplanned)}.")
     return lines
 
 
-def run_problems(run: CellResult, evaluated: list[str], from_step: float) -> list[str]:
+def run_problems(run: CellResult, from_step: float) -> list[str]:
     """Return the problems of a training: missing, unfinished or unreadable parts."""
     problems, total = list(run.notes), f"{run.total_steps / MILLION:.4g} million steps"
     if not run.rows:
@@ -91,31 +80,36 @@ def run_problems(run: CellResult, evaluated: list[str], from_step: float) -> lis
     if run.rows and run.steps < from_step:
         end = f"ends before {from_step / MILLION:g} million steps"
         problems.append(f"{end}; its number is the mean of its last {LAST_SHARE:.0%}")
-    rows = run.counted_rows(run.environment, from_step)
-    for name in (metric.name for metric in PAPER_METRICS):
-        count = sum(not math.isfinite(row[name]) for row in rows)
+    rows = run.counted_rows(run.cell.environment, from_step)
+    for metric in PAPER_METRICS:
+        count = sum(not math.isfinite(row[metric.name]) for row in rows)
         if count:
-            problems.append(f"{count} of the {len(rows)} evaluations that count have no {name}")
-    for name in evaluated:
-        if name == run.environment:
+            problems.append(f"{count} of the {len(rows)} evaluations that count have no {metric.name}")
+    for name in run.cell.evaluated_in:
+        result = run.results.get(name)
+        if name == run.cell.environment:
             continue
-        if name not in run.results:
+        if result is None:
             problems.append(f"not evaluated in {name}")
-        elif not run.is_finished(run.results[name]["steps"]):
-            problems.append(f"evaluated in {name} after {run.results[name]['steps'] / MILLION:.4g} of {total}")
+        elif not run.is_finished(result["steps"]):
+            problems.append(f"evaluated in {name} after {result['steps'] / MILLION:.4g} of {total}")
     return problems
 
 
-def number(table: Table, column: str, task: str, metric: Metric) -> str:
+def marked(text: str, is_significant: bool, *summaries: Summary) -> str:
+    """Return an entry of a table: bold if it is significant, with a dagger if what it comes from is not final."""
+    text = f"**{text}**" if is_significant else text
+    return text if all(summary.is_final for summary in summaries) else f"{text} †"
+
+
+def number(cells: Cells, task: str, metric: Metric) -> str:
     """Return an entry of Table I: mean, standard error, number of seeds; bold if significantly the best."""
-    summary, digits = table[column][task].get(metric.name), metric.digits
+    summary, digits = cells[task].get(metric.name), metric.digits
     if summary is None:
         return "–"
     error = "" if summary.standard_error is None else f" ± {summary.standard_error:.{digits}f}"
     text = f"{summary.mean:.{digits}f}{error} ({len(summary.values)})"
-    if is_best(table[column], task, metric):
-        text = f"**{text}**"
-    return text if summary.is_final else f"{text} †"
+    return marked(text, is_best(cells, task, metric), summary)
 
 
 def is_best(cells: Cells, task: str, metric: Metric) -> bool:
@@ -127,26 +121,28 @@ def is_best(cells: Cells, task: str, metric: Metric) -> bool:
     return means[task] == best and bool(own) and all(p is not None and p < SIGNIFICANT for p in own)
 
 
-def metric_table(experiment: Experiment, table: Table, columns: list[str], with_paper: bool) -> list[str]:
-    """Return the lines of a table with a row per metric and task, if wished with the paper's values beside ours."""
+def metric_table(table: Table, columns: list[str]) -> list[str]:
+    """Return the lines of a table with a row per metric and task, and the paper's values beside ours if it has any."""
+    header = ["metric", "task"]
+    for column in columns:
+        header += [column, "paper"] if is_of_paper(column) else [column]
     rows = []
-    for metric in PAPER_METRICS:
-        for task in experiment.tasks:
-            row = [metric.label, f"`{task}` ({MODELS[task]})" if task in MODELS else f"`{task}`"]
-            for column in columns:
-                row.append(number(table, column, task, metric))
-                if with_paper:
-                    paper = paper_value(task, column, metric.name)
-                    row.append("–" if paper is None else f"{paper:.{metric.digits}f}")
-            rows.append(row)
-    header = [cell for name in columns for cell in ([name, "paper"] if with_paper else [name])]
-    return markdown_table(["metric", "task", *header], rows)
+    for metric, task in ((metric, task) for metric in PAPER_METRICS for task in table[columns[0]]):
+        row = [metric.label, f"`{task}` ({MODELS[task]})" if task in MODELS else f"`{task}`"]
+        for column in columns:
+            row.append(number(table[column], task, metric))
+            if is_of_paper(column):
+                paper = paper_value(task, column, metric.name)
+                row.append("–" if paper is None else f"{paper:.{metric.digits}f}")
+        rows.append(row)
+    return markdown_table(header, rows)
 
 
 def table_one(experiment: Experiment, table: Table, from_step: float) -> list[str]:
     """Return Table I next to the paper's."""
+    num_planned = len(experiment.plan.seeds)
     return [
-        f"Mean ± standard error over seeds (number of seeds, of {len(experiment.seeds)} that were planned). A seed's",
+        f"Mean ± standard error over seeds (number of seeds, of {num_planned} that were planned). A seed's",
         "number is the mean of its evaluations during training, in the environment of training, from step",
         f"{from_step / MILLION:g} million on, or of the last {LAST_SHARE:.0%} if training has not come that far. The",
         "exception is `doubled`: trained in `high_frequency`, with the last checkpoint evaluated in `doubled`. The",
@@ -155,20 +151,20 @@ def table_one(experiment: Experiment, table: Table, from_step: float) -> list[st
         "or trainings are not finished, so the number will change. Tracking % is better when higher, all else when",
         "lower. The paper's means are of four seeds; it prints no errors, and no numbers of default torque control.",
         "",
-        *metric_table(experiment, table, [name for name in table if is_of_paper(name)], with_paper=True),
+        *metric_table(table, [name for name in table if is_of_paper(name)]),
     ]
 
 
-def other_table(experiment: Experiment, table: Table) -> list[str]:
+def other_table(table: Table) -> list[str]:
     """Return the metrics in environments other than those of training, which the paper does not have."""
     columns = [name for name in table if not is_of_paper(name)]
     if not columns:
         return ["None were planned."]
     text = "Trained -> evaluated: metrics of the last checkpoint, over seeds as above. The paper has no such numbers."
-    return [text, "", *metric_table(experiment, table, columns, with_paper=False)]
+    return [text, "", *metric_table(table, columns)]
 
 
-def differences(experiment: Experiment, table: Table) -> list[str]:
+def differences(table: Table) -> list[str]:
     """Return tests of all pairs of tasks in each column of Table I, and of each task against the baselines."""
     lines = [
         "First minus second task, and the p value of a two-sided Welch's t-test over seeds with Holm's correction.",
@@ -179,11 +175,10 @@ def differences(experiment: Experiment, table: Table) -> list[str]:
     for column in filter(is_of_paper, table):
         cells = table[column]
         lines += ["", f"### {column}"]
-        tasks = [task for task in experiment.tasks if cells[task]]
+        tasks = [task for task in cells if cells[task]]
         families = {"All pairs": list(combinations(tasks, 2))}
-        for baseline in BASELINES:
-            if baseline in tasks:
-                families[f"Against `{baseline}`"] = [(task, baseline) for task in tasks if task != baseline]
+        for baseline in (task for task in BASELINES if task in tasks):
+            families[f"Against `{baseline}`"] = [(task, baseline) for task in tasks if task != baseline]
         for title, pairs in families.items():
             if all(p is None for metric in PAPER_METRICS for p in compare(cells, metric.name, pairs)):
                 lines += ["", f"{title}: no test is possible; it takes at least two seeds of two tasks."]
@@ -193,49 +188,42 @@ def differences(experiment: Experiment, table: Table) -> list[str]:
 
 
 def difference_table(cells: Cells, pairs: list[tuple[str, str]]) -> list[str]:
-    """Return the differences of pairs of tasks in all metrics."""
+    """Return the differences of pairs of tasks in all metrics, with their p values."""
     rows = [[f"`{first}` - `{second}`"] for first, second in pairs]
     for metric in PAPER_METRICS:
         p_values = compare(cells, metric.name, pairs)
         for row, (first, second), p in zip(rows, pairs, p_values, strict=True):
-            row.append(difference(cells, first, second, metric, p))
+            one, other = cells[first].get(metric.name), cells[second].get(metric.name)
+            if one is None or other is None:
+                row.append("no data")
+                continue
+            p_text = "no p value" if p is None else f"p = {p:.2g}"
+            text = f"{one.mean - other.mean:+.{metric.digits}f}, {p_text}"
+            row.append(marked(text, p is not None and p < SIGNIFICANT, one, other))
     return markdown_table(["pair", *(metric.label for metric in PAPER_METRICS)], rows)
 
 
-def difference(cells: Cells, first: str, second: str, metric: Metric, p: float | None) -> str:
-    """Return the entry for a pair of tasks: the difference of their means and its p value."""
-    one, other = cells[first].get(metric.name), cells[second].get(metric.name)
-    if one is None or other is None:
-        return "no data"
-    text = f"{one.mean - other.mean:+.{metric.digits}f}, " + ("no p value" if p is None else f"p = {p:.2g}")
-    text = f"**{text}**" if p is not None and p < SIGNIFICANT else text
-    return text if one.is_final and other.is_final else f"{text} †"
-
-
-def figure_lines(figures: list[str], problem: str) -> list[str]:
+def figure_lines(figures: list[str]) -> list[str]:
     """Return the figures, and which of the paper's are absent."""
     lines = [f"![{title}]({file_name(title)})\n" for title in figures]
     absent = [title for title in FIGURES if title not in figures]
     if absent:
-        lines.append(f"No {', '.join(absent)}: {problem or 'there are no data for it'}.")
+        lines.append(f"No {', '.join(absent)}: there are no data for it.")
     return [*lines, f"The numbers are in `{TABLE_FILE}`, all evaluations in `{EVALUATIONS_FILE}`."]
 
 
 def setup_lines(experiment: Experiment, from_step: float, out: Path) -> list[str]:
     """Return machines, versions, the plan and the commands that repeat the experiment."""
-    devices = sorted({device for run in experiment.runs.values() for device in run.devices})
-    configs = [config for run in experiment.runs.values() for config in run.configs]
+    devices = sorted({device for run in experiment.runs for device in run.devices})
+    configs = [config for run in experiment.runs for config in run.configs]
     versions = {", ".join(f"{k} {v}" for k, v in (config.get("versions") or {}).items()) for config in configs}
+    plan = (experiment.folder / SETTINGS_FILE).read_text(encoding="utf-8", errors="replace")
     folder, report_folder = portable_path(experiment.folder), portable_path(out)
     return [
         f"- Devices, as named in settings and results: {', '.join(devices) or 'unknown'}",
         *(f"- Versions: {text or 'unknown'}" for text in sorted(versions)),
         "- Plan (`experiment.yaml`); all settings of a training are in its `config.yaml`:",
-        "",
-        "```yaml",
-        experiment.plan.rstrip(),
-        "```",
-        "",
+        f"\n```yaml\n{plan.rstrip()}\n```\n",
         "To repeat it:",
         "",
         "```bash",

@@ -14,9 +14,8 @@ from statistics import fmean, stdev
 from typing import Any
 
 from legged_torque.experiments.curves import CURVE_METRICS, Row, read_rows, to_row
+from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, read_plan
 from legged_torque.experiments.paper_values import ENVIRONMENTS, paper_value
-from legged_torque.experiments.significance import holm, welch
-from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import CONFIG_FILE, load_config
 
@@ -29,24 +28,14 @@ EVALUATIONS_FILE = "evaluations.csv.gz"
 
 @dataclass
 class CellResult:
-    """One training: a task, in an environment, with a seed.
+    """What there is of a training that has begun."""
 
-    Attributes:
-        rows: Evaluations during training, merged over its runs.
-        results: Evaluations of the last checkpoint, by environment.
-        configs: The ``config.yaml`` of its runs.
-        devices: Where it was trained and evaluated.
-        notes: Problems with its files.
-    """
-
-    task: str
-    environment: str
-    seed: int
-    rows: list[Row] = field(default_factory=list)
-    results: dict[str, Row] = field(default_factory=dict)
-    configs: list[dict[str, Any]] = field(default_factory=list)
-    devices: set[str] = field(default_factory=set)
-    notes: list[str] = field(default_factory=list)
+    cell: Cell
+    rows: list[Row] = field(default_factory=list)  # evaluations during training, merged over its runs
+    results: dict[str, Row] = field(default_factory=dict)  # evaluations of the last checkpoint, by environment
+    configs: list[dict[str, Any]] = field(default_factory=list)  # config.yaml of its runs
+    devices: set[str] = field(default_factory=set)  # where it was trained and evaluated
+    notes: list[str] = field(default_factory=list)  # problems with its files
 
     @property
     def steps(self) -> float:
@@ -70,7 +59,7 @@ class CellResult:
 
     def counted_rows(self, evaluated: str, from_step: float) -> list[Row]:
         """Return the evaluations in an environment that count for Table I."""
-        if evaluated != self.environment:
+        if evaluated != self.cell.environment:
             return [self.results[evaluated]] if evaluated in self.results else []
         first = from_step if self.steps >= from_step else (1.0 - LAST_SHARE) * self.steps
         return [row for row in self.rows if row["steps"] >= first]
@@ -78,31 +67,20 @@ class CellResult:
 
 @dataclass
 class Experiment:
-    """An experiment as planned, and its results.
-
-    Attributes:
-        environments: Environments of evaluation for each environment of training.
-        plan: Text of ``experiment.yaml``.
-        runs: Trainings that have begun, by task, environment and seed.
-        unplanned: Folders of trainings that the plan does not name.
-    """
+    """The folder of an experiment."""
 
     folder: Path
-    tasks: list[str]
-    environments: dict[str, list[str]]
-    seeds: list[int]
-    plan: str
-    runs: dict[tuple[str, str, int], CellResult] = field(default_factory=dict)
-    unplanned: list[str] = field(default_factory=list)
+    plan: Matrix
+    runs: list[CellResult]  # trainings that have begun, in the plan's order
+    unplanned: list[str]  # folders of trainings that the plan does not name
 
     def runs_of(self, task: str, environment: str) -> list[CellResult]:
         """Return the trainings of a task in an environment that have begun."""
-        keys = [(task, environment, seed) for seed in self.seeds]
-        return [self.runs[key] for key in keys if key in self.runs]
+        return [run for run in self.runs if (run.cell.task, run.cell.environment) == (task, environment)]
 
     def columns(self) -> dict[str, tuple[str, str]]:
         """Return the environments of training and evaluation by column, those of Table I first."""
-        pairs = [(trained, name) for trained, names in self.environments.items() for name in [trained, *names]]
+        pairs = [(trained, name) for trained, names in self.plan.environments.items() for name in [trained, *names]]
         columns = {column_name(*pair): pair for pair in pairs}
         first = [name for name in ENVIRONMENTS if name in columns]
         return {name: columns[name] for name in [*first, *columns]}
@@ -145,69 +123,50 @@ def is_of_paper(column: str) -> bool:
 
 
 def read_experiment(folder: Path) -> Experiment:
-    """Read the folder of an experiment.
-
-    Raises:
-        UserError: If there is none, or its plan cannot be read.
-    """
-    file = folder / "experiment.yaml"
+    """Read the folder of an experiment; UserError if there is none, or its plan cannot be read."""
     if not folder.is_dir():
         raise UserError(f"there is no folder '{folder}'")
-    if not file.is_file():
-        raise UserError(f"'{folder}' is not the folder of an experiment: it has no experiment.yaml")
-    text = file.read_text(encoding="utf-8", errors="replace")
-    plan = parse_yaml(text, f"'{file}'")
-    kinds = {"tasks": list, "environments": dict, "seeds": list}
-    if not isinstance(plan, dict) or not all(isinstance(plan.get(key), kind) for key, kind in kinds.items()):
-        raise UserError(f"'{file}' lacks the lists tasks and seeds, or environments as a mapping to lists")
-    environments = {name: list(evaluated or []) for name, evaluated in plan["environments"].items()}
-    experiment = Experiment(folder, plan["tasks"], environments, plan["seeds"], text)
-    for path in sorted(path for path in folder.iterdir() if path.is_dir()):
-        match = re.fullmatch(r"(.+)-(.+)-s(\d+)", path.name)
-        if not match:
-            continue
-        task, environment, seed = match[1], match[2], int(match[3])
-        if task in plan["tasks"] and environment in environments and seed in plan["seeds"]:
-            run = read_cell(path, CellResult(task, environment, seed))
-            run.notes = [note.replace(f"{folder}/", "") for note in run.notes]
-            experiment.runs[task, environment, seed] = run
-        else:
-            experiment.unplanned.append(path.name)
-    return experiment
+    plan = read_plan(folder / SETTINGS_FILE)
+    cells = plan.cells(folder)
+    others = {path.name for path in folder.iterdir() if path.is_dir()} - {cell.name for cell in cells}
+    unplanned = sorted(name for name in others if re.fullmatch(r".+-.+-s\d+", name))
+    return Experiment(folder, plan, [read_cell(cell) for cell in cells if cell.folder.is_dir()], unplanned)
 
 
-def read_cell(folder: Path, cell: CellResult) -> CellResult:
+def read_cell(cell: Cell) -> CellResult:
     """Read the files of a cell's folder. A run's rows replace those of earlier runs from its first evaluation on."""
-    for run_dir in sorted(path for path in folder.iterdir() if path.is_dir()):
+    result = CellResult(cell)
+    for run_dir in sorted(cell.folder.glob("*/")):
         if (run_dir / CONFIG_FILE).is_file():
             try:
-                cell.configs.append(load_config(run_dir))
-                cell.devices.add(str(cell.configs[-1].get("device")))
+                result.configs.append(load_config(run_dir))
+                result.devices.add(str(result.configs[-1].get("device")))
             except UserError as error:
-                cell.notes.append(str(error))
-        rows = read_rows(run_dir / "evaluations.csv", cell.notes)
+                result.notes.append(str(error))
+        rows = read_rows(run_dir / "evaluations.csv", result.notes)
         if rows:
-            cell.rows = [row for row in cell.rows if row["steps"] < rows[0]["steps"]] + rows
-    for file in sorted([*folder.glob("result_*.json"), *folder.glob("*/result_*.json")]):
+            result.rows = [row for row in result.rows if row["steps"] < rows[0]["steps"]] + rows
+    for file in sorted([*cell.folder.glob("result_*.json"), *cell.folder.glob("*/result_*.json")]):
         try:
-            result = json.loads(file.read_text(encoding="utf-8"))
-            means = {name: estimate.get("mean") for name, estimate in result["metrics"].items()}
-            row = to_row({"steps": result["steps"], **means})
+            values = json.loads(file.read_text(encoding="utf-8"))
+            means = {name: estimate.get("mean") for name, estimate in values["metrics"].items()}
+            row = to_row({"steps": values["steps"], **means})
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            cell.notes.append(f"'{file}' cannot be read")
+            result.notes.append(f"'{file}' cannot be read")
             continue
-        cell.devices.add(str(result.get("device")))
+        result.devices.add(str(values.get("device")))
         environment = file.stem.removeprefix("result_")
-        if environment not in cell.results or row["steps"] >= cell.results[environment]["steps"]:
-            cell.results[environment] = row
-    return cell
+        if environment not in result.results or row["steps"] >= result.results[environment]["steps"]:
+            result.results[environment] = row
+    result.notes = [note.replace(f"{cell.folder.parent}/", "") for note in result.notes]
+    return result
 
 
 def summarize(experiment: Experiment, from_step: float) -> Table:
     """Return all metrics over seeds. The value of a seed is the mean of its finite evaluations that count."""
     table: Table = {}
     for column, (trained, evaluated) in experiment.columns().items():
-        for task in experiment.tasks:
+        for task in experiment.plan.tasks:
             runs = experiment.runs_of(task, trained)
             counted = [(run, run.counted_rows(evaluated, from_step)) for run in runs]
             are_finished = all(run.is_finished(rows[-1]["steps"]) for run, rows in counted if rows)
@@ -216,7 +175,7 @@ def summarize(experiment: Experiment, from_step: float) -> Table:
                 finite = [[row[name] for row in rows if math.isfinite(row[name])] for _, rows in counted]
                 values = [fmean(numbers) for numbers in finite if numbers]
                 if values:
-                    cell[name] = Summary(values, are_finished and len(values) == len(experiment.seeds))
+                    cell[name] = Summary(values, are_finished and len(values) == len(experiment.plan.seeds))
     return table
 
 
@@ -226,20 +185,42 @@ def compare(cells: Cells, metric: str, pairs: list[tuple[str, str]]) -> list[flo
     return holm([welch(values[first], values[second]) for first, second in pairs])
 
 
+def welch(first: list[float], second: list[float]) -> float | None:
+    """Return the two-sided p value of Welch's t-test; None with fewer than two values on a side, or no variance."""
+    try:
+        from scipy.stats import ttest_ind_from_stats
+    except ImportError:
+        raise UserError("reports need the extra: pip install -e .[plots]") from None
+    if min(len(first), len(second)) < 2 or stdev(first) == stdev(second) == 0.0:
+        return None
+    one, other = ((fmean(values), stdev(values), len(values)) for values in (first, second))
+    return float(ttest_ind_from_stats(*one, *other, equal_var=False).pvalue)
+
+
+def holm(p_values: list[float | None]) -> list[float | None]:
+    """Return the p values with Holm's correction for as many tests as there are; None stays None."""
+    order = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
+    corrected, largest = list(p_values), 0.0
+    for rank, (p, i) in enumerate(order):
+        largest = max(largest, min(1.0, (len(order) - rank) * p))
+        corrected[i] = largest
+    return corrected
+
+
 def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
     """Write all summaries as CSV, and every evaluation during training as compressed CSV."""
     names = [metric.name for metric in CURVE_METRICS]
     summaries: list[list[Any]] = [["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean"]]
-    for column, cells in table.items():
-        for task, name in ((task, name) for task in cells for name in names):
-            found = cells[task].get(name)
-            numbers = [found.mean, found.standard_error, len(found.values)] if found else [None, None, 0]
-            summaries.append([task, column, name, *numbers, paper_value(task, column, name)])
+    keys = [(task, column, name) for column, cells in table.items() for task in cells for name in names]
+    for task, column, name in keys:
+        found = table[column][task].get(name)
+        numbers = [found.mean, found.standard_error, len(found.values)] if found else [None, None, 0]
+        summaries.append([task, column, name, *numbers, paper_value(task, column, name)])
     evaluations: list[list[Any]] = [["task", "environment", "seed", "steps", *names]]
-    for (task, environment, seed), run in experiment.runs.items():
-        for row in run.rows:
-            values = [row[name] if math.isfinite(row[name]) else None for name in names]
-            evaluations.append([task, environment, seed, row["steps"], *values])
+    runs = sorted(experiment.runs, key=lambda run: run.cell.name)
+    for cell, row in ((run.cell, row) for run in runs for row in run.rows):
+        values = [row[name] if math.isfinite(row[name]) else None for name in names]
+        evaluations.append([cell.task, cell.environment, cell.seed, row["steps"], *values])
     (out / TABLE_FILE).write_bytes(csv_bytes(summaries))
     (out / EVALUATIONS_FILE).write_bytes(gzip.compress(csv_bytes(evaluations), mtime=0))  # the same bytes every time
 

@@ -8,39 +8,23 @@ import shutil
 import subprocess
 import sys
 import time
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from statistics import fmean
 from types import FrameType
 from typing import BinaryIO
 
 from legged_torque.experiments.job import Job, Worker, try_lock
-from legged_torque.experiments.matrix import (
-    SETTINGS_FILE,
-    Cell,
-    Matrix,
-    cell_state,
-    check_same,
-    is_json,
-    part_file,
-    result_file,
-    step_command,
-)
+from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, cell_state, check_same, is_json, step_command
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
 
-POLL = 0.2
-"""Seconds between checks of the processes."""
-SHOW_EVERY = 1.0
-"""Seconds between updates of the live line."""
+POLL = 0.2  # seconds between checks of the processes
+SHOW_EVERY = 1.0  # seconds between updates of the live line
 
 
 class CountedStop(StopRequest):
-    """While this context is open, Ctrl-C and SIGTERM are only counted, so that they can be passed on.
-
-    Attributes:
-        count: Number of signals so far.
-    """
+    """While this context is open, Ctrl-C and SIGTERM are only counted, so that they can be passed on."""
 
     count = 0
 
@@ -54,17 +38,11 @@ class ExperimentRun:
     """Trains and evaluates all cells of a matrix."""
 
     def __init__(self, matrix: Matrix, out: Path, workers: list[Worker]) -> None:
-        """Find the cells that are not done; nothing is written or started yet.
-
-        Args:
-            matrix: The trainings and evaluations.
-            out: Folder of all results, as an absolute path.
-            workers: Where processes run.
-        """
+        """Find the cells that are not done; nothing is written or started yet. ``out`` is an absolute path."""
         self.matrix, self.out, self.workers = matrix, out, workers
-        self.queue = [cell for cell in matrix.cells() if not self._is_done(cell)]
-        self._num_cells = len(matrix.cells())
-        self._num_done = self._num_cells - len(self.queue)
+        cells = matrix.cells(out)
+        self.queue = [cell for cell in cells if cell.missing()]
+        self._num_cells, self._num_done = len(cells), len(cells) - len(self.queue)
         self._failures: list[str] = []  # a message per failed cell
         self._reported: set[Cell] = set()  # cells reported to be held by another process
         self._durations: list[float] = []  # of cells finished here [s]
@@ -72,10 +50,7 @@ class ExperimentRun:
         self._shown = 0.0  # when the live line was last updated [s]
 
     def run(self) -> int:
-        """Work until all cells are done or have failed, or the user asks to stop.
-
-        Returns:
-            Exit status: 0 if all cells are done, 1 if one has failed.
+        """Work until all cells are done or have failed, or the user asks to stop; return the exit status.
 
         Raises:
             KeyboardInterrupt: If the user asked to stop. No process is left running.
@@ -84,14 +59,12 @@ class ExperimentRun:
         passed_on, stop = 0, CountedStop()
         try:
             with stop:
-                while True:
+                while self._jobs() or (self.queue and not stop.requested):
                     if stop.count > passed_on:
                         passed_on = stop.count
                         self._ask_to_stop()
                     for worker in self.workers:
                         self._attend(worker, stop.requested)
-                    if not self._jobs() and (stop.requested or not self.queue):
-                        break
                     self._show_live_line()
                     time.sleep(POLL)
         finally:
@@ -109,10 +82,6 @@ class ExperimentRun:
         """Return the jobs that are running."""
         return [worker.job for worker in self.workers if worker.job is not None]
 
-    def _is_done(self, cell: Cell) -> bool:
-        """Return whether a cell has all its results."""
-        return all(is_json(result_file(self.out, cell, name)) for name in cell.evaluated_in)
-
     def _attend(self, worker: Worker, stopping: bool) -> None:
         """Finish a worker's step if its process has ended, and give it the next step if it is free."""
         job = worker.job
@@ -125,14 +94,14 @@ class ExperimentRun:
     def _take_cell(self, worker: Worker) -> None:
         """Start the first cell that no other process holds, if there is one."""
         for cell in list(self.queue):
-            lock = try_lock(self.out / cell.name / "lock")
+            lock = try_lock(cell.folder / "lock")
             if lock is None:
                 if cell not in self._reported:
                     self._reported.add(cell)
                     self._print(f"{cell.name}: another process works on it; left for later")
                 continue
             self.queue.remove(cell)
-            if not self._is_done(cell):
+            if cell.missing():
                 self._start_step(worker, cell, lock, time.monotonic())
                 return
             self._num_done += 1  # finished by another process
@@ -141,11 +110,11 @@ class ExperimentRun:
     def _start_step(self, worker: Worker, cell: Cell, lock: BinaryIO, cell_start: float) -> None:
         """Start a process for the next step of a cell."""
         try:
-            state = cell_state(self.out, cell)
+            state = cell_state(cell)
             if state.step != "evaluate":  # they would be results of another training
                 for name in cell.evaluated_in:
-                    result_file(self.out, cell, name).unlink(missing_ok=True)
-            command = step_command(self.matrix, self.out, cell, state, worker.device)
+                    cell.result_file(name).unlink(missing_ok=True)
+            command = step_command(self.matrix, cell, state, worker.device)
             worker.job = Job(cell, state, lock, cell_start, command, worker)
         except (OSError, subprocess.SubprocessError, UserError) as error:
             self._fail(cell, lock, str(error))
@@ -159,12 +128,12 @@ class ExperimentRun:
         if problem and not stopping:
             self._fail(job.cell, job.lock, problem, job)
             return
-        is_done = self._is_done(job.cell)
+        is_done = not job.cell.missing()
         if is_done:
             self._num_done += 1
             self._durations.append(time.monotonic() - job.cell_start)
         if not problem:
-            took = duration_text(time.monotonic() - job.start)
+            took = timedelta(seconds=round(time.monotonic() - job.start))
             self._print(f"{job.cell.name}: {job.step_text()} on {worker.name} took {took} | {self._progress()}")
         if is_done or stopping:
             job.lock.close()
@@ -179,19 +148,19 @@ class ExperimentRun:
             how = f"was ended by signal {-status}" if status < 0 else f"has failed with exit status {status}"
             return f"{job.step_text()} {how}"
         if job.state.step != "evaluate":
-            state = cell_state(self.out, job.cell)
+            state = cell_state(job.cell)
             how_far = f"after {state.iterations} of {state.total} iterations" if state.total else "without a checkpoint"
             return f"training has ended {how_far}" if state.step in ("train", "resume") else ""
-        part = part_file(self.out, job.cell, job.state.missing[0])
-        if not is_json(part):
-            return f"{job.step_text()} has left no readable '{part}'"
-        os.replace(part, result_file(self.out, job.cell, job.state.missing[0]))
+        name = job.state.missing[0]
+        if not is_json(job.cell.part_file(name)):
+            return f"{job.step_text()} has left no readable '{job.cell.part_file(name)}'"
+        job.cell.part_file(name).replace(job.cell.result_file(name))
         return ""
 
     def _fail(self, cell: Cell, lock: BinaryIO, reason: str, job: Job | None = None) -> None:
-        """Give up a cell; the last lines of the job's log are printed at the end."""
+        """Give up a cell; the last ten lines of the job's log are printed at the end."""
         lock.close()
-        lines = [f"the last lines of {job.log}:", *job.last_lines()] if job else []
+        lines = [f"the last lines of {job.log}:", *job.output().splitlines()[-10:]] if job else []
         self._failures.append("\n    ".join([f"{cell.name}: {reason}", *lines]))
         self._print(f"{cell.name}: {reason} | {self._progress()}")
 
@@ -203,16 +172,12 @@ class ExperimentRun:
             self._print("Stopping: trainings finish their iteration and save; once more to stop at once.")
 
     def _progress(self) -> str:
-        """Describe the progress of all cells and the time left."""
-        left = time_left(self._durations, self._num_left(), len(self.workers))
-        text = "time left unknown yet" if left is None else f"{duration_text(left)} left"
-        elapsed = duration_text(time.monotonic() - self._start)
+        """Describe the progress of all cells and the time left; cells in training count in part."""
+        cells = self._num_cells - self._num_done - len(self._failures) - sum(job.fraction() for job in self._jobs())
+        left = time_left(self._durations, cells, len(self.workers))
+        text = "time left unknown yet" if left is None else f"{timedelta(seconds=round(left))} left"
+        elapsed = timedelta(seconds=round(time.monotonic() - self._start))
         return f"{self._num_done} of {self._num_cells} cells done, {elapsed}, {text}"
-
-    def _num_left(self) -> float:
-        """Return how many cells are left; cells in training count in part."""
-        left = self._num_cells - self._num_done - len(self._failures)
-        return left - sum(job.fraction() for job in self._jobs())
 
     def _print(self, text: str) -> None:
         """Print a line with the time, over the live line if there is one."""
@@ -221,24 +186,14 @@ class ExperimentRun:
 
     def _show_live_line(self) -> None:
         """Update the live line, if there is a terminal and the update is due."""
-        if not sys.stdout.isatty() or time.monotonic() - self._shown < SHOW_EVERY:
-            return
-        self._shown = time.monotonic()
-        line = " | ".join([self._progress(), *map(str, self._jobs())])
-        print(line[: columns()].ljust(columns()), end="\r", flush=True)
+        if sys.stdout.isatty() and time.monotonic() - self._shown >= SHOW_EVERY:
+            self._shown = time.monotonic()
+            line = " | ".join([self._progress(), *map(str, self._jobs())])
+            print(line[: columns()].ljust(columns()), end="\r", flush=True)
 
 
 def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
-    """Create the folder of the results, or check that its settings are the same, and copy the description into it.
-
-    Args:
-        matrix: The matrix that the file describes.
-        file: The description.
-        out: The folder.
-
-    Raises:
-        UserError: If the folder was made with other settings.
-    """
+    """Create the folder of the results, and copy the matrix's file into it; UserError if it has other settings."""
     check_same(matrix, out)  # before anything is created
     out.mkdir(parents=True, exist_ok=True)
     with open(out / "lock", "a") as lock:
@@ -252,27 +207,10 @@ def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
 
 
 def time_left(durations: list[float], cells: float, num_workers: int) -> float | None:
-    """Return the remaining time [s]; None if it is unknown.
-
-    Args:
-        durations: Durations of finished cells [s].
-        cells: Number of cells left; cells in training count in part.
-        num_workers: Number of cells worked on at a time.
-    """
+    """Return the time for the cells that are left [s], from the durations of finished ones [s]; None if unknown."""
     if cells <= 0:
         return 0.0
-    if not durations:
-        return None
-    return fmean(durations) * max(cells / num_workers, min(cells, 1.0))
-
-
-def duration_text(seconds: float) -> str:
-    """Return a duration as text, in its two largest units."""
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes:02d} min"
-    return f"{minutes} min {seconds:02d} s" if minutes else f"{seconds} s"
+    return fmean(durations) * max(cells / num_workers, min(cells, 1.0)) if durations else None
 
 
 def columns() -> int:

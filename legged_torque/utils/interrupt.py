@@ -9,23 +9,15 @@ from types import FrameType
 
 
 class StopRequest:
-    """While this context is open, the first Ctrl-C or SIGTERM only asks to stop; the second one stops at once.
+    """While this context is open, the first Ctrl-C or SIGTERM only asks to stop; the second one stops at once."""
 
-    Attributes:
-        requested: Whether a signal has asked to stop.
-    """
-
-    _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-    def __init__(self) -> None:
-        """Start without a request."""
-        self.requested = False
+    requested = False  # whether a signal has asked to stop
 
     def __enter__(self) -> StopRequest:
         """Take over the signals; only a process's main thread can do so."""
         self._old = {}
         if threading.current_thread() is threading.main_thread():
-            self._old = {number: signal.signal(number, self._handle) for number in self._SIGNALS}
+            self._old = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
         return self
 
     def __exit__(self, *exception: object) -> None:

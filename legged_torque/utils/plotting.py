@@ -12,15 +12,9 @@ from legged_torque.utils.errors import UserError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-DPI = 130
-
 
 def load_pyplot() -> ModuleType:
-    """Return ``matplotlib.pyplot``, set up to write files and open no windows.
-
-    Raises:
-        UserError: If matplotlib is missing.
-    """
+    """Return ``matplotlib.pyplot``, set up to write files and open no windows; UserError if it is missing."""
     try:
         import matplotlib
 
@@ -32,16 +26,7 @@ def load_pyplot() -> ModuleType:
 
 
 def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
-    """Return the JSON object that a script has written.
-
-    Args:
-        file: The file.
-        keys: Keys that the object must have.
-        script: Name of the script, for the message.
-
-    Raises:
-        UserError: If the file cannot be read or was not written by ``script``.
-    """
+    """Return the JSON object with these keys, or more, that ``script`` has written; UserError if it is none."""
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -52,13 +37,9 @@ def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
 
 
 def save_figure(figure: Figure, file: Path) -> None:
-    """Write a figure in the format that the file's ending names.
-
-    Raises:
-        UserError: If the file cannot be written or the format is unknown.
-    """
+    """Write a figure in the format that the file's ending names; UserError if that is unknown or cannot be written."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(file, dpi=DPI)
+        figure.savefig(file, dpi=130)
     except (OSError, ValueError) as error:  # ValueError: unknown format
         raise UserError(f"cannot write '{file}': {error}") from None

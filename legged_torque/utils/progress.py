@@ -8,22 +8,20 @@ import re
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import TextIO
 
 import warp as wp
 
-SHOW_AFTER = 2.0
-"""Seconds of compilation before a line is shown. Shorter compilations are not reported."""
-QUIET_AFTER = 5.0
-"""Seconds without compilation after which the line is finished."""
-END_AFTER = 120.0
-"""Seconds without compilation after which watching ends, so that it costs a long training nothing."""
+SHOW_AFTER = 2.0  # seconds of compilation before a line is shown; shorter compilations are not reported
+QUIET_AFTER = 5.0  # seconds without compilation after which the line is finished
+END_AFTER = 120.0  # seconds without compilation after which watching ends, so that it costs a long training nothing
 _POLL = 0.25
 _BUILD = re.compile(r"_p(\d+)_t\d+$")  # end of the name of a build folder: process id, thread
 
 
 class CompileProgress:
-    """While this context is open, a line on standard error reports that kernels are being compiled.
+    """While this context is open, a line on standard error (or ``stream``) reports that kernels are being compiled.
 
     The line reads "compiling physics kernels, once per machine: 12 modules, 34 s". It is rewritten every second in a
     terminal and repeated every ten seconds elsewhere. Nothing is shown if all kernels are in Warp's cache. A thread
@@ -34,11 +32,7 @@ class CompileProgress:
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:
-        """Prepare; nothing is watched yet.
-
-        Args:
-            stream: Where to write; None is standard error.
-        """
+        """Prepare; nothing is watched yet."""
         self.modules = 0
         self._stream = stream or sys.stderr
         self._terminal = self._stream.isatty()
@@ -69,14 +63,17 @@ class CompileProgress:
         start = time.monotonic()
         while not self._stop.wait(_POLL):
             now = time.monotonic()
+            pause = now - self._last_build
             if self._is_compiling():
-                pause = now - self._last_build
                 self._seconds += pause if pause < QUIET_AFTER else _POLL
                 self._last_build = now
-                self._write_line(now)
+                if self._seconds >= SHOW_AFTER and now - (self._last_line or -1e9) >= self._interval:
+                    self._last_line = now
+                    # the cursor returns to the start of the line, so that later output covers it
+                    self._write("compiling physics kernels, once per machine", "\r" if self._terminal else "\n")
             elif now - max(start, self._last_build) > END_AFTER:
                 return
-            elif now - self._last_build > QUIET_AFTER:
+            elif pause > QUIET_AFTER:
                 self._finish_line()
 
     def _is_compiling(self) -> bool:
@@ -93,34 +90,23 @@ class CompileProgress:
         builds = (_BUILD.search(name) for name in [*entries, *_entries(os.path.join(folder, "lto"))])
         return any(build and int(build[1]) == os.getpid() for build in builds)  # other processes share the cache
 
-    def _write_line(self, now: float) -> None:
-        """Show the progress, if an update is due."""
-        if self._seconds < SHOW_AFTER or (self._last_line is not None and now - self._last_line < self._interval):
-            return
-        self._last_line = now
-        line = f"compiling physics kernels, once per machine: {self.modules} modules, {self._seconds:.0f} s"
-        # the cursor returns to the start of the line, so that later output covers it
-        self._stream.write(f"{line}\r" if self._terminal else f"{line}\n")
+    def _write(self, text: str, end: str) -> None:
+        """Write a line with the progress."""
+        self._stream.write(f"{text}: {self.modules} modules, {self._seconds:.0f} s{end}")
         self._stream.flush()
 
     def _finish_line(self) -> None:
         """Replace an unfinished line with its final text, if there is one."""
-        if self._last_line is None:
-            return
-        self._last_line = None
-        line = f"compiled physics kernels: {self.modules} modules, {self._seconds:.0f} s"
-        self._stream.write(f"{line:<80}\n" if self._terminal else f"{line}\n")
-        self._stream.flush()
+        if self._last_line is not None:
+            self._last_line = None
+            self._write("compiled physics kernels", " " * 40 + "\n" if self._terminal else "\n")
 
 
 def _entries(folder: str) -> dict[str, int]:
     """Return the entries of a folder with their times of modification [ns]; nothing if the folder is missing."""
     result: dict[str, int] = {}
-    try:
-        names = os.listdir(folder)
-    except OSError:
-        return result
-    for name in names:
-        with contextlib.suppress(OSError):  # moved in the meantime
-            result[name] = os.stat(os.path.join(folder, name)).st_mtime_ns
+    with contextlib.suppress(OSError):
+        for path in Path(folder).iterdir():
+            with contextlib.suppress(OSError):  # moved in the meantime
+                result[path.name] = path.stat().st_mtime_ns
     return result
