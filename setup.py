@@ -8,8 +8,9 @@ from setuptools import find_packages, setup
 ROOT = Path(__file__).parent
 VERSION = re.search(r'__version__ = "(.+?)"', (ROOT / "legged_torque" / "__init__.py").read_text("utf-8")).group(1)
 EXPORT = ["onnx>=1.16,<2", "onnxruntime>=1.18,<2", "jsonschema>=4.18,<5"]
+PLOTS = ["matplotlib", "scipy>=1.10,<2"]
 VIDEO = ["imageio", "imageio-ffmpeg", "pillow>=10.1"]
-TEST = ["pytest", "pytest-xdist>=3.6,<4", "setuptools>=77", "matplotlib", *VIDEO, *EXPORT]
+TEST = ["pytest", "pytest-xdist>=3.6,<4", "setuptools>=77", *PLOTS, *VIDEO, *EXPORT]
 
 setup(
     name="legged_torque",
@@ -43,7 +44,7 @@ setup(
     ],
     extras_require={
         "video": VIDEO,
-        "plots": ["matplotlib"],
+        "plots": PLOTS,
         "viewer": ["viser>=1.1,<2", "trimesh>=4.8,<6", "pillow"],
         "wandb": ["wandb"],
         "export": EXPORT,
