@@ -19,23 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass
 class Asset:
-    """A robot's model and which of its parts mean what.
-
-    Attributes:
-        mj_model: The model to simulate.
-        dof_names: Names of the joints, in the order of the MJCF.
-        geom_names: Names of the collision geoms; places below are places in this list.
-        feet: Places of the feet.
-        penalized: Places of the geoms of the collision term.
-        terminating: Places of the geoms that end an episode.
-    """
+    """A robot's model and which of its parts mean what."""
 
     mj_model: mujoco.MjModel
-    dof_names: list[str]
-    geom_names: list[str]
-    feet: list[int]
-    penalized: list[int]
-    terminating: list[int]
+    dof_names: list[str]  # of the joints, in the order of the MJCF
+    geom_names: list[str]  # of the collision geoms; the lists below are places in this one
+    feet: list[int]  # also those of ``foot_names``
+    penalized: list[int]  # geoms of the collision term
+    terminating: list[int]  # geoms that end an episode
 
     @property
     def foot_names(self) -> list[str]:
@@ -48,14 +39,11 @@ class Asset:
 
 
 def load_asset(cfg: LeggedRobotCfg) -> Asset:
-    """Load a robot.
-
-    Args:
-        cfg: Settings of the task, of which ``asset`` and ``sim.dt`` count.
+    """Load the robot of ``cfg.asset``, to be simulated in steps of ``cfg.sim.dt``.
 
     Raises:
-        UserError: If the file cannot be read, a name in the settings matches nothing, or motors are in another order
-            than joints.
+        UserError: If the file cannot be read, a name in the settings matches nothing, or motors and joints differ in
+            order.
     """
     settings = cfg.asset
     spec = read_spec(resource_path(settings.file))
@@ -86,10 +74,7 @@ def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence
     Args:
         setting: Name of the setting, for messages.
         values: One number for all joints, or numbers by a part of the joints' names; the first one that matches counts.
-        dof_names: Names of the joints.
-
-    Raises:
-        UserError: If a joint has no number, or a name matches no joint.
+        dof_names: Names of the joints; a UserError names one without a number, or what matches no joint.
     """
     if not isinstance(values, dict):
         return [values] * len(dof_names)
@@ -106,11 +91,7 @@ def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence
 
 
 def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[float]:
-    """Return the nominal joint angles [rad] in the order of the joints.
-
-    Args:
-        angles: ``init_state.default_joint_angles``, in the same order.
-        dof_names: Names of the joints in the order of the MJCF.
+    """Return the nominal joint angles [rad] of ``init_state.default_joint_angles``, whose order must be that of the MJCF.
 
     Raises:
         UserError: If a joint is missing or unknown, or the order is another one.

@@ -127,23 +127,17 @@ def control_parameters(task: LeggedRobot) -> list[Parameter]:
 def mirrors(drawn: list[Parameter], sizes: dict[str, int]) -> dict[str, Mirroring | None]:
     """Return the mirror images of the numbers of :attr:`Randomization.values`, by name; None where it is not known.
 
-    Args:
-        drawn: The parameters.
-        sizes: How many numbers of its own each has.
+    ``sizes`` says how many numbers of its own each of the drawn parameters has.
     """
     own = [parameter for parameter in drawn if parameter.name in sizes]
     return {p.name: p.mirror or (SCALAR if sizes[p.name] == 1 else None) for p in own}
 
 
 def of_model(task: LeggedRobot, name: str, field: str, columns: Sequence[int], **settings: Any) -> Parameter:
-    """Return a parameter that is kept in a field of the model.
+    """Return a parameter kept in a field of the model: one of :data:`MODEL_FIELDS`.
 
-    Args:
-        task: The task.
-        name: Name of the parameter.
-        field: Name of the field, one of :data:`MODEL_FIELDS`, or "gravity".
-        columns: Which numbers of a world's part of the field, all of its entries behind each other.
-        settings: All else that a :class:`~legged_torque.sim.randomization.Parameter` takes.
+    ``columns`` are numbers of a world's part of the field, all of its entries behind each other; ``settings`` is all
+    else that a :class:`~legged_torque.sim.randomization.Parameter` takes.
     """
     return Parameter(name, task.sim.field(field).flatten(1), list(columns), model_field=field, **settings)
 

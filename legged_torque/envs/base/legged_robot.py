@@ -57,11 +57,7 @@ class LeggedRobot(BaseTask):
     cfg: LeggedRobotCfg
 
     def __init__(self, cfg: LeggedRobotCfg, device: str = "cpu") -> None:
-        """Create the worlds and put each into a random initial state.
-
-        Args:
-            cfg: Settings of the task; ``env.num_actions`` is filled in.
-            device: "cpu" or "cuda:N".
+        """Create the worlds on "cpu" or "cuda:N", each in a random initial state; ``cfg.env.num_actions`` is filled in.
 
         Raises:
             UserError: If a setting makes no sense or names something that does not exist.
@@ -85,13 +81,9 @@ class LeggedRobot(BaseTask):
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
 
     def _compute_torques(self, actions: Tensor) -> Tensor:
-        """Return joint torques for actions; called at every physics step. This is position control (eq. 8).
+        """Return the torques that motors are asked for [N m]; called at every physics step.
 
-        Args:
-            actions: Shape: (num_envs, num_actions).
-
-        Returns:
-            Torques that the motors are asked for [N m]. Shape: (num_envs, num_dof).
+        This is position control (eq. 8). Shapes: (num_envs, num_actions) to (num_envs, num_dof).
         """
         return self._pd_torques(actions)
 
@@ -215,12 +207,7 @@ class LeggedRobot(BaseTask):
         self.last_dof_vel.copy_(self.dof_vel)
 
     def set_state(self, qpos: Tensor, qvel: Tensor) -> None:
-        """Put all worlds into given states, with the observations that follow; episodes go on.
-
-        Args:
-            qpos: As ``sim.qpos``. Shape: (num_envs, nq).
-            qvel: As ``sim.qvel``. Shape: (num_envs, nv).
-        """
+        """Put all worlds into states as in ``sim.qpos`` and ``sim.qvel``, and observe them; episodes go on."""
         self.sim.qpos.copy_(qpos)
         self.sim.qvel.copy_(qvel)
         self._update_state()

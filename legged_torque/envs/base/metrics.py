@@ -32,11 +32,7 @@ class WalkingMetrics:
         self._sums.zero_()
 
     def add_step(self, commands: Tensor) -> None:
-        """Add the step that the task has just made.
-
-        Args:
-            commands: A copy of the commands that held during the step. Shape: (num_envs, 3).
-        """
+        """Add the step that the task has just made, with a copy of the commands that held in it (num_envs, 3)."""
         task = self._task
         velocity = task.planar_velocity()
         self._sums += metrics.step_sums(

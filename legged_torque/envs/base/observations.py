@@ -19,29 +19,17 @@ if TYPE_CHECKING:
 
 @dataclass
 class ObservationTerm:
-    """One part of the observations.
+    """One part of the observations."""
 
-    Attributes:
-        name: Its name, also in ``policy.yaml``.
-        value: Returns the unscaled values. Shape: (num_envs, size).
-        mirror: Their left-right mirror image; None if it is not known, then learning from mirror images is refused.
-        scale: Factor on all values, or on each.
-        noise: Largest error of the policy's sensor, uniform, before scaling.
-        privileged: Whether only the critic sees it.
-        unit: Unit of the values.
-        frame: In which they are given: "trunk", "joint" or "none".
-        meaning: What they are.
-    """
-
-    name: str
-    value: Callable[[], Tensor]
-    mirror: Mirroring | None
-    scale: float | Sequence[float] = 1.0
-    noise: float = 0.0
-    privileged: bool = False
-    unit: str = ""
-    frame: str = "none"
-    meaning: str = ""
+    name: str  # also in ``policy.yaml``
+    value: Callable[[], Tensor]  # returns the unscaled values. Shape: (num_envs, size)
+    mirror: Mirroring | None  # left-right mirror image; None: not known, learning from mirror images is refused
+    scale: float | Sequence[float] = 1.0  # factor on all values, or on each
+    noise: float = 0.0  # largest error of the policy's sensor, uniform, before scaling
+    privileged: bool = False  # whether only the critic sees it
+    unit: str = ""  # of the values
+    frame: str = "none"  # in which they are given: "trunk", "joint" or "none"
+    meaning: str = ""  # what they are
 
 
 def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
@@ -170,8 +158,7 @@ class Observations:
     def compute(self, is_new: Tensor) -> None:
         """Compute the observations of this moment.
 
-        Args:
-            is_new: Worlds whose episode has just started: their history starts with copies. Shape: (num_envs,), bool.
+        Where an episode has just started, as ``is_new`` says, the history starts with copies. Shape: (num_envs,), bool.
         """
         critic = torch.cat([term.value() for term in self.terms], dim=1) * self._scales
         policy = critic[:, : self._policy_size]

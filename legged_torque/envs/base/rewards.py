@@ -56,14 +56,9 @@ class Rewards:
         return self._scales * self._curriculum(total_steps)
 
     def compute(self, total_steps: Tensor, diverged: Tensor) -> Tensor:
-        """Return the sum of all terms and add them to the sums of the episode.
+        """Return the sum of all terms and add them to the sums of the episode. Shape: (num_envs,).
 
-        Args:
-            total_steps: Steps of training so far. Scalar, int64.
-            diverged: Worlds whose reward is 0, since their state is not finite. Shape: (num_envs,), bool.
-
-        Returns:
-            Shape: (num_envs,).
+        ``total_steps`` are those of training so far, a scalar; where the state has diverged, terms are 0.
         """
         terms = torch.stack([function() for function in self._functions])
         terms = torch.where(diverged, 0.0, terms)

@@ -34,13 +34,9 @@ class RobotSymmetry:
         dof_axes: Sequence[Sequence[float]],
         foot_names: Sequence[str],
     ) -> None:
-        """Match names.
+        """Match names: those of the legs in ``asset.mirrored_legs``, and of joints and feet in their order.
 
-        Args:
-            mirrored_legs: ``asset.mirrored_legs``.
-            dof_names: Names of the joints in their order.
-            dof_axes: Their axes in the frames of their bodies. Shape: (num_dof, 3).
-            foot_names: Names of the feet in their order.
+        ``dof_axes`` are the joints' axes in the frames of their bodies. Shape: (num_dof, 3).
         """
         self.joints: Mirroring | None = None
         self.feet: Mirroring | None = None
@@ -55,11 +51,7 @@ class RobotSymmetry:
 
 
 def _place(names: Sequence[str], leg: str) -> int:
-    """Return the place of the name that begins with that of a leg.
-
-    Raises:
-        UserError: If there is none.
-    """
+    """Return the place of the name that begins with that of a leg; a UserError if there is none."""
     for place, name in enumerate(names):
         if name.startswith(leg):
             return place
@@ -92,12 +84,10 @@ class Mirror:
         """Prepare the permutations.
 
         Args:
-            parts: For each kind of vector its terms, by name, one behind the other.
+            parts: For each kind of vector its terms, by name, one behind the other; a UserError if the mirror image of
+                one is not known.
             problem: Why the robot is not symmetric, if it is not.
             device: Name of the device.
-
-        Raises:
-            UserError: If the mirror image of a term is not known.
         """
         self._maps = {}
         for kind, terms in parts.items():
@@ -109,12 +99,7 @@ class Mirror:
             self._maps[kind] = torch.tensor(whole.order, device=device), torch.tensor(whole.signs, device=device)
 
     def __call__(self, name: str, values: Tensor) -> Tensor:
-        """Return the mirror image.
-
-        Args:
-            name: "policy", "critic" or "actions".
-            values: Shape: (samples, size).
-        """
+        """Return the mirror image of "policy", "critic" or "actions". Shape: (samples, size)."""
         order, signs = self._maps[name]
         return values[:, order] * signs
 
@@ -137,10 +122,7 @@ def with_mirror_images(
 ) -> tuple[TensorDict | None, Tensor | None]:
     """Return observations and actions followed by their mirror images: rsl_rl's ``data_augmentation_func``.
 
-    Args:
-        env: The task.
-        obs: Observations, each (samples, size), or None.
-        actions: Shape: (samples, num_actions), or None.
+    Shapes: (samples, size) and (samples, num_actions); what is None stays None.
     """
     if obs is not None:
         tensors: Any = obs.items()

@@ -28,11 +28,7 @@ NOT_PARAMETERS = ("keep_fixed", "push_velocity", "action_delay")
 
 
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:
-    """Check the settings of a task.
-
-    Raises:
-        UserError: Naming the first setting that makes no sense.
-    """
+    """Raise a UserError that names the first setting of a task that makes no sense."""
     for key, value in {
         "env.num_envs": cfg.env.num_envs,
         "env.history_length": cfg.env.history_length,
