@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import mujoco
@@ -81,12 +82,12 @@ class RobotDynamics:
         self._allocate(bodies)
 
     def update(self, qpos: Tensor, qvel: Tensor) -> None:
-        """Evaluate everything at new states.
+        """Evaluate everything at new states. Shapes: (num_states, nq), (num_states, nv).
 
         Args:
-            qpos: Trunk position [m], trunk quaternion (w, x, y, z), joint positions [rad]. Shape: (num_states, nq).
-            qvel: Trunk linear velocity in the world frame [m/s], trunk angular velocity in the trunk's frame [rad/s],
-                joint velocities [rad/s]. Shape: (num_states, nv).
+            qpos: Trunk position [m], trunk quaternion (w, x, y, z), joint positions [rad].
+            qvel: Trunk velocity in the world [m/s], its angular velocity in its own frame and those of the joints
+                [rad/s].
         """
         self._qpos.copy_(qpos)
         self._qvel.copy_(qvel)
@@ -132,10 +133,7 @@ class RobotDynamics:
     def _allocate(self, bodies: np.ndarray) -> None:
         """Allocate the results, Jacobians contact by contact, and list the points whose Jacobians are needed."""
         n, nv, k = self.num_states, self.mj_model.nv, len(bodies)
-
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(*shape, device=self.device)
-
+        zeros = functools.partial(torch.zeros, device=self.device)
         self.inertia, self.gravity, self.coriolis = zeros(n, nv, nv), zeros(n, nv), zeros(n, nv)
         self.contact_bias, self.trunk_jacobian = zeros(n, k, 3), zeros(n, 6, nv)
         points, jacobians = zeros(k, n, 3), zeros(k, n, 3, nv)
@@ -153,11 +151,7 @@ class RobotDynamics:
 
 
 def _check_model(model: mujoco.MjModel, contact_geoms: list[str], names: list[str]) -> None:
-    """Refuse what the formulas here do not hold for.
-
-    Raises:
-        UserError: See :class:`RobotDynamics`.
-    """
+    """Raise a UserError for what the formulas here do not hold for."""
     types = model.jnt_type
     if types[0] != mujoco.mjtJoint.mjJNT_FREE or (types[1:] != mujoco.mjtJoint.mjJNT_HINGE).any():
         raise UserError("whole-body control needs a robot with a free trunk, all other joints being hinges")

@@ -31,27 +31,18 @@ HIGHEST_SPEED = 0.3
 
 @dataclass
 class StandingResult:
-    """How a trial went.
+    """How a trial went."""
 
-    Attributes:
-        standing: Which worlds stand at the end and have not fallen before. Shape: (num_envs,), bool.
-        share: Share of these worlds.
-        mean_torque: Mean absolute torque over joints, time and worlds that have not fallen [N m].
-    """
-
-    standing: Tensor
-    share: float
-    mean_torque: float
+    standing: Tensor  # which worlds stand at the end and have not fallen before. Shape: (num_envs,), bool
+    share: float  # of these worlds
+    mean_torque: float  # mean absolute torque over joints, time and worlds that have not fallen [N m]
 
 
 def use_standing_trials(cfg: LeggedRobotCfg, decimation: int = 1) -> None:
     """Change a task's settings such that episodes start from the random states of ``--perturbation low``.
 
-    Parameters are not random, nobody pushes and sensors have no noise.
-
-    Args:
-        cfg: Settings of a task that is to be made.
-        decimation: Physics steps per control step: 1 for a controller at 200 Hz, 4 for a policy at 50 Hz.
+    Parameters are not random, nobody pushes and sensors have no noise. A control step has as many physics steps as
+    ``decimation`` says: 1 for a controller at 200 Hz, 4 for a policy at 50 Hz.
     """
     apply_perturbation(cfg, "low")
     quiet = {"randomize_parameters": False, "push_robots": False}
@@ -61,16 +52,11 @@ def use_standing_trials(cfg: LeggedRobotCfg, decimation: int = 1) -> None:
 def place_on_ground(
     task: LeggedRobot, dynamics: RobotDynamics, clearance: tuple[float, float] = START_CLEARANCE
 ) -> None:
-    """Start an episode in every world, the lowest foot just above the ground.
+    """Start an episode in every world, the lowest foot just above the ground, which is level at z = 0.
 
     The task draws its initial states; then trunks are moved up or down until the lowest point of the lowest foot has a
-    random clearance. States in which another collision geom would be below the ground are drawn again, at most
+    random clearance [m]. States in which another collision geom would be below the ground are drawn again, at most
     :data:`MAX_DRAWS` times; what is left then is raised until that geom touches the ground. Waits for the host.
-
-    Args:
-        task: The task; worlds are level at z = 0.
-        dynamics: Kinematics of its robot, for as many states as it has worlds.
-        clearance: Lowest and highest clearance [m].
 
     Raises:
         UserError: If a collision geom is neither sphere, capsule nor box.
@@ -96,13 +82,10 @@ def place_on_ground(
 
 
 def is_standing(task: LeggedRobot) -> Tensor:
-    """Return which worlds stand: high, level and slow, with nothing but feet on the ground.
+    """Return which worlds stand: high, level and slow, with nothing but feet on the ground. Shape: (num_envs,), bool.
 
     Contacts are those of the last physics step. Whether a world has fallen before and was reset is not known here, see
     :func:`measure_standing`.
-
-    Returns:
-        Shape: (num_envs,), bool.
     """
     upright = (task.base_height > LOWEST_HEIGHT) & (task.projected_gravity[:, 2] < HIGHEST_GRAVITY_Z)
     only_feet = task.contacts.sum(dim=1) == task.feet_contact.sum(dim=1)
@@ -166,11 +149,7 @@ class _LowestPoints:
 
 
 def _rounded_box(model: mujoco.MjModel, geom: int) -> tuple[list[float], float]:
-    """Return half sizes [m] and radius [m] of a geom.
-
-    Raises:
-        UserError: If it is neither sphere, capsule nor box.
-    """
+    """Return half sizes [m] and radius [m] of a geom; a UserError if it is neither sphere, capsule nor box."""
     kind, size = model.geom_type[geom], model.geom_size[geom].tolist()
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         return [0.0, 0.0, 0.0], size[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import mujoco
 import torch
 from torch import Tensor
 
@@ -40,23 +39,13 @@ class WholeBodySettings:
 
 @dataclass
 class WholeBodyTorques:
-    """What the controller decides: torques in N m; forces by the ground on the robot, in N in the world frame.
+    """What the controller decides: torques in N m; forces by the ground on the robot, in N in the world frame."""
 
-    Attributes:
-        task: Gamma_task (eq. 4). Shape: (n, joints).
-        posture: Gamma_posture (eq. 5). Shape: (n, joints).
-        force: Gamma_force (eq. 6). Shape: (n, joints).
-        total: Gamma (eq. 3), clipped to the torque limits. Shape: (n, joints).
-        contact_forces: f_csd (eq. 10), zero where nothing touches. Shape: (n, k, 3).
-        wrench_residual: What the contacts cannot give of the wrench that the trunk needs: force in the world frame
-            [N], moment in the trunk's frame [N m]; given minus needed. Shape: (n, 6).
-    """
-
-    task: Tensor
-    posture: Tensor
-    force: Tensor
-    total: Tensor
-    contact_forces: Tensor
+    task: Tensor  # Gamma_task (eq. 4). Shape: (n, joints)
+    posture: Tensor  # Gamma_posture (eq. 5). Shape: (n, joints)
+    force: Tensor  # Gamma_force (eq. 6). Shape: (n, joints)
+    total: Tensor  # Gamma (eq. 3), clipped to the torque limits. Shape: (n, joints)
+    contact_forces: Tensor  # f_csd (eq. 10), zero where nothing touches. Shape: (n, k, 3)
     wrench_residual: Tensor
 
 
@@ -84,12 +73,7 @@ class WholeBodyController:
     def __init__(
         self, dynamics: RobotDynamics, nominal_pose: Sequence[float], settings: WholeBodySettings | None = None
     ) -> None:
-        """Prepare the constants.
-
-        Args:
-            dynamics: The robot; every call of the controller updates it.
-            nominal_pose: q_nominal [rad]. Shape: (joints,).
-            settings: Gains and limits; None takes the defaults.
+        """Prepare the constants; every call of the controller updates ``dynamics``, ``nominal_pose`` is in rad.
 
         Raises:
             UserError: If the pose has another number of joints, a joint lacks a motor with force limits, or a setting
@@ -101,12 +85,12 @@ class WholeBodyController:
         joints = model.nv - TRUNK_DOFS
         if len(nominal_pose) != joints:
             raise UserError(f"the nominal pose has {len(nominal_pose)} joints, the robot {joints}")
-        if not _has_direct_motors(model):
+        driven = model.actuator_trnid[:, 0].tolist()
+        if driven != list(range(1, model.njnt)) or not (model.actuator_forcelimited == 1).all():
             raise UserError("whole-body control needs one motor with a force range per joint, in the joints' order")
         self._pose = torch.tensor(nominal_pose, dtype=torch.float32, device=device)
-        self._lowest, self._highest = torch.tensor(
-            model.actuator_forcerange.T.copy(), dtype=torch.float32, device=device
-        )
+        ranges = model.actuator_forcerange.T.copy()
+        self._lowest, self._highest = torch.tensor(ranges, dtype=torch.float32, device=device)
         limits = ForceLimits(settings.friction, settings.lowest_force, settings.highest_force)
         self._distribute = ForceDistribution(limits, settings.arm, settings.force_regularization, device)
         self._nominal_feet = self._feet_in_nominal_pose()
@@ -187,9 +171,3 @@ class WholeBodyController:
         qpos[:, TRUNK_DOFS + 1 :] = self._pose
         robot.update(qpos, torch.zeros(robot.num_states, robot.mj_model.nv, device=robot.device))
         return robot.contact_points[0].clone()
-
-
-def _has_direct_motors(model: mujoco.MjModel) -> bool:
-    """Return whether actuator i is a motor of hinge i with a force range."""
-    joints = list(range(1, model.njnt))
-    return model.actuator_trnid[:, 0].tolist() == joints and bool((model.actuator_forcelimited == 1).all())

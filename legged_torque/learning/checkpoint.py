@@ -23,12 +23,7 @@ def write(file: Path, content: dict[str, Any]) -> None:
 
 
 def read(file: Path, what: str, device: str) -> Any:
-    """Return what :func:`write` has written.
-
-    Args:
-        file: The file.
-        what: What it should be, for the message.
-        device: Where its tensors go.
+    """Return what :func:`write` has written, with its tensors on a device; ``what`` it should be is for the message.
 
     Raises:
         UserError: If it cannot be read.

@@ -80,13 +80,7 @@ class TrainingEvaluator:
 
 
 def evaluation_cfg(cfg: Any, num_envs: int, perturbation: str = "") -> Any:
-    """Return a copy of a task's settings for evaluation.
-
-    Args:
-        cfg: The task's settings.
-        num_envs: Number of worlds.
-        perturbation: Name of the environment; empty leaves it as it is.
-    """
+    """Return a copy of a task's settings for evaluation in an environment; an empty name leaves that as it is."""
     cfg = copy.deepcopy(cfg)
     cfg.env.num_envs = num_envs
     for term in section_keys(cfg.rewards.scales):

@@ -82,11 +82,7 @@ class Randomization:
     ) -> None:
         """Prepare the tables; nothing is drawn yet.
 
-        Args:
-            parameters: What to draw.
-            num_envs: Number of worlds.
-            device: "cpu" or "cuda:N".
-            keep_probability: Share of draws in which the parameters that may keep their values at the start do so.
+        Parameters that may keep their values at the start do so in a share of draws, ``keep_probability``.
 
         Raises:
             UserError: If a parameter is not float32 or has not two axes.
@@ -121,14 +117,7 @@ class Randomization:
         self._rows: wp.array = wp.array(rows, dtype=kernels.Row, device=device)
 
     def draw(self, mask: Tensor) -> None:
-        """Draw all parameters anew.
-
-        Args:
-            mask: In which worlds. Shape: (num_envs,), bool.
-
-        Raises:
-            UserError: If worlds share a parameter.
-        """
+        """Draw all parameters anew in the worlds of ``mask`` (num_envs,), bool; a UserError if worlds share one."""
         if self._without_rows:
             raise UserError(f"random parameters without a row per world: {', '.join(self._without_rows)}")
         self._seeds.random_()

@@ -23,9 +23,8 @@ class ActionTerm:
 
 def position_residual(scale: Tensor, weight: Tensor | None = None) -> ActionTerm:
     """Return the term of PD targets (eq. 8); for the arguments see :class:`ActionTerm`."""
-    return ActionTerm(
-        "position_residual", scale, "rad", "joint position relative to nominal_pose, for PD control", weight
-    )
+    meaning = "joint position relative to nominal_pose, for PD control"
+    return ActionTerm("position_residual", scale, "rad", meaning, weight)
 
 
 def torque(scale: Tensor, weight: Tensor | None = None) -> ActionTerm:

@@ -91,7 +91,7 @@ def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence
 
 
 def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[float]:
-    """Return the nominal joint angles [rad] of ``init_state.default_joint_angles``, whose order must be that of the MJCF.
+    """Return the nominal joint angles [rad] of ``init_state.default_joint_angles``, in the order of the MJCF.
 
     Raises:
         UserError: If a joint is missing or unknown, or the order is another one.

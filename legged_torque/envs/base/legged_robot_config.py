@@ -11,10 +11,8 @@ from legged_torque.utils.config import BaseConfig, Section
 class LinearChange(Section):
     """A value that changes linearly with the total number of environment steps (paper, eq. 1)."""
 
-    start = 1.0
-    end = 1.0
-    t_start = 0  # [total steps]
-    t_end = 1  # [total steps]
+    start, end = 1.0, 1.0
+    t_start, t_end = 0, 1  # [total steps]
 
 
 class LeggedRobotCfg(BaseConfig):
@@ -178,16 +176,12 @@ class LeggedRobotCfg(BaseConfig):
             """Factors on the scales: linear from start to end between two total step counts (eq. 1)."""
 
             class tracking_lin_vel(LinearChange):
-                start = 4.0
-                end = 2.0
-                t_start = 0
-                t_end = 10_000_000
+                start, end = 4.0, 2.0
+                t_start, t_end = 0, 10_000_000
 
             class tracking_ang_vel(LinearChange):
-                start = 0.1
-                end = 1.0
-                t_start = 0
-                t_end = 10_000_000
+                start, end = 0.1, 1.0
+                t_start, t_end = 0, 10_000_000
 
     class normalization:
         """Scales and limits of what the networks see and say."""

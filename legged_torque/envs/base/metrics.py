@@ -78,13 +78,11 @@ class CommandBreakdown:
         task = self._task
         velocity = task.planar_velocity()
         error = (commands - velocity).abs()
-        tracking = (
-            torch.stack(metrics.tracking_percentage(torch, error, commands)).unsqueeze(2).expand(-1, *error.shape)
-        )
+        tracking = torch.stack(metrics.tracking_percentage(torch, error, commands))
         low, high = self._ranges.T
         place = ((commands - low) / (high - low).clamp(min=1e-6) * NUM_BINS).long().clamp(0, NUM_BINS - 1)
         member = torch.nn.functional.one_hot(place, NUM_BINS) * ~task.reset_buf.view(-1, 1, 1)
-        rows = torch.stack([torch.ones_like(error), error, *tracking])
+        rows = torch.stack([torch.ones_like(error), error, *tracking.unsqueeze(2).expand(-1, *error.shape)])
         self._sums += (rows.unsqueeze(3) * member).sum(dim=1)
 
     def table(self) -> dict[str, list[dict[str, float]]]:

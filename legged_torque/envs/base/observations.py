@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict
@@ -32,6 +32,18 @@ class ObservationTerm:
     meaning: str = ""  # what they are
 
 
+_DESCRIPTIONS = {
+    "projected_gravity": ("", "trunk", "unit vector of gravity, (0, 0, -1) when upright"),
+    "angular_velocity": ("rad/s", "trunk", "of the trunk"),
+    "command": ("m/s, m/s, rad/s", "trunk", "commanded v_x, v_y and yaw rate"),
+    "joint_position": ("rad", "joint", "q - nominal_pose"),
+    "joint_velocity": ("rad/s", "joint", "qd"),
+    "last_action": ("", "none", "clipped actions of the step before, 0 at the start"),
+    "random_parameters": ("", "none", "drawn parameters as shares of their ranges, -1 to 1"),
+}
+"""Unit, frame and meaning of the standard terms."""
+
+
 def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
     """Return the terms of all tasks: what a real robot can measure (paper, App. I-B), then what only a simulator knows.
 
@@ -40,72 +52,26 @@ def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
     scales, noise, symmetry = task.cfg.normalization.obs_scales, task.cfg.noise.noise_scales, task.symmetry
     command_scales = (scales.lin_vel, scales.lin_vel, scales.ang_vel)
     joints, feet = symmetry.joints, symmetry.feet
+    actions = joints and Mirroring.joined([joints] * len(task.action_terms()))
     parameters = [mirror for mirror in task.parameter_mirrors.values() if mirror]
     parameter_mirror = Mirroring.joined(parameters) if len(parameters) == len(task.parameter_mirrors) else None
+
+    def term(
+        name: str, value: Any, mirror: Mirroring | None, scale: Any = 1.0, error: float = 0.0, privileged: bool = False
+    ) -> ObservationTerm:
+        return ObservationTerm(name, value, mirror, scale, error, privileged, *_DESCRIPTIONS.get(name, ()))
+
     return [
-        ObservationTerm(
-            "projected_gravity",
-            lambda: task.projected_gravity,
-            VECTOR,
-            noise=noise.gravity,
-            frame="trunk",
-            meaning="unit vector of gravity, (0, 0, -1) when upright",
-        ),
-        ObservationTerm(
-            "angular_velocity",
-            lambda: task.base_ang_vel,
-            AXIAL_VECTOR,
-            scales.ang_vel,
-            noise.ang_vel,
-            unit="rad/s",
-            frame="trunk",
-            meaning="of the trunk",
-        ),
-        ObservationTerm(
-            "command",
-            lambda: task.commands,
-            PLANAR_VELOCITY,
-            command_scales,
-            unit="m/s, m/s, rad/s",
-            frame="trunk",
-            meaning="commanded v_x, v_y and yaw rate",
-        ),
-        ObservationTerm(
-            "joint_position",
-            lambda: task.dof_pos - task.default_dof_pos,
-            joints,
-            scales.dof_pos,
-            noise.dof_pos,
-            unit="rad",
-            frame="joint",
-            meaning="q - nominal_pose",
-        ),
-        ObservationTerm(
-            "joint_velocity",
-            lambda: task.dof_vel,
-            joints,
-            scales.dof_vel,
-            noise.dof_vel,
-            unit="rad/s",
-            frame="joint",
-            meaning="qd",
-        ),
-        ObservationTerm(
-            "last_action",
-            lambda: task.actions,
-            joints and Mirroring.joined([joints] * len(task.action_terms())),
-            meaning="clipped actions of the step before, 0 at the start",
-        ),
-        ObservationTerm("linear_velocity", lambda: task.base_lin_vel, VECTOR, scales.lin_vel, privileged=True),
-        ObservationTerm("height", lambda: task.base_height.unsqueeze(1), SCALAR, privileged=True),
-        ObservationTerm("feet_contact", lambda: task.feet_contact, feet, privileged=True),
-        ObservationTerm(
-            "random_parameters",
-            lambda: task.randomization.values,
-            parameter_mirror,
-            privileged=True,
-            meaning="drawn parameters as shares of their ranges, -1 to 1",
-        ),
+        term("projected_gravity", lambda: task.projected_gravity, VECTOR, error=noise.gravity),
+        term("angular_velocity", lambda: task.base_ang_vel, AXIAL_VECTOR, scales.ang_vel, noise.ang_vel),
+        term("command", lambda: task.commands, PLANAR_VELOCITY, command_scales),
+        term("joint_position", lambda: task.dof_pos - task.default_dof_pos, joints, scales.dof_pos, noise.dof_pos),
+        term("joint_velocity", lambda: task.dof_vel, joints, scales.dof_vel, noise.dof_vel),
+        term("last_action", lambda: task.actions, actions),
+        term("linear_velocity", lambda: task.base_lin_vel, VECTOR, scales.lin_vel, privileged=True),
+        term("height", lambda: task.base_height.unsqueeze(1), SCALAR, privileged=True),
+        term("feet_contact", lambda: task.feet_contact, feet, privileged=True),
+        term("random_parameters", lambda: task.randomization.values, parameter_mirror, privileged=True),
     ]
 
 
@@ -179,10 +145,8 @@ class Observations:
     def mirrors(self) -> dict[str, list[tuple[str, Mirroring | None]]]:
         """Return the mirror images of the groups, term by term with their names."""
         policy = [(term.name, term.mirror) for term in self.policy_terms()]
-        return {
-            "policy": policy * self._history_length,
-            "critic": [(term.name, term.mirror) for term in self.terms],
-        }
+        critic = [(term.name, term.mirror) for term in self.terms]
+        return {"policy": policy * self._history_length, "critic": critic}
 
 
 def _per_value(value: float | Sequence[float], size: int) -> list[float]:

@@ -32,12 +32,7 @@ class DerivedConstants:
     """
 
     def __init__(self, mj_model: mujoco.MjModel, model: mjw.Model, num_envs: int) -> None:
-        """Prepare; gives every world its own row of both fields.
-
-        Args:
-            mj_model: The model.
-            model: The same on the device.
-            num_envs: Number of worlds.
+        """Prepare; gives every world its own row of both fields of ``model``, the one on the device.
 
         Raises:
             UserError: If the robot's structure is not a trunk with branches.
@@ -64,11 +59,7 @@ class DerivedConstants:
         self._measure_worlds(self._dim[0])
 
     def update(self, mask: wp.array) -> None:
-        """Recompute the constants.
-
-        Args:
-            mask: Which worlds. Shape: (num_envs,), bool.
-        """
+        """Recompute the constants in the worlds of ``mask``. Shape: (num_envs,), bool."""
         if self._branches_vary:
             self._measure_branches(mask)
         wp.launch(
