@@ -39,14 +39,10 @@ class ForceDistribution:
     def __init__(
         self, limits: ForceLimits, arm: float, regularization: float, device: str, dtype: torch.dtype = torch.float32
     ) -> None:
-        """Keep the settings and the constants on the device.
+        """Keep the settings and the constants on the device; a UserError if no force is inside the limits.
 
-        Args:
-            limits: What each contact can bear; a UserError if no force is inside.
-            arm: Length that makes moments comparable with forces [m].
-            regularization: Weight of single forces against the wrench, small against 1.
-            device: Name of the device.
-            dtype: Floating point type of all that follows.
+        ``arm`` makes moments comparable with forces [m], ``regularization`` weighs single forces against the wrench,
+        small against 1.
         """
         if limits.friction <= 0.0 or not 0.0 <= limits.lowest < limits.highest:
             raise UserError(f"contact forces need friction > 0 and 0 <= lowest < highest, not {limits}")

@@ -50,13 +50,10 @@ class RobotDynamics:
     def __init__(
         self, mj_model: mujoco.MjModel, num_states: int, device: str, contact_geoms: Sequence[str] | None = None
     ) -> None:
-        """Prepare the model and all buffers.
+        """Prepare the model and all buffers, on "cpu" or "cuda:N".
 
-        Args:
-            mj_model: Nominal model whose first body is the free trunk and whose other joints are hinges.
-            num_states: Number of states that are evaluated together.
-            device: "cpu" or "cuda:N".
-            contact_geoms: Spheres that may touch the ground; None takes those with "foot" in their names.
+        The first body of the nominal model is the free trunk, its other joints are hinges. Points of contact are on
+        spheres, ``contact_geoms``; None takes those with "foot" in their names.
 
         Raises:
             UserError: If the model has another structure or a geom does not exist or is no sphere.
@@ -82,13 +79,7 @@ class RobotDynamics:
         self._allocate(bodies)
 
     def update(self, qpos: Tensor, qvel: Tensor) -> None:
-        """Evaluate everything at new states. Shapes: (num_states, nq), (num_states, nv).
-
-        Args:
-            qpos: Trunk position [m], trunk quaternion (w, x, y, z), joint positions [rad].
-            qvel: Trunk velocity in the world [m/s], its angular velocity in its own frame and those of the joints
-                [rad/s].
-        """
+        """Evaluate everything at new states, as in the simulator's ``qpos`` and ``qvel``, one row per state."""
         self._qpos.copy_(qpos)
         self._qvel.copy_(qvel)
         model, data = self._model, self._data

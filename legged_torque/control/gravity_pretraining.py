@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from rsl_rl.models import MLPModel
@@ -32,8 +32,7 @@ STANDING_SECONDS = 5.0
 """Time after which the learned policy must stand."""
 
 
-@dataclass
-class Pairs:
+class Pairs(NamedTuple):
     """What the policy sees, and the actions that the controller takes there."""
 
     observations: Tensor  # group "policy" of the task's observations. Shape: (pairs, size)
@@ -41,8 +40,7 @@ class Pairs:
 
     def split(self, size: int) -> list[Pairs]:
         """Return the pairs in parts of at most ``size``."""
-        parts = zip(self.observations.split(size), self.actions.split(size), strict=True)
-        return [Pairs(observations, actions) for observations, actions in parts]
+        return [Pairs(*part) for part in zip(self.observations.split(size), self.actions.split(size), strict=True)]
 
     def shuffled(self) -> Pairs:
         """Return the pairs in random order."""
@@ -115,8 +113,8 @@ def learn_to_stand(
 ) -> tuple[Collection, dict[str, list[float]]]:
     """Let the actor imitate the controller, first where that goes, then also where the actor itself goes (DAgger).
 
-    The task's episodes start from random states, the actor changes in place, ``settings`` is ``pretraining``. Returns
-    all pairs, and the errors after every epoch of every round, see :func:`supervise`.
+    The task's episodes start from random states, the actor changes in place. Returns all pairs, and the errors after
+    every epoch of every round, see :func:`supervise`.
     """
     followed: list[Followed] = []
     errors: dict[str, list[float]] = {"training": [], "held_out": []}
@@ -131,8 +129,7 @@ def learn_to_stand(
     return collection, errors
 
 
-@dataclass
-class Followed:
+class Followed(NamedTuple):
     """Configurations that were followed in closed loop, and the controller's opinion at each step, whoever was acting.
 
     All shapes begin with (num_steps, configurations).
@@ -177,8 +174,7 @@ def select(followed: list[Followed], settings: Any) -> Collection:
     As in the paper, pairs of large torques are dropped, and so are those whose contacts cannot bear what the controller
     wants by far, and what comes after a fall.
     """
-    names = [field.name for field in dataclasses.fields(Followed)]
-    everything = Followed(*(torch.cat([getattr(part, name) for part in followed], dim=1) for name in names))
+    everything = Followed(*(torch.cat(parts, dim=1) for parts in zip(*followed, strict=True)))
     reasons = {
         "after a fall": ~everything.upright,
         f"mean torque over {settings.max_mean_torque:g} N m": ~(everything.mean_torques <= settings.max_mean_torque),

@@ -69,11 +69,8 @@ def inverse_triangle(factor: Tensor) -> Tensor:
 def contact_space(inertia: Tensor, jacobians: Tensor, bias: Tensor, mask: Tensor) -> ContactSpace:
     """Compute what the contacts in ``mask`` demand and leave free (eq. 9).
 
-    Args:
-        inertia: Joint space inertia A. Shape: (n, nv, nv).
-        jacobians: J_c of all candidate contacts. Shape: (n, k, 3, nv).
-        bias: dJ_c/dt qvel [m/s^2]. Shape: (n, k, 3).
-        mask: Which contacts touch the ground. Shape: (n, k), bool.
+    Shapes: joint space inertia A (n, nv, nv), J_c of all candidate contacts (n, k, 3, nv), ``bias`` dJ_c/dt qvel
+    [m/s^2] (n, k, 3), which contacts touch the ground (n, k), bool.
     """
     rows = mask.repeat_interleave(3, dim=1)
     jacobian = torch.where(rows.unsqueeze(2), jacobians.flatten(1, 2), 0.0)
@@ -107,11 +104,8 @@ def torque_map(task: TaskSpace, joints: Tensor, damping: float) -> Tensor:
     other exert nothing, and the least torques have no such part: they accelerate the robot as the task demands and as
     little as possible beyond.
 
-    Args:
-        task: The task.
-        joints: Which joints may serve the task; others have rows of zeros. Shape: (n, nv - 6), bool.
-        damping: Tikhonov damping relative to the mean square singular value: with fewer than three contacts some forces
-            F can hardly be exerted.
+    Only ``joints`` (n, nv - 6), bool, serve the task; others have rows of zeros. ``damping`` is Tikhonov's, relative to
+    the mean square singular value: with fewer than three contacts some forces F can hardly be exerted.
     """
     exerted = torch.where(joints.unsqueeze(1), task.inverse[:, :, TRUNK_DOFS:], 0.0)
     gram = exerted @ exerted.mT
@@ -138,13 +132,8 @@ def contact_forces(contacts: ContactSpace, torques: Tensor, bias_forces: Tensor)
 
     f_c = J_c_bar^T (h - S_k^T Gamma) - Lambda_c dJ_c/dt qvel = -(J_c_bar^T S_k^T Gamma - mu_c - p_c).
 
-    Args:
-        contacts: The contacts.
-        torques: Gamma [N m]. Shape: (n, nv - 6).
-        bias_forces: h, Coriolis, centrifugal and gravity forces. Shape: (n, nv).
-
-    Returns:
-        Forces in the world frame [N], zero where nothing touches. Shape: (n, k, 3).
+    Gamma are the torques [N m] (n, nv - 6), h Coriolis, centrifugal and gravity forces (n, nv). Forces are in the world
+    frame [N], zero where nothing touches. Shape: (n, k, 3).
     """
     applied = torch.nn.functional.pad(torques, (TRUNK_DOFS, 0)) - bias_forces
     forces = -apply(contacts.inverse.mT, applied) - apply(contacts.inertia, contacts.bias)

@@ -102,10 +102,7 @@ def measure_standing(task: LeggedRobot, torques: Callable[[LeggedRobot], Tensor]
         task: A task whose actions are torques, after :func:`place_on_ground`.
         torques: Returns the torques [N m] (num_envs, num_dof) that the task applies for its next control step. Which
             feet touch the ground is best told by ``task.feet_contact``.
-        duration: [s], shorter than an episode.
-
-    Raises:
-        UserError: If the task cannot apply torques or its episodes are too short.
+        duration: [s], shorter than an episode; a UserError if it is not, or if the task cannot apply torques.
     """
     if not isinstance(task, TorqueRobot):
         raise UserError("torques can only be measured in a task whose actions are torques, such as a1_torque")

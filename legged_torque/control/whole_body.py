@@ -46,7 +46,7 @@ class WholeBodyTorques:
     force: Tensor  # Gamma_force (eq. 6). Shape: (n, joints)
     total: Tensor  # Gamma (eq. 3), clipped to the torque limits. Shape: (n, joints)
     contact_forces: Tensor  # f_csd (eq. 10), zero where nothing touches. Shape: (n, k, 3)
-    wrench_residual: Tensor
+    wrench_residual: Tensor  # wrench on the trunk, given less needed; moment in its own frame. Shape: (n, 6)
 
 
 class WholeBodyController:

@@ -44,16 +44,10 @@ class OnDevicePPO(PPO):
         max_learning_rate: float = 1e-2,
         **kwargs,
     ) -> None:
-        """Create the algorithm; arguments are those of rsl_rl's PPO.
+        """Create the algorithm; arguments are those of rsl_rl's PPO, and an upper bound of an adaptive learning rate.
 
-        Args:
-            actor: The policy.
-            critic: The value function.
-            storage: Where rollouts are kept.
-            learning_rate: Learning rate, the first one if it adapts.
-            optimizer: "adam" or "adamw", which torch can skip on the device.
-            max_learning_rate: Upper bound of an adaptive learning rate; rsl_rl's is 1e-2.
-            kwargs: All other settings of rsl_rl's PPO; a UserError if one of all makes no sense.
+        The optimizer is "adam" or "adamw", which torch can skip on the device. A setting that makes no sense is a
+        UserError.
         """
         if optimizer not in ("adam", "adamw"):
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])

@@ -38,13 +38,9 @@ class OnPolicyRunner(runners.OnPolicyRunner):
     alg: OnDevicePPO
 
     def __init__(self, env: LeggedRobot, train_cfg: dict, log_dir: str | None = None, device: str = "cpu") -> None:
-        """Create the runner.
+        """Create the runner, with settings in rsl_rl's layout and on the task's device, "cpu" or "cuda:N".
 
-        Args:
-            env: The task.
-            train_cfg: Settings in rsl_rl's layout.
-            log_dir: Folder of the run, created when training starts; None keeps nothing.
-            device: "cpu" or "cuda:N", that of the task.
+        The folder of the run, ``log_dir``, is created when training starts; None keeps nothing.
 
         Raises:
             UserError: If a network reads observations that the task does not have, or processes do not find each other.
@@ -72,8 +68,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train, and leave a checkpoint; Ctrl-C ends training after the current iteration, a second one at once.
 
-        All processes that train together end after the same iteration, whichever of them is asked to stop. Starting at
-        random episode lengths, as if episodes were running already, they do not all end at once.
+        All processes that train together end after the same iteration, whichever of them is asked to stop. If episodes
+        start at random lengths, they do not all end at once.
         """
         if init_at_random_ep_len:
             high = int(self.env.max_episode_length)
@@ -160,7 +156,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         return state["infos"]
 
     def resume(self, path: str) -> None:
-        """Continue a training from its checkpoint, random numbers included; a UserError if it is not one of such."""
+        """Continue a training from its checkpoint, random numbers included; a UserError if it has none."""
         self.continue_random_numbers(self.load(path))
 
     def continue_random_numbers(self, infos: dict) -> None:

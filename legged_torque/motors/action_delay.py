@@ -19,14 +19,10 @@ class ActionDelay:
     """
 
     def __init__(self, newest: Tensor, longest: int, unit: str, decimation: int) -> None:
-        """Prepare; there is no delay until one is drawn.
+        """Prepare; there is no delay until one is drawn, up to the longest in the unit, one of :data:`UNITS`.
 
-        Args:
-            newest: Buffer of the newest actions, which :meth:`keep` and :meth:`actions` read. Shape: (num_envs,
-                num_actions).
-            longest: Longest delay, in the unit.
-            unit: One of :data:`UNITS`.
-            decimation: Physics steps per control step.
+        ``newest`` is the buffer of the newest actions, which :meth:`keep` and :meth:`actions` read (num_envs,
+        num_actions).
         """
         self._decimation = decimation
         self._physics_steps = decimation if unit == "control_steps" else 1

@@ -57,19 +57,13 @@ class Simulator:
         ls_iterations: int = 20,
         per_world: Sequence[str] = (),
     ) -> None:
-        """Build the worlds, all in the model's reference pose.
+        """Build the worlds on "cpu" or "cuda:N", all in the reference pose of a model with contact sensors.
 
-        Args:
-            model: Model of one world, see :func:`~legged_torque.sim.model.build_model`.
-            num_envs: Number of worlds.
-            device: "cpu" or "cuda:N".
-            engine: One of :data:`ENGINES`.
-            solver_iterations: Most iterations of the constraint solver per physics step.
-            ls_iterations: Most iterations of its line search.
-            per_world: Fields of the model, or "gravity", of which each world gets its own.
+        Each has its own rows of the fields ``per_world``, "gravity" among them. Iterations of the constraint solver,
+        and of its line search, are the most per physics step.
 
         Raises:
-            UserError: If the engine is unknown or cannot simulate this robot.
+            UserError: If the engine, one of :data:`ENGINES`, is unknown or cannot simulate this robot.
         """
         if engine not in ENGINES:
             raise unknown_name("sim.engine", engine, ENGINES)

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
 from legged_torque import resource_path
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.model import build_model, collision_geoms, indices_matching, read_spec
 from legged_torque.utils.errors import UserError, unknown_name
-
-if TYPE_CHECKING:
-    from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 
 
 @dataclass
@@ -42,8 +39,7 @@ def load_asset(cfg: LeggedRobotCfg) -> Asset:
     """Load the robot of ``cfg.asset``, to be simulated in steps of ``cfg.sim.dt``.
 
     Raises:
-        UserError: If the file cannot be read, a name in the settings matches nothing, or motors and joints differ in
-            order.
+        UserError: If the file cannot be read, a name in the settings matches nothing, or motors are in another order.
     """
     settings = cfg.asset
     spec = read_spec(resource_path(settings.file))
@@ -69,12 +65,13 @@ def _check_motors(model: mujoco.MjModel, dof_names: list[str], file: str) -> Non
 
 
 def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:
-    """Return a number for each joint.
+    """Return a number for each joint; the setting's name is for messages.
 
-    Args:
-        setting: Name of the setting, for messages.
-        values: One number for all joints, or numbers by a part of the joints' names; the first one that matches counts.
-        dof_names: Names of the joints; a UserError names one without a number, or what matches no joint.
+    Values are one number for all joints, or numbers by a part of the joints' names, of which the first that matches
+    counts.
+
+    Raises:
+        UserError: If a joint has no number, or a name matches no joint.
     """
     if not isinstance(values, dict):
         return [values] * len(dof_names)

@@ -46,9 +46,8 @@ class BaseTask(VecEnv):
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Apply actions for one control step. Shape: (num_envs, num_actions); one that is not finite resets its world.
 
-        Returns:
-            Observations (a copy); rewards (num_envs,); dones (num_envs,), bool; extras with "time_outs" (num_envs,),
-                bool. Rewards, dones and extras are buffers that the next step overwrites.
+        Returns observations (a copy); rewards (num_envs,); dones (num_envs,), bool; extras with "time_outs"
+        (num_envs,), bool. Rewards, dones and extras are buffers that the next step overwrites.
         """
         self._given_actions.copy_(actions)
         self.step_graph()

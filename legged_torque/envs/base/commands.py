@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 
 
 class UniformCommands:

@@ -118,11 +118,8 @@ def measure(
 ) -> WalkingMetrics:
     """Let a policy act from fresh episodes on, and return its metrics.
 
-    Args:
-        task: Where it acts.
-        policy: Actions for observations; give it mean actions to see what it has learned.
-        num_steps: Control steps.
-        on_step: Called after every step with the commands that held, e.g. to record it.
+    Give it mean actions to see what it has learned. ``on_step`` is called after every step with the commands that held,
+    e.g. to record it.
     """
     walking = WalkingMetrics(task)
     obs = task.reset()

@@ -87,15 +87,7 @@ class Observations:
     def __init__(
         self, terms: Sequence[ObservationTerm], history_length: int, clip: float, add_noise: bool, num_envs: int
     ) -> None:
-        """Allocate the buffers.
-
-        Args:
-            terms: What is seen.
-            history_length: Control steps that the policy sees.
-            clip: Largest absolute value of an observation.
-            add_noise: Whether the policy's sensors have errors.
-            num_envs: Number of worlds.
-        """
+        """Allocate the buffers. Observations are clipped to +-``clip``; ``add_noise`` is for the policy alone."""
         self.terms = sorted(terms, key=lambda term: term.privileged)
         values = [term.value() for term in self.terms]
         device = values[0].device

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from legged_torque.envs.base.commands import UniformCommands
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.randomization import Parameter, Randomization
 from legged_torque.sim.simulator import Simulator
-
-if TYPE_CHECKING:
-    from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 
 PUSH_ADDED = 0.5
 """Share of pushes that add a velocity; the others set one."""
@@ -37,7 +34,7 @@ class RandomEvents:
         initial_state: Sequence[Parameter],
         parameters: Sequence[Parameter],
     ) -> None:
-        """Prepare; nothing is drawn yet. Of ``cfg``, ``domain_rand`` and the probability of new commands count."""
+        """Prepare; nothing is drawn yet. ``init_angles`` are among the fields of ``initial_state``."""
         settings = self._settings = cfg.domain_rand
         self._sim, self._commands, self.init_angles = sim, commands, init_angles
         device, n = sim.device, sim.num_envs

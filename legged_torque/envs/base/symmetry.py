@@ -15,6 +15,8 @@ from legged_torque.utils.mirroring import Mirroring
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
 
+Names = Sequence[str]
+
 
 class RobotSymmetry:
     """Which joints and feet of a robot are mirror images of each other.
@@ -28,11 +30,7 @@ class RobotSymmetry:
     """
 
     def __init__(
-        self,
-        mirrored_legs: Sequence[Sequence[str]],
-        dof_names: Sequence[str],
-        dof_axes: Sequence[Sequence[float]],
-        foot_names: Sequence[str],
+        self, mirrored_legs: Sequence[Names], dof_names: Names, dof_axes: Sequence[Sequence[float]], foot_names: Names
     ) -> None:
         """Match names: those of the legs in ``asset.mirrored_legs``, and of joints and feet in their order.
 
@@ -83,11 +81,8 @@ class Mirror:
     def __init__(self, parts: Mapping[str, Sequence[tuple[str, Mirroring | None]]], problem: str, device: str) -> None:
         """Prepare the permutations.
 
-        Args:
-            parts: For each kind of vector its terms, by name, one behind the other; a UserError if the mirror image of
-                one is not known.
-            problem: Why the robot is not symmetric, if it is not.
-            device: Name of the device.
+        ``parts`` are, for each kind of vector, its terms by name, one behind the other. A UserError says which mirror
+        image is not known, or the ``problem``, why the robot is not symmetric.
         """
         self._maps = {}
         for kind, terms in parts.items():

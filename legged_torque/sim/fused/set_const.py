@@ -62,13 +62,9 @@ class DerivedConstants:
         """Recompute the constants in the worlds of ``mask``. Shape: (num_envs,), bool."""
         if self._branches_vary:
             self._measure_branches(mask)
-        wp.launch(
-            self._derive,
-            dim=self._dim,
-            inputs=[self._tables, mask, self._rotation, self._measured, self._coms, ROWS],
-            outputs=[self._tables.body_invweight0, self._tables.dof_invweight0],
-            device=self._device,
-        )
+        inputs = [self._tables, mask, self._rotation, self._measured, self._coms, ROWS]
+        outputs = [self._tables.body_invweight0, self._tables.dof_invweight0]
+        wp.launch(self._derive, self._dim, inputs, outputs, device=self._device)
 
     def _measure_worlds(self, num_worlds: int) -> None:
         """Allocate and measure the branches of all worlds, or of one for all."""
@@ -82,13 +78,8 @@ class DerivedConstants:
 
     def _measure_branches(self, mask: wp.array) -> None:
         """Measure the branches of some worlds in the reference pose."""
-        wp.launch(
-            self._measure,
-            dim=self._measured.shape,
-            inputs=[self._tables, mask, self._qpos, self._rest],
-            outputs=[self._measured, self._coms],
-            device=self._device,
-        )
+        inputs, outputs = [self._tables, mask, self._qpos, self._rest], [self._measured, self._coms]
+        wp.launch(self._measure, self._measured.shape, inputs, outputs, device=self._device)
 
 
 @wp.func

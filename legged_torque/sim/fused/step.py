@@ -52,13 +52,8 @@ class FusedStep:
 
     def __call__(self, sense: bool) -> None:
         """Advance every world by one physics step; ``sense`` says whether to write the contact sensors."""
-        wp.launch(
-            self._kernel,
-            dim=self._dim,
-            inputs=[*self._model, sense, *self._data, *self._scratch],
-            block_dim=BLOCK_DIM,
-            device=self._device,
-        )
+        inputs = [*self._model, sense, *self._data, *self._scratch]
+        wp.launch(self._kernel, self._dim, inputs, block_dim=BLOCK_DIM, device=self._device)
 
 
 @functools.cache

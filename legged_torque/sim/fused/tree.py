@@ -23,13 +23,11 @@ _GEOM_POINTS = {
 class Tree:
     """A robot's structure: a floating trunk and branches of hinge joints, each with ``depth`` joints.
 
-    Attributes:
-        joints: Joint of each place. Shape: (branches, depth).
-        points: Per branch, the points that can touch the floor: geom, depth of its body (0 is the trunk), position in
-            half sizes of the geom, radius in first sizes of the geom.
+    ``points`` are, per branch, those that can touch the floor: geom, depth of its body (0 is the trunk), position in
+    half sizes of the geom, radius in first sizes of the geom.
     """
 
-    joints: np.ndarray
+    joints: np.ndarray  # joint of each place. Shape: (branches, depth)
     points: list[list[tuple[int, int, tuple[float, float, float], float]]]
 
     @property
