@@ -68,9 +68,8 @@ class ForceDistribution:
         all limits; otherwise they change such that the trunk feels as little of it as possible.
 
         Args:
-            grasp: G, the first six rows of J_c^T: from contact forces to force [N] and moment [N m]. Shape: (n, 6, 3
-                k).
-            wrench: Wanted wrench on the trunk. Shape: (n, 6).
+            grasp: G, the first six rows of J_c^T. Shape: (n, 6, 3 k).
+            wrench: Wanted force [N] and moment [N m] on the trunk. Shape: (n, 6).
             reference: Forces on the robot, in the world [N], that settle what the wrench leaves open. Shape: (n, k, 3).
             mask: Which contacts touch the ground. Shape: (n, k), bool.
             iterations: Iterations of the solver.

@@ -53,10 +53,7 @@ class RobotDynamics:
         """Prepare the model and all buffers, on "cpu" or "cuda:N".
 
         The first body of the nominal model is the free trunk, its other joints are hinges. Points of contact are on
-        spheres, ``contact_geoms``; None takes those with "foot" in their names.
-
-        Raises:
-            UserError: If the model has another structure or a geom does not exist or is no sphere.
+        spheres, ``contact_geoms``; None takes those with "foot" in their names. A UserError if any of it is otherwise.
         """
         names = [mj_model.geom(i).name for i in range(mj_model.ngeom)]
         chosen = [name for name in names if "foot" in name] if contact_geoms is None else list(contact_geoms)

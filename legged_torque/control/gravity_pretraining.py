@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from rsl_rl.models import MLPModel
@@ -32,7 +32,8 @@ STANDING_SECONDS = 5.0
 """Time after which the learned policy must stand."""
 
 
-class Pairs(NamedTuple):
+@dataclass
+class Pairs:
     """What the policy sees, and the actions that the controller takes there."""
 
     observations: Tensor  # group "policy" of the task's observations. Shape: (pairs, size)
@@ -129,7 +130,8 @@ def learn_to_stand(
     return collection, errors
 
 
-class Followed(NamedTuple):
+@dataclass
+class Followed:
     """Configurations that were followed in closed loop, and the controller's opinion at each step, whoever was acting.
 
     All shapes begin with (num_steps, configurations).
@@ -174,7 +176,8 @@ def select(followed: list[Followed], settings: Any) -> Collection:
     As in the paper, pairs of large torques are dropped, and so are those whose contacts cannot bear what the controller
     wants by far, and what comes after a fall.
     """
-    everything = Followed(*(torch.cat(parts, dim=1) for parts in zip(*followed, strict=True)))
+    names = [field.name for field in dataclasses.fields(Followed)]
+    everything = Followed(*(torch.cat([getattr(part, name) for part in followed], dim=1) for name in names))
     reasons = {
         "after a fall": ~everything.upright,
         f"mean torque over {settings.max_mean_torque:g} N m": ~(everything.mean_torques <= settings.max_mean_torque),

@@ -56,10 +56,8 @@ def place_on_ground(
 
     The task draws its initial states; then trunks are moved up or down until the lowest point of the lowest foot has a
     random clearance [m]. States in which another collision geom would be below the ground are drawn again, at most
-    :data:`MAX_DRAWS` times; what is left then is raised until that geom touches the ground. Waits for the host.
-
-    Raises:
-        UserError: If a collision geom is neither sphere, capsule nor box.
+    :data:`MAX_DRAWS` times; what is left then is raised until that geom touches the ground. Waits for the host. A
+    UserError if a collision geom is neither sphere, capsule nor box.
     """
     geoms = _LowestPoints(task, dynamics)
     qpos, qvel = torch.zeros_like(task.sim.qpos), torch.zeros_like(task.sim.qvel)
@@ -96,13 +94,10 @@ def is_standing(task: LeggedRobot) -> Tensor:
 def measure_standing(task: LeggedRobot, torques: Callable[[LeggedRobot], Tensor], duration: float) -> StandingResult:
     """Let a controller or policy act from the present state on, and see who stands in the end.
 
-    Worlds that the task resets, because the trunk touched the ground or the state diverged, have fallen.
-
-    Args:
-        task: A task whose actions are torques, after :func:`place_on_ground`.
-        torques: Returns the torques [N m] (num_envs, num_dof) that the task applies for its next control step. Which
-            feet touch the ground is best told by ``task.feet_contact``.
-        duration: [s], shorter than an episode; a UserError if it is not, or if the task cannot apply torques.
+    The task's actions are torques; call :func:`place_on_ground` before. Worlds that it resets, because the trunk
+    touched the ground or the state diverged, have fallen. ``torques`` returns those of its next control step [N m]
+    (num_envs, num_dof); which feet touch the ground is best told by ``task.feet_contact``. The duration [s] is shorter
+    than an episode. A UserError if it is not, or if the task cannot apply torques.
     """
     if not isinstance(task, TorqueRobot):
         raise UserError("torques can only be measured in a task whose actions are torques, such as a1_torque")

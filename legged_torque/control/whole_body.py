@@ -75,9 +75,8 @@ class WholeBodyController:
     ) -> None:
         """Prepare the constants; every call of the controller updates ``dynamics``, ``nominal_pose`` is in rad.
 
-        Raises:
-            UserError: If the pose has another number of joints, a joint lacks a motor with force limits, or a setting
-                makes no sense.
+        A UserError if the pose has another number of joints, a joint lacks a motor with force limits, or a setting
+        makes no sense.
         """
         self.settings = settings = settings or WholeBodySettings()
         self.dynamics = dynamics
@@ -97,12 +96,10 @@ class WholeBodyController:
 
     @single_threaded()
     def __call__(self, qpos: Tensor, qvel: Tensor, mask: Tensor) -> WholeBodyTorques:
-        """Compute the torques for many states at once.
+        """Compute the torques for many states at once, on level ground at z = 0.
 
-        Args:
-            qpos: Positions as in :meth:`RobotDynamics.update`, on level ground at z = 0. Shape: (n, nq).
-            qvel: Velocities as there. Shape: (n, nv).
-            mask: Which of the candidate contacts touch the ground. Shape: (n, k), bool.
+        ``qpos`` and ``qvel`` are as in :meth:`RobotDynamics.update`; ``mask`` (n, k), bool, says which contacts touch
+        the ground.
         """
         robot = self.dynamics
         robot.update(qpos, qvel)

@@ -23,11 +23,7 @@ def write(file: Path, content: dict[str, Any]) -> None:
 
 
 def read(file: Path, what: str, device: str) -> Any:
-    """Return what :func:`write` has written, with its tensors on a device; ``what`` it should be is for the message.
-
-    Raises:
-        UserError: If it cannot be read.
-    """
+    """Return what :func:`write` has written, on a device; a UserError that names ``what`` if it cannot be read."""
     try:
         return torch.load(file, weights_only=True, map_location=device)
     except Exception as error:  # torch raises about anything for a file that is not its own

@@ -52,8 +52,7 @@ class MultiHeadModel(MLPModel):
     ) -> None:
         """Create the model; arguments are those of rsl_rl's ``MLPModel``, and sizes of the hidden layers of each head.
 
-        Raises:
-            UserError: If the number of actions is odd or a layer is missing.
+        A UserError if the number of actions is odd or a layer is missing.
         """
         if output_dim % 2:
             raise UserError(f"a multi-head actor needs an even number of actions, env.num_actions is {output_dim}")

@@ -45,8 +45,7 @@ def pretrained_file(task: str, train_cfg: Any, log_root: str | None = None) -> P
 def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> None:
     """See that a file holds a pre-trained policy that fits a task, and make it on the device if it is missing.
 
-    Raises:
-        UserError: If there is one, but its inputs or outputs mean something else.
+    A UserError if there is one, but its inputs or outputs mean something else.
     """
     if not file.exists():
         print(f"There is no pre-trained policy '{file}' yet; making it.", flush=True)

@@ -40,10 +40,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
     def __init__(self, env: LeggedRobot, train_cfg: dict, log_dir: str | None = None, device: str = "cpu") -> None:
         """Create the runner, with settings in rsl_rl's layout and on the task's device, "cpu" or "cuda:N".
 
-        The folder of the run, ``log_dir``, is created when training starts; None keeps nothing.
-
-        Raises:
-            UserError: If a network reads observations that the task does not have, or processes do not find each other.
+        The folder of the run, ``log_dir``, is created when training starts; None keeps nothing. A UserError if a
+        network reads observations that the task does not have, or processes that train together do not find each other.
         """
         torch.set_float32_matmul_precision("high")  # TF32 on a GPU
         for key, groups in train_cfg["obs_groups"].items():
@@ -136,12 +134,10 @@ class OnPolicyRunner(runners.OnPolicyRunner):
     def load(
         self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
     ) -> dict:
-        """Continue from a checkpoint: networks, optimizer, counters and with them all curricula.
+        """Continue from a checkpoint: networks, optimizer, counters and with them all curricula; return its infos.
 
-        Arguments are those of rsl_rl's runner, whose device is the default. Returns the checkpoint's infos.
-
-        Raises:
-            UserError: If the file is not a checkpoint or belongs to another kind of policy.
+        Arguments are those of rsl_rl's runner, whose device is the default. A UserError if the file is not a checkpoint
+        or belongs to another kind of policy.
         """
         state = checkpoint.read(Path(path), "checkpoint", map_location or self.device)
         try:
@@ -162,10 +158,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
     def continue_random_numbers(self, infos: dict) -> None:
         """Go on with the random numbers of the run that a checkpoint is from, instead of repeating them.
 
-        Processes beyond those of that run keep their own numbers.
-
-        Raises:
-            UserError: If the infos, from :meth:`load`, do not say where the random numbers stood.
+        Processes beyond those of that run keep their own numbers. A UserError if the infos, from :meth:`load`, do not
+        say where the random numbers stood.
         """
         try:
             states = infos["random_states"]

@@ -63,12 +63,9 @@ class Randomization:
     def __init__(
         self, parameters: Sequence[Parameter], num_envs: int, device: str, keep_probability: float = 0.0
     ) -> None:
-        """Prepare the tables; nothing is drawn yet.
+        """Prepare the tables; nothing is drawn yet. A UserError if a parameter is not float32 or has not two axes.
 
         Parameters that may keep their values at the start do so in a share of draws, ``keep_probability``.
-
-        Raises:
-            UserError: If a parameter is not float32 or has not two axes.
         """
         self._fields = [parameter.field for parameter in parameters]  # their memory must not be freed
         self._without_rows = [parameter.name for parameter in parameters if len(parameter.field) != num_envs]

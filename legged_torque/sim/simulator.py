@@ -60,10 +60,8 @@ class Simulator:
         """Build the worlds on "cpu" or "cuda:N", all in the reference pose of a model with contact sensors.
 
         Each has its own rows of the fields ``per_world``, "gravity" among them. Iterations of the constraint solver,
-        and of its line search, are the most per physics step.
-
-        Raises:
-            UserError: If the engine, one of :data:`ENGINES`, is unknown or cannot simulate this robot.
+        and of its line search, are the most per physics step. A UserError if the engine, one of :data:`ENGINES`, is
+        unknown or cannot simulate this robot.
         """
         if engine not in ENGINES:
             raise unknown_name("sim.engine", engine, ENGINES)

@@ -38,8 +38,7 @@ class Asset:
 def load_asset(cfg: LeggedRobotCfg) -> Asset:
     """Load the robot of ``cfg.asset``, to be simulated in steps of ``cfg.sim.dt``.
 
-    Raises:
-        UserError: If the file cannot be read, a name in the settings matches nothing, or motors are in another order.
+    A UserError if the file cannot be read, a name in the settings matches nothing, or motors are in another order.
     """
     settings = cfg.asset
     spec = read_spec(resource_path(settings.file))
@@ -65,13 +64,9 @@ def _check_motors(model: mujoco.MjModel, dof_names: list[str], file: str) -> Non
 
 
 def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:
-    """Return a number for each joint; the setting's name is for messages.
+    """Return a number for each joint: one for all, or by a part of their names, of which the first that matches counts.
 
-    Values are one number for all joints, or numbers by a part of the joints' names, of which the first that matches
-    counts.
-
-    Raises:
-        UserError: If a joint has no number, or a name matches no joint.
+    A UserError, which names the setting, if a joint has no number or a name matches no joint.
     """
     if not isinstance(values, dict):
         return [values] * len(dof_names)
@@ -88,10 +83,9 @@ def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence
 
 
 def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[float]:
-    """Return the nominal joint angles [rad] of ``init_state.default_joint_angles``, in the order of the MJCF.
+    """Return the angles [rad] of ``init_state.default_joint_angles``, in the order of the MJCF.
 
-    Raises:
-        UserError: If a joint is missing or unknown, or the order is another one.
+    A UserError if a joint is missing or unknown, or the order is another one.
     """
     key = "init_state.default_joint_angles"
     for name in angles:

@@ -59,8 +59,7 @@ class LeggedRobot(BaseTask):
     def __init__(self, cfg: LeggedRobotCfg, device: str = "cpu") -> None:
         """Create the worlds on "cpu" or "cuda:N", each in a random initial state; ``cfg.env.num_actions`` is filled in.
 
-        Raises:
-            UserError: If a setting makes no sense or names something that does not exist.
+        A UserError if a setting makes no sense or names something that does not exist.
         """
         check_env_cfg(cfg)
         super().__init__(cfg.env.num_envs, device)

@@ -57,11 +57,7 @@ def _place(names: Sequence[str], leg: str) -> int:
 
 
 def counterparts(names: Sequence[str], mirrored_legs: Sequence[Sequence[str]]) -> tuple[int, ...]:
-    """Return where each part's counterpart on the other side stands: that of FR_hip is FL_hip.
-
-    Raises:
-        UserError: If one is missing.
-    """
+    """Return where each part's counterpart on the other side is: that of FR_hip is FL_hip; a UserError without it."""
     other_leg = {leg: other for pair in mirrored_legs for leg, other in (pair, reversed(pair))}
     result = []
     for name in names:
@@ -102,8 +98,7 @@ class Mirror:
 def make_mirror(task: LeggedRobot) -> Mirror:
     """Return what reflects a task's observations and actions.
 
-    Raises:
-        UserError: If the robot is not symmetric, or the mirror image of a term or of a random parameter is not known.
+    A UserError if the robot is not symmetric, or the mirror image of a term or of a random parameter is not known.
     """
     actions = [(term.name, task.symmetry.joints) for term in task.action_terms()]
     unknown = [name for name, mirroring in task.parameter_mirrors.items() if mirroring is None]

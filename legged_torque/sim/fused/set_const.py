@@ -34,8 +34,7 @@ class DerivedConstants:
     def __init__(self, mj_model: mujoco.MjModel, model: mjw.Model, num_envs: int) -> None:
         """Prepare; gives every world its own row of both fields of ``model``, the one on the device.
 
-        Raises:
-            UserError: If the robot's structure is not a trunk with branches.
+        A UserError if the robot's structure is not a trunk with branches.
         """
         tree = read_tree(mj_model)
         self._device = model.qpos0.device

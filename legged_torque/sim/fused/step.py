@@ -32,10 +32,8 @@ class FusedStep:
     def __init__(self, mj_model: mujoco.MjModel, model: mjw.Model, data: mjw.Data) -> None:
         """Read the robot's structure and prepare the kernel; it compiles at the first step.
 
-        Parameters that change in ``model``, the one on the device, act at once.
-
-        Raises:
-            UserError: If the robot has something that this step does not simulate.
+        Parameters that change in ``model``, the one on the device, act at once. A UserError if the robot has something
+        that this step does not simulate.
         """
         tree = read_tree(mj_model)
         self._device = data.qpos.device
