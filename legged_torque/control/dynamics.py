@@ -29,21 +29,19 @@ class RobotDynamics:
     of spheres, as on level ground. Nothing here waits for the host, and all tensors keep their addresses.
 
     Attributes:
-        inertia: Joint space inertia A(q), armatures included. Shape: (num_states, nv, nv).
-        gravity: Generalized gravity forces g(q), so that A qacc + coriolis + gravity are the applied forces.
-            Shape: (num_states, nv).
-        coriolis: Coriolis and centrifugal forces. Shape: (num_states, nv).
-        contact_points: World positions of the candidate contact points [m]. Shape: (num_states, k, 3).
-        contact_jacobians: J_c of eq. 9: point velocity in the world frame from qvel. Shape: (num_states, k, 3, nv).
-        contact_bias: dJ_c/dt qvel: acceleration of the points at qacc = 0 [m/s^2]. Shape: (num_states, k, 3).
+        inertia: Joint space inertia A(q), armatures included. Shape: (n, nv, nv), n being the number of states.
+        gravity: Generalized forces g(q): A qacc + coriolis + gravity are the applied forces. Shape: (n, nv).
+        coriolis: Coriolis and centrifugal forces. Shape: (n, nv).
+        contact_points: World positions of the candidate contact points [m]. Shape: (n, k, 3).
+        contact_jacobians: J_c of eq. 9: point velocity in the world frame from qvel. Shape: (n, k, 3, nv).
+        contact_bias: dJ_c/dt qvel: acceleration of the points at qacc = 0 [m/s^2]. Shape: (n, k, 3).
         trunk_jacobian: Trunk's linear, then angular velocity, both in the world frame. Its own rate of change times
-            qvel is zero, since qacc turned into the world frame is the trunk's acceleration.
-            Shape: (num_states, 6, nv).
-        trunk_position: World position of the trunk's origin [m]. Shape: (num_states, 3).
-        trunk_rotation: Turns trunk vectors into world vectors. Shape: (num_states, 3, 3).
-        com: Centre of mass of the whole robot in the world [m]. Shape: (num_states, 3).
-        geom_positions: World positions of all geoms [m]. Shape: (num_states, ngeom, 3).
-        geom_rotations: Turn geom vectors into world vectors. Shape: (num_states, ngeom, 3, 3).
+            qvel is zero, since qacc turned into the world frame is the trunk's acceleration. Shape: (n, 6, nv).
+        trunk_position: World position of the trunk's origin [m]. Shape: (n, 3).
+        trunk_rotation: Turns trunk vectors into world vectors. Shape: (n, 3, 3).
+        com: Centre of mass of the whole robot in the world [m]. Shape: (n, 3).
+        geom_positions: World positions of all geoms [m]. Shape: (n, ngeom, 3).
+        geom_rotations: Turn geom vectors into world vectors. Shape: (n, ngeom, 3, 3).
         contact_joints: Which joints carry which contact point. Shape: (k, nv - 6), bool.
     """
 
@@ -76,7 +74,7 @@ class RobotDynamics:
         self._allocate(bodies)
 
     def update(self, qpos: Tensor, qvel: Tensor) -> None:
-        """Evaluate everything at new states, as in the simulator's ``qpos`` and ``qvel``, one row per state."""
+        """Evaluate everything at new states, as in the simulator's ``qpos`` and ``qvel`` (n, nq), (n, nv)."""
         self._qpos.copy_(qpos)
         self._qvel.copy_(qvel)
         model, data = self._model, self._data

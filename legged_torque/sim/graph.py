@@ -68,10 +68,8 @@ class CudaGraph:
     def __init__(self, function: Callable[[], None], device: str, enabled: bool = True) -> None:
         """Prepare the graph; nothing runs yet."""
         self.enabled = enabled
-        self._function = function
-        self._device = device
+        self._function, self._device, self._calls = function, device, 0
         self._is_cuda = torch.device(device).type == "cuda"
-        self._calls = 0
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> None:

@@ -65,9 +65,7 @@ class Simulator:
         """
         if engine not in ENGINES:
             raise unknown_name("sim.engine", engine, ENGINES)
-        self.mj_model = model
-        self.num_envs = num_envs
-        self.device = device
+        self.mj_model, self.num_envs, self.device = model, num_envs, device
         prepare_device(device)
         self._wp_device = wp.get_device(device)
         contacts = max_contacts(model) if engine == "mujoco_warp" else 1  # the fused step keeps its contacts itself
@@ -85,14 +83,11 @@ class Simulator:
             self._reference_pose: wp.array = wp.array(model.qpos0, dtype=wp.float32)
         self._constants = DerivedConstants(model, self.model, num_envs) if per_world else None
         self._step = FusedStep(model, self.model, self.data) if engine == "fused" else WarpStep(self.model, self.data)
-        self.qpos = wp.to_torch(self.data.qpos)
-        self.qvel = wp.to_torch(self.data.qvel)
-        self.qacc_warmstart = wp.to_torch(self.data.qacc_warmstart)
-        self.ctrl = wp.to_torch(self.data.ctrl)
+        state = (self.data.qpos, self.data.qvel, self.data.qacc_warmstart, self.data.ctrl)
+        self.qpos, self.qvel, self.qacc_warmstart, self.ctrl = map(wp.to_torch, state)
         self.diverged = wp.to_torch(self._diverged)
         sensors = wp.to_torch(self.data.sensordata).view(num_envs, -1, CONTACT_DATA)
-        self.contact_found = sensors[:, :, 0]
-        self.contact_force = sensors[:, :, 1:]
+        self.contact_found, self.contact_force = sensors[:, :, 0], sensors[:, :, 1:]
 
     def field(self, name: str) -> Tensor:
         """Return a writable field of the model, one that was asked for ``per_world``. Shape: (num_envs, ...)."""

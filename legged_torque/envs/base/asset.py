@@ -21,7 +21,7 @@ class Asset:
     mj_model: mujoco.MjModel
     dof_names: list[str]  # of the joints, in the order of the MJCF
     geom_names: list[str]  # of the collision geoms; the lists below are places in this one
-    feet: list[int]  # also those of ``foot_names``
+    feet: list[int]  # in the order of ``foot_names``
     penalized: list[int]  # geoms of the collision term
     terminating: list[int]  # geoms that end an episode
 

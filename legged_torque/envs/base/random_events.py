@@ -59,7 +59,7 @@ class RandomEvents:
     def happen(self, is_new: Tensor) -> None:
         """Draw commands and parameters where an episode begins or chance says so, and push where chance says so.
 
-        Where an episode begins, says ``is_new``. Shape: (num_envs,), bool.
+        ``is_new`` (num_envs,), bool, says where an episode begins.
         """
         chosen = torch.rand(4, self._sim.num_envs, device=self._sim.device) < self._probabilities
         new_commands, new_parameters = chosen[:2] | is_new

@@ -48,7 +48,7 @@ class RobotSymmetry:
             self.problem = str(error)
 
 
-def _place(names: Sequence[str], leg: str) -> int:
+def _place(names: Names, leg: str) -> int:
     """Return the place of the name that begins with that of a leg; a UserError if there is none."""
     for place, name in enumerate(names):
         if name.startswith(leg):
@@ -56,7 +56,7 @@ def _place(names: Sequence[str], leg: str) -> int:
     raise UserError(f"asset.mirrored_legs: no foot's name begins with '{leg}'; the feet are {', '.join(names)}")
 
 
-def counterparts(names: Sequence[str], mirrored_legs: Sequence[Sequence[str]]) -> tuple[int, ...]:
+def counterparts(names: Names, mirrored_legs: Sequence[Names]) -> tuple[int, ...]:
     """Return where each part's counterpart on the other side is: that of FR_hip is FL_hip; a UserError without it."""
     other_leg = {leg: other for pair in mirrored_legs for leg, other in (pair, reversed(pair))}
     result = []
