@@ -1,4 +1,4 @@
-"""Draw learning curves (Figure 3): ``python scripts/plot_curves.py docs/results/none/curves.csv.gz --out curves.png``."""
+"""Draw learning curves (Figure 3): ``python scripts/plot_curves.py CURVES.csv.gz --out curves.png``."""
 
 from pathlib import Path
 

@@ -71,19 +71,30 @@ def rows(node: ast.ClassDef, path: str, source: str, notes: dict[int, str], know
     result = []
     for statement in node.body:
         if isinstance(statement, ast.ClassDef):
-            text = (ast.get_docstring(statement) or "").replace("``", "`")
+            text = ast.get_docstring(statement) or notes.get(statement.lineno, "")
             if text:
-                result.append(f"| **`{path}{statement.name}`** | | {text.splitlines()[0]} |")
+                result.append(f"| **`{path}{statement.name}`** | | {text.splitlines()[0].replace('``', '`')} |")
             result += rows(statement, f"{path}{statement.name}.", source, notes, known)
-        elif isinstance(statement, (ast.Assign, ast.AnnAssign)) and statement.value is not None:
-            target = statement.targets[0] if isinstance(statement, ast.Assign) else statement.target
-            value = " ".join((ast.get_source_segment(source, statement.value) or "").split())
+        for name, node_of_value in assignments(statement):
+            value = " ".join((ast.get_source_segment(source, node_of_value) or "").split())
             value = value if len(value) <= 60 else f"{value[:57]}..."
-            key = f"{path}{ast.unparse(target)}"
-            before = known.get(key, known.get(ast.unparse(target), ""))
-            known[key] = note = notes.get(statement.end_lineno or 0, before).replace("|", "\\|")
-            result.append(f"| `{key}` | `{value}` | {note} |")
+            before = known.get(f"{path}{name}", known.get(name, ""))
+            note = notes.get(getattr(statement, "end_lineno", 0), before).replace("|", "\\|")
+            known[f"{path}{name}"] = note
+            result.append(f"| `{path}{name}` | `{value}` | {note} |")
     return result
+
+
+def assignments(statement: ast.stmt) -> list[tuple[str, ast.expr]]:
+    """Return the settings that a statement sets, with their values; ``a, b = 1, 2`` sets two."""
+    if isinstance(statement, ast.AnnAssign) and statement.value is not None:
+        return [(ast.unparse(statement.target), statement.value)]
+    if not isinstance(statement, ast.Assign):
+        return []
+    (target,), value = statement.targets, statement.value
+    if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+        return [(ast.unparse(name), part) for name, part in zip(target.elts, value.elts, strict=True)]
+    return [(ast.unparse(target), value)]
 
 
 def settings_table(module: ModuleType, name: str, known: dict[str, str]) -> str:

@@ -17,7 +17,7 @@ from torch import Tensor
 from legged_torque.utils.errors import UserError
 
 ITERATIONS = 12
-"""Enough for single precision (errors up to 3 N); in double precision each further one gains about a digit."""
+"""Enough for single precision, where forces were seen to be up to 3 N off; in double each more gains about a digit."""
 CENTERING = 0.1
 """Factor by which each iteration is to reduce the complementarity."""
 TO_BOUNDARY = 0.99
@@ -26,36 +26,23 @@ TO_BOUNDARY = 0.99
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """Limits of the force of a contact, on level ground.
+    """What a contact can bear, on level ground."""
 
-    Attributes:
-        friction: Coefficient mu of the friction pyramid |f_x| + |f_y| <= mu f_z, which lies inside the cone.
-        lowest: Lowest normal force of a contact [N], at least 0.
-        highest: Highest normal force of a contact [N].
-    """
-
-    friction: float
-    lowest: float
-    highest: float
+    friction: float  # mu of the pyramid |f_x| + |f_y| <= mu f_z, which lies inside the cone
+    lowest: float  # normal force [N], at least 0
+    highest: float  # normal force [N]
 
 
 class ForceDistribution:
-    """Finds contact forces within the limits that come closest to a wanted wrench on the trunk."""
+    """Finds contact forces that the contacts can bear and that come nearest to a wanted wrench on the trunk."""
 
     def __init__(
         self, limits: ForceLimits, arm: float, regularization: float, device: str, dtype: torch.dtype = torch.float32
     ) -> None:
-        """Keep the settings and the constants on the device.
+        """Keep the settings and the constants on the device; a UserError if no force is inside the limits.
 
-        Args:
-            limits: Limits of each contact.
-            arm: Length that makes moments comparable with forces [m].
-            regularization: Weight of single forces against the wrench, small against 1.
-            device: Name of the device.
-            dtype: Floating point type of all that follows.
-
-        Raises:
-            UserError: If no force is inside the limits.
+        ``arm`` makes moments comparable with forces [m], ``regularization`` weighs single forces against the wrench,
+        small against 1.
         """
         if limits.friction <= 0.0 or not 0.0 <= limits.lowest < limits.highest:
             raise UserError(f"contact forces need friction > 0 and 0 <= lowest < highest, not {limits}")
@@ -81,11 +68,9 @@ class ForceDistribution:
         all limits; otherwise they change such that the trunk feels as little of it as possible.
 
         Args:
-            grasp: G, the first six rows of J_c^T, from contact forces to the wrench on the trunk, force [N] and moment
-                [N m]. Shape: (n, 6, 3 k).
-            wrench: Wanted wrench. Shape: (n, 6).
-            reference: Forces on the robot in the world frame [N] that settle what the wrench leaves open.
-                Shape: (n, k, 3).
+            grasp: G, the first six rows of J_c^T. Shape: (n, 6, 3 k).
+            wrench: Wanted force [N] and moment [N m] on the trunk. Shape: (n, 6).
+            reference: Forces on the robot, in the world [N], that settle what the wrench leaves open. Shape: (n, k, 3).
             mask: Which contacts touch the ground. Shape: (n, k), bool.
             iterations: Iterations of the solver.
 
@@ -104,18 +89,10 @@ class ForceDistribution:
         return self._highest * forces, self._highest * residual.squeeze(2)
 
     def _solve(self, hessian: Tensor, linear: Tensor, active: Tensor, iterations: int) -> Tensor:
-        """Minimize 1/2 f^T H f - b^T f within the limits, all in units of the highest normal force.
+        """Minimize 1/2 f^T H f - b^T f within the limits, all in units of the highest normal force. Shape: (n, k, 3).
 
-        Every iterate is inside the limits: the start is, and steps stop before them.
-
-        Args:
-            hessian: H. Shape: (n, 3 k, 3 k).
-            linear: b. Shape: (n, 3 k, 1).
-            active: Shape: (n, k, 1), bool.
-            iterations: Number of steps.
-
-        Returns:
-            The forces. Shape: (n, k, 3).
+        Every iterate is inside the limits: the start is, and steps stop before them. Shapes of H, b and the mask of
+        contacts: (n, 3 k, 3 k), (n, 3 k, 1), (n, k, 1).
         """
         forces = torch.where(active, self._start, 0.0)
         multipliers = active.to(forces).expand(*forces.shape[:2], len(self._bounds))
@@ -142,9 +119,8 @@ class ForceDistribution:
         matrix = hessian.clone()
         blocks = matrix.view(n, k, 3, k, 3).diagonal(dim1=1, dim2=3)
         blocks.add_((stiffness @ self._outer).view(n, k, 3, 3).permute(0, 2, 3, 1))
-        matrix.diagonal(dim1=1, dim2=2).mul_(
-            1.0 + 4.0 * torch.finfo(matrix.dtype).eps
-        )  # rounding must not make it singular
+        rounding = 4.0 * torch.finfo(matrix.dtype).eps  # must not make it singular
+        matrix.diagonal(dim1=1, dim2=2).mul_(1.0 + rounding)
         factor = torch.linalg.cholesky_ex(matrix).L
         # A CUDA graph can capture triangular solves, but not cholesky_solve.
         half = torch.linalg.solve_triangular(factor, gradient.reshape(n, 3 * k, 1), upper=False)

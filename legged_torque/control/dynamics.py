@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
-from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -22,44 +22,36 @@ TRUNK_DOFS = 6
 
 
 class RobotDynamics:
-    """The robot's nominal model, evaluated at ``num_states`` states at once.
+    """What a controller knows of the robot: its nominal model, evaluated at ``num_states`` states at once.
 
     It has a MuJoCo Warp ``Data`` of its own, because the simulator's fused step does not fill one, and because the
     controller must not know the randomized parameters of the simulated worlds. Points of contact are the lowest points
     of spheres, as on level ground. Nothing here waits for the host, and all tensors keep their addresses.
 
     Attributes:
-        inertia: Joint space inertia A(q), armatures included. Shape: (num_states, nv, nv).
-        gravity: Generalized gravity forces g(q), so that A qacc + coriolis + gravity are the applied forces.
-            Shape: (num_states, nv).
-        coriolis: Coriolis and centrifugal forces. Shape: (num_states, nv).
-        contact_points: World positions of the candidate contact points [m]. Shape: (num_states, k, 3).
-        contact_jacobians: J_c of eq. 9: point velocity in the world frame from qvel. Shape: (num_states, k, 3, nv).
-        contact_bias: dJ_c/dt qvel: acceleration of the points at qacc = 0 [m/s^2]. Shape: (num_states, k, 3).
+        inertia: Joint space inertia A(q), armatures included. Shape: (n, nv, nv), n being the number of states.
+        gravity: Generalized forces g(q): A qacc + coriolis + gravity are the applied forces. Shape: (n, nv).
+        coriolis: Coriolis and centrifugal forces. Shape: (n, nv).
+        contact_points: World positions of the candidate contact points [m]. Shape: (n, k, 3).
+        contact_jacobians: J_c of eq. 9: point velocity in the world frame from qvel. Shape: (n, k, 3, nv).
+        contact_bias: dJ_c/dt qvel: acceleration of the points at qacc = 0 [m/s^2]. Shape: (n, k, 3).
         trunk_jacobian: Trunk's linear, then angular velocity, both in the world frame. Its own rate of change times
-            qvel is zero, since qacc turned into the world frame is the trunk's acceleration.
-            Shape: (num_states, 6, nv).
-        trunk_position: World position of the trunk's origin [m]. Shape: (num_states, 3).
-        trunk_rotation: Turns trunk vectors into world vectors. Shape: (num_states, 3, 3).
-        com: Centre of mass of the whole robot in the world [m]. Shape: (num_states, 3).
-        geom_positions: World positions of all geoms [m]. Shape: (num_states, ngeom, 3).
-        geom_rotations: Turn geom vectors into world vectors. Shape: (num_states, ngeom, 3, 3).
+            qvel is zero, since qacc turned into the world frame is the trunk's acceleration. Shape: (n, 6, nv).
+        trunk_position: World position of the trunk's origin [m]. Shape: (n, 3).
+        trunk_rotation: Turns trunk vectors into world vectors. Shape: (n, 3, 3).
+        com: Centre of mass of the whole robot in the world [m]. Shape: (n, 3).
+        geom_positions: World positions of all geoms [m]. Shape: (n, ngeom, 3).
+        geom_rotations: Turn geom vectors into world vectors. Shape: (n, ngeom, 3, 3).
         contact_joints: Which joints carry which contact point. Shape: (k, nv - 6), bool.
     """
 
     def __init__(
         self, mj_model: mujoco.MjModel, num_states: int, device: str, contact_geoms: Sequence[str] | None = None
     ) -> None:
-        """Prepare the model and all buffers.
+        """Prepare the model and all buffers, on "cpu" or "cuda:N".
 
-        Args:
-            mj_model: Nominal model whose first body is the free trunk and whose other joints are hinges.
-            num_states: Number of states that are evaluated together.
-            device: "cpu" or "cuda:N".
-            contact_geoms: Spheres that may touch the ground; None takes those with "foot" in their names.
-
-        Raises:
-            UserError: If the model has another structure or a geom does not exist or is no sphere.
+        The first body of the nominal model is the free trunk, its other joints are hinges. Points of contact are on
+        spheres, ``contact_geoms``; None takes those with "foot" in their names. A UserError if any of it is otherwise.
         """
         names = [mj_model.geom(i).name for i in range(mj_model.ngeom)]
         chosen = [name for name in names if "foot" in name] if contact_geoms is None else list(contact_geoms)
@@ -82,13 +74,7 @@ class RobotDynamics:
         self._allocate(bodies)
 
     def update(self, qpos: Tensor, qvel: Tensor) -> None:
-        """Evaluate everything at new states.
-
-        Args:
-            qpos: Trunk position [m], trunk quaternion (w, x, y, z), joint positions [rad]. Shape: (num_states, nq).
-            qvel: Trunk linear velocity in the world frame [m/s], trunk angular velocity in the trunk's frame [rad/s],
-                joint velocities [rad/s]. Shape: (num_states, nv).
-        """
+        """Evaluate everything at new states, as in the simulator's ``qpos`` and ``qvel`` (n, nq), (n, nv)."""
         self._qpos.copy_(qpos)
         self._qvel.copy_(qvel)
         model, data = self._model, self._data
@@ -107,7 +93,7 @@ class RobotDynamics:
         torch.sub(self._bias, self.gravity, out=self.coriolis)
 
     def _place_contacts(self) -> None:
-        """Compute contact points and their acceleration at qacc = 0."""
+        """Compute contact points and what accelerates them at qacc = 0."""
         points = self.geom_positions[:, self._geoms]
         points[:, :, 2] -= self._radii
         self.contact_points.copy_(points)
@@ -133,15 +119,12 @@ class RobotDynamics:
     def _allocate(self, bodies: np.ndarray) -> None:
         """Allocate the results, Jacobians contact by contact, and list the points whose Jacobians are needed."""
         n, nv, k = self.num_states, self.mj_model.nv, len(bodies)
-
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(*shape, device=self.device)
-
+        zeros = functools.partial(torch.zeros, device=self.device)
         self.inertia, self.gravity, self.coriolis = zeros(n, nv, nv), zeros(n, nv), zeros(n, nv)
         self.contact_bias, self.trunk_jacobian = zeros(n, k, 3), zeros(n, 6, nv)
         points, jacobians = zeros(k, n, 3), zeros(k, n, 3, nv)
         self.contact_points, self.contact_jacobians = points.transpose(0, 1), jacobians.transpose(0, 1)
-        self._jacobian_jobs: list[tuple[Any, ...]] = [
+        self._jacobian_jobs: list[tuple] = [
             (self._body_ids(body), wp.from_torch(point, dtype=wp.vec3), wp.from_torch(jacobian), None)
             for body, point, jacobian in zip(bodies, points, jacobians, strict=True)
         ]
@@ -154,11 +137,7 @@ class RobotDynamics:
 
 
 def _check_model(model: mujoco.MjModel, contact_geoms: list[str], names: list[str]) -> None:
-    """Refuse models for which the formulas do not hold.
-
-    Raises:
-        UserError: See :class:`RobotDynamics`.
-    """
+    """Raise a UserError for what the formulas here do not hold for."""
     types = model.jnt_type
     if types[0] != mujoco.mjtJoint.mjJNT_FREE or (types[1:] != mujoco.mjtJoint.mjJNT_HINGE).any():
         raise UserError("whole-body control needs a robot with a free trunk, all other joints being hinges")

@@ -1,4 +1,4 @@
-"""Gravity pre-training (paper, III-A): a torque policy learns to stand by imitating the whole-body controller."""
+"""Gravity pre-training (paper, III-A): a torque policy learns to stand from what the whole-body controller does."""
 
 from __future__ import annotations
 
@@ -34,20 +34,14 @@ STANDING_SECONDS = 5.0
 
 @dataclass
 class Pairs:
-    """Observations of the policy, and the actions of the controller in the same states.
+    """What the policy sees, and the actions that the controller takes there."""
 
-    Attributes:
-        observations: Group "policy" of the task's observations. Shape: (pairs, size).
-        actions: Torques of the controller over the torque scale. Shape: (pairs, num_actions).
-    """
-
-    observations: Tensor
-    actions: Tensor
+    observations: Tensor  # group "policy" of the task's observations. Shape: (pairs, size)
+    actions: Tensor  # torques of the controller over the torque scale. Shape: (pairs, num_actions)
 
     def split(self, size: int) -> list[Pairs]:
         """Return the pairs in parts of at most ``size``."""
-        parts = zip(self.observations.split(size), self.actions.split(size), strict=True)
-        return [Pairs(observations, actions) for observations, actions in parts]
+        return [Pairs(*part) for part in zip(self.observations.split(size), self.actions.split(size), strict=True)]
 
     def shuffled(self) -> Pairs:
         """Return the pairs in random order."""
@@ -57,36 +51,20 @@ class Pairs:
 
 @dataclass
 class Collection:
-    """Pairs from following random configurations.
+    """What came of following random configurations."""
 
-    Attributes:
-        training: Pairs to learn from.
-        held_out: Pairs of other configurations, to measure the error.
-        dropped: How many pairs were dropped, by reason.
-        mean_torques: Mean absolute torque of every pair, dropped ones included [N m]. Shape: (all pairs,).
-        residuals: Wrench residual of every pair, see :func:`residual_share`. Shape: (all pairs,).
-    """
-
-    training: Pairs
-    held_out: Pairs
-    dropped: dict[str, int]
-    mean_torques: Tensor
-    residuals: Tensor
+    training: Pairs  # to learn from
+    held_out: Pairs  # of other configurations, to measure what was learned
+    dropped: dict[str, int]  # how many pairs were dropped, by reason
+    mean_torques: Tensor  # mean absolute torque [N m], of dropped pairs too. Shape: (all pairs,)
+    residuals: Tensor  # see :func:`residual_share`, of dropped pairs too. Shape: (all pairs,)
 
 
 def pretrain(name: str, env_cfg: Any, train_cfg: Any, device: str) -> tuple[MLPModel, dict[str, Any]]:
     """Make a policy that stands: the ``pretraining.function`` of ``a1_torque_gravity``.
 
-    It has random numbers of its own, so that training is the same whether the policy was made now or loaded.
-
-    Args:
-        name: Name of the task.
-        env_cfg: Settings of the task.
-        train_cfg: Settings of its training; those of this function are ``pretraining``.
-        device: "cpu" or "cuda:N".
-
-    Returns:
-        The actor, and a report of plain values.
+    Its random numbers are its own, so that a training is the same whether it had to make its policy or found one. Its
+    settings are ``pretraining`` of ``train_cfg``. Returns the actor, and a report of plain values.
     """
     cfg, settings = copy.deepcopy(env_cfg), train_cfg.pretraining
     check_settings(settings)
@@ -100,6 +78,7 @@ def pretrain(name: str, env_cfg: Any, train_cfg: Any, device: str) -> tuple[MLPM
         seconds = time.perf_counter() - start
         standing = standing_shares(task, controller, actor)
     print(f"Standing after 5 s: {' and '.join(f'the {who} {share:.1%}' for who, share in standing.items())}.")
+    torques, residuals = histogram(collection.mean_torques, 40.0), histogram(collection.residuals, 5.0)
     report = {
         "task": name,
         "device": device_name(task.device),
@@ -109,20 +88,13 @@ def pretrain(name: str, env_cfg: Any, train_cfg: Any, device: str) -> tuple[MLPM
         "rms_error": errors,
         "standing": standing,
         "seconds": seconds,
-        "histograms": {
-            "mean_torque": histogram(collection.mean_torques, 40.0),
-            "residual": histogram(collection.residuals, 5.0),
-        },
+        "histograms": {"mean_torque": torques, "residual": residuals},
     }
     return actor, report
 
 
 def check_settings(settings: Any) -> None:
-    """Refuse settings that make no sense.
-
-    Raises:
-        UserError: Naming the first one.
-    """
+    """Raise a UserError that names the first setting that makes no sense."""
     if not hasattr(settings, "num_configurations"):
         raise UserError("these training settings have no gravity pre-training; inherit those of a1_torque_gravity")
     for name in ("num_configurations", "num_steps", "num_rounds", "num_epochs", "batch_size"):
@@ -140,16 +112,10 @@ def check_settings(settings: Any) -> None:
 def learn_to_stand(
     task: LeggedRobot, controller: WholeBodyController, actor: MLPModel, settings: Any
 ) -> tuple[Collection, dict[str, list[float]]]:
-    """Let the actor imitate the controller, in states that the controller reaches, then in its own ones (DAgger).
+    """Let the actor imitate the controller, first where that goes, then also where the actor itself goes (DAgger).
 
-    Args:
-        task: The task, whose episodes start from random states.
-        controller: The controller to imitate.
-        actor: The policy, changed in place.
-        settings: ``pretraining`` of the training's settings.
-
-    Returns:
-        All pairs, and the errors after every epoch of every round, see :func:`supervise`.
+    The task's episodes start from random states, the actor changes in place. Returns all pairs, and the errors after
+    every epoch of every round, see :func:`supervise`.
     """
     followed: list[Followed] = []
     errors: dict[str, list[float]] = {"training": [], "held_out": []}
@@ -166,35 +132,26 @@ def learn_to_stand(
 
 @dataclass
 class Followed:
-    """Configurations that were followed in closed loop, with the controller's torques at each step.
+    """Configurations that were followed in closed loop, and the controller's opinion at each step, whoever was acting.
 
-    Attributes:
-        observations: What the policy sees. Shape: (num_steps, configurations, size).
-        actions: The controller's torques over the torque scale. Shape: (num_steps, configurations, num_actions).
-        mean_torques: Mean absolute torque of the controller [N m]. Shape: (num_steps, configurations).
-        residuals: See :func:`residual_share`. Shape: (num_steps, configurations).
-        upright: Whether the robot has not fallen before. Shape: (num_steps, configurations), bool.
+    All shapes begin with (num_steps, configurations).
     """
 
-    observations: Tensor
-    actions: Tensor
-    mean_torques: Tensor
-    residuals: Tensor
-    upright: Tensor
+    observations: Tensor  # what the policy sees. Shape: (..., size)
+    actions: Tensor  # the controller's torques over the torque scale. Shape: (..., num_actions)
+    mean_torques: Tensor  # mean absolute torque of the controller [N m]
+    residuals: Tensor  # see :func:`residual_share`
+    upright: Tensor  # whether the robot has not fallen before, bool
 
 
 @single_threaded()
 def follow(
     task: LeggedRobot, controller: WholeBodyController, act: Act | None, num_configurations: int, num_steps: int
 ) -> Followed:
-    """Draw random configurations and follow each for some control steps.
+    """Draw random configurations and follow each for some control steps, in worlds that are used again and again.
 
-    Args:
-        task: The task; its worlds are used again and again.
-        controller: The controller whose torques are recorded.
-        act: Moves the robot in place of the controller; torques hold for a control step.
-        num_configurations: Number of configurations.
-        num_steps: Control steps of each.
+    The controller's torques are noted; if ``act`` is given, it moves the robot instead. Torques hold for a control
+    step.
     """
     parts: list[list[Tensor]] = []
     for start in range(0, num_configurations, task.num_envs):
@@ -214,14 +171,10 @@ def follow(
 
 
 def select(followed: list[Followed], settings: Any) -> Collection:
-    """Keep the useful pairs, and hold out those of some configurations, which are the same every time.
+    """Keep the pairs that are worth learning, and hold back those of some configurations, of the same ones every time.
 
-    As in the paper, pairs with large torques are dropped; so are pairs whose contact limits are far from what the
-    controller wants, and those after a fall.
-
-    Args:
-        followed: The followed configurations.
-        settings: ``pretraining`` of the training's settings.
+    As in the paper, pairs of large torques are dropped, and so are those whose contacts cannot bear what the controller
+    wants by far, and what comes after a fall.
     """
     names = [field.name for field in dataclasses.fields(Followed)]
     everything = Followed(*(torch.cat([getattr(part, name) for part in followed], dim=1) for name in names))
@@ -246,9 +199,9 @@ def select(followed: list[Followed], settings: Any) -> Collection:
 
 
 def residual_share(controller: WholeBodyController, decided: WholeBodyTorques) -> Tensor:
-    """Return the part of the wanted wrench that the contacts cannot give, as a share of the weight. Shape: (n,).
+    """Return what the limits of the contacts leave out of the wanted wrench, as a share of the weight. Shape: (n,).
 
-    Moments are divided by the arm of the controller's settings.
+    Moments count by the arm of the controller's settings.
     """
     model = controller.dynamics.mj_model
     weight = float(model.body_mass.sum() * abs(model.opt.gravity[2]))
@@ -257,18 +210,10 @@ def residual_share(controller: WholeBodyController, decided: WholeBodyTorques) -
 
 
 def supervise(task: LeggedRobot, actor: MLPModel, collection: Collection, settings: Any) -> dict[str, list[float]]:
-    """Train the actor's mean on the pairs and their mirror images with the mean square error.
+    """Train the actor's mean on the pairs and on their mirror images by their mean square error.
 
-    Last actions are shuffled; otherwise the policy would copy them and could not correct its own mistakes.
-
-    Args:
-        task: The task, which knows mirror images.
-        actor: The policy, changed in place.
-        collection: The pairs.
-        settings: ``pretraining`` of the training's settings.
-
-    Returns:
-        Root mean square errors after every epoch [N m]: "training" and "held_out".
+    Last actions are shuffled; otherwise the policy would copy them and could not correct its own mistakes. Returns the
+    root mean square errors after every epoch [N m], "training" and "held_out".
     """
     num_batches = math.ceil(len(collection.training.actions) / settings.batch_size)
     optimizer = torch.optim.Adam(actor.parameters(), lr=settings.learning_rate)
@@ -317,12 +262,12 @@ def make_controller(task: LeggedRobot, settings: WholeBodySettings | None = None
 
 
 def act_by_controller(controller: WholeBodyController) -> Act:
-    """Return a function that gives the controller's torques for a task's state [N m]."""
+    """Return the function that asks the controller for the torques of a task's state [N m]."""
     return lambda task: controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0).total
 
 
 def act_by_policy(actor: MLPModel) -> Act:
-    """Return a function that gives a policy's mean torques [N m]."""
+    """Return the function that asks a policy for its mean torques [N m]."""
 
     def torques(task: LeggedRobot) -> Tensor:
         with torch.no_grad():
@@ -341,6 +286,6 @@ def standing_shares(task: LeggedRobot, controller: WholeBodyController, actor: M
 
 
 def histogram(values: Tensor, highest: float, bins: int = 50) -> dict[str, list[float]]:
-    """Return the counts of values in equal bins from 0; the last bin includes larger values."""
+    """Return how many values fall into equal bins from 0; those beyond the highest count in the last one."""
     counts = torch.histc(values.clamp(max=highest), bins, 0.0, highest)
     return {"edges": torch.linspace(0.0, highest, bins + 1).tolist(), "counts": counts.tolist()}

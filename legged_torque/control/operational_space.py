@@ -28,46 +28,30 @@ TRUNK_DOFS = 6
 
 @dataclass
 class ContactSpace:
-    """The space of contacts, and the motions that do not disturb them.
+    """The space of contacts, and the motions that leave it alone."""
 
-    Attributes:
-        jacobian: J_c (eq. 9) with rows of zeros where nothing touches. Shape: (n, 3 k, nv).
-        inertia: Lambda_c = (J_c A^-1 J_c^T)^-1, zero where nothing touches. Shape: (n, 3 k, 3 k).
-        inverse: J_c_bar = A^-1 J_c^T Lambda_c, the dynamically consistent inverse of J_c. Shape: (n, nv, 3 k).
-        projector: N_c = 1 - J_c_bar J_c, onto motions that leave all contact points at rest. Shape: (n, nv, nv).
-        mobility: N_c A^-1, symmetric: acceleration per generalized force with the contacts held. Shape: (n, nv, nv).
-        bias: dJ_c/dt qvel [m/s^2], zero where nothing touches. Shape: (n, 3 k).
-    """
-
-    jacobian: Tensor
-    inertia: Tensor
-    inverse: Tensor
-    projector: Tensor
-    mobility: Tensor
-    bias: Tensor
+    jacobian: Tensor  # J_c (eq. 9) with rows of zeros where nothing touches. Shape: (n, 3 k, nv)
+    inertia: Tensor  # Lambda_c = (J_c A^-1 J_c^T)^-1, zero where nothing touches. Shape: (n, 3 k, 3 k)
+    inverse: Tensor  # J_c_bar = A^-1 J_c^T Lambda_c, dynamically consistent inverse of J_c. Shape: (n, nv, 3 k)
+    projector: Tensor  # N_c = 1 - J_c_bar J_c, onto motions with all contacts at rest. Shape: (n, nv, nv)
+    mobility: Tensor  # N_c A^-1, symmetric: acceleration per force with the contacts held. Shape: (n, nv, nv)
+    bias: Tensor  # dJ_c/dt qvel [m/s^2], zero where nothing touches. Shape: (n, 3 k)
 
 
 @dataclass
 class TaskSpace:
-    """The contact-consistent dynamics of a task x: Lambda d^2x/dt^2 + mu + p = F (eq. 2).
+    """The contact-consistent dynamics of a task x: Lambda d^2x/dt^2 + mu + p = F (eq. 2)."""
 
-    Attributes:
-        inertia: Lambda = (J N_c A^-1 J^T)^-1. Shape: (n, m, m).
-        coriolis: mu, Coriolis and centrifugal forces, those that hold the contacts included. Shape: (n, m).
-        gravity: p, gravity forces. Shape: (n, m).
-        inverse: J_bar^T = Lambda J N_c A^-1, which turns generalized forces into F. Shape: (n, m, nv).
-    """
-
-    inertia: Tensor
-    coriolis: Tensor
-    gravity: Tensor
-    inverse: Tensor
+    inertia: Tensor  # Lambda = (J N_c A^-1 J^T)^-1. Shape: (n, m, m)
+    coriolis: Tensor  # mu, Coriolis and centrifugal forces, those that hold the contacts included. Shape: (n, m)
+    gravity: Tensor  # p, gravity forces. Shape: (n, m)
+    inverse: Tensor  # J_bar^T = Lambda J N_c A^-1, which turns generalized forces into F. Shape: (n, m, nv)
 
 
 def invert(matrix: Tensor) -> Tensor:
-    """Return the inverses of symmetric positive definite matrices; zero for one that rounding made indefinite.
+    """Return the inverses of symmetric positive definite matrices. Shape: (..., m, m).
 
-    That happens in single precision where a leg is stretched. Shape: (..., m, m).
+    It is zero for a matrix that rounding made indefinite, as happens in single precision where a leg is stretched.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
     inverse = inverse_triangle(factor)
@@ -75,21 +59,18 @@ def invert(matrix: Tensor) -> Tensor:
 
 
 def inverse_triangle(factor: Tensor) -> Tensor:
-    """Return the inverses of lower triangular matrices; unlike cholesky_inverse, a CUDA graph can capture it.
+    """Return the inverses of lower triangular matrices. Shape: (..., m, m).
 
-    Shape: (..., m, m).
+    Unlike cholesky_inverse, a CUDA graph can capture it.
     """
     return torch.linalg.solve_triangular(factor, _eye(factor), upper=False)
 
 
 def contact_space(inertia: Tensor, jacobians: Tensor, bias: Tensor, mask: Tensor) -> ContactSpace:
-    """Compute the constraints of the contacts in ``mask`` and the motions that remain free (eq. 9).
+    """Compute what the contacts in ``mask`` demand and leave free (eq. 9).
 
-    Args:
-        inertia: Joint space inertia A. Shape: (n, nv, nv).
-        jacobians: J_c of all candidate contacts. Shape: (n, k, 3, nv).
-        bias: dJ_c/dt qvel [m/s^2]. Shape: (n, k, 3).
-        mask: Which contacts touch the ground. Shape: (n, k), bool.
+    Shapes: joint space inertia A (n, nv, nv), J_c of all candidate contacts (n, k, 3, nv), ``bias`` dJ_c/dt qvel
+    [m/s^2] (n, k, 3), which contacts touch the ground (n, k), bool.
     """
     rows = mask.repeat_interleave(3, dim=1)
     jacobian = torch.where(rows.unsqueeze(2), jacobians.flatten(1, 2), 0.0)
@@ -107,11 +88,7 @@ def contact_space(inertia: Tensor, jacobians: Tensor, bias: Tensor, mask: Tensor
 def task_space(contacts: ContactSpace, jacobian: Tensor, coriolis: Tensor, gravity: Tensor) -> TaskSpace:
     """Compute the contact-consistent dynamics of a task whose dJ/dt qvel is zero, such as the trunk's pose (eq. 2).
 
-    Args:
-        contacts: The contacts.
-        jacobian: J of the task. Shape: (n, m, nv).
-        coriolis: C, Coriolis and centrifugal generalized forces. Shape: (n, nv).
-        gravity: g, generalized gravity forces. Shape: (n, nv).
+    Shapes of J, Coriolis and centrifugal forces C, and gravity forces g: (n, m, nv), (n, nv), (n, nv).
     """
     moved = jacobian @ contacts.mobility
     inertia = invert(moved @ jacobian.mT)
@@ -121,20 +98,14 @@ def task_space(contacts: ContactSpace, jacobian: Tensor, coriolis: Tensor, gravi
 
 
 def torque_map(task: TaskSpace, joints: Tensor, damping: float) -> Tensor:
-    """Return J_k^T, which turns task forces F into the least joint torques that exert them (eq. 4).
+    """Return J_k^T, which turns task forces F into the least joint torques that exert them (eq. 4) (n, nv - 6, m).
 
     J_bar^T S_k^T is what torques exert; J_k^T is its pseudo-inverse. Torques that only press contacts against each
     other exert nothing, and the least torques have no such part: they accelerate the robot as the task demands and as
     little as possible beyond.
 
-    Args:
-        task: The task.
-        joints: Which joints may serve the task. Shape: (n, nv - 6), bool.
-        damping: Tikhonov damping relative to the mean square singular value: with fewer than three contacts some
-            forces F can hardly be exerted.
-
-    Returns:
-        The map, with rows of zeros for other joints. Shape: (n, nv - 6, m).
+    Only ``joints`` (n, nv - 6), bool, serve the task; others have rows of zeros. ``damping`` is Tikhonov's, relative to
+    the mean square singular value: with fewer than three contacts some forces F can hardly be exerted.
     """
     exerted = torch.where(joints.unsqueeze(1), task.inverse[:, :, TRUNK_DOFS:], 0.0)
     gram = exerted @ exerted.mT
@@ -144,24 +115,14 @@ def torque_map(task: TaskSpace, joints: Tensor, damping: float) -> Tensor:
 
 
 def task_force(task: TaskSpace, acceleration: Tensor) -> Tensor:
-    """Return F = Lambda f* + mu + p (eqs. 2 and 4).
-
-    Args:
-        task: The task.
-        acceleration: f*, the wanted acceleration of the task [m/s^2, rad/s^2]. Shape: (n, m).
-    """
+    """Return F = Lambda f* + mu + p (eqs. 2 and 4) for f*, the wanted acceleration [m/s^2, rad/s^2]. Shapes: (n, m)."""
     return apply(task.inertia, acceleration) + task.coriolis + task.gravity
 
 
 def posture_torques(task: TaskSpace, to_torques: Tensor, torques: Tensor) -> Tensor:
-    """Return N^T Gamma_0, the part of posture torques that does not disturb the task (eq. 5).
+    """Return N^T Gamma_0, the part of posture torques that does not disturb the task (eq. 5) [N m] (n, nv - 6).
 
-    N^T = 1 - J_k^T J_bar^T S_k^T.
-
-    Args:
-        task: The task.
-        to_torques: J_k^T, see :func:`torque_map`. Shape: (n, nv - 6, m).
-        torques: Gamma_0 [N m]. Shape: (n, nv - 6).
+    N^T = 1 - J_k^T J_bar^T S_k^T, with J_k^T from :func:`torque_map`.
     """
     return torques - apply(to_torques, apply(task.inverse[:, :, TRUNK_DOFS:], torques))
 
@@ -171,13 +132,8 @@ def contact_forces(contacts: ContactSpace, torques: Tensor, bias_forces: Tensor)
 
     f_c = J_c_bar^T (h - S_k^T Gamma) - Lambda_c dJ_c/dt qvel = -(J_c_bar^T S_k^T Gamma - mu_c - p_c).
 
-    Args:
-        contacts: The contacts.
-        torques: Gamma [N m]. Shape: (n, nv - 6).
-        bias_forces: h, Coriolis, centrifugal and gravity forces. Shape: (n, nv).
-
-    Returns:
-        Forces in the world frame [N], zero where nothing touches. Shape: (n, k, 3).
+    Gamma are the torques [N m] (n, nv - 6), h Coriolis, centrifugal and gravity forces (n, nv). Forces are in the world
+    frame [N], zero where nothing touches. Shape: (n, k, 3).
     """
     applied = torch.nn.functional.pad(torques, (TRUNK_DOFS, 0)) - bias_forces
     forces = -apply(contacts.inverse.mT, applied) - apply(contacts.inertia, contacts.bias)

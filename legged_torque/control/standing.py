@@ -1,4 +1,4 @@
-"""Standing up from random states: initial states, the criterion, and the success rate."""
+"""Standing up from random states: where such trials start, what counts as standing, and how often it works."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from legged_torque.utils.options import apply_perturbation
 START_CLEARANCE = (0.0, 0.02)
 """Lowest and highest clearance of the lowest foot at the start [m]."""
 MAX_DRAWS = 20
-"""Maximum number of draws until no other part of the robot is below the ground."""
+"""How often states are drawn until no other part of the robot is below the ground."""
 LOWEST_HEIGHT = 0.2
 """Lowest height of a standing robot's trunk [m]."""
 HIGHEST_GRAVITY_Z = -0.9
@@ -31,27 +31,18 @@ HIGHEST_SPEED = 0.3
 
 @dataclass
 class StandingResult:
-    """Result of a trial.
+    """How a trial went."""
 
-    Attributes:
-        standing: Which worlds stand at the end and have not fallen before. Shape: (num_envs,), bool.
-        share: Share of these worlds.
-        mean_torque: Mean absolute torque over joints, time and worlds that have not fallen [N m].
-    """
-
-    standing: Tensor
-    share: float
-    mean_torque: float
+    standing: Tensor  # which worlds stand at the end and have not fallen before. Shape: (num_envs,), bool
+    share: float  # of these worlds
+    mean_torque: float  # mean absolute torque over joints, time and worlds that have not fallen [N m]
 
 
 def use_standing_trials(cfg: LeggedRobotCfg, decimation: int = 1) -> None:
     """Change a task's settings such that episodes start from the random states of ``--perturbation low``.
 
-    There are no random parameters, pushes or sensor noise.
-
-    Args:
-        cfg: Settings of a task that is to be made.
-        decimation: Physics steps per control step: 1 for a controller at 200 Hz, 4 for a policy at 50 Hz.
+    Parameters are not random, nobody pushes and sensors have no noise. A control step has as many physics steps as
+    ``decimation`` says: 1 for a controller at 200 Hz, 4 for a policy at 50 Hz.
     """
     apply_perturbation(cfg, "low")
     quiet = {"randomize_parameters": False, "push_robots": False}
@@ -61,19 +52,12 @@ def use_standing_trials(cfg: LeggedRobotCfg, decimation: int = 1) -> None:
 def place_on_ground(
     task: LeggedRobot, dynamics: RobotDynamics, clearance: tuple[float, float] = START_CLEARANCE
 ) -> None:
-    """Start an episode in every world, the lowest foot just above the ground.
+    """Start an episode in every world, the lowest foot just above the ground, which is level at z = 0.
 
     The task draws its initial states; then trunks are moved up or down until the lowest point of the lowest foot has a
-    random clearance. States in which another collision geom would be below the ground are drawn again, at most
-    :data:`MAX_DRAWS` times; what is left then is raised until that geom touches the ground. Waits for the host.
-
-    Args:
-        task: The task; worlds are level at z = 0.
-        dynamics: Kinematics of its robot, for as many states as it has worlds.
-        clearance: Lowest and highest clearance [m].
-
-    Raises:
-        UserError: If a collision geom is neither sphere, capsule nor box.
+    random clearance [m]. States in which another collision geom would be below the ground are drawn again, at most
+    :data:`MAX_DRAWS` times; what is left then is raised until that geom touches the ground. Waits for the host. A
+    UserError if a collision geom is neither sphere, capsule nor box.
     """
     geoms = _LowestPoints(task, dynamics)
     qpos, qvel = torch.zeros_like(task.sim.qpos), torch.zeros_like(task.sim.qvel)
@@ -96,13 +80,10 @@ def place_on_ground(
 
 
 def is_standing(task: LeggedRobot) -> Tensor:
-    """Return which worlds stand: high, level and slow, with nothing but feet on the ground.
+    """Return which worlds stand: high, level and slow, with nothing but feet on the ground. Shape: (num_envs,), bool.
 
     Contacts are those of the last physics step. Whether a world has fallen before and was reset is not known here, see
     :func:`measure_standing`.
-
-    Returns:
-        Shape: (num_envs,), bool.
     """
     upright = (task.base_height > LOWEST_HEIGHT) & (task.projected_gravity[:, 2] < HIGHEST_GRAVITY_Z)
     only_feet = task.contacts.sum(dim=1) == task.feet_contact.sum(dim=1)
@@ -111,18 +92,12 @@ def is_standing(task: LeggedRobot) -> Tensor:
 
 
 def measure_standing(task: LeggedRobot, torques: Callable[[LeggedRobot], Tensor], duration: float) -> StandingResult:
-    """Let a controller or policy act from the present state, and measure which worlds stand at the end.
+    """Let a controller or policy act from the present state on, and see who stands in the end.
 
-    Worlds that the task resets, because the trunk touched the ground or the state diverged, have fallen.
-
-    Args:
-        task: A task whose actions are torques, after :func:`place_on_ground`.
-        torques: Returns the torques [N m] (num_envs, num_dof) that the task applies for its next control step. Which
-            feet touch the ground is best told by ``task.feet_contact``.
-        duration: [s], shorter than an episode.
-
-    Raises:
-        UserError: If the task cannot apply torques or its episodes are too short.
+    The task's actions are torques; call :func:`place_on_ground` before. Worlds that it resets, because the trunk
+    touched the ground or the state diverged, have fallen. ``torques`` returns those of its next control step [N m]
+    (num_envs, num_dof); which feet touch the ground is best told by ``task.feet_contact``. The duration [s] is shorter
+    than an episode. A UserError if it is not, or if the task cannot apply torques.
     """
     if not isinstance(task, TorqueRobot):
         raise UserError("torques can only be measured in a task whose actions are torques, such as a1_torque")
@@ -166,11 +141,7 @@ class _LowestPoints:
 
 
 def _rounded_box(model: mujoco.MjModel, geom: int) -> tuple[list[float], float]:
-    """Return half sizes [m] and radius [m] of a geom.
-
-    Raises:
-        UserError: If it is neither sphere, capsule nor box.
-    """
+    """Return half sizes [m] and radius [m] of a geom; a UserError if it is neither sphere, capsule nor box."""
     kind, size = model.geom_type[geom], model.geom_size[geom].tolist()
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         return [0.0, 0.0, 0.0], size[0]

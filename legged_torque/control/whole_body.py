@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import mujoco
 import torch
 from torch import Tensor
 
@@ -18,7 +17,7 @@ from legged_torque.utils.threads import single_threaded
 
 @dataclass(frozen=True)
 class WholeBodySettings:
-    """Gains and limits of the controller; the defaults suit the A1 at 200 Hz."""
+    """What the controller wants and may do; the defaults are for the A1 at 200 Hz."""
 
     height: float = 0.303  # [m] of the trunk's origin above the ground
     position_stiffness: float = 30.0  # [1/s^2] of the trunk towards its height and the middle of its feet
@@ -40,24 +39,14 @@ class WholeBodySettings:
 
 @dataclass
 class WholeBodyTorques:
-    """Results of the controller: torques [N m], and forces by the ground on the robot in the world frame [N].
+    """What the controller decides: torques in N m; forces by the ground on the robot, in N in the world frame."""
 
-    Attributes:
-        task: Gamma_task (eq. 4). Shape: (n, joints).
-        posture: Gamma_posture (eq. 5). Shape: (n, joints).
-        force: Gamma_force (eq. 6). Shape: (n, joints).
-        total: Gamma (eq. 3), clipped to the torque limits. Shape: (n, joints).
-        contact_forces: f_csd (eq. 10), zero where nothing touches. Shape: (n, k, 3).
-        wrench_residual: What the contacts cannot give of the wrench that the trunk needs: force in the world frame
-            [N], moment in the trunk's frame [N m]; given minus needed. Shape: (n, 6).
-    """
-
-    task: Tensor
-    posture: Tensor
-    force: Tensor
-    total: Tensor
-    contact_forces: Tensor
-    wrench_residual: Tensor
+    task: Tensor  # Gamma_task (eq. 4). Shape: (n, joints)
+    posture: Tensor  # Gamma_posture (eq. 5). Shape: (n, joints)
+    force: Tensor  # Gamma_force (eq. 6). Shape: (n, joints)
+    total: Tensor  # Gamma (eq. 3), clipped to the torque limits. Shape: (n, joints)
+    contact_forces: Tensor  # f_csd (eq. 10), zero where nothing touches. Shape: (n, k, 3)
+    wrench_residual: Tensor  # wrench on the trunk, given less needed; moment in its own frame. Shape: (n, 6)
 
 
 class WholeBodyController:
@@ -84,16 +73,10 @@ class WholeBodyController:
     def __init__(
         self, dynamics: RobotDynamics, nominal_pose: Sequence[float], settings: WholeBodySettings | None = None
     ) -> None:
-        """Prepare the constants.
+        """Prepare the constants; every call of the controller updates ``dynamics``, ``nominal_pose`` is in rad.
 
-        Args:
-            dynamics: The robot; every call of the controller updates it.
-            nominal_pose: q_nominal [rad]. Shape: (joints,).
-            settings: Gains and limits; None takes the defaults.
-
-        Raises:
-            UserError: If the pose has another number of joints, a joint lacks a motor with force limits, or a setting
-                makes no sense.
+        A UserError if the pose has another number of joints, a joint lacks a motor with force limits, or a setting
+        makes no sense.
         """
         self.settings = settings = settings or WholeBodySettings()
         self.dynamics = dynamics
@@ -101,24 +84,22 @@ class WholeBodyController:
         joints = model.nv - TRUNK_DOFS
         if len(nominal_pose) != joints:
             raise UserError(f"the nominal pose has {len(nominal_pose)} joints, the robot {joints}")
-        if not _has_direct_motors(model):
+        driven = model.actuator_trnid[:, 0].tolist()
+        if driven != list(range(1, model.njnt)) or not (model.actuator_forcelimited == 1).all():
             raise UserError("whole-body control needs one motor with a force range per joint, in the joints' order")
         self._pose = torch.tensor(nominal_pose, dtype=torch.float32, device=device)
-        self._lowest, self._highest = torch.tensor(
-            model.actuator_forcerange.T.copy(), dtype=torch.float32, device=device
-        )
+        ranges = model.actuator_forcerange.T.copy()
+        self._lowest, self._highest = torch.tensor(ranges, dtype=torch.float32, device=device)
         limits = ForceLimits(settings.friction, settings.lowest_force, settings.highest_force)
         self._distribute = ForceDistribution(limits, settings.arm, settings.force_regularization, device)
         self._nominal_feet = self._feet_in_nominal_pose()
 
     @single_threaded()
     def __call__(self, qpos: Tensor, qvel: Tensor, mask: Tensor) -> WholeBodyTorques:
-        """Compute the torques for many states at once.
+        """Compute the torques for many states at once, on level ground at z = 0.
 
-        Args:
-            qpos: Positions as in :meth:`RobotDynamics.update`, on level ground at z = 0. Shape: (n, nq).
-            qvel: Velocities as there. Shape: (n, nv).
-            mask: Which of the candidate contacts touch the ground. Shape: (n, k), bool.
+        ``qpos`` and ``qvel`` are as in :meth:`RobotDynamics.update`; ``mask`` (n, k), bool, says which contacts touch
+        the ground.
         """
         robot = self.dynamics
         robot.update(qpos, qvel)
@@ -187,9 +168,3 @@ class WholeBodyController:
         qpos[:, TRUNK_DOFS + 1 :] = self._pose
         robot.update(qpos, torch.zeros(robot.num_states, robot.mj_model.nv, device=robot.device))
         return robot.contact_points[0].clone()
-
-
-def _has_direct_motors(model: mujoco.MjModel) -> bool:
-    """Return whether actuator i is a motor of hinge i with a force range."""
-    joints = list(range(1, model.njnt))
-    return model.actuator_trnid[:, 0].tolist() == joints and bool((model.actuator_forcelimited == 1).all())

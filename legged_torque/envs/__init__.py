@@ -1,44 +1,22 @@
 """All tasks, and what a variant builds on."""
 
-from legged_torque.envs.approaches.multi_head import MultiHeadRobot
-from legged_torque.envs.approaches.torque import TorqueRobot
-from legged_torque.envs.approaches.torque_curriculum import TorqueCurriculumRobot
-from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO, LinearChange
-from legged_torque.envs.base.observations import ObservationTerm
-from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
-from legged_torque.envs.tasks import (
-    A1MultiHeadCfg,
-    A1MultiHeadCfgPPO,
-    A1TorqueCfg,
-    A1TorqueCfgPPO,
-    A1TorqueCurriculumCfg,
-    A1TorqueCurriculumCfgPPO,
-    A1TorqueGravityCfgPPO,
-    A1TorqueMultiHeadCfg,
-)
-from legged_torque.utils.config import Section
-from legged_torque.utils.task_registry import task_registry
-
-__all__ = [
-    "A1Cfg",
-    "A1CfgPPO",
-    "A1MultiHeadCfg",
-    "A1MultiHeadCfgPPO",
-    "A1TorqueCfg",
-    "A1TorqueCfgPPO",
-    "A1TorqueCurriculumCfg",
-    "A1TorqueCurriculumCfgPPO",
-    "A1TorqueGravityCfgPPO",
-    "A1TorqueMultiHeadCfg",
-    "LeggedRobot",
-    "LeggedRobotCfg",
-    "LeggedRobotCfgPPO",
-    "LinearChange",
-    "MultiHeadRobot",
-    "ObservationTerm",
-    "Section",
-    "TorqueCurriculumRobot",
-    "TorqueRobot",
-    "task_registry",
-]
+from legged_torque.envs.approaches.multi_head import MultiHeadRobot as MultiHeadRobot
+from legged_torque.envs.approaches.torque import TorqueRobot as TorqueRobot
+from legged_torque.envs.approaches.torque_curriculum import TorqueCurriculumRobot as TorqueCurriculumRobot
+from legged_torque.envs.base.legged_robot import LeggedRobot as LeggedRobot
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg as LeggedRobotCfg
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfgPPO as LeggedRobotCfgPPO
+from legged_torque.envs.base.legged_robot_config import LinearChange as LinearChange
+from legged_torque.envs.base.observations import ObservationTerm as ObservationTerm
+from legged_torque.envs.robots.a1 import A1Cfg as A1Cfg
+from legged_torque.envs.robots.a1 import A1CfgPPO as A1CfgPPO
+from legged_torque.envs.tasks import A1MultiHeadCfg as A1MultiHeadCfg
+from legged_torque.envs.tasks import A1MultiHeadCfgPPO as A1MultiHeadCfgPPO
+from legged_torque.envs.tasks import A1TorqueCfg as A1TorqueCfg
+from legged_torque.envs.tasks import A1TorqueCfgPPO as A1TorqueCfgPPO
+from legged_torque.envs.tasks import A1TorqueCurriculumCfg as A1TorqueCurriculumCfg
+from legged_torque.envs.tasks import A1TorqueCurriculumCfgPPO as A1TorqueCurriculumCfgPPO
+from legged_torque.envs.tasks import A1TorqueGravityCfgPPO as A1TorqueGravityCfgPPO
+from legged_torque.envs.tasks import A1TorqueMultiHeadCfg as A1TorqueMultiHeadCfg
+from legged_torque.utils.config import Section as Section
+from legged_torque.utils.task_registry import task_registry as task_registry

@@ -2,68 +2,50 @@
 
 from __future__ import annotations
 
-from legged_torque.envs.approaches.multi_head import (
-    MultiHeadCfg,
-    MultiHeadCfgPPO,
-    MultiHeadRobot,
-    TorqueMultiHeadCfg,
-)
-from legged_torque.envs.approaches.torque import TorqueCfg, TorqueCfgPPO, TorqueRobot
-from legged_torque.envs.approaches.torque_curriculum import (
-    TorqueCurriculumCfg,
-    TorqueCurriculumCfgPPO,
-    TorqueCurriculumRobot,
-)
-from legged_torque.envs.approaches.torque_gravity import TorqueGravityCfgPPO
+from legged_torque.envs.approaches import multi_head, torque, torque_curriculum, torque_gravity
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.utils.task_registry import task_registry
 
-task_registry.register("a1_position", LeggedRobot, A1Cfg(), A1CfgPPO())
 
-
-class A1TorqueCfg(TorqueCfg, A1Cfg):
+class A1TorqueCfg(torque.TorqueCfg, A1Cfg):
     """A1 whose actions are torques."""
 
 
-class A1TorqueCfgPPO(TorqueCfgPPO, A1CfgPPO):
+class A1TorqueCfgPPO(torque.TorqueCfgPPO, A1CfgPPO):
     """Its training."""
 
 
-task_registry.register("a1_torque", TorqueRobot, A1TorqueCfg(), A1TorqueCfgPPO())
-
-
-class A1TorqueGravityCfgPPO(TorqueGravityCfgPPO, A1CfgPPO):
+class A1TorqueGravityCfgPPO(torque_gravity.TorqueGravityCfgPPO, A1CfgPPO):
     """Training of ``a1_torque`` from a policy that stands."""
 
 
-task_registry.register("a1_torque_gravity", TorqueRobot, A1TorqueCfg(), A1TorqueGravityCfgPPO())
-
-
-class A1TorqueCurriculumCfg(TorqueCurriculumCfg, A1Cfg):
+class A1TorqueCurriculumCfg(torque_curriculum.TorqueCurriculumCfg, A1Cfg):
     """A1 with torques that is first rewarded for its nominal pose."""
 
 
-class A1TorqueCurriculumCfgPPO(TorqueCurriculumCfgPPO, A1CfgPPO):
+class A1TorqueCurriculumCfgPPO(torque_curriculum.TorqueCurriculumCfgPPO, A1CfgPPO):
     """Its training."""
 
 
-task_registry.register(
-    "a1_torque_curriculum", TorqueCurriculumRobot, A1TorqueCurriculumCfg(), A1TorqueCurriculumCfgPPO()
-)
-
-
-class A1TorqueMultiHeadCfg(TorqueMultiHeadCfg, A1Cfg):
+class A1TorqueMultiHeadCfg(multi_head.TorqueMultiHeadCfg, A1Cfg):
     """A1 with positions and torques; the PD part fades to 0."""
 
 
-class A1MultiHeadCfg(MultiHeadCfg, A1Cfg):
+class A1MultiHeadCfg(multi_head.MultiHeadCfg, A1Cfg):
     """A1 with positions and torques; the PD part fades to 0.1."""
 
 
-class A1MultiHeadCfgPPO(MultiHeadCfgPPO, A1CfgPPO):
+class A1MultiHeadCfgPPO(multi_head.MultiHeadCfgPPO, A1CfgPPO):
     """Training of both."""
 
 
-task_registry.register("a1_torque_multihead", MultiHeadRobot, A1TorqueMultiHeadCfg(), A1MultiHeadCfgPPO())
-task_registry.register("a1_multihead", MultiHeadRobot, A1MultiHeadCfg(), A1MultiHeadCfgPPO())
+for name, robot, env_cfg, train_cfg in (
+    ("a1_position", LeggedRobot, A1Cfg, A1CfgPPO),
+    ("a1_torque", torque.TorqueRobot, A1TorqueCfg, A1TorqueCfgPPO),
+    ("a1_torque_gravity", torque.TorqueRobot, A1TorqueCfg, A1TorqueGravityCfgPPO),
+    ("a1_torque_curriculum", torque_curriculum.TorqueCurriculumRobot, A1TorqueCurriculumCfg, A1TorqueCurriculumCfgPPO),
+    ("a1_torque_multihead", multi_head.MultiHeadRobot, A1TorqueMultiHeadCfg, A1MultiHeadCfgPPO),
+    ("a1_multihead", multi_head.MultiHeadRobot, A1MultiHeadCfg, A1MultiHeadCfgPPO),
+):
+    task_registry.register(name, robot, env_cfg(), train_cfg())

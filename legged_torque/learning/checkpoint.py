@@ -23,16 +23,7 @@ def write(file: Path, content: dict[str, Any]) -> None:
 
 
 def read(file: Path, what: str, device: str) -> Any:
-    """Return what :func:`write` has written.
-
-    Args:
-        file: The file.
-        what: What it should be, for the message.
-        device: Where its tensors go.
-
-    Raises:
-        UserError: If it cannot be read.
-    """
+    """Return what :func:`write` has written, on a device; a UserError that names ``what`` if it cannot be read."""
     try:
         return torch.load(file, weights_only=True, map_location=device)
     except Exception as error:  # torch raises about anything for a file that is not its own

@@ -35,13 +35,9 @@ class TrainingEvaluator:
     """
 
     def __init__(self, task: LeggedRobot, policy: Callable[[TensorDict], Tensor], settings: dict, seed: int) -> None:
-        """Build the worlds.
+        """Build the worlds; ``settings`` are ``evaluation`` of those of the training, the seed is its own.
 
-        Args:
-            task: The task of the training, from whose counters curricula follow here too.
-            policy: Mean actions for observations.
-            settings: ``evaluation`` of the training's settings.
-            seed: Random seed, of the evaluation alone.
+        Curricula follow from the counters of ``task``, the one of the training. ``policy`` returns mean actions.
         """
         self._task, self._policy = task, policy
         cfg = evaluation_cfg(task.cfg, min(settings["num_envs"], task.num_envs), settings["perturbation"])
@@ -80,13 +76,7 @@ class TrainingEvaluator:
 
 
 def evaluation_cfg(cfg: Any, num_envs: int, perturbation: str = "") -> Any:
-    """Return a copy of a task's settings for evaluation.
-
-    Args:
-        cfg: The task's settings.
-        num_envs: Number of worlds.
-        perturbation: Name of the environment; empty leaves it as it is.
-    """
+    """Return a copy of a task's settings for evaluation in an environment; an empty name leaves that as it is."""
     cfg = copy.deepcopy(cfg)
     cfg.env.num_envs = num_envs
     for term in section_keys(cfg.rewards.scales):

@@ -17,14 +17,9 @@ class MultiHeadMLP(nn.Module):
     def __init__(
         self, input_dim: int, output_dim: int, hidden_dims: list[int], head_hidden_dims: list[int], activation: str
     ) -> None:
-        """Create the layers.
+        """Create the general layers, and the hidden and output layers of both heads.
 
-        Args:
-            input_dim: Size of the observations.
-            output_dim: Size of the output: positions, then torques, one of each per joint.
-            hidden_dims: Sizes of the general layers.
-            head_hidden_dims: Sizes of the hidden layers of either head.
-            activation: Activation after every hidden layer.
+        The output is positions, then torques, one of each per joint; an activation follows every hidden layer.
         """
         super().__init__()
         num_dof = output_dim // 2
@@ -55,21 +50,9 @@ class MultiHeadModel(MLPModel):
         distribution_cfg: dict | None = None,
         head_hidden_dims: tuple[int, ...] | list[int] = (128,),
     ) -> None:
-        """Create the model; all arguments but the last are those of rsl_rl's ``MLPModel``.
+        """Create the model; arguments are those of rsl_rl's ``MLPModel``, and sizes of the hidden layers of each head.
 
-        Args:
-            obs: Observations, for their sizes.
-            obs_groups: Groups of observations per set.
-            obs_set: The set that this model reads.
-            output_dim: Number of actions; half of them are positions, half torques.
-            hidden_dims: Sizes of the general layers, at least two.
-            activation: Activation function.
-            obs_normalization: Whether to normalize observations.
-            distribution_cfg: Distribution of the actions.
-            head_hidden_dims: Sizes of the hidden layers of either head.
-
-        Raises:
-            UserError: If the number of actions is odd or a layer is missing.
+        A UserError if the number of actions is odd or a layer is missing.
         """
         if output_dim % 2:
             raise UserError(f"a multi-head actor needs an even number of actions, env.num_actions is {output_dim}")

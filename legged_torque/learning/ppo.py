@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import chain
-
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
@@ -46,19 +44,10 @@ class OnDevicePPO(PPO):
         max_learning_rate: float = 1e-2,
         **kwargs,
     ) -> None:
-        """Create the algorithm; arguments are those of rsl_rl's PPO.
+        """Create the algorithm; arguments are those of rsl_rl's PPO, and an upper bound of an adaptive learning rate.
 
-        Args:
-            actor: The policy.
-            critic: The value function.
-            storage: Where rollouts are kept.
-            learning_rate: Learning rate, the first one if it adapts.
-            optimizer: "adam" or "adamw", which torch can skip on the device.
-            max_learning_rate: Upper bound of an adaptive learning rate; rsl_rl's is 1e-2.
-            kwargs: All other settings of rsl_rl's PPO.
-
-        Raises:
-            UserError: If a setting makes no sense.
+        The optimizer is "adam" or "adamw", which torch can skip on the device. A setting that makes no sense is a
+        UserError.
         """
         if optimizer not in ("adam", "adamw"):
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
@@ -79,12 +68,9 @@ class OnDevicePPO(PPO):
             )
         self._max_learning_rate = max_learning_rate
         self.learning_rate = torch.tensor(learning_rate, device=self.device)
-        self.optimizer = type(self.optimizer)(
-            chain(self.actor.parameters(), self.critic.parameters()),
-            lr=self.learning_rate,
-            fused=True,
-            capturable=True,
-        )
+        self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        make_optimizer = type(self.optimizer)
+        self.optimizer = make_optimizer(self._parameters, lr=self.learning_rate, fused=True, capturable=True)
         self._actor_learns = torch.ones((), device=self.device)
         self._skip = torch.zeros((), device=self.device)
         self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # where torch's own gradient scaler tells a fused optimizer to skip
@@ -109,8 +95,8 @@ class OnDevicePPO(PPO):
     def update(self) -> dict[str, float]:
         """Learn from the stored rollout: every epoch goes through it in random order, a minibatch at a time.
 
-        Returns:
-            The numbers of :data:`LOSS_NAMES`, over all processes. Reading them is the only time that the host waits.
+        Returns the numbers of :data:`LOSS_NAMES`, over all processes. Reading them is the only time that the host
+        waits.
         """
         self._losses.zero_()
         for _ in range(self.num_learning_epochs):
@@ -168,9 +154,10 @@ class OnDevicePPO(PPO):
         self.optimizer.zero_grad()
         loss.backward()
         if self.is_multi_gpu:
-            distributed.average([*self._gradients(), kl])
+            distributed.average([*(parameter.grad for parameter in self._parameters if parameter.grad is not None), kl])
         self._adapt_learning_rate(kl)
-        norms = self._clip_gradients()
+        models = (self.actor, self.critic)  # each is clipped by itself
+        norms = torch.stack([nn.utils.clip_grad_norm_(m.parameters(), self.max_grad_norm) for m in models])
         gradient_norm = torch.linalg.vector_norm(norms)
         self._skip.copy_(~torch.isfinite(gradient_norm))
         self.optimizer.step()
@@ -204,11 +191,6 @@ class OnDevicePPO(PPO):
         params = tuple(params[: self._batch_size] for params in self.actor.output_distribution_params)
         return self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
 
-    def _gradients(self) -> list[Tensor]:
-        """Return the gradients of actor and critic."""
-        parameters = chain(self.actor.parameters(), self.critic.parameters())
-        return [parameter.grad for parameter in parameters if parameter.grad is not None]
-
     def _adapt_learning_rate(self, kl: Tensor) -> None:
         """Steer the learning rate by the mean KL divergence."""
         if self.schedule == "adaptive":
@@ -232,8 +214,3 @@ class OnDevicePPO(PPO):
             change = (values - batch.values).clamp(-self.clip_param, self.clip_param)
             error = torch.max(error, (batch.values + change - batch.returns).square())
         return error.mean()
-
-    def _clip_gradients(self) -> Tensor:
-        """Clip the gradients of actor and critic, each to ``max_grad_norm``; return their norms before. Shape: (2,)."""
-        norms = [nn.utils.clip_grad_norm_(m.parameters(), self.max_grad_norm) for m in (self.actor, self.critic)]
-        return torch.stack(norms)

@@ -6,6 +6,8 @@ again wherever these are the same, and refused where they are not.
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +43,9 @@ def pretrained_file(task: str, train_cfg: Any, log_root: str | None = None) -> P
 
 
 def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> None:
-    """See that there is a pre-trained policy that fits a task, and make it if it is missing.
+    """See that a file holds a pre-trained policy that fits a task, and make it on the device if it is missing.
 
-    Args:
-        file: Where it is kept.
-        task: Name of the task.
-        env_cfg: Settings of the task.
-        train_cfg: Settings of its training.
-        device: Where to make it.
-
-    Raises:
-        UserError: If there is one, but its inputs or outputs mean something else.
+    A UserError if there is one, but its inputs or outputs mean something else.
     """
     if not file.exists():
         print(f"There is no pre-trained policy '{file}' yet; making it.", flush=True)
@@ -61,11 +55,7 @@ def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device:
 
 
 def make_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> dict[str, Any]:
-    """Make a task's pre-trained policy, and return what its making reports; arguments as for :func:`find_pretrained`.
-
-    Raises:
-        UserError: If the task has no pre-training.
-    """
+    """Make a task's pre-trained policy, and return what its making reports; a UserError if it has no pre-training."""
     if not train_cfg.pretraining.function:
         raise UserError(f"task '{task}' has no pre-training: its pretraining.function is empty")
     actor, report = resolve_callable(train_cfg.pretraining.function)(task, env_cfg, train_cfg, device)
@@ -84,11 +74,7 @@ def start_from(runner: OnPolicyRunner, file: Path) -> None:
 
 
 def check_spaces(file: Path, env_cfg: Any, train_cfg: Any) -> None:
-    """Refuse a pre-trained policy whose inputs, outputs or network are not those of a task.
-
-    Raises:
-        UserError: Naming the first setting that differs.
-    """
+    """Refuse a pre-trained policy whose inputs, outputs or network are not those of a task, naming what differs."""
     of_file = read_pretrained(file)["spaces"]
     for name, value in spaces(env_cfg, train_cfg).items():
         if of_file.get(name) != value:
@@ -99,11 +85,7 @@ def check_spaces(file: Path, env_cfg: Any, train_cfg: Any) -> None:
 
 
 def read_pretrained(file: Path) -> dict[str, Any]:
-    """Return what a file of a pre-trained policy holds.
-
-    Raises:
-        UserError: If it is not one.
-    """
+    """Return what a file of a pre-trained policy holds; a UserError if it is not one."""
     content = checkpoint.read(file, "pre-trained policy", "cpu")
     if not isinstance(content, dict) or not {"actor_state_dict", "spaces", "report"} <= content.keys():
         raise UserError(f"'{file}' is not a pre-trained policy")
@@ -116,10 +98,7 @@ def spaces(env_cfg: Any, train_cfg: Any) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for part, paths in SPACES.items():
         for path in paths:
-            value = settings[part]
-            for key in path.split("."):
-                value = value[key]
-            result |= flat(path, value)
+            result |= flat(path, reduce(getitem, path.split("."), settings[part]))
     return result
 
 

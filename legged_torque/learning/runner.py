@@ -38,17 +38,10 @@ class OnPolicyRunner(runners.OnPolicyRunner):
     alg: OnDevicePPO
 
     def __init__(self, env: LeggedRobot, train_cfg: dict, log_dir: str | None = None, device: str = "cpu") -> None:
-        """Create the runner.
+        """Create the runner, with settings in rsl_rl's layout and on the task's device, "cpu" or "cuda:N".
 
-        Args:
-            env: The task.
-            train_cfg: Settings in rsl_rl's layout.
-            log_dir: Folder of the run, created when training starts; None keeps nothing.
-            device: "cpu" or "cuda:N", that of the task.
-
-        Raises:
-            UserError: If a network reads observations that the task does not have, or processes that should train
-                together cannot find each other.
+        The folder of the run, ``log_dir``, is created when training starts; None keeps nothing. A UserError if a
+        network reads observations that the task does not have, or processes that train together do not find each other.
         """
         torch.set_float32_matmul_precision("high")  # TF32 on a GPU
         for key, groups in train_cfg["obs_groups"].items():
@@ -73,12 +66,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train, and leave a checkpoint; Ctrl-C ends training after the current iteration, a second one at once.
 
-        All processes that train together end after the same iteration, whichever of them is asked to stop.
-
-        Args:
-            num_learning_iterations: How many iterations to add.
-            init_at_random_ep_len: Whether to start as if episodes were running for random times already, so that they
-                do not all end at once.
+        All processes that train together end after the same iteration, whichever of them is asked to stop. If episodes
+        start at random lengths, they do not all end at once.
         """
         if init_at_random_ep_len:
             high = int(self.env.max_episode_length)
@@ -124,11 +113,9 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             torch.distributed.destroy_process_group()
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Save everything that training needs to continue, atomically; all processes that train together call it.
+        """Save all that training needs to continue; all processes that train together call it.
 
-        Args:
-            path: The file; it is either complete or absent.
-            infos: More to keep, of plain values and tensors.
+        The file is either complete or absent; ``infos`` is more to keep, of plain values and tensors.
         """
         state = self.alg.save()
         state["iter"] = self.current_learning_iteration
@@ -147,19 +134,10 @@ class OnPolicyRunner(runners.OnPolicyRunner):
     def load(
         self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
     ) -> dict:
-        """Continue from a checkpoint: networks, optimizer, counters and with them all curricula.
+        """Continue from a checkpoint: networks, optimizer, counters and with them all curricula; return its infos.
 
-        Args:
-            path: The file.
-            load_cfg: What to load, see rsl_rl; None loads everything.
-            strict: Whether the networks must match exactly.
-            map_location: Device to load to; None is the runner's.
-
-        Returns:
-            The checkpoint's infos.
-
-        Raises:
-            UserError: If the file is not a checkpoint or belongs to another kind of policy.
+        Arguments are those of rsl_rl's runner, whose device is the default. A UserError if the file is not a checkpoint
+        or belongs to another kind of policy.
         """
         state = checkpoint.read(Path(path), "checkpoint", map_location or self.device)
         try:
@@ -174,21 +152,14 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         return state["infos"]
 
     def resume(self, path: str) -> None:
-        """Continue the training of a checkpoint, random numbers included.
-
-        Raises:
-            UserError: If the file is not a checkpoint of such a training.
-        """
+        """Continue a training from its checkpoint, random numbers included; a UserError if it has none."""
         self.continue_random_numbers(self.load(path))
 
     def continue_random_numbers(self, infos: dict) -> None:
         """Go on with the random numbers of the run that a checkpoint is from, instead of repeating them.
 
-        Args:
-            infos: From :meth:`load`. Processes beyond those of that run keep their own numbers.
-
-        Raises:
-            UserError: If the checkpoint does not say where its random numbers stood.
+        Processes beyond those of that run keep their own numbers. A UserError if the infos, from :meth:`load`, do not
+        say where the random numbers stood.
         """
         try:
             states = infos["random_states"]
@@ -220,11 +191,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self.cfg["multi_gpu"] = None
         if self.is_distributed:
             distributed.join(self.device)
-            self.cfg["multi_gpu"] = {
-                "global_rank": self.gpu_global_rank,
-                "local_rank": self.gpu_local_rank,
-                "world_size": self.gpu_world_size,
-            }
+            ranks = {"global_rank": self.gpu_global_rank, "local_rank": self.gpu_local_rank}
+            self.cfg["multi_gpu"] = {**ranks, "world_size": self.gpu_world_size}
 
     def _wait(self) -> None:
         """Wait until the device has done what was asked of it."""
@@ -245,13 +213,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             seed = self.cfg["seed"] + EVALUATION_SEED
             self._evaluator = TrainingEvaluator(self.env, self.alg.actor, settings, seed)
         metrics = self._evaluator.evaluate()
-        row = {
-            "steps": steps,
-            "iteration": self.current_learning_iteration + 1,
-            "seconds": seconds,
-            **metrics,
-            "critic_gradient_norm": losses["critic_gradient_norm"],
-        }
+        row = {"steps": steps, "iteration": self.current_learning_iteration + 1, "seconds": seconds, **metrics}
+        row["critic_gradient_norm"] = losses["critic_gradient_norm"]
         assert self.log_dir is not None  # there is a writer only where something is kept
         append_row(Path(self.log_dir) / EVALUATIONS_FILE, row)
         logged = {f"Evaluation/{name}": value for name, value in metrics.items()}
@@ -269,16 +232,9 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         values = torch.stack(list(curricula.values())).tolist() if curricula else []
         numbers |= {f"Curriculum/{name}": value for name, value in zip(curricula, values, strict=True)}
         self.logger.ep_extras.append(numbers)
-        self._unwritten_log = {
-            "it": self.current_learning_iteration,
-            "start_it": start_it,
-            "total_it": total_it,
-            **times,
-            "loss_dict": losses,
-            "learning_rate": float(self.alg.learning_rate),
-            "action_std": self.alg.get_policy().output_std.cpu(),
-            "rnd_weight": None,
-        }
+        progress = {"it": self.current_learning_iteration, "start_it": start_it, "total_it": total_it, **times}
+        policy = {"learning_rate": float(self.alg.learning_rate), "action_std": self.alg.get_policy().output_std.cpu()}
+        self._unwritten_log = {**progress, **policy, "loss_dict": losses, "rnd_weight": None}
 
     def _write_log(self) -> None:
         """Log the previous iteration; takes milliseconds."""

@@ -11,15 +11,9 @@ MOTORS: dict[str, type[Motors]] = {"ideal": IdealMotors}
 
 
 def make_motors(model: str, num_envs: int, limits: Tensor) -> Motors:
-    """Return the motors that the settings ask for.
+    """Return the motors that ``motors.model`` asks for; a UserError if there is no such model.
 
-    Args:
-        model: ``motors.model`` of the settings.
-        num_envs: Number of worlds.
-        limits: Lowest and highest torques [N m]. Shape: (2, num_dof).
-
-    Raises:
-        UserError: If there is no such model.
+    ``limits`` are the lowest and highest torques [N m]. Shape: (2, num_dof).
     """
     if model not in MOTORS:
         raise unknown_name("motors.model", model, MOTORS)

@@ -19,14 +19,10 @@ class ActionDelay:
     """
 
     def __init__(self, newest: Tensor, longest: int, unit: str, decimation: int) -> None:
-        """Prepare; there is no delay until one is drawn.
+        """Prepare; there is no delay until one is drawn, up to the longest in the unit, one of :data:`UNITS`.
 
-        Args:
-            newest: The buffer of the newest actions, which :meth:`keep` and :meth:`actions` read.
-                Shape: (num_envs, num_actions).
-            longest: Longest delay, in the unit.
-            unit: One of :data:`UNITS`.
-            decimation: Physics steps per control step.
+        ``newest`` is the buffer of the newest actions, which :meth:`keep` and :meth:`actions` read (num_envs,
+        num_actions).
         """
         self._decimation = decimation
         self._physics_steps = decimation if unit == "control_steps" else 1
@@ -46,14 +42,7 @@ class ActionDelay:
             self._before.masked_fill_(mask.view(1, -1, 1), 0.0)
 
     def actions(self, physics_step: int) -> Tensor:
-        """Return the actions that have reached the motors.
-
-        Args:
-            physics_step: Number of the physics step within the control step.
-
-        Returns:
-            Shape: (num_envs, num_actions).
-        """
+        """Return the actions that have reached the motors by this physics step. Shape: (num_envs, num_actions)."""
         if not len(self._before):
             return self._newest
         missing = self.drawn.floor() * self._physics_steps - physics_step

@@ -17,21 +17,14 @@ class Motors(ABC):
     """
 
     def __init__(self, num_envs: int, limits: Tensor) -> None:
-        """Create motors of full strength.
-
-        Args:
-            num_envs: Number of worlds.
-            limits: See above.
-        """
+        """Create motors of full strength, see above."""
         self.limits = limits
         self.strength = torch.ones(num_envs, limits.shape[1], device=limits.device)
 
     @abstractmethod
     def apply(self, wanted: Tensor, dof_vel: Tensor, out: Tensor) -> None:
-        """Write the torques that the joints get; runs at every physics step, inside a CUDA graph.
+        """Write to ``out`` the torques that the joints get [N m]; runs at every physics step, inside a CUDA graph.
 
-        Args:
-            wanted: Torques that ``_compute_torques`` asks for [N m]. Shape: (num_envs, num_dof).
-            dof_vel: Joint velocities [rad/s]. Shape: (num_envs, num_dof).
-            out: Applied torques [N m]. Shape: (num_envs, num_dof).
+        ``wanted`` are those that ``_compute_torques`` asks for [N m], ``dof_vel`` in rad/s. Shapes: (num_envs,
+        num_dof).
         """

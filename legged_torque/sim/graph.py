@@ -18,11 +18,8 @@ _STREAMS: dict[str, tuple[torch.cuda.Stream, wp.Stream]] = {}
 def prepare_device(device: str) -> None:
     """Initialize Warp and make one stream current for both torch and Warp, on which everything runs and is captured.
 
-    A CUDA graph cannot be captured on the default stream, and Warp knows a stream only as long as the object lives
-    that wraps it: therefore one pair per device, kept for the life of the process.
-
-    Args:
-        device: "cpu", which has no streams, or "cuda:N".
+    A CUDA graph cannot be captured on the default stream, and Warp knows a stream only as long as the object lives that
+    wraps it: therefore one pair per device, kept for the life of the process. "cpu" has no streams.
     """
     if torch.device(device).type != "cuda":
         with _silent_stderr():  # on a machine without a GPU, Warp's native code complains that it finds no driver
@@ -69,18 +66,10 @@ class CudaGraph:
     """
 
     def __init__(self, function: Callable[[], None], device: str, enabled: bool = True) -> None:
-        """Prepare the graph; nothing runs yet.
-
-        Args:
-            function: What to replay.
-            device: Name of the device.
-            enabled: See above; may be changed at any time.
-        """
+        """Prepare the graph; nothing runs yet."""
         self.enabled = enabled
-        self._function = function
-        self._device = device
+        self._function, self._device, self._calls = function, device, 0
         self._is_cuda = torch.device(device).type == "cuda"
-        self._calls = 0
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> None:

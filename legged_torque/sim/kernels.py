@@ -9,16 +9,14 @@ MAX_VELOCITY = 1e4
 MAX_ACCELERATION = 1e10
 """Largest acceleration [m/s^2, rad/s^2] of a world that is still believed."""
 
+Mask, Integers, Numbers = wp.array(dtype=wp.bool), wp.array(dtype=wp.int32), wp.array(dtype=wp.float32)
+Rows = wp.array2d(dtype=wp.float32)
+"""Types of arguments: which worlds; integers and other numbers; several numbers per world."""
+
 
 @wp.kernel(enable_backward=False)
 def reset_worlds(
-    mask: wp.array(dtype=wp.bool),
-    reference_pose: wp.array(dtype=wp.float32),
-    qpos: wp.array2d(dtype=wp.float32),
-    qvel: wp.array2d(dtype=wp.float32),
-    qacc_warmstart: wp.array2d(dtype=wp.float32),
-    ctrl: wp.array2d(dtype=wp.float32),
-    sensordata: wp.array2d(dtype=wp.float32),
+    mask: Mask, reference_pose: Numbers, qpos: Rows, qvel: Rows, qacc_warmstart: Rows, ctrl: Rows, sensordata: Rows
 ):
     """Write everything that a world carries from one step to the next."""
     world = wp.tid()
@@ -35,9 +33,7 @@ def reset_worlds(
 
 
 @wp.kernel(enable_backward=False)
-def set_orientation(
-    mask: wp.array(dtype=wp.bool), angles: wp.array2d(dtype=wp.float32), qpos: wp.array2d(dtype=wp.float32)
-):
+def set_orientation(mask: Mask, angles: Rows, qpos: Rows):
     """Write the quaternion (w, x, y, z) of one world; Warp's own are (x, y, z, w)."""
     world = wp.tid()
     if mask[world]:
@@ -51,12 +47,7 @@ def set_orientation(
 
 
 @wp.kernel(enable_backward=False)
-def push(
-    mask: wp.array(dtype=wp.bool),
-    velocity: wp.array2d(dtype=wp.float32),
-    add: wp.array(dtype=wp.bool),
-    qvel: wp.array2d(dtype=wp.float32),
-):
+def push(mask: Mask, velocity: Rows, add: Mask, qvel: Rows):
     """Set or add the trunk's linear velocity of one world."""
     world = wp.tid()
     if mask[world]:
@@ -65,14 +56,7 @@ def push(
 
 
 @wp.kernel(enable_backward=False)
-def flag_diverged(
-    qpos: wp.array2d(dtype=wp.float32),
-    qvel: wp.array2d(dtype=wp.float32),
-    qacc: wp.array2d(dtype=wp.float32),
-    overflow: wp.array(dtype=wp.int32),
-    diverged: wp.array(dtype=wp.bool),
-    overflow_seen: wp.array(dtype=wp.int32),
-):
+def flag_diverged(qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverged: Mask, overflow_seen: Integers):
     """Check one world; comparisons are written so that NaN fails them."""
     world = wp.tid()
     good = bool(True)  # a variable; Warp would take True for a constant
@@ -109,12 +93,7 @@ class Row:
 
 
 @wp.kernel(enable_backward=False)
-def draw(
-    mask: wp.array(dtype=wp.bool),
-    seeds: wp.array(dtype=wp.int32),
-    rows: wp.array(dtype=Row),
-    values: wp.array2d(dtype=wp.float32),
-):
+def draw(mask: Mask, seeds: Integers, rows: wp.array(dtype=Row), values: Rows):
     """Write one number of one world."""
     world, column = wp.tid()
     if mask[world]:

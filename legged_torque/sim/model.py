@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from legged_torque.utils.errors import UserError, unknown_name
 
@@ -16,11 +17,7 @@ _REDUCE_NETFORCE = 3
 
 
 def read_spec(file: Path) -> mujoco.MjSpec:
-    """Read a MJCF file.
-
-    Raises:
-        UserError: If it is missing or cannot be read.
-    """
+    """Read a MJCF file; a UserError if it is missing or cannot be read."""
     try:
         return mujoco.MjSpec.from_file(str(file))
     except ValueError as error:
@@ -34,11 +31,7 @@ def collision_geoms(spec: mujoco.MjSpec, floor: str = "floor") -> list[str]:
 
 
 def indices_matching(names: list[str], parts: list[str]) -> list[int]:
-    """Return which names contain one of ``parts``.
-
-    Raises:
-        UserError: If a part matches no name.
-    """
+    """Return which names contain one of ``parts``; a UserError if a part matches no name."""
     for part in parts:
         if not any(part in name for name in names):
             raise unknown_name("collision geom (part of its name)", part, names)
@@ -48,11 +41,8 @@ def indices_matching(names: list[str], parts: list[str]) -> list[int]:
 def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = "floor") -> mujoco.MjModel:
     """Compile the model to simulate: without what is only there to be seen, and with contact sensors.
 
-    Args:
-        spec: The robot and its ground.
-        contact_geoms: Names of the geoms whose contacts with the floor are sensed, one contact sensor each, in this
-            order. They are the only sensors of the model.
-        floor: Name of the ground's geom.
+    The contacts of each of ``contact_geoms`` with the floor are sensed, by a sensor each, in this order. They are the
+    only sensors of the model.
     """
     spec.compiler.discardvisual = True
     for sensor in list(spec.sensors):
@@ -73,30 +63,16 @@ def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = "flo
 def max_contacts(model: mujoco.MjModel) -> int:
     """Return the most contacts that one world can have: one per sphere, two per capsule, eight per other geom."""
     per_type = {int(mujoco.mjtGeom.mjGEOM_SPHERE): 1, int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2}
-    total = 0
-    for first in range(model.ngeom):
-        for second in range(first + 1, model.ngeom):
-            if _collide(model, first, second):
-                total += min(per_type.get(int(model.geom_type[geom]), 8) for geom in (first, second))
-    return total
+    touches = (model.geom_contype[:, None] & model.geom_conaffinity) != 0
+    pairs = np.argwhere(np.triu(touches | touches.T, k=1))
+    return sum(min(per_type.get(int(kind), 8) for kind in model.geom_type[pair]) for pair in pairs)
 
 
 def max_constraints(model: mujoco.MjModel, contacts: int, any_friction: bool = False) -> int:
     """Return the most constraint rows that one world can have (pyramidal friction cones).
 
-    Args:
-        model: The model.
-        contacts: Number of contacts.
-        any_friction: Whether worlds may have dry friction in joints where the model has none.
+    With ``any_friction``, worlds may have dry friction in joints where the model has none.
     """
     rows_per_contact = 2 * (int(model.geom_condim.max()) - 1)
     friction = model.nv if any_friction else int((model.dof_frictionloss > 0).sum())
     return contacts * rows_per_contact + friction + int(model.jnt_limited.sum())
-
-
-def _collide(model: mujoco.MjModel, first: int, second: int) -> bool:
-    """Return whether two geoms can touch by their collision masks, as MuJoCo defines it."""
-    return bool(
-        (model.geom_contype[first] & model.geom_conaffinity[second])
-        | (model.geom_contype[second] & model.geom_conaffinity[first])
-    )

@@ -10,13 +10,7 @@ def owner(model: mjw.Model, name: str) -> mjw.Model | mjw.Option:
 
 
 def expand(model: mjw.Model, name: str, num_envs: int) -> None:
-    """Replace a field that all worlds share by one with a row per world, all alike at first.
-
-    Args:
-        model: Model on the device; a field that has been expanded before stays as it is.
-        name: Name of the field.
-        num_envs: Number of worlds.
-    """
+    """Replace a field that all worlds share by one with a row per world, all alike at first; others stay."""
     field = getattr(owner(model, name), name)
     if field.shape[0] != num_envs:
         rows = field.numpy().repeat(num_envs, axis=0)

@@ -21,38 +21,21 @@ Range = tuple[float, float]
 
 @dataclass
 class Parameter:
-    """Numbers of each world that are drawn together: value = (base + weight x U(offset)) x U(scale).
+    """Numbers of each world that are drawn together: value = (base + weight x U(offset)) x U(scale)."""
 
-    Attributes:
-        name: Key of its ranges in the settings.
-        field: Where the numbers are kept, one row per world. Shape: (num_envs, any).
-        columns: Which numbers of a row.
-        base: What is added to, per column; None is the value at the start.
-        weight: Factor on the offset, per column or for all.
-        offset: Range of the offset.
-        scale: Range of the scale.
-        shared: Whether all columns take the same offset and scale, or each its own.
-        same_draw_as: Name of an earlier parameter whose draws it takes.
-        may_keep: Whether it keeps its value at the start in a share of the draws.
-        limits: Lowest and highest values, per column, into which draws are clipped.
-        model_field: Name of the field of the model that ``field`` shows; None if it is none.
-        mirror: Left-right mirror image of the numbers that are drawn; None: that of one number is itself, that of
-            several is not known.
-    """
-
-    name: str
-    field: Tensor
-    columns: Sequence[int]
-    base: Sequence[float] | float | None = None
-    weight: Sequence[float] | float = 1.0
+    name: str  # key of its ranges in the settings
+    field: Tensor  # where the numbers are kept, one row per world. Shape: (num_envs, any)
+    columns: Sequence[int]  # which numbers of a row
+    base: Sequence[float] | float | None = None  # what is added to, per column; None is the value at the start
+    weight: Sequence[float] | float = 1.0  # factor on the offset, per column or for all
     offset: Range = (0.0, 0.0)
     scale: Range = (1.0, 1.0)
-    shared: bool = False
-    same_draw_as: str | None = None
-    may_keep: bool = False
-    limits: tuple[Sequence[float], Sequence[float]] | None = None
-    model_field: str | None = None
-    mirror: Mirroring | None = None
+    shared: bool = False  # whether all columns take the same offset and scale, or each its own
+    same_draw_as: str | None = None  # name of an earlier parameter whose draws it takes
+    may_keep: bool = False  # whether it keeps its value at the start in a share of the draws
+    limits: tuple[Sequence[float], Sequence[float]] | None = None  # lowest and highest, per column, to clip draws to
+    model_field: str | None = None  # name of the field of the model that ``field`` shows; None if it is none
+    mirror: Mirroring | None = None  # of the numbers drawn; None: one number is its own image, several are unknown
 
 
 _NUMBERS_PER_BODY = {"body_mass": 1, "body_inertia": 3, "body_ipos": 3, "body_iquat": 4, "body_pos": 3, "body_quat": 4}
@@ -80,16 +63,9 @@ class Randomization:
     def __init__(
         self, parameters: Sequence[Parameter], num_envs: int, device: str, keep_probability: float = 0.0
     ) -> None:
-        """Prepare the tables; nothing is drawn yet.
+        """Prepare the tables; nothing is drawn yet. A UserError if a parameter is not float32 or has not two axes.
 
-        Args:
-            parameters: What to draw.
-            num_envs: Number of worlds.
-            device: "cpu" or "cuda:N".
-            keep_probability: Share of draws in which the parameters that may keep their values at the start do so.
-
-        Raises:
-            UserError: If a parameter is not float32 or has not two axes.
+        Parameters that may keep their values at the start do so in a share of draws, ``keep_probability``.
         """
         self._fields = [parameter.field for parameter in parameters]  # their memory must not be freed
         self._without_rows = [parameter.name for parameter in parameters if len(parameter.field) != num_envs]
@@ -115,37 +91,25 @@ class Randomization:
                     row.place = len(at_start)
                     at_start.append((row.own_value - row.middle) * row.per_half_range)
                 rows.append(row)
-        self._num_envs, self._device = num_envs, device
+        self._device = device
         self.values = torch.tensor(at_start, device=device).repeat(num_envs, 1)
         self._seeds = torch.zeros(num_envs, dtype=torch.int32, device=device)
         self._rows: wp.array = wp.array(rows, dtype=kernels.Row, device=device)
 
     def draw(self, mask: Tensor) -> None:
-        """Draw all parameters anew.
-
-        Args:
-            mask: In which worlds. Shape: (num_envs,), bool.
-
-        Raises:
-            UserError: If worlds share a parameter.
-        """
+        """Draw all parameters anew in the worlds of ``mask`` (num_envs,), bool; a UserError if worlds share one."""
         if self._without_rows:
             raise UserError(f"random parameters without a row per world: {', '.join(self._without_rows)}")
         self._seeds.random_()
-        wp.launch(
-            kernels.draw,
-            dim=(self._num_envs, len(self._rows)),
-            inputs=[wp.from_torch(mask), wp.from_torch(self._seeds), self._rows, wp.from_torch(self.values)],
-            device=self._device,
-        )
+        arrays = [wp.from_torch(mask), wp.from_torch(self._seeds), self._rows, wp.from_torch(self.values)]
+        wp.launch(kernels.draw, (len(self.values), len(self._rows)), arrays, device=self._device)
 
 
 def check_field(parameter: Parameter) -> None:
     """Raise a UserError unless a parameter's numbers are of the kind that the kernel writes to their addresses."""
-    field = parameter.field
-    if field.dtype != torch.float32 or field.dim() != 2:
-        shape = tuple(field.shape)
-        raise UserError(f"random parameter '{parameter.name}' must be float32 with two axes, not {field.dtype} {shape}")
+    kind, shape = parameter.field.dtype, tuple(parameter.field.shape)
+    if kind != torch.float32 or len(shape) != 2:
+        raise UserError(f"random parameter '{parameter.name}' must be float32 with two axes, not {kind} {shape}")
 
 
 def table(parameter: Parameter, keep_probability: float) -> list[Any]:

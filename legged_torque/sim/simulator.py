@@ -24,13 +24,7 @@ from legged_torque.utils.errors import unknown_name
 ENGINES = ("fused", "mujoco_warp")
 """What may step the worlds: one kernel per step for legged robots on a plane, or MuJoCo Warp for any robot."""
 
-_BUFFER_FLAGS = (
-    mjw.OverflowType.NEFC,
-    mjw.OverflowType.NJMAX_NNZ,
-    mjw.OverflowType.BROADPHASE,
-    mjw.OverflowType.NARROWPHASE,
-    mjw.OverflowType.CONTACT_MATCH,
-)
+_BUFFERS = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CONTACT_MATCH")
 
 
 class Simulator:
@@ -63,25 +57,15 @@ class Simulator:
         ls_iterations: int = 20,
         per_world: Sequence[str] = (),
     ) -> None:
-        """Build the worlds, all in the model's reference pose.
+        """Build the worlds on "cpu" or "cuda:N", all in the reference pose of a model with contact sensors.
 
-        Args:
-            model: Model of one world, see :func:`~legged_torque.sim.model.build_model`.
-            num_envs: Number of worlds.
-            device: "cpu" or "cuda:N".
-            engine: One of :data:`ENGINES`.
-            solver_iterations: Most iterations of the constraint solver per physics step.
-            ls_iterations: Most iterations of its line search.
-            per_world: Fields of the model, or "gravity", of which each world gets its own.
-
-        Raises:
-            UserError: If the engine is unknown or cannot simulate this robot.
+        Each has its own rows of the fields ``per_world``, "gravity" among them. Iterations of the constraint solver,
+        and of its line search, are the most per physics step. A UserError if the engine, one of :data:`ENGINES`, is
+        unknown or cannot simulate this robot.
         """
         if engine not in ENGINES:
             raise unknown_name("sim.engine", engine, ENGINES)
-        self.mj_model = model
-        self.num_envs = num_envs
-        self.device = device
+        self.mj_model, self.num_envs, self.device = model, num_envs, device
         prepare_device(device)
         self._wp_device = wp.get_device(device)
         contacts = max_contacts(model) if engine == "mujoco_warp" else 1  # the fused step keeps its contacts itself
@@ -99,21 +83,14 @@ class Simulator:
             self._reference_pose: wp.array = wp.array(model.qpos0, dtype=wp.float32)
         self._constants = DerivedConstants(model, self.model, num_envs) if per_world else None
         self._step = FusedStep(model, self.model, self.data) if engine == "fused" else WarpStep(self.model, self.data)
-        self.qpos = wp.to_torch(self.data.qpos)
-        self.qvel = wp.to_torch(self.data.qvel)
-        self.qacc_warmstart = wp.to_torch(self.data.qacc_warmstart)
-        self.ctrl = wp.to_torch(self.data.ctrl)
+        state = (self.data.qpos, self.data.qvel, self.data.qacc_warmstart, self.data.ctrl)
+        self.qpos, self.qvel, self.qacc_warmstart, self.ctrl = map(wp.to_torch, state)
         self.diverged = wp.to_torch(self._diverged)
         sensors = wp.to_torch(self.data.sensordata).view(num_envs, -1, CONTACT_DATA)
-        self.contact_found = sensors[:, :, 0]
-        self.contact_force = sensors[:, :, 1:]
+        self.contact_found, self.contact_force = sensors[:, :, 0], sensors[:, :, 1:]
 
     def field(self, name: str) -> Tensor:
-        """Return a field of the model, or "gravity", that is writable.
-
-        Args:
-            name: One of those that were asked for ``per_world``. Shape: (num_envs, ...).
-        """
+        """Return a writable field of the model, one that was asked for ``per_world``. Shape: (num_envs, ...)."""
         return wp.to_torch(getattr(owner(self.model, name), name))
 
     def vary_legs(self) -> None:
@@ -124,10 +101,9 @@ class Simulator:
         self._derived_constants().vary_branches()
 
     def update_constants(self, mask: Tensor) -> None:
-        """Recompute what MuJoCo derives from masses and armatures, after they have been changed, see :meth:`vary_legs`.
+        """Recompute what MuJoCo derives from masses and armatures, after these changed in the worlds of ``mask``.
 
-        Args:
-            mask: In which worlds. Shape: (num_envs,), bool.
+        Shape: (num_envs,), bool; see :meth:`vary_legs`.
         """
         self._derived_constants().update(wp.from_torch(mask))
 
@@ -138,39 +114,33 @@ class Simulator:
         return self._constants
 
     def step(self, sense: bool = True) -> None:
-        """Advance every world by one physics step under the torques in ``ctrl``.
+        """Advance every world by one physics step under the torques in ``ctrl``, and update the contact sensors.
 
-        Args:
-            sense: Whether to update the contact sensors; of several steps, only the last one needs to.
+        Of several steps, only the last one needs to ``sense``.
         """
         self._step(sense)
 
     def reset(self, mask: Tensor) -> None:
-        """Put worlds back to the reference pose, at rest, with every buffer cleared, warm starts included.
+        """Put the worlds of ``mask`` (num_envs,), bool, back to the reference pose, at rest.
 
-        Args:
-            mask: Which worlds. Shape: (num_envs,), bool.
+        All their buffers are cleared, warm starts included.
         """
         data = self.data
         state = (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, data.sensordata)
         self._launch(kernels.reset_worlds, wp.from_torch(mask), self._reference_pose, *state)
 
     def set_orientation(self, mask: Tensor, angles: Tensor) -> None:
-        """Turn trunks: about x (roll), then y (pitch), then z (yaw), all axes of the world.
+        """Turn the trunks of the worlds in ``mask`` (num_envs,), bool, by roll, pitch and yaw [rad] (num_envs, 3).
 
-        Args:
-            mask: In which worlds. Shape: (num_envs,), bool.
-            angles: Roll, pitch and yaw [rad]. Shape: (num_envs, 3).
+        That is about x, then y, then z, all axes of the world.
         """
         self._launch(kernels.set_orientation, wp.from_torch(mask), wp.from_torch(angles), self.data.qpos)
 
     def push(self, mask: Tensor, velocity: Tensor, add: Tensor) -> None:
-        """Change velocities of trunks.
+        """Change the velocities of trunks in the worlds of ``mask``. Shape: (num_envs,), bool.
 
-        Args:
-            mask: In which worlds. Shape: (num_envs,), bool.
-            velocity: In the world frame [m/s]. Shape: (num_envs, 3).
-            add: Where it is added; elsewhere it replaces the trunk's own. Shape: (num_envs,), bool.
+        ``velocity`` in the world frame [m/s] (num_envs, 3) is added where ``add`` (num_envs,), bool, says so; elsewhere
+        it replaces the trunk's own.
         """
         drawn = (wp.from_torch(mask), wp.from_torch(velocity), wp.from_torch(add))
         self._launch(kernels.push, *drawn, self.data.qvel)
@@ -191,7 +161,7 @@ class Simulator:
         Waits for the device: not for the hot path.
         """
         bits = functools.reduce(operator.or_, wp.to_torch(self._overflow).unique().tolist())
-        names = [flag.name for flag in _BUFFER_FLAGS if flag & bits]
+        names = [name for name in _BUFFERS if mjw.OverflowType[name] & bits]
         if not names:
             return None
         return f"simulation buffers overflowed ({', '.join(names)}): some contacts were ignored"

@@ -13,12 +13,7 @@ class WarpStep:
     """Steps all worlds of a MuJoCo Warp ``Data``."""
 
     def __init__(self, model: mjw.Model, data: mjw.Data) -> None:
-        """Keep model and data.
-
-        Args:
-            model: The model on the device.
-            data: The worlds.
-        """
+        """Keep model and data on the device."""
         self._model, self._data = model, data
         self._device = data.qpos.device
         self._flags = model.opt.disableflags
@@ -26,11 +21,7 @@ class WarpStep:
             model.opt.graph_conditional = False  # unrolled solver iterations are faster than a device loop
 
     def __call__(self, sense: bool) -> None:
-        """Advance every world by one physics step.
-
-        Args:
-            sense: Whether to write the contact sensors.
-        """
+        """Advance every world by one physics step; ``sense`` says whether to write the contact sensors."""
         self._model.opt.disableflags = self._flags if sense else self._flags | _NO_SENSORS
         with wp.ScopedDevice(self._device):
             mjw.step(self._model, self._data)

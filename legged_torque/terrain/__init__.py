@@ -9,11 +9,7 @@ TERRAINS: dict[str, type[Terrain]] = {"plane": Plane}
 
 
 def make_terrain(mesh_type: str) -> Terrain:
-    """Return the ground that the settings ask for.
-
-    Raises:
-        UserError: If there is no such ground.
-    """
+    """Return the ground that ``terrain.mesh_type`` asks for; a UserError if there is no such ground."""
     if mesh_type not in TERRAINS:
         raise unknown_name("terrain.mesh_type", mesh_type, TERRAINS)
     return TERRAINS[mesh_type]()

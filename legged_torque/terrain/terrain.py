@@ -12,14 +12,7 @@ class Terrain(ABC):
 
     @abstractmethod
     def height(self, points: Tensor) -> Tensor:
-        """Return the height of the ground under points [m].
-
-        Args:
-            points: Shape: (..., 3); only x and y count.
-
-        Returns:
-            Shape: (...,).
-        """
+        """Return the height of the ground at x and y of points [m]. Shapes: (..., 3) to (...,)."""
 
     @abstractmethod
     def normal(self, points: Tensor) -> Tensor:
@@ -29,9 +22,7 @@ class Terrain(ABC):
     def move_to_origin(self, mask: Tensor, base_pos: Tensor) -> None:
         """Move trunks, placed as if the world's origin were 0, to where episodes of their worlds start.
 
-        Args:
-            mask: In which worlds. Shape: (num_envs,), bool.
-            base_pos: Positions of the trunks, changed in place. Shape: (num_envs, 3).
+        Of the worlds in ``mask`` (num_envs,), bool, ``base_pos`` is changed in place. Shape: (num_envs, 3).
         """
 
     def height_above(self, points: Tensor) -> Tensor:

@@ -57,16 +57,12 @@ class TorqueMultiHeadCfg(LeggedRobotCfg):
             update_interval = 64_000  # [total steps]; weights change between rollouts only
 
             class pd(LinearChange):
-                start = 1.0
-                end = 0.0
-                t_start = 0
-                t_end = 50_000_000
+                start, end = 1.0, 0.0
+                t_start, t_end = 0, 50_000_000
 
             class torque(LinearChange):
-                start = 1.0
-                end = 1.0
-                t_start = 0
-                t_end = 50_000_000
+                start, end = 1.0, 1.0
+                t_start, t_end = 0, 50_000_000
 
 
 class MultiHeadCfg(TorqueMultiHeadCfg):

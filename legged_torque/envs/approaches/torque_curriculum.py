@@ -31,18 +31,14 @@ class TorqueCurriculumCfg(TorqueCfg):
 
         class curriculum:
             class nominal_position(LinearChange):
-                start = 20.0
-                end = 1.0
-                t_start = 0
-                t_end = 5_000_000
+                start, end = 20.0, 1.0
+                t_start, t_end = 0, 5_000_000
 
             class tracking_lin_vel:
-                t_start = 3_000_000
-                t_end = 13_000_000
+                t_start, t_end = 3_000_000, 13_000_000
 
             class tracking_ang_vel:
-                t_start = 3_000_000
-                t_end = 13_000_000
+                t_start, t_end = 3_000_000, 13_000_000
 
 
 class TorqueCurriculumCfgPPO(TorqueCfgPPO):

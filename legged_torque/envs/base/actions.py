@@ -12,27 +12,19 @@ class ActionTerm:
     """One action per joint; mirrored as the joints are.
 
     ``_compute_torques`` says what is done with it. Sizes, mirror images, ``policy.yaml`` and plots follow from here.
-
-    Attributes:
-        name: What ``policy.yaml`` calls it: "position_residual" or "torque".
-        scale: Factor on the action, one per world. Shape: (num_envs, 1).
-        unit: Unit of scale times action.
-        meaning: What scale times action is.
-        weight: Weight of its torques, a scalar on the device; None is 1.
     """
 
-    name: str
-    scale: Tensor
-    unit: str
-    meaning: str
-    weight: Tensor | None = None
+    name: str  # what ``policy.yaml`` calls it: "position_residual" or "torque"
+    scale: Tensor  # factor on the action, one per world. Shape: (num_envs, 1)
+    unit: str  # of scale times action
+    meaning: str  # what scale times action is
+    weight: Tensor | None = None  # of its torques, a scalar on the device; None is 1
 
 
 def position_residual(scale: Tensor, weight: Tensor | None = None) -> ActionTerm:
     """Return the term of PD targets (eq. 8); for the arguments see :class:`ActionTerm`."""
-    return ActionTerm(
-        "position_residual", scale, "rad", "joint position relative to nominal_pose, for PD control", weight
-    )
+    meaning = "joint position relative to nominal_pose, for PD control"
+    return ActionTerm("position_residual", scale, "rad", meaning, weight)
 
 
 def torque(scale: Tensor, weight: Tensor | None = None) -> ActionTerm:

@@ -4,38 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
 from legged_torque import resource_path
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.model import build_model, collision_geoms, indices_matching, read_spec
 from legged_torque.utils.errors import UserError, unknown_name
-
-if TYPE_CHECKING:
-    from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 
 
 @dataclass
 class Asset:
-    """A robot's model and which of its parts mean what.
-
-    Attributes:
-        mj_model: The model to simulate.
-        dof_names: Names of the joints, in the order of the MJCF.
-        geom_names: Names of the collision geoms; places below are places in this list.
-        feet: Places of the feet.
-        penalized: Places of the geoms of the collision term.
-        terminating: Places of the geoms that end an episode.
-    """
+    """A robot's model and which of its parts mean what."""
 
     mj_model: mujoco.MjModel
-    dof_names: list[str]
-    geom_names: list[str]
-    feet: list[int]
-    penalized: list[int]
-    terminating: list[int]
+    dof_names: list[str]  # of the joints, in the order of the MJCF
+    geom_names: list[str]  # of the collision geoms; the lists below are places in this one
+    feet: list[int]  # in the order of ``foot_names``
+    penalized: list[int]  # geoms of the collision term
+    terminating: list[int]  # geoms that end an episode
 
     @property
     def foot_names(self) -> list[str]:
@@ -48,14 +36,9 @@ class Asset:
 
 
 def load_asset(cfg: LeggedRobotCfg) -> Asset:
-    """Load a robot.
+    """Load the robot of ``cfg.asset``, to be simulated in steps of ``cfg.sim.dt``.
 
-    Args:
-        cfg: Settings of the task, of which ``asset`` and ``sim.dt`` count.
-
-    Raises:
-        UserError: If the file cannot be read, a name in the settings matches nothing, or motors are in another order
-            than joints.
+    A UserError if the file cannot be read, a name in the settings matches nothing, or motors are in another order.
     """
     settings = cfg.asset
     spec = read_spec(resource_path(settings.file))
@@ -81,15 +64,9 @@ def _check_motors(model: mujoco.MjModel, dof_names: list[str], file: str) -> Non
 
 
 def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:
-    """Return a number for each joint.
+    """Return a number for each joint: one for all, or by a part of their names, of which the first that matches counts.
 
-    Args:
-        setting: Name of the setting, for messages.
-        values: One number for all joints, or numbers by a part of the joints' names; the first one that matches counts.
-        dof_names: Names of the joints.
-
-    Raises:
-        UserError: If a joint has no number, or a name matches no joint.
+    A UserError, which names the setting, if a joint has no number or a name matches no joint.
     """
     if not isinstance(values, dict):
         return [values] * len(dof_names)
@@ -106,14 +83,9 @@ def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence
 
 
 def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[float]:
-    """Return the nominal joint angles [rad] in the order of the joints.
+    """Return the angles [rad] of ``init_state.default_joint_angles``, in the order of the MJCF.
 
-    Args:
-        angles: ``init_state.default_joint_angles``, in the same order.
-        dof_names: Names of the joints in the order of the MJCF.
-
-    Raises:
-        UserError: If a joint is missing or unknown, or the order is another one.
+    A UserError if a joint is missing or unknown, or the order is another one.
     """
     key = "init_state.default_joint_angles"
     for name in angles:

@@ -34,12 +34,7 @@ class BaseTask(VecEnv):
     """Processes that train together, each with as many worlds; the runner sets it."""
 
     def __init__(self, num_envs: int, device: str) -> None:
-        """Allocate rewards, ends and counters.
-
-        Args:
-            num_envs: Number of worlds.
-            device: "cpu" or "cuda:N".
-        """
+        """Allocate rewards, ends and counters of ``num_envs`` worlds on the device, "cpu" or "cuda:N"."""
         self.num_envs, self.device = num_envs, device
         self.rew_buf, self.episode_return = torch.zeros(2, num_envs, device=device).unbind()
         self.reset_buf, self.time_out_buf = torch.zeros(2, num_envs, dtype=torch.bool, device=device).unbind()
@@ -49,14 +44,10 @@ class BaseTask(VecEnv):
         self.step_graph = CudaGraph(self._step, device)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
-        """Apply actions for one control step.
+        """Apply actions for one control step. Shape: (num_envs, num_actions); one that is not finite resets its world.
 
-        Args:
-            actions: Shape: (num_envs, num_actions). Worlds with an action that is not finite are reset.
-
-        Returns:
-            Observations (a copy); rewards (num_envs,); dones (num_envs,), bool; extras with "time_outs" (num_envs,),
-            bool. Rewards, dones and extras are buffers that the next step overwrites.
+        Returns observations (a copy); rewards (num_envs,); dones (num_envs,), bool; extras with "time_outs"
+        (num_envs,), bool. Rewards, dones and extras are buffers that the next step overwrites.
         """
         self._given_actions.copy_(actions)
         self.step_graph()

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 
 
 class UniformCommands:
@@ -19,12 +16,7 @@ class UniformCommands:
     """
 
     def __init__(self, cfg: LeggedRobotCfg, device: str) -> None:
-        """Start with commands of 0.
-
-        Args:
-            cfg: Settings of the task, of which ``commands.ranges`` and the number of worlds count.
-            device: Name of the device.
-        """
+        """Start with commands of 0; they will be drawn from ``cfg.commands.ranges``."""
         ranges = cfg.commands.ranges
         self.values = torch.zeros(cfg.env.num_envs, 3, device=device)
         limits = [ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw]
@@ -39,10 +31,6 @@ class UniformCommands:
         self._span.copy_(span if command is None else torch.zeros(3))
 
     def resample(self, mask: Tensor) -> None:
-        """Draw new commands.
-
-        Args:
-            mask: In which worlds. Shape: (num_envs,), bool.
-        """
+        """Draw new commands in the worlds of ``mask``. Shape: (num_envs,), bool."""
         drawn = torch.addcmul(self._low, self._span, torch.rand_like(self.values))
         torch.where(mask.unsqueeze(1), drawn, self.values, out=self.values)

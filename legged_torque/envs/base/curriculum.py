@@ -17,12 +17,7 @@ class LinearCurriculum:
     """
 
     def __init__(self, settings: Sequence[LinearChange | type[LinearChange] | None], device: str) -> None:
-        """Create the curricula.
-
-        Args:
-            settings: One entry per value; None stands for a constant 1.
-            device: Name of the device.
-        """
+        """Create one curriculum per entry; None stands for a constant 1."""
         rows = [(c.start, c.end, c.t_start, c.t_end) if c else (1.0, 1.0, 0, 1) for c in settings]
         start, end, t_start, t_end = torch.tensor(rows, dtype=torch.float64, device=device).view(-1, 4).unbind(dim=1)
         self._start, self._change = start, end - start

@@ -12,18 +12,8 @@ if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
 
 MODEL_FIELDS = (
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "geom_size",
-    "geom_pos",
-    "dof_damping",
-    "dof_armature",
-    "jnt_stiffness",
-    "dof_frictionloss",
-    "geom_friction",
-    "geom_solref",
-    "gravity",
+    *("body_mass", "body_inertia", "body_ipos", "geom_size", "geom_pos", "geom_friction", "geom_solref", "gravity"),
+    *("dof_damping", "dof_armature", "jnt_stiffness", "dof_frictionloss"),
 )
 """Fields of the model of which each world has its own."""
 
@@ -75,14 +65,13 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
         return of_model(task, name, field, columns, may_keep=True, mirror=joint_values, **absolute(cfg, name))
 
     trunk_com, foot_offset = offset(cfg, "trunk_com_offset"), offset(cfg, "foot_offset")
+    foot_radius = absolute(cfg, "foot_radius")
     inertia = {**trunk, "weight": inertia_per_mass, "shared": True, "same_draw_as": "trunk_mass"}
     return [
         of_model(task, "trunk_mass", "body_mass", [TRUNK], **trunk),
         of_model(task, "trunk_inertia", "body_inertia", entries(3, [TRUNK]), **inertia),
         of_model(task, "trunk_com", "body_ipos", entries(3, [TRUNK]), mirror=VECTOR, **trunk_com),
-        of_model(
-            task, "foot_radius", "geom_size", [3 * foot for foot in feet], shared=True, **absolute(cfg, "foot_radius")
-        ),
+        of_model(task, "foot_radius", "geom_size", [3 * foot for foot in feet], shared=True, **foot_radius),
         of_model(task, "foot_offset", "geom_pos", entries(3, feet), mirror=foot_vectors, **foot_offset),
         of_joints("dof_damping", "dof_damping", dofs),
         of_joints("dof_armature", "dof_armature", dofs),
@@ -127,23 +116,17 @@ def control_parameters(task: LeggedRobot) -> list[Parameter]:
 def mirrors(drawn: list[Parameter], sizes: dict[str, int]) -> dict[str, Mirroring | None]:
     """Return the mirror images of the numbers of :attr:`Randomization.values`, by name; None where it is not known.
 
-    Args:
-        drawn: The parameters.
-        sizes: How many numbers of its own each has.
+    ``sizes`` says how many numbers of its own each of the drawn parameters has.
     """
     own = [parameter for parameter in drawn if parameter.name in sizes]
     return {p.name: p.mirror or (SCALAR if sizes[p.name] == 1 else None) for p in own}
 
 
 def of_model(task: LeggedRobot, name: str, field: str, columns: Sequence[int], **settings: Any) -> Parameter:
-    """Return a parameter that is kept in a field of the model.
+    """Return a parameter kept in a field of the model: one of :data:`MODEL_FIELDS`.
 
-    Args:
-        task: The task.
-        name: Name of the parameter.
-        field: Name of the field, one of :data:`MODEL_FIELDS`, or "gravity".
-        columns: Which numbers of a world's part of the field, all of its entries behind each other.
-        settings: All else that a :class:`~legged_torque.sim.randomization.Parameter` takes.
+    ``columns`` are numbers of a world's part of the field, all of its entries behind each other; ``settings`` is all
+    else that a :class:`~legged_torque.sim.randomization.Parameter` takes.
     """
     return Parameter(name, task.sim.field(field).flatten(1), list(columns), model_field=field, **settings)
 

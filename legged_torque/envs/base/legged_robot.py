@@ -57,14 +57,9 @@ class LeggedRobot(BaseTask):
     cfg: LeggedRobotCfg
 
     def __init__(self, cfg: LeggedRobotCfg, device: str = "cpu") -> None:
-        """Create the worlds and put each into a random initial state.
+        """Create the worlds on "cpu" or "cuda:N", each in a random initial state; ``cfg.env.num_actions`` is filled in.
 
-        Args:
-            cfg: Settings of the task; ``env.num_actions`` is filled in.
-            device: "cpu" or "cuda:N".
-
-        Raises:
-            UserError: If a setting makes no sense or names something that does not exist.
+        A UserError if a setting makes no sense or names something that does not exist.
         """
         check_env_cfg(cfg)
         super().__init__(cfg.env.num_envs, device)
@@ -76,22 +71,17 @@ class LeggedRobot(BaseTask):
         self._init_actions()
         self._prepare_reward_functions()
         self._init_random_events()
-        history, clip = cfg.env.history_length, cfg.normalization.clip_observations
-        terms = self.observation_terms()
-        self.observations = Observations(terms, history, clip, cfg.noise.add_noise, self.num_envs)
+        seen = (cfg.env.history_length, cfg.normalization.clip_observations, cfg.noise.add_noise)
+        self.observations = Observations(self.observation_terms(), *seen, self.num_envs)
         self.obs_buf = self.observations.buffers
         self.reset()
 
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
 
     def _compute_torques(self, actions: Tensor) -> Tensor:
-        """Return joint torques for actions; called at every physics step. This is position control (eq. 8).
+        """Return the torques that motors are asked for [N m]; called at every physics step.
 
-        Args:
-            actions: Shape: (num_envs, num_actions).
-
-        Returns:
-            Torques that the motors are asked for [N m]. Shape: (num_envs, num_dof).
+        This is position control (eq. 8). Shapes: (num_envs, num_actions) to (num_envs, num_dof).
         """
         return self._pd_torques(actions)
 
@@ -215,12 +205,7 @@ class LeggedRobot(BaseTask):
         self.last_dof_vel.copy_(self.dof_vel)
 
     def set_state(self, qpos: Tensor, qvel: Tensor) -> None:
-        """Put all worlds into given states, with the observations that follow; episodes go on.
-
-        Args:
-            qpos: As ``sim.qpos``. Shape: (num_envs, nq).
-            qvel: As ``sim.qvel``. Shape: (num_envs, nv).
-        """
+        """Put all worlds into states as in ``sim.qpos`` and ``sim.qvel``, and observe them; episodes go on."""
         self.sim.qpos.copy_(qpos)
         self.sim.qvel.copy_(qvel)
         self._update_state()
@@ -234,14 +219,12 @@ class LeggedRobot(BaseTask):
         self.asset = load_asset(cfg)
         model = self.asset.mj_model
         per_world = MODEL_FIELDS if cfg.domain_rand.randomize_parameters else ()
-        self.sim = Simulator(
-            model, self.num_envs, self.device, sim.engine, sim.solver_iterations, sim.ls_iterations, per_world
-        )
+        limits = (sim.solver_iterations, sim.ls_iterations)
+        self.sim = Simulator(model, self.num_envs, self.device, sim.engine, *limits, per_world)
         self.dof_names, self.foot_names = self.asset.dof_names, self.asset.foot_names
         self.num_dof = len(self.dof_names)
-        self.symmetry = RobotSymmetry(
-            cfg.asset.mirrored_legs, self.dof_names, self.asset.dof_axes().tolist(), self.foot_names
-        )
+        axes = self.asset.dof_axes().tolist()
+        self.symmetry = RobotSymmetry(cfg.asset.mirrored_legs, self.dof_names, axes, self.foot_names)
         self.terrain = make_terrain(cfg.terrain.mesh_type)
         self.motors = make_motors(cfg.motors.model, self.num_envs, self._tensor(model.actuator_forcerange.T))
         self.torque_limits, self.motor_strength = self.motors.limits, self.motors.strength
@@ -249,9 +232,9 @@ class LeggedRobot(BaseTask):
         self.dof_pos, self.dof_vel = self.sim.qpos[:, 7:], self.sim.qvel[:, 6:]
         self.base_ang_vel = self.sim.qvel[:, 3:6]
         self.torques = self.sim.ctrl
-        limits = self._tensor(model.jnt_range[1:])
-        middle = limits.mean(dim=1, keepdim=True)
-        self.dof_pos_limits = middle + cfg.rewards.soft_dof_pos_limit * (limits - middle)
+        ranges = self._tensor(model.jnt_range[1:])
+        middle = ranges.mean(dim=1, keepdim=True)
+        self.dof_pos_limits = middle + cfg.rewards.soft_dof_pos_limit * (ranges - middle)
         places = (self.asset.feet, self.asset.penalized, self.asset.terminating)
         self.feet_indices, self.penalized_contact_indices, self.termination_contact_indices = (
             torch.tensor(chosen, dtype=torch.long, device=self.device) for chosen in places
@@ -279,18 +262,16 @@ class LeggedRobot(BaseTask):
             name = type(self).__name__
             raise UserError(f"env.num_actions must be {self.num_actions} for {name}, not {env.num_actions}")
         env.num_actions = self.num_actions
-        self._given_actions, self.actions, self.last_actions = torch.zeros(
-            3, self.num_envs, self.num_actions, device=self.device
-        ).unbind()
+        actions = torch.zeros(3, self.num_envs, self.num_actions, device=self.device)
+        self._given_actions, self.actions, self.last_actions = actions.unbind()
         self.action_delay = ActionDelay(self.actions, rand.action_delay[1], rand.action_delay_unit, control.decimation)
 
     def _prepare_reward_functions(self) -> None:
         """Collect the functions of all terms with a scale that is not zero, and their weights."""
         scales = {name: scale for name, scale in to_dict(self.cfg.rewards.scales).items() if scale != 0.0}
         known = [name.removeprefix("_reward_") for name in dir(type(self)) if name.startswith("_reward_")]
-        curricula = {
-            name: getattr(self.cfg.rewards.curriculum, name) for name in section_keys(self.cfg.rewards.curriculum)
-        }
+        curriculum = self.cfg.rewards.curriculum
+        curricula = {name: getattr(curriculum, name) for name in section_keys(curriculum)}
         for name in [*scales, *curricula]:
             if name not in known:
                 raise unknown_name("reward term", name, known)

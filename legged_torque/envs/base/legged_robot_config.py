@@ -20,18 +20,14 @@ class LinearChange(Section):
 class LeggedRobotCfg(BaseConfig):
     """Settings of :class:`~legged_torque.envs.base.legged_robot.LeggedRobot`."""
 
-    class env:
-        """Worlds and episodes."""
-
+    class env:  # worlds and episodes
         num_envs = 4096  # worlds of each process
         num_envs_cpu = 64  # default on a CPU, where a world-step costs about a millisecond
         num_actions: int | None = None  # None: those of the approach for each joint of the robot
         history_length = 1  # control steps whose observations the policy sees, the newest first
         episode_length_s = 20.0  # [s]
 
-    class asset:
-        """The robot, and which of its geoms mean what."""
-
+    class asset:  # the robot, and which of its geoms mean what
         file = ""  # MJCF, absolute or below resources/
         foot_name = "foot"  # collision geoms whose name contains this are feet
         penalize_contacts_on: list[str] = []  # likewise: those of the collision term
@@ -39,27 +35,19 @@ class LeggedRobotCfg(BaseConfig):
         mirrored_legs: list[list[str]] = []  # pairs [right, left] of names of legs, with which names of parts begin
         max_dof_vel = 0.0  # [rad/s] highest speed of the joints
 
-    class sim:
-        """Physics."""
-
+    class sim:  # physics
         dt = 0.005  # [s] physics step
         engine = "fused"  # one kernel per physics step, for legged robots on a plane; or "mujoco_warp" for any robot
         solver_iterations = 10  # at most
         ls_iterations = 20  # line search, at most
 
-    class terrain:
-        """The ground."""
-
+    class terrain:  # the ground
         mesh_type = "plane"  # the only one so far
 
-    class motors:
-        """What joints get of the torques that actions ask for."""
-
+    class motors:  # what joints get of the torques that actions ask for
         model = "ideal"  # any torque within the limits, at once
 
-    class init_state:
-        """Where episodes start, and the nominal pose."""
-
+    class init_state:  # where episodes start, and the nominal pose
         pos = [0.0, 0.0, 1.0]  # [m] of the trunk at a reset: high enough for stretched legs
         default_joint_angles: dict[str, float] = {}  # [rad] q_nominal, by joint name, in the order of the MJCF
 
@@ -113,34 +101,24 @@ class LeggedRobotCfg(BaseConfig):
         push_probability = 0.002  # per control step and world
         push_velocity = [-0.3, 0.3]  # [m/s] on each axis
 
-    class noise:
-        """Errors of the policy's sensors: uniform, at most this much either way."""
-
+    class noise:  # errors of the policy's sensors: uniform, at most this much either way
         add_noise = False  # whether sensors have errors
 
-        class noise_scales:
-            """By group of observations."""
-
+        class noise_scales:  # by group of observations
             dof_pos = 0.01  # [rad]
             dof_vel = 1.5  # [rad/s]
             ang_vel = 0.2  # [rad/s]
             gravity = 0.05  # of the unit vector
 
-    class commands:
-        """Commanded velocities, in the trunk's frame."""
-
+    class commands:  # commanded velocities, in the trunk's frame
         resampling_probability = 0.002  # per control step: about every 10 s at 50 Hz
 
-        class ranges:
-            """Drawn uniformly."""
-
+        class ranges:  # drawn uniformly
             lin_vel_x = [-1.0, 1.0]  # [m/s]
             lin_vel_y = [-1.0, 1.0]  # [m/s]
             ang_vel_yaw = [-1.0, 1.0]  # [rad/s]
 
-    class control:
-        """From actions to torques."""
-
+    class control:  # from actions to torques
         decimation = 4  # physics steps per control step: 50 Hz
         refresh_torques = True  # whether torques are computed anew at every physics step
         stiffness: float | dict[str, float] = 0.0  # [N m/rad] Kp; of all joints, or by a part of their names
@@ -148,18 +126,14 @@ class LeggedRobotCfg(BaseConfig):
         action_scale = 0.25  # [rad] per unit of a position action
         torque_scale = 1.0  # [N m] per unit of a torque action
 
-    class rewards:
-        """The terms of Table III; each is a method ``_reward_<term>``."""
-
+    class rewards:  # the terms of Table III; each is a method ``_reward_<term>``
         only_positive_rewards = True  # clip the sum at 0 from below
         tracking_temperature = 4.0  # gamma of both tracking terms
         soft_dof_pos_limit = 0.9  # share of a joint's range, beyond which dof_pos_limits acts
         base_height_target = 0.0  # [m] of the trunk above the ground, in the nominal pose
         feet_air_time_target = 0.5  # [s] swings are rewarded for what they last beyond this
 
-        class scales:
-            """Weights of Table III; each is multiplied by the control step and by its factor of ``curriculum``."""
-
+        class scales:  # weights of Table III; each times the control step and its factor of ``curriculum``
             tracking_lin_vel = 1.0  # following commanded v_x and v_y
             tracking_ang_vel = 1.0  # following the commanded yaw rate
             lin_vel_z = -2.0  # vertical velocity of the trunk
@@ -174,30 +148,20 @@ class LeggedRobotCfg(BaseConfig):
             feet_air_time = 0.1  # long swings
             symmetry = -0.5  # right and left foot of a pair both in the air
 
-        class curriculum:
-            """Factors on the scales: linear from start to end between two total step counts (eq. 1)."""
-
+        class curriculum:  # factors on the scales: linear from start to end between two total step counts (eq. 1)
             class tracking_lin_vel(LinearChange):
-                start = 4.0  # factor up to t_start
-                end = 2.0  # factor from t_end on
-                t_start = 0  # [total steps]
-                t_end = 10_000_000  # [total steps]
+                start, end = 4.0, 2.0
+                t_start, t_end = 0, 10_000_000
 
             class tracking_ang_vel(LinearChange):
-                start = 0.1  # factor up to t_start
-                end = 1.0  # factor from t_end on
-                t_start = 0  # [total steps]
-                t_end = 10_000_000  # [total steps]
+                start, end = 0.1, 1.0
+                t_start, t_end = 0, 10_000_000
 
-    class normalization:
-        """Scales and limits of what the networks see and say."""
-
+    class normalization:  # scales and limits of what the networks see and say
         clip_observations = 100.0  # largest absolute value, after scaling
         clip_actions = 100.0  # largest absolute value
 
-        class obs_scales:
-            """Factors on observations."""
-
+        class obs_scales:  # factors on observations
             lin_vel = 2.0  # of velocities in m/s, commands included
             ang_vel = 0.25  # of angular velocities in rad/s, commands included
             dof_pos = 1.0  # of joint angles in rad
@@ -222,19 +186,10 @@ class LeggedRobotCfg(BaseConfig):
 
     def parameter_ranges(self) -> dict[str, dict]:
         """Return the named changes that ``--ranges`` chooses from: those of this class, and narrower ones."""
-        narrow = {
-            "ground_friction": [0.8, 1.2],
-            "contact_stiffness": [900.0, 1100.0],
-            "contact_damping": [72.0, 88.0],
-            "gravity": [9.51, 10.11],
-            "motor_strength": [0.9, 1.1],
-            "joint_offset": [-0.01, 0.01],
-            "action_scale_offset": [0.0, 0.0],
-            "stiffness_offset": [0.0, 0.0],
-            "stiffness_scale": [0.9, 1.1],
-            "damping_offset": [0.0, 0.0],
-            "damping_scale": [0.9, 1.1],
-        }
+        ground = {"ground_friction": [0.8, 1.2], "contact_stiffness": [900.0, 1100.0], "contact_damping": [72.0, 88.0]}
+        scales = {name: [0.9, 1.1] for name in ("motor_strength", "stiffness_scale", "damping_scale")}
+        offsets = {name: [0.0, 0.0] for name in ("action_scale_offset", "stiffness_offset", "damping_offset")}
+        narrow = {"gravity": [9.51, 10.11], "joint_offset": [-0.01, 0.01], **ground, **scales, **offsets}
         wide = {name: list(getattr(type(self).domain_rand, name)) for name in narrow}
         return {"wide": {"domain_rand": wide}, "narrow": {"domain_rand": narrow}}
 
@@ -244,9 +199,7 @@ class LeggedRobotCfgPPO(BaseConfig):
 
     seed = 1  # of all random numbers of a training
 
-    class runner:
-        """Rollouts, checkpoints and logs."""
-
+    class runner:  # rollouts, checkpoints and logs
         class_name = "legged_torque.learning.runner:OnPolicyRunner"  # what trains
         capture = True  # on a GPU, replay steps, rollouts and updates as CUDA graphs; False runs the same without
         num_steps_per_env = 24  # control steps of a rollout
@@ -257,51 +210,37 @@ class LeggedRobotCfgPPO(BaseConfig):
         logger = "tensorboard"  # or "wandb" or "none"
         wandb_project = "legged_torque"  # where wandb keeps the runs
 
-    class evaluation:
-        """Measuring the policy while it learns: mean actions, in worlds of their own, between rollouts."""
-
+    class evaluation:  # measuring the policy while it learns: mean actions, in worlds of their own, between rollouts
         interval = 128_000  # environment steps from one evaluation to the next; 0: none
         num_samples = 32_000  # world steps of one evaluation: the paper's 16 worlds x 2000 steps
         num_envs = 4000  # worlds, at most as many as train
         perturbation = ""  # environment, one of ``perturbations``; empty: that of the training
 
-    class pretraining:
-        """A policy that is made by supervision before training starts, and from which it starts."""
-
+    class pretraining:  # a policy that is made by supervision before training starts, and from which it starts
         function = ""  # what makes it: "module:function"; empty: training starts from random networks
         file = ""  # where it is kept; empty: pretrained/<task>.pt in the folder of all experiments
         critic_warmup_iterations = 0  # iterations in which only the critic learns
 
-    class obs_groups:
-        """Which observations which network reads."""
-
+    class obs_groups:  # which observations which network reads
         actor = ["policy"]  # groups of the policy
         critic = ["critic"]  # groups of the value function
 
-    class actor:
-        """The policy's network, an rsl_rl model."""
-
+    class actor:  # the policy's network, an rsl_rl model
         class_name = "MLPModel"  # an rsl_rl model
         hidden_dims = [512, 256, 128]  # sizes of the hidden layers
         activation = "elu"  # after every hidden layer
 
-        class distribution_cfg:
-            """The distribution of its actions."""
-
+        class distribution_cfg:  # the distribution of its actions
             class_name = "legged_torque.learning.distribution:GaussianDistribution"  # rsl_rl's, made for graphs
             init_std = 1.0  # standard deviation of actions at the start
             std_type = "log"  # what is learned: its logarithm, or "scalar"
 
-    class critic:
-        """The value function's network."""
-
+    class critic:  # the value function's network
         class_name = "MLPModel"  # an rsl_rl model
         hidden_dims = [512, 256, 128]  # sizes of the hidden layers
         activation = "elu"  # after every hidden layer
 
-    class algorithm:
-        """PPO, with rsl_rl's names."""
-
+    class algorithm:  # PPO, with rsl_rl's names
         class_name = "legged_torque.learning.ppo:OnDevicePPO"  # rsl_rl's PPO without waiting for the host
         num_learning_epochs = 5  # times that each rollout is learned from
         num_mini_batches = 4  # gradient steps per epoch
@@ -317,9 +256,7 @@ class LeggedRobotCfgPPO(BaseConfig):
         max_learning_rate = 1e-2  # upper bound of an adaptive learning rate
         use_clipped_value_loss = True  # whether value changes are clipped too
 
-        class symmetry_cfg:
-            """Learning from mirror images as well, with rsl_rl's names."""
-
+        class symmetry_cfg:  # learning from mirror images as well, with rsl_rl's names
             use_data_augmentation = False  # whether minibatches hold mirror images as well
             use_mirror_loss = False  # whether actions that are not mirror images cost
             mirror_loss_coeff = 0.1  # weight of that loss
@@ -327,20 +264,8 @@ class LeggedRobotCfgPPO(BaseConfig):
 
     def presets(self) -> dict[str, dict]:
         """Return the named changes to the settings of task and training that ``--preset`` chooses from."""
-        paper = {  # Table II to the letter
-            "env": {"num_envs": 16, "num_envs_cpu": 16},
-            "runner": {"num_steps_per_env": 2000},
-            "algorithm": {
-                "num_learning_epochs": 5,
-                "num_mini_batches": 32,
-                "clip_param": 0.1,
-                "gamma": 0.99,
-                "lam": 0.9,
-                "entropy_coef": 5e-4,
-                "learning_rate": 1e-4,
-                "max_grad_norm": 5.0,
-                "schedule": "fixed",
-                "symmetry_cfg": {"use_data_augmentation": False},
-            },
-        }
-        return {"parallel": {}, "paper": paper}
+        rollouts = {"env": {"num_envs": 16, "num_envs_cpu": 16}, "runner": {"num_steps_per_env": 2000}}
+        ppo = {"num_learning_epochs": 5, "num_mini_batches": 32, "clip_param": 0.1, "gamma": 0.99, "lam": 0.9}
+        ppo |= {"entropy_coef": 5e-4, "learning_rate": 1e-4, "max_grad_norm": 5.0}
+        fixed = {"schedule": "fixed", "symmetry_cfg": {"use_data_augmentation": False}}
+        return {"parallel": {}, "paper": {**rollouts, "algorithm": {**ppo, **fixed}}}  # Table II to the letter

@@ -32,11 +32,7 @@ class WalkingMetrics:
         self._sums.zero_()
 
     def add_step(self, commands: Tensor) -> None:
-        """Add the step that the task has just made.
-
-        Args:
-            commands: A copy of the commands that held during the step. Shape: (num_envs, 3).
-        """
+        """Add the step that the task has just made, with a copy of the commands that held in it (num_envs, 3)."""
         task = self._task
         velocity = task.planar_velocity()
         self._sums += metrics.step_sums(
@@ -82,13 +78,11 @@ class CommandBreakdown:
         task = self._task
         velocity = task.planar_velocity()
         error = (commands - velocity).abs()
-        tracking = (
-            torch.stack(metrics.tracking_percentage(torch, error, commands)).unsqueeze(2).expand(-1, *error.shape)
-        )
+        tracking = torch.stack(metrics.tracking_percentage(torch, error, commands))
         low, high = self._ranges.T
         place = ((commands - low) / (high - low).clamp(min=1e-6) * NUM_BINS).long().clamp(0, NUM_BINS - 1)
         member = torch.nn.functional.one_hot(place, NUM_BINS) * ~task.reset_buf.view(-1, 1, 1)
-        rows = torch.stack([torch.ones_like(error), error, *tracking])
+        rows = torch.stack([torch.ones_like(error), error, *tracking.unsqueeze(2).expand(-1, *error.shape)])
         self._sums += (rows.unsqueeze(3) * member).sum(dim=1)
 
     def table(self) -> dict[str, list[dict[str, float]]]:
@@ -124,11 +118,8 @@ def measure(
 ) -> WalkingMetrics:
     """Let a policy act from fresh episodes on, and return its metrics.
 
-    Args:
-        task: Where it acts.
-        policy: Actions for observations; give it mean actions to see what it has learned.
-        num_steps: Control steps.
-        on_step: Called after every step with the commands that held, e.g. to record it.
+    Give it mean actions to see what it has learned. ``on_step`` is called after every step with the commands that held,
+    e.g. to record it.
     """
     walking = WalkingMetrics(task)
     obs = task.reset()

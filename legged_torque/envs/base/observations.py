@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict
@@ -19,29 +19,29 @@ if TYPE_CHECKING:
 
 @dataclass
 class ObservationTerm:
-    """One part of the observations.
+    """One part of the observations."""
 
-    Attributes:
-        name: Its name, also in ``policy.yaml``.
-        value: Returns the unscaled values. Shape: (num_envs, size).
-        mirror: Their left-right mirror image; None if it is not known, then learning from mirror images is refused.
-        scale: Factor on all values, or on each.
-        noise: Largest error of the policy's sensor, uniform, before scaling.
-        privileged: Whether only the critic sees it.
-        unit: Unit of the values.
-        frame: In which they are given: "trunk", "joint" or "none".
-        meaning: What they are.
-    """
+    name: str  # also in ``policy.yaml``
+    value: Callable[[], Tensor]  # returns the unscaled values. Shape: (num_envs, size)
+    mirror: Mirroring | None  # left-right mirror image; None: not known, learning from mirror images is refused
+    scale: float | Sequence[float] = 1.0  # factor on all values, or on each
+    noise: float = 0.0  # largest error of the policy's sensor, uniform, before scaling
+    privileged: bool = False  # whether only the critic sees it
+    unit: str = ""  # of the values
+    frame: str = "none"  # in which they are given: "trunk", "joint" or "none"
+    meaning: str = ""  # what they are
 
-    name: str
-    value: Callable[[], Tensor]
-    mirror: Mirroring | None
-    scale: float | Sequence[float] = 1.0
-    noise: float = 0.0
-    privileged: bool = False
-    unit: str = ""
-    frame: str = "none"
-    meaning: str = ""
+
+_DESCRIPTIONS = {
+    "projected_gravity": ("", "trunk", "unit vector of gravity, (0, 0, -1) when upright"),
+    "angular_velocity": ("rad/s", "trunk", "of the trunk"),
+    "command": ("m/s, m/s, rad/s", "trunk", "commanded v_x, v_y and yaw rate"),
+    "joint_position": ("rad", "joint", "q - nominal_pose"),
+    "joint_velocity": ("rad/s", "joint", "qd"),
+    "last_action": ("", "none", "clipped actions of the step before, 0 at the start"),
+    "random_parameters": ("", "none", "drawn parameters as shares of their ranges, -1 to 1"),
+}
+"""Unit, frame and meaning of the standard terms."""
 
 
 def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
@@ -52,72 +52,26 @@ def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
     scales, noise, symmetry = task.cfg.normalization.obs_scales, task.cfg.noise.noise_scales, task.symmetry
     command_scales = (scales.lin_vel, scales.lin_vel, scales.ang_vel)
     joints, feet = symmetry.joints, symmetry.feet
+    actions = joints and Mirroring.joined([joints] * len(task.action_terms()))
     parameters = [mirror for mirror in task.parameter_mirrors.values() if mirror]
     parameter_mirror = Mirroring.joined(parameters) if len(parameters) == len(task.parameter_mirrors) else None
+
+    def term(
+        name: str, value: Any, mirror: Mirroring | None, scale: Any = 1.0, error: float = 0.0, privileged: bool = False
+    ) -> ObservationTerm:
+        return ObservationTerm(name, value, mirror, scale, error, privileged, *_DESCRIPTIONS.get(name, ()))
+
     return [
-        ObservationTerm(
-            "projected_gravity",
-            lambda: task.projected_gravity,
-            VECTOR,
-            noise=noise.gravity,
-            frame="trunk",
-            meaning="unit vector of gravity, (0, 0, -1) when upright",
-        ),
-        ObservationTerm(
-            "angular_velocity",
-            lambda: task.base_ang_vel,
-            AXIAL_VECTOR,
-            scales.ang_vel,
-            noise.ang_vel,
-            unit="rad/s",
-            frame="trunk",
-            meaning="of the trunk",
-        ),
-        ObservationTerm(
-            "command",
-            lambda: task.commands,
-            PLANAR_VELOCITY,
-            command_scales,
-            unit="m/s, m/s, rad/s",
-            frame="trunk",
-            meaning="commanded v_x, v_y and yaw rate",
-        ),
-        ObservationTerm(
-            "joint_position",
-            lambda: task.dof_pos - task.default_dof_pos,
-            joints,
-            scales.dof_pos,
-            noise.dof_pos,
-            unit="rad",
-            frame="joint",
-            meaning="q - nominal_pose",
-        ),
-        ObservationTerm(
-            "joint_velocity",
-            lambda: task.dof_vel,
-            joints,
-            scales.dof_vel,
-            noise.dof_vel,
-            unit="rad/s",
-            frame="joint",
-            meaning="qd",
-        ),
-        ObservationTerm(
-            "last_action",
-            lambda: task.actions,
-            joints and Mirroring.joined([joints] * len(task.action_terms())),
-            meaning="clipped actions of the step before, 0 at the start",
-        ),
-        ObservationTerm("linear_velocity", lambda: task.base_lin_vel, VECTOR, scales.lin_vel, privileged=True),
-        ObservationTerm("height", lambda: task.base_height.unsqueeze(1), SCALAR, privileged=True),
-        ObservationTerm("feet_contact", lambda: task.feet_contact, feet, privileged=True),
-        ObservationTerm(
-            "random_parameters",
-            lambda: task.randomization.values,
-            parameter_mirror,
-            privileged=True,
-            meaning="drawn parameters as shares of their ranges, -1 to 1",
-        ),
+        term("projected_gravity", lambda: task.projected_gravity, VECTOR, error=noise.gravity),
+        term("angular_velocity", lambda: task.base_ang_vel, AXIAL_VECTOR, scales.ang_vel, noise.ang_vel),
+        term("command", lambda: task.commands, PLANAR_VELOCITY, command_scales),
+        term("joint_position", lambda: task.dof_pos - task.default_dof_pos, joints, scales.dof_pos, noise.dof_pos),
+        term("joint_velocity", lambda: task.dof_vel, joints, scales.dof_vel, noise.dof_vel),
+        term("last_action", lambda: task.actions, actions),
+        term("linear_velocity", lambda: task.base_lin_vel, VECTOR, scales.lin_vel, privileged=True),
+        term("height", lambda: task.base_height.unsqueeze(1), SCALAR, privileged=True),
+        term("feet_contact", lambda: task.feet_contact, feet, privileged=True),
+        term("random_parameters", lambda: task.randomization.values, parameter_mirror, privileged=True),
     ]
 
 
@@ -133,15 +87,7 @@ class Observations:
     def __init__(
         self, terms: Sequence[ObservationTerm], history_length: int, clip: float, add_noise: bool, num_envs: int
     ) -> None:
-        """Allocate the buffers.
-
-        Args:
-            terms: What is seen.
-            history_length: Control steps that the policy sees.
-            clip: Largest absolute value of an observation.
-            add_noise: Whether the policy's sensors have errors.
-            num_envs: Number of worlds.
-        """
+        """Allocate the buffers. Observations are clipped to +-``clip``; ``add_noise`` is for the policy alone."""
         self.terms = sorted(terms, key=lambda term: term.privileged)
         values = [term.value() for term in self.terms]
         device = values[0].device
@@ -170,8 +116,7 @@ class Observations:
     def compute(self, is_new: Tensor) -> None:
         """Compute the observations of this moment.
 
-        Args:
-            is_new: Worlds whose episode has just started: their history starts with copies. Shape: (num_envs,), bool.
+        Where an episode has just started, as ``is_new`` says, the history starts with copies. Shape: (num_envs,), bool.
         """
         critic = torch.cat([term.value() for term in self.terms], dim=1) * self._scales
         policy = critic[:, : self._policy_size]
@@ -192,10 +137,8 @@ class Observations:
     def mirrors(self) -> dict[str, list[tuple[str, Mirroring | None]]]:
         """Return the mirror images of the groups, term by term with their names."""
         policy = [(term.name, term.mirror) for term in self.policy_terms()]
-        return {
-            "policy": policy * self._history_length,
-            "critic": [(term.name, term.mirror) for term in self.terms],
-        }
+        critic = [(term.name, term.mirror) for term in self.terms]
+        return {"policy": policy * self._history_length, "critic": critic}
 
 
 def _per_value(value: float | Sequence[float], size: int) -> list[float]:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from legged_torque.envs.base.commands import UniformCommands
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.randomization import Parameter, Randomization
 from legged_torque.sim.simulator import Simulator
-
-if TYPE_CHECKING:
-    from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 
 PUSH_ADDED = 0.5
 """Share of pushes that add a velocity; the others set one."""
@@ -37,16 +34,7 @@ class RandomEvents:
         initial_state: Sequence[Parameter],
         parameters: Sequence[Parameter],
     ) -> None:
-        """Prepare; nothing is drawn yet.
-
-        Args:
-            cfg: Settings of the task, of which ``domain_rand`` and the probability of new commands count.
-            sim: The worlds.
-            commands: What draws commands.
-            init_angles: See above; one of the fields of ``initial_state``.
-            initial_state: What to draw at resets.
-            parameters: What to draw of robot, ground and controller.
-        """
+        """Prepare; nothing is drawn yet. ``init_angles`` are among the fields of ``initial_state``."""
         settings = self._settings = cfg.domain_rand
         self._sim, self._commands, self.init_angles = sim, commands, init_angles
         device, n = sim.device, sim.num_envs
@@ -58,29 +46,20 @@ class RandomEvents:
         self.parameters = Randomization(parameters, n, device, settings.keep_probability)
 
     def reset_state(self, mask: Tensor) -> None:
-        """Draw positions, velocities and delays, and clear what the simulator kept.
-
-        Args:
-            mask: In which worlds. Shape: (num_envs,), bool.
-        """
+        """Draw states and delays in the worlds of ``mask`` (num_envs,), bool, and clear what the simulator kept."""
         self._sim.reset(mask)
         self.initial_state.draw(mask)
         self._sim.set_orientation(mask, self.init_angles)
 
     def draw_parameters(self, mask: Tensor) -> None:
-        """Draw parameters of robot, ground and controller anew.
-
-        Args:
-            mask: In which worlds. Shape: (num_envs,), bool.
-        """
+        """Draw parameters of robot, ground and controller anew in the worlds of ``mask``. Shape: (num_envs,), bool."""
         self.parameters.draw(mask)
         self._sim.update_constants(mask)
 
     def happen(self, is_new: Tensor) -> None:
         """Draw commands and parameters where an episode begins or chance says so, and push where chance says so.
 
-        Args:
-            is_new: Worlds whose episode begins. Shape: (num_envs,), bool.
+        ``is_new`` (num_envs,), bool, says where an episode begins.
         """
         chosen = torch.rand(4, self._sim.num_envs, device=self._sim.device) < self._probabilities
         new_commands, new_parameters = chosen[:2] | is_new

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from legged_torque.envs.base.curriculum import LinearCurriculum
-
-if TYPE_CHECKING:
-    from legged_torque.envs.base.legged_robot_config import LinearChange
+from legged_torque.envs.base.legged_robot_config import LinearChange
 
 
 class Rewards:
@@ -33,16 +30,9 @@ class Rewards:
         num_envs: int,
         device: str,
     ) -> None:
-        """Prepare the weights.
+        """Prepare the weights: each term's scale per second, times its factor of the curricula, if it has one.
 
-        Args:
-            functions: Each term's values. Shapes: (num_envs,).
-            scales: Each term's weight per second.
-            curricula: Factors on the weights that change in training, of those terms that have one.
-            only_positive: Whether the sum is clipped at 0 from below.
-            dt: Control step [s].
-            num_envs: Number of worlds.
-            device: Name of the device.
+        ``functions`` return each term's values, one per world.
         """
         self.names = list(functions)
         self.episode_sums = torch.zeros(len(self.names), num_envs, device=device)
@@ -56,14 +46,9 @@ class Rewards:
         return self._scales * self._curriculum(total_steps)
 
     def compute(self, total_steps: Tensor, diverged: Tensor) -> Tensor:
-        """Return the sum of all terms and add them to the sums of the episode.
+        """Return the sum of all terms and add them to the sums of the episode. Shape: (num_envs,).
 
-        Args:
-            total_steps: Steps of training so far. Scalar, int64.
-            diverged: Worlds whose reward is 0, since their state is not finite. Shape: (num_envs,), bool.
-
-        Returns:
-            Shape: (num_envs,).
+        ``total_steps`` are those of training so far, a scalar; where the state has diverged, terms are 0.
         """
         terms = torch.stack([function() for function in self._functions])
         terms = torch.where(diverged, 0.0, terms)

@@ -15,6 +15,8 @@ from legged_torque.utils.mirroring import Mirroring
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
 
+Names = Sequence[str]
+
 
 class RobotSymmetry:
     """Which joints and feet of a robot are mirror images of each other.
@@ -28,19 +30,11 @@ class RobotSymmetry:
     """
 
     def __init__(
-        self,
-        mirrored_legs: Sequence[Sequence[str]],
-        dof_names: Sequence[str],
-        dof_axes: Sequence[Sequence[float]],
-        foot_names: Sequence[str],
+        self, mirrored_legs: Sequence[Names], dof_names: Names, dof_axes: Sequence[Sequence[float]], foot_names: Names
     ) -> None:
-        """Match names.
+        """Match names: those of the legs in ``asset.mirrored_legs``, and of joints and feet in their order.
 
-        Args:
-            mirrored_legs: ``asset.mirrored_legs``.
-            dof_names: Names of the joints in their order.
-            dof_axes: Their axes in the frames of their bodies. Shape: (num_dof, 3).
-            foot_names: Names of the feet in their order.
+        ``dof_axes`` are the joints' axes in the frames of their bodies. Shape: (num_dof, 3).
         """
         self.joints: Mirroring | None = None
         self.feet: Mirroring | None = None
@@ -54,24 +48,16 @@ class RobotSymmetry:
             self.problem = str(error)
 
 
-def _place(names: Sequence[str], leg: str) -> int:
-    """Return the place of the name that begins with that of a leg.
-
-    Raises:
-        UserError: If there is none.
-    """
+def _place(names: Names, leg: str) -> int:
+    """Return the place of the name that begins with that of a leg; a UserError if there is none."""
     for place, name in enumerate(names):
         if name.startswith(leg):
             return place
     raise UserError(f"asset.mirrored_legs: no foot's name begins with '{leg}'; the feet are {', '.join(names)}")
 
 
-def counterparts(names: Sequence[str], mirrored_legs: Sequence[Sequence[str]]) -> tuple[int, ...]:
-    """Return where each part's counterpart on the other side stands: that of FR_hip is FL_hip.
-
-    Raises:
-        UserError: If one is missing.
-    """
+def counterparts(names: Names, mirrored_legs: Sequence[Names]) -> tuple[int, ...]:
+    """Return where each part's counterpart on the other side is: that of FR_hip is FL_hip; a UserError without it."""
     other_leg = {leg: other for pair in mirrored_legs for leg, other in (pair, reversed(pair))}
     result = []
     for name in names:
@@ -91,13 +77,8 @@ class Mirror:
     def __init__(self, parts: Mapping[str, Sequence[tuple[str, Mirroring | None]]], problem: str, device: str) -> None:
         """Prepare the permutations.
 
-        Args:
-            parts: For each kind of vector its terms, by name, one behind the other.
-            problem: Why the robot is not symmetric, if it is not.
-            device: Name of the device.
-
-        Raises:
-            UserError: If the mirror image of a term is not known.
+        ``parts`` are, for each kind of vector, its terms by name, one behind the other. A UserError says which mirror
+        image is not known, or the ``problem``, why the robot is not symmetric.
         """
         self._maps = {}
         for kind, terms in parts.items():
@@ -109,12 +90,7 @@ class Mirror:
             self._maps[kind] = torch.tensor(whole.order, device=device), torch.tensor(whole.signs, device=device)
 
     def __call__(self, name: str, values: Tensor) -> Tensor:
-        """Return the mirror image.
-
-        Args:
-            name: "policy", "critic" or "actions".
-            values: Shape: (samples, size).
-        """
+        """Return the mirror image of "policy", "critic" or "actions". Shape: (samples, size)."""
         order, signs = self._maps[name]
         return values[:, order] * signs
 
@@ -122,8 +98,7 @@ class Mirror:
 def make_mirror(task: LeggedRobot) -> Mirror:
     """Return what reflects a task's observations and actions.
 
-    Raises:
-        UserError: If the robot is not symmetric, or the mirror image of a term or of a random parameter is not known.
+    A UserError if the robot is not symmetric, or the mirror image of a term or of a random parameter is not known.
     """
     actions = [(term.name, task.symmetry.joints) for term in task.action_terms()]
     unknown = [name for name, mirroring in task.parameter_mirrors.items() if mirroring is None]
@@ -137,10 +112,7 @@ def with_mirror_images(
 ) -> tuple[TensorDict | None, Tensor | None]:
     """Return observations and actions followed by their mirror images: rsl_rl's ``data_augmentation_func``.
 
-    Args:
-        env: The task.
-        obs: Observations, each (samples, size), or None.
-        actions: Shape: (samples, num_actions), or None.
+    Shapes: (samples, size) and (samples, num_actions); what is None stays None.
     """
     if obs is not None:
         tensors: Any = obs.items()

@@ -14,12 +14,7 @@ class TaskLog:
     """What happened in a task since the last :meth:`read`."""
 
     def __init__(self, reward_names: list[str], device: str) -> None:
-        """Start with empty sums.
-
-        Args:
-            reward_names: Names of the reward terms, in the order of the task's ``episode_sums``.
-            device: Name of the device.
-        """
+        """Start with empty sums; names of reward terms are in the order of the task's ``episode_sums``."""
         self._names = [*reward_names, "steps", "episodes", "length", "return", "diverged", "error_xy", "error_yaw"]
         self._num_terms = len(reward_names)
         self._sums = torch.zeros(len(self._names), device=device)
@@ -46,13 +41,10 @@ class TaskLog:
     def read(self, max_episode_length_s: float) -> dict[str, float]:
         """Return the means since the last call and start anew. Waits for the device.
 
-        Args:
-            max_episode_length_s: Length of a full episode [s]; rewards of episodes are divided by it, as in legged_gym.
-
-        Returns:
-            Per finished episode: "Episode_Reward/<term>", "return", "length" (absent if none has finished). Per step:
-            "Tracking/error_xy" [m^2/s^2], "Tracking/error_yaw" [rad^2/s^2]. "Health/diverged_worlds": worlds that were
-            reset because their state was not finite.
+        Per finished episode: "Episode_Reward/<term>", divided by the length of a full episode [s] as in legged_gym,
+        "return" and "length"; absent if none has finished. Per step: "Tracking/error_xy" [m^2/s^2],
+        "Tracking/error_yaw" [rad^2/s^2]. "Health/diverged_worlds": worlds that were reset because their state was not
+        finite.
         """
         sums = dict(zip(self._names, self._sums.tolist(), strict=True))
         self._sums.zero_()

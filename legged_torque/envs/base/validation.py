@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
+
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.motors.action_delay import UNITS
-from legged_torque.utils.config import section_keys
+from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 
 POSITIVE = (
-    "trunk_mass_scale",
-    "foot_radius",
-    "dof_damping",
-    "dof_armature",
-    "dof_stiffness",
-    "dof_frictionloss",
-    "ground_friction",
-    "contact_stiffness",
-    "contact_damping",
-    "motor_strength",
-    "stiffness_scale",
-    "damping_scale",
+    *("trunk_mass_scale", "foot_radius", "dof_damping", "dof_armature", "dof_stiffness", "dof_frictionloss"),
+    *("ground_friction", "contact_stiffness", "contact_damping"),
+    *("motor_strength", "stiffness_scale", "damping_scale"),
 )
 """Ranges of ``domain_rand`` that make no sense below 0."""
 
@@ -28,49 +21,35 @@ NOT_PARAMETERS = ("keep_fixed", "push_velocity", "action_delay")
 
 
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:
-    """Check the settings of a task.
-
-    Raises:
-        UserError: Naming the first setting that makes no sense.
-    """
-    for key, value in {
-        "env.num_envs": cfg.env.num_envs,
-        "env.history_length": cfg.env.history_length,
-        "control.decimation": cfg.control.decimation,
-        "sim.solver_iterations": cfg.sim.solver_iterations,
-        "sim.ls_iterations": cfg.sim.ls_iterations,
-    }.items():
-        if value < 1:
-            raise UserError(f"{key} must be at least 1, not {value}")
-    for key, seconds in {"sim.dt": cfg.sim.dt, "env.episode_length_s": cfg.env.episode_length_s}.items():
-        if not seconds > 0.0:
-            raise UserError(f"{key} must be greater than 0, not {seconds}")
+    """Raise a UserError that names the first setting of a task that makes no sense."""
+    counts = ("env.num_envs", "env.history_length", "control.decimation", "sim.solver_iterations", "sim.ls_iterations")
+    for key in counts:
+        if attrgetter(key)(cfg) < 1:
+            raise UserError(f"{key} must be at least 1, not {attrgetter(key)(cfg)}")
+    for key in ("sim.dt", "env.episode_length_s"):
+        if not attrgetter(key)(cfg) > 0.0:
+            raise UserError(f"{key} must be greater than 0, not {attrgetter(key)(cfg)}")
     if len(cfg.init_state.pos) != 3:
         raise UserError(f"init_state.pos must be [x, y, z], not {cfg.init_state.pos}")
     if cfg.rewards.scales.symmetry and not cfg.asset.mirrored_legs:
-        raise UserError(
-            "rewards.scales.symmetry needs asset.mirrored_legs: which legs are the right and left of a pair"
-        )
+        raise UserError("rewards.scales.symmetry needs asset.mirrored_legs: which legs are right and left of a pair")
     if cfg.rewards.scales.base_height and not cfg.rewards.base_height_target > 0.0:
         raise UserError(f"rewards.base_height_target must be greater than 0, not {cfg.rewards.base_height_target}")
     _check_probability("commands.resampling_probability", cfg.commands.resampling_probability)
-    for key in section_keys(cfg.noise.noise_scales):
-        if getattr(cfg.noise.noise_scales, key) < 0.0:
-            raise UserError(
-                f"noise.noise_scales.{key} must not be negative, it is {getattr(cfg.noise.noise_scales, key)}"
-            )
+    for key, error in to_dict(cfg.noise.noise_scales).items():
+        if error < 0.0:
+            raise UserError(f"noise.noise_scales.{key} must not be negative, it is {error}")
     for key in POSITIVE:
         limits = getattr(cfg.domain_rand, key)
         if limits is not None and min(limits) < 0.0:
             raise UserError(f"domain_rand.{key} must not be negative, it is {limits}")
-    ranges = [key for key in section_keys(cfg.domain_rand) if isinstance(getattr(cfg.domain_rand, key), list)]
+    ranges = [key for key, value in to_dict(cfg.domain_rand).items() if isinstance(value, list)]
     ranges = [key for key in ranges if key not in NOT_PARAMETERS and not key.startswith("init_")]
     for name in cfg.domain_rand.keep_fixed:
         if name not in ranges:
             raise unknown_name("range in domain_rand.keep_fixed", name, ranges)
     for name, section in {"commands.ranges": cfg.commands.ranges, "domain_rand": cfg.domain_rand}.items():
-        for key in section_keys(section):
-            value = getattr(section, key)
+        for key, value in to_dict(section).items():
             if key.endswith("probability"):
                 _check_probability(f"{name}.{key}", value)
             elif isinstance(value, list) and key != "keep_fixed":

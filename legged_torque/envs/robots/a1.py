@@ -18,20 +18,12 @@ class A1Cfg(LeggedRobotCfg):
 
     class init_state:
         pos = [0.0, 0.0, 0.4]
-        default_joint_angles = {
-            "FR_hip_joint": -0.1,
-            "FR_thigh_joint": 0.8,
-            "FR_calf_joint": -1.5,
-            "FL_hip_joint": 0.1,
-            "FL_thigh_joint": 0.8,
-            "FL_calf_joint": -1.5,
-            "RR_hip_joint": -0.1,
-            "RR_thigh_joint": 1.0,
-            "RR_calf_joint": -1.5,
-            "RL_hip_joint": 0.1,
-            "RL_thigh_joint": 1.0,
-            "RL_calf_joint": -1.5,
-        }
+        default_joint_angles = (
+            {"FR_hip_joint": -0.1, "FR_thigh_joint": 0.8, "FR_calf_joint": -1.5}
+            | {"FL_hip_joint": 0.1, "FL_thigh_joint": 0.8, "FL_calf_joint": -1.5}
+            | {"RR_hip_joint": -0.1, "RR_thigh_joint": 1.0, "RR_calf_joint": -1.5}
+            | {"RL_hip_joint": 0.1, "RL_thigh_joint": 1.0, "RL_calf_joint": -1.5}
+        )
 
     class control:
         stiffness = 20.0

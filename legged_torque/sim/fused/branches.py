@@ -10,21 +10,12 @@ from typing import NamedTuple
 
 import warp as wp
 
+from legged_torque.sim.fused import solver
 from legged_torque.sim.fused.constraint import make_joint_rows
 from legged_torque.sim.fused.contact import Contacts, find_contacts
 from legged_torque.sim.fused.integrate import integrate_branch, sense_branch
 from legged_torque.sim.fused.math import group_sum, group_sum3
 from legged_torque.sim.fused.smooth import Pose, add_bodies, links_maker, make_equations
-from legged_torque.sim.fused.solver import (
-    assemble,
-    assemble_damping,
-    eliminate,
-    move,
-    row_slopes,
-    slopes_at_start,
-    start,
-    turn_to,
-)
 from legged_torque.sim.fused.tables import Tables, Worlds, dof
 from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
@@ -35,19 +26,12 @@ LINE_SEARCH_TOLERANCE = wp.constant(0.01)
 
 
 class Layout(NamedTuple):
-    """What a kernel is made for: a robot's structure, and how its branches are spread over threads.
-
-    Attributes:
-        branches: Number of branches.
-        depth: Joints per branch.
-        points: Most contacts of a branch with the floor.
-        lanes: Threads per world, a power of two; 1 on a CPU.
-    """
+    """What a kernel is made for: a robot's structure, and how its branches are spread over threads."""
 
     branches: int
-    depth: int
-    points: int
-    lanes: int
+    depth: int  # joints per branch
+    points: int  # most contacts of a branch with the floor
+    lanes: int  # threads per world, a power of two; 1 on a CPU
 
     @classmethod
     def of(cls, tree: Tree, on_gpu: bool) -> "Layout":
@@ -121,7 +105,7 @@ def around_solver(layout: Layout) -> SimpleNamespace:
             b = lane + i * wp.static(lanes)
             if b < wp.static(branches):
                 branch = make_branch(tables, worlds, world, b, trunk, contacts)
-                branch = start(branch, trunk.rot, acc, contacts)
+                branch = solver.start(branch, trunk.rot, acc, contacts)
                 total = add_bodies(total, branch.smooth.total)
             place.keep(kept, world, i, branch)
         return branch, total
@@ -133,8 +117,8 @@ def around_solver(layout: Layout) -> SimpleNamespace:
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
             if lane + i * wp.static(lanes) < wp.static(branches):
-                branch = assemble_damping(branch, timestep)
-                system = eliminate(branch, system, TrunkSystem())
+                branch = solver.assemble_damping(branch, timestep)
+                system = solver.eliminate(branch, system, TrunkSystem())
             place.keep(kept, world, i, branch)
         return branch, system
 
@@ -178,8 +162,8 @@ def in_solver(layout: Layout) -> SimpleNamespace:
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
             if lane + i * wp.static(lanes) < wp.static(branches):
-                branch, add = assemble(branch, rot, acc, contacts)
-                system = eliminate(branch, system, add)
+                branch, add = solver.assemble(branch, rot, acc, contacts)
+                system = solver.eliminate(branch, system, add)
             place.keep(kept, world, i, branch)
         return branch, system
 
@@ -192,8 +176,8 @@ def in_solver(layout: Layout) -> SimpleNamespace:
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
             if lane + i * wp.static(lanes) < wp.static(branches):
-                branch = turn_to(branch, rot, step, contacts)
-                slopes += slopes_at_start(branch, step, contacts)
+                branch = solver.turn_to(branch, rot, step, contacts)
+                slopes += solver.slopes_at_start(branch, step, contacts)
             place.keep(kept, world, i, branch)
         return branch, group_sum3(slopes, wp.static(lanes))
 
@@ -209,7 +193,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
             slopes = wp.vec2(0.0, 0.0)
             for i in range(wp.static(per_lane)):
                 branch = place.take(kept, world, i, branch)
-                slopes += row_slopes(branch, contacts, alpha)
+                slopes += solver.row_slopes(branch, contacts, alpha)
             slope = at_start[1] + alpha * at_start[2] + group_sum(slopes[0], wp.static(lanes))
             curvature = at_start[2] + group_sum(slopes[1], wp.static(lanes))
             if wp.abs(slope) <= -LINE_SEARCH_TOLERANCE * at_start[0]:
@@ -229,7 +213,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
         flips = float(0.0)
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
-            branch, changed = move(branch, contacts, alpha)
+            branch, changed = solver.move(branch, contacts, alpha)
             flips += changed
             place.keep(kept, world, i, branch)
         return branch, group_sum(flips, wp.static(lanes))

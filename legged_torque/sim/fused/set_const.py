@@ -32,15 +32,9 @@ class DerivedConstants:
     """
 
     def __init__(self, mj_model: mujoco.MjModel, model: mjw.Model, num_envs: int) -> None:
-        """Prepare; gives every world its own row of both fields.
+        """Prepare; gives every world its own row of both fields of ``model``, the one on the device.
 
-        Args:
-            mj_model: The model.
-            model: The same on the device.
-            num_envs: Number of worlds.
-
-        Raises:
-            UserError: If the robot's structure is not a trunk with branches.
+        A UserError if the robot's structure is not a trunk with branches.
         """
         tree = read_tree(mj_model)
         self._device = model.qpos0.device
@@ -64,20 +58,12 @@ class DerivedConstants:
         self._measure_worlds(self._dim[0])
 
     def update(self, mask: wp.array) -> None:
-        """Recompute the constants.
-
-        Args:
-            mask: Which worlds. Shape: (num_envs,), bool.
-        """
+        """Recompute the constants in the worlds of ``mask``. Shape: (num_envs,), bool."""
         if self._branches_vary:
             self._measure_branches(mask)
-        wp.launch(
-            self._derive,
-            dim=self._dim,
-            inputs=[self._tables, mask, self._rotation, self._measured, self._coms, ROWS],
-            outputs=[self._tables.body_invweight0, self._tables.dof_invweight0],
-            device=self._device,
-        )
+        inputs = [self._tables, mask, self._rotation, self._measured, self._coms, ROWS]
+        outputs = [self._tables.body_invweight0, self._tables.dof_invweight0]
+        wp.launch(self._derive, self._dim, inputs, outputs, device=self._device)
 
     def _measure_worlds(self, num_worlds: int) -> None:
         """Allocate and measure the branches of all worlds, or of one for all."""
@@ -91,13 +77,8 @@ class DerivedConstants:
 
     def _measure_branches(self, mask: wp.array) -> None:
         """Measure the branches of some worlds in the reference pose."""
-        wp.launch(
-            self._measure,
-            dim=self._measured.shape,
-            inputs=[self._tables, mask, self._qpos, self._rest],
-            outputs=[self._measured, self._coms],
-            device=self._device,
-        )
+        inputs, outputs = [self._tables, mask, self._qpos, self._rest], [self._measured, self._coms]
+        wp.launch(self._measure, self._measured.shape, inputs, outputs, device=self._device)
 
 
 @wp.func

@@ -8,14 +8,7 @@ import functools
 
 import warp as wp
 
-from legged_torque.sim.fused.math import (
-    column,
-    quat_multiply,
-    quat_rotation,
-    quat_to_matrix,
-    symmetric,
-    with_column,
-)
+from legged_torque.sim.fused.math import column, quat_multiply, quat_rotation, quat_to_matrix, symmetric, with_column
 from legged_torque.sim.fused.tables import Tables, Worlds, dof, of_world, qadr, row
 from legged_torque.sim.fused.types import AnyBranch, AnyLinks, Body, Trunk, branch_types
 

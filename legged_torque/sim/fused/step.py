@@ -32,13 +32,8 @@ class FusedStep:
     def __init__(self, mj_model: mujoco.MjModel, model: mjw.Model, data: mjw.Data) -> None:
         """Read the robot's structure and prepare the kernel; it compiles at the first step.
 
-        Args:
-            mj_model: The model.
-            model: The same on the device; parameters that change there act at once.
-            data: The worlds.
-
-        Raises:
-            UserError: If the robot has something that this step does not simulate.
+        Parameters that change in ``model``, the one on the device, act at once. A UserError if the robot has something
+        that this step does not simulate.
         """
         tree = read_tree(mj_model)
         self._device = data.qpos.device
@@ -54,18 +49,9 @@ class FusedStep:
         self._kernel, self._dim = make_kernel(layout), (data.nworld, layout.lanes)
 
     def __call__(self, sense: bool) -> None:
-        """Advance every world by one physics step.
-
-        Args:
-            sense: Whether to write the contact sensors.
-        """
-        wp.launch(
-            self._kernel,
-            dim=self._dim,
-            inputs=[*self._model, sense, *self._data, *self._scratch],
-            block_dim=BLOCK_DIM,
-            device=self._device,
-        )
+        """Advance every world by one physics step; ``sense`` says whether to write the contact sensors."""
+        inputs = [*self._model, sense, *self._data, *self._scratch]
+        wp.launch(self._kernel, self._dim, inputs, block_dim=BLOCK_DIM, device=self._device)
 
 
 @functools.cache

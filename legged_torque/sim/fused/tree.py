@@ -23,13 +23,11 @@ _GEOM_POINTS = {
 class Tree:
     """A robot's structure: a floating trunk and branches of hinge joints, each with ``depth`` joints.
 
-    Attributes:
-        joints: Joint of each place. Shape: (branches, depth).
-        points: Per branch, the points that can touch the floor: geom, depth of its body (0 is the trunk), position in
-            half sizes of the geom, radius in first sizes of the geom.
+    ``points`` are, per branch, those that can touch the floor: geom, depth of its body (0 is the trunk), position in
+    half sizes of the geom, radius in first sizes of the geom.
     """
 
-    joints: np.ndarray
+    joints: np.ndarray  # joint of each place. Shape: (branches, depth)
     points: list[list[tuple[int, int, tuple[float, float, float], float]]]
 
     @property
@@ -39,11 +37,7 @@ class Tree:
 
 
 def read_tree(model: mujoco.MjModel) -> Tree:
-    """Return the structure of a robot.
-
-    Raises:
-        UserError: If it has something that the fused step does not simulate.
-    """
+    """Return the structure of a robot; a UserError if it has something that the fused step does not simulate."""
     _check(model)
     children = [[c for c in range(2, model.nbody) if model.body_parentid[c] == b] for b in range(model.nbody)]
     chains = []
@@ -97,10 +91,8 @@ def _check_bodies(model: mujoco.MjModel) -> None:
     """Check bodies and joints."""
     hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
     _require(model.nbody > 1 and model.jnt_type[0] == free and model.jnt_bodyid[0] == 1, "its trunk is not free")
-    _require(
-        bool((model.body_jntnum[1:] == 1).all() and (model.jnt_type[1:] == hinge).all()),
-        "each body but the trunk must have one hinge joint (fixed bodies: compiler fusestatic)",
-    )
+    hinges = bool((model.body_jntnum[1:] == 1).all() and (model.jnt_type[1:] == hinge).all())
+    _require(hinges, "each body but the trunk must have one hinge joint (fixed bodies: compiler fusestatic)")
     _require(not (model.body_parentid[2:] == 0).any(), "something beside the trunk hangs on the world")
     _require(not model.body_gravcomp.any(), "bodies are compensated for gravity")
     _require(bool(model.jnt_limited[1:].all()), "each joint needs a range")
@@ -108,10 +100,8 @@ def _check_bodies(model: mujoco.MjModel) -> None:
     _require(not (model.jnt_actfrclimited.any()), "joints limit the forces of their actuators")
     root = [model.dof_damping[:6], model.dof_armature[:6], model.dof_frictionloss[:6], model.jnt_stiffness[:1]]
     _require(not any(values.any() for values in root), "the trunk's free joint has passive forces or armature")
-    _require(
-        not _any_of(model, "jnt_stiffnesspoly", "jnt_springyield", "dof_dampingpoly"),
-        "springs or dampers are not linear",
-    )
+    nonlinear = _any_of(model, "jnt_stiffnesspoly", "jnt_springyield", "dof_dampingpoly")
+    _require(not nonlinear, "springs or dampers are not linear")
 
 
 def _check_contacts(model: mujoco.MjModel) -> None:
@@ -135,12 +125,10 @@ def _check_contacts(model: mujoco.MjModel) -> None:
 
 def _check_motors(model: mujoco.MjModel) -> None:
     """Check the actuators: at most one plain motor per hinge."""
-    plain = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
-        model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED
-    )
-    plain &= (model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE) & (
-        model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE
-    )
+    plain = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    plain &= model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED
+    plain &= model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE
+    plain &= model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE
     extras = _any_of(model, "actuator_delay", "actuator_damping", "actuator_dampingpoly", "actuator_armature")
     _require(bool((plain & (model.actuator_gainprm[:, 0] == 1)).all()) and not extras, "actuators must be motors")
     joints = model.actuator_trnid[:, 0]
