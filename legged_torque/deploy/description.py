@@ -43,16 +43,9 @@ COMMENTS = {
 
 
 def read(path: str | Path) -> tuple[dict[str, Any], Path]:
-    """Read and check the description of a policy.
+    """Read and check the description of a policy; return it and the file of the network.
 
-    Args:
-        path: ``policy.yaml``, a network beside it, or the folder of both.
-
-    Returns:
-        The description, and the file of the network.
-
-    Raises:
-        UserError: If a file is missing or the description is not a valid one.
+    ``path`` is ``policy.yaml``, a network beside it, or the folder of both. A UserError tells what is missing or wrong.
     """
     path = Path(path)
     if not path.exists():
@@ -84,10 +77,9 @@ def to_yaml(description: dict[str, Any]) -> str:
 
 
 def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
-    """Check a description against the schema, and whether its parts fit together; ``where`` is its file's name.
+    """Check a description against the schema, and whether its parts fit together.
 
-    Raises:
-        UserError: If an entry is wrong; the message names the first one.
+    A UserError names the first wrong entry, and ``where`` it is.
     """
     _check_schema(description, where)
     for path, value in _numbers(description):

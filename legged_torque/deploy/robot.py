@@ -31,10 +31,9 @@ class MujocoRobot:
     """
 
     def __init__(self, xml: str | Path, description: dict[str, Any]) -> None:
-        """Load the robot of an MJCF file, with or without a floor, for a description: contents of ``policy.yaml``.
+        """Load the robot of an MJCF file, with or without a floor; ``description`` are the contents of ``policy.yaml``.
 
-        Raises:
-            UserError: If the file cannot be read, or lacks a joint or a motor that the policy needs.
+        A UserError if the file cannot be read, or lacks a joint or a motor that the policy needs.
         """
         self.notes: list[str] = []
         self.model = self._load(Path(xml))

@@ -106,10 +106,9 @@ def to_dict(section: Any) -> dict[str, Any]:
 
 
 def update_from_dict(section: Any, values: dict[str, Any], path: str = "") -> None:
-    """Write nested dictionaries of values into a configuration; messages begin with the dotted path of ``section``.
+    """Write nested dictionaries of values into a configuration; ``path`` is where ``section`` itself stands.
 
-    Raises:
-        UserError: If a key does not exist or a value has the wrong type.
+    A key that does not exist, or a value of the wrong type, is a UserError.
     """
     if not isinstance(values, dict):
         raise UserError(f"config key '{path}' is a section with entries, it cannot be the value {values!r}")

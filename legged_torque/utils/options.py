@@ -54,10 +54,7 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
     """Change settings as the options ask; what is more explicit wins.
 
     In this order: the preset, the number of worlds that suits the device, the settings of a loaded run ("env" and
-    "train" of ``run_config``), the perturbation, the ranges, single options, ``set``.
-
-    Raises:
-        UserError: If an option makes no sense.
+    "train" of ``run_config``), the perturbation, the ranges, single options, ``set``. One without sense is a UserError.
     """
     apply_preset(env_cfg, train_cfg, options.preset or DEFAULT_PRESET)
     if resolve_device(options.device) == "cpu":

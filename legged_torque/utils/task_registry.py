@@ -63,11 +63,7 @@ class TaskRegistry:
     def get_cfgs(
         self, name: str, args: Options | None = None, run_config: dict[str, Any] | None = None
     ) -> tuple[Any, Any]:
-        """Return copies of the settings of a task and of its training, or of a loaded run's, as ``args`` change them.
-
-        Raises:
-            UserError: If there is no such task or an option makes no sense.
-        """
+        """Return copies of the settings of a task and its training, or of a loaded run's, as ``args`` change them."""
         env_cfg, train_cfg = (copy.deepcopy(cfg) for cfg in self._get(name)[1:])
         train_cfg.runner.experiment_name = train_cfg.runner.experiment_name or name
         if args is not None:
@@ -122,8 +118,7 @@ class TaskRegistry:
     def load_run(self, options: Options) -> LoadedRun:
         """Return the run that the options name.
 
-        Raises:
-            UserError: If there is no such run or checkpoint, it is of another task, or its settings cannot be read.
+        A UserError if there is no such run or checkpoint, it is of another task, or its settings cannot be read.
         """
         _, train_cfg = self.get_cfgs(options.task)
         train_cfg.runner.experiment_name = options.experiment_name or train_cfg.runner.experiment_name
@@ -137,10 +132,8 @@ class TaskRegistry:
     def make_loaded(self, run: LoadedRun, options: Options, env_cfg: Any = None) -> tuple[VecEnv, OnPolicyRunner]:
         """Create the task of a run, and a runner that holds the policy of its checkpoint and keeps nothing.
 
-        ``env_cfg`` are settings of the task in place of the run's.
-
-        Raises:
-            UserError: If the checkpoint cannot be read or is of another kind of policy.
+        ``env_cfg`` are settings of the task in place of the run's. A UserError if the checkpoint cannot be read or is
+        of another kind of policy.
         """
         env, _ = self.make_env(options.task, options, env_cfg or run.env_cfg)
         runner, _ = self.make_alg_runner(env, train_cfg=run.train_cfg, log_root=None)
