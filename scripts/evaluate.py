@@ -4,7 +4,6 @@ from legged_torque.utils.rendering import without_renderer
 
 without_renderer()  # before anything imports mujoco
 
-import json
 import math
 from dataclasses import asdict
 from pathlib import Path
@@ -12,10 +11,10 @@ from pathlib import Path
 import torch
 
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.metrics import COMMANDS, CommandBreakdown, WalkingMetrics, measure
+from legged_torque.envs.base.metrics import COMMANDS, CommandBreakdown, measure
 from legged_torque.learning.evaluator import evaluation_cfg
 from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import prepare_file, run_script
+from legged_torque.utils.cli import add_command_arg, check_at_least, prepare_file, run_script, write_json
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
@@ -29,17 +28,10 @@ def main() -> None:
     add_task_args(parser)
     parser.set_defaults(num_envs=16, seed=1)
     parser.add_argument("--steps", type=int, default=2000, help="control steps; default: %(default)s")
-    parser.add_argument(
-        "--command",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "YAW"),
-        help="fixed command [m/s, m/s, rad/s]; default: drawn as in training",
-    )
+    add_command_arg(parser)
     parser.add_argument("--json", type=Path, help="file to write")
     args = parser.parse_args()
-    if args.steps < 1:
-        raise UserError(f"--steps must be at least 1, not {args.steps}")
+    check_at_least(args, 1, "steps")
     if args.command and not all(map(math.isfinite, args.command)):
         raise UserError(f"--command must be finite, not {args.command}")
     options = options_of(args)
@@ -54,33 +46,20 @@ def main() -> None:
     breakdown = CommandBreakdown(env)
     torch.manual_seed(args.seed)  # building and loading have drawn numbers too
     metrics = measure(env, runner.get_inference_policy(env.device), args.steps, breakdown.add_step)
-    result = {
-        "task": args.task,
-        "run": str(run.folder),
-        "checkpoint": run.checkpoint.name,
-        "steps": runner.logger.tot_timesteps,
-        "perturbation": args.perturbation or "as in training",
-        "ranges": args.ranges or "as in training",
-        "command": args.command,
-        "num_envs": env.num_envs,
-        "num_steps": args.steps,
-        "seed": args.seed,
-        "device": device_name(env.device),
-        "versions": package_versions(),
-    }
-    print(f"{run.checkpoint}, after {result['steps']:,} steps of training, {env.num_envs} worlds x {args.steps} steps:")
-    print_metrics(metrics)
-    print_breakdown(breakdown)
-    if args.json:
-        result["metrics"] = {name: asdict(estimate) for name, estimate in metrics.estimates().items()}
-        result["by_command"] = breakdown.table()
-        args.json.write_text(json.dumps(without_nan(result), indent=1) + "\n", encoding="utf-8")
-
-
-def print_metrics(metrics: WalkingMetrics) -> None:
-    """Print a line per metric."""
+    trained = runner.logger.tot_timesteps
+    print(f"{run.checkpoint}, after {trained:,} steps of training, {env.num_envs} worlds x {args.steps} steps:")
     for name, estimate in metrics.estimates().items():
         print(f"  {name:<18} {estimate.mean:10.4f} +- {estimate.standard_error:.4f} {UNITS[name]}")
+    print_breakdown(breakdown)
+    if args.json:
+        kept = "as in training"
+        result = {"task": args.task, "run": str(run.folder), "checkpoint": run.checkpoint.name, "steps": trained}
+        result |= {"perturbation": args.perturbation or kept, "ranges": args.ranges or kept, "command": args.command}
+        result |= {"num_envs": env.num_envs, "num_steps": args.steps, "seed": args.seed}
+        result |= {"device": device_name(env.device), "versions": package_versions()}
+        result["metrics"] = {name: asdict(estimate) for name, estimate in metrics.estimates().items()}
+        result["by_command"] = breakdown.table()
+        write_json(args.json, result)
 
 
 def print_breakdown(breakdown: CommandBreakdown) -> None:
@@ -88,19 +67,8 @@ def print_breakdown(breakdown: CommandBreakdown) -> None:
     print(f"  {'command':<12} {'from':>6} {'to':>6} {'share':>6} {'tracking':>9} {'error':>7}")
     for name, parts in breakdown.table().items():
         for part in parts:
-            print(
-                f"  {name:<12} {part['from']:>6.2f} {part['to']:>6.2f} {part['share']:>6.2f} "
-                f"{part['track_percentage']:>9.3f} {part['error']:>7.3f}"
-            )
-
-
-def without_nan(value):
-    """Return a value with null in place of what is not a number, which JSON does not know."""
-    if isinstance(value, dict):
-        return {key: without_nan(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [without_nan(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+            line = "  {:<12} {from:>6.2f} {to:>6.2f} {share:>6.2f} {track_percentage:>9.3f} {error:>7.3f}"
+            print(line.format(name, **part))
 
 
 if __name__ == "__main__":

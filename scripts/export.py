@@ -23,12 +23,8 @@ def main() -> None:
     env, runner = task_registry.make_loaded(run, options, nominal_cfg(run.env_cfg))
     iterations = runner.current_learning_iteration
     out = args.out or run.folder / f"exported_{iterations}"
-    training = {
-        "run": run.folder.name,
-        "checkpoint": run.checkpoint.name,
-        "iterations": iterations,
-        "total_steps": int(env.total_steps),
-    }
+    training = {"run": run.folder.name, "checkpoint": run.checkpoint.name}
+    training |= {"iterations": iterations, "total_steps": int(env.total_steps)}
     difference = export_policy(env, runner.alg.get_policy(), out, args.task, training)
     print(f"{run.checkpoint}, after {training['total_steps']:,} steps of training:")
     print(f"  exported to {out}: policy.onnx, policy.pt, policy.yaml")

@@ -16,7 +16,7 @@ from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import measure
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, run_script
+from legged_torque.utils.cli import Parser, check_at_least, run_script
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
@@ -25,10 +25,8 @@ from legged_torque.viewer import native
 from legged_torque.viewer.session import Session
 from legged_torque.viewer.video import TaskRecorder
 
-NUM_ENVS = {"none": 16, "web": 4, "native": 1}
-"""Default number of worlds, by viewer."""
-MAX_GRID = 25
-"""Maximum number of tiles; more would be unreadable."""
+NUM_ENVS = {"none": 16, "web": 4, "native": 1}  # default number of worlds, by viewer
+MAX_GRID = 25  # maximum number of tiles; more would be unreadable
 
 
 def main() -> None:
@@ -36,23 +34,17 @@ def main() -> None:
     parser = Parser(__doc__)
     add_task_args(parser)
     parser.set_defaults(seed=1)
-    parser.add_argument(
-        "--steps", type=int, default=500, help="control steps, 50 of them a second; default: %(default)s"
-    )
+    hint = "control steps, 50 of them a second; default: %(default)s"
+    parser.add_argument("--steps", type=int, default=500, help=hint)
     parser.add_argument("--video", type=Path, help="mp4 to write; default: in the run's folder")
     parser.add_argument("--grid", type=int, help="number of robots in the video: 1, 4, 9, 16 or 25; default: 1")
-    parser.add_argument(
-        "--viewer",
-        choices=NUM_ENVS,
-        default="none",
-        help="none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's "
-        "window; default: %(default)s",
-    )
+    hint = """none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's
+        window; default: %(default)s"""
+    parser.add_argument("--viewer", choices=NUM_ENVS, default="none", help=hint)
     parser.add_argument("--host", default="127.0.0.1", help="address of the page; default: %(default)s, this machine")
     parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
     args = parser.parse_args()
-    if args.steps < 1:
-        raise UserError(f"--steps must be at least 1, not {args.steps}")
+    check_at_least(args, 1, "steps")
     if not 1 <= args.port <= 65535:
         raise UserError(f"--port must be from 1 to 65535, not {args.port}")
     choose_worlds(args)
@@ -68,11 +60,7 @@ def main() -> None:
 
 
 def choose_worlds(args: argparse.Namespace) -> None:
-    """Choose how many worlds there are and how many of them are drawn.
-
-    Raises:
-        UserError: If that many cannot be drawn.
-    """
+    """Choose how many worlds there are and how many of them are drawn; a UserError if that many cannot be."""
     if args.grid is not None and args.viewer != "none":
         raise UserError(f"--grid is for videos, which --viewer {args.viewer} does not make")
     args.grid = 1 if args.grid is None else args.grid
@@ -85,11 +73,7 @@ def choose_worlds(args: argparse.Namespace) -> None:
 
 
 def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
-    """Return the function that shows a session of the robot in an MJCF file.
-
-    Raises:
-        UserError: If a package or a screen is missing.
-    """
+    """Return the function that shows a session of a robot's MJCF; a UserError if a package or a screen is missing."""
     if args.viewer == "native":
         native.check_display("--viewer web")
         return native.watch

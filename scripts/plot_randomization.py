@@ -100,12 +100,7 @@ def main() -> None:
 
 
 def parameters(task: LeggedRobot, fixed: LeggedRobot) -> list[Panel]:
-    """Return the panels of initial state, robot, ground and controller.
-
-    Args:
-        task: The task.
-        fixed: The same task without random parameters.
-    """
+    """Return the panels of initial state, robot, ground and controller; ``fixed`` has no random parameters."""
     panels = [action_delay(task)]
     for drawn in domain_rand.initial_state(task):
         if drawn.name not in ("base_pos", "action_delay"):  # never random, and a whole number
@@ -132,11 +127,6 @@ def panel_of(drawn: Parameter, group: str, own: list[float]) -> Panel:
 
     Numbers that replace the own values are shown over their weight. If columns have different own values, the
     differences to these are shown, or the ratios if a factor is drawn.
-
-    Args:
-        drawn: The parameter.
-        group: One of :data:`GROUPS`.
-        own: Values without draws, per column.
     """
     columns = list(drawn.columns)[: 1 if drawn.shared else None]
     own = np.array(own[: len(columns)])

@@ -11,7 +11,6 @@ NO_RENDERER = None if "--viewer" in sys.argv else choose_offscreen_renderer()  #
 
 import argparse
 import contextlib
-import json
 import math
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Events, Simulation
-from legged_torque.utils.cli import Parser, prepare_file, run_script
+from legged_torque.utils.cli import Parser, add_command_arg, check_at_least, prepare_file, run_script, write_json
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS, Estimate, estimates, ratios
 from legged_torque.viewer.native import simulation_window
@@ -36,25 +35,16 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--xml", type=Path, help="MJCF of the robot; default: that of the training")
     parser.add_argument("--steps", type=int, default=2000, help="control steps of each robot; default: %(default)s")
     parser.add_argument("--robots", type=int, default=16, help="robots, one after another; default: %(default)s")
-    parser.add_argument(
-        "--command",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "YAW"),
-        help="fixed command [m/s, m/s, rad/s]; default: drawn as in training",
-    )
-    parser.add_argument(
-        "--push_velocity", type=float, default=0.0, help="largest velocity of a push per axis [m/s]; default: none"
-    )
+    add_command_arg(parser)
+    hint = "largest velocity of a push per axis [m/s]; default: none"
+    parser.add_argument("--push_velocity", type=float, default=0.0, help=hint)
     parser.add_argument("--push_probability", type=float, help="probability of a push per control step; default: 0.002")
     parser.add_argument("--seed", type=int, default=1, help="random seed; default: %(default)s")
     parser.add_argument("--video", type=Path, help="mp4 of the first robot")
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
     args = parser.parse_args()
-    for name in ("steps", "robots"):
-        if getattr(args, name) < 1:
-            raise UserError(f"--{name} must be at least 1, not {getattr(args, name)}")
+    check_at_least(args, 1, "steps", "robots")
     if args.seed < 0:
         raise UserError(f"--seed must not be negative, it is {args.seed}")
     if args.push_probability is not None and not args.push_velocity:
@@ -83,7 +73,10 @@ def main() -> None:
     recorder = SimulationRecorder(simulation) if args.video else None
     sums = []
     with simulation_window(simulation) if args.viewer else contextlib.nullcontext(lambda: None) as show:
-        print_heading(policy, robot, xml)
+        training = policy.description["training"]
+        print(f"{policy.description['task']}, {training['checkpoint']} of {training['run']}, in MuJoCo with '{xml}':")
+        for note in robot.notes:
+            print(f"  note: {note}")
         for number in range(args.robots):
             record = recorder.add_step if recorder and number == 0 else lambda: None
             sums.append(simulation.run(args.steps, [args.seed, number], lambda record=record: (record(), show())))
@@ -93,29 +86,18 @@ def main() -> None:
     for name, value in metrics.items():
         print(f"  {name:<18} {value.mean:10.4f} +- {value.standard_error:.4f} {UNITS[name]}")
     if args.json:
-        write_json(args, policy, robot, metrics)
+        write_results(args, policy, robot, metrics)
     if recorder:
         recorder.save(args.video, NO_RENDERER)
 
 
-def print_heading(policy: Policy, robot: MujocoRobot, xml: Path) -> None:
-    """Print what is simulated, and how the MJCF differs from the policy's description."""
-    training = policy.description["training"]
-    print(f"{policy.description['task']}, {training['checkpoint']} of {training['run']}, in MuJoCo with '{xml}':")
-    for note in robot.notes:
-        print(f"  note: {note}")
-
-
-def write_json(args: argparse.Namespace, policy: Policy, robot: MujocoRobot, metrics: dict[str, Estimate]) -> None:
+def write_results(args: argparse.Namespace, policy: Policy, robot: MujocoRobot, metrics: dict[str, Estimate]) -> None:
     """Write arguments and results; null stands for what was not measured."""
     result = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
     result["task"], result["training"] = policy.description["task"], policy.description["training"]
     result["notes"], result["versions"] = robot.notes, {"mujoco": mujoco.__version__, "numpy": np.__version__}
-    result["metrics"] = {
-        name: {key: number if math.isfinite(number) else None for key, number in vars(value).items()}
-        for name, value in metrics.items()
-    }
-    args.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    result["metrics"] = {name: vars(estimate) for name, estimate in metrics.items()}
+    write_json(args.json, result)
 
 
 if __name__ == "__main__":

@@ -43,16 +43,9 @@ COMMENTS = {
 
 
 def read(path: str | Path) -> tuple[dict[str, Any], Path]:
-    """Read and check the description of a policy.
+    """Read and check the description of a policy; return it and the file of the network.
 
-    Args:
-        path: ``policy.yaml``, a network beside it, or the folder of both.
-
-    Returns:
-        The description, and the file of the network.
-
-    Raises:
-        UserError: If a file is missing or the description is not a valid one.
+    ``path`` is ``policy.yaml``, a network beside it, or the folder of both. A UserError tells what is missing or wrong.
     """
     path = Path(path)
     if not path.exists():
@@ -86,12 +79,7 @@ def to_yaml(description: dict[str, Any]) -> str:
 def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
     """Check a description against the schema, and whether its parts fit together.
 
-    Args:
-        description: As read from YAML.
-        where: Name of its file, for messages.
-
-    Raises:
-        UserError: If an entry is wrong; the message names the first one.
+    A UserError names the first wrong entry, and ``where`` it is.
     """
     _check_schema(description, where)
     for path, value in _numbers(description):
@@ -132,12 +120,8 @@ def _check_schema(description: Any, where: str) -> None:
 def _check_joints(description: dict[str, Any], where: str) -> None:
     """Check that values by joint cover all joints and no others."""
     joints = description["joint_order"]
-    by_joint = {
-        "nominal_pose": description["nominal_pose"],
-        "gains.stiffness": description["gains"]["stiffness"],
-        "gains.damping": description["gains"]["damping"],
-        "torque_limits": description["torque_limits"],
-    }
+    by_joint = {key: description[key] for key in ("nominal_pose", "torque_limits")}
+    by_joint |= {f"gains.{key}": values for key, values in description["gains"].items()}
     for path, values in by_joint.items():
         for name in values:
             if name not in joints:
@@ -172,9 +156,8 @@ def _check_terms(description: dict[str, Any], where: str) -> None:
 
 def _check_ranges(description: dict[str, Any], where: str) -> None:
     """Check that no range has its ends swapped."""
-    ranges = {f"torque_limits.{joint}": limits for joint, limits in description["torque_limits"].items()}
-    ranges |= {f"commands.{key}": limits for key, limits in description["commands"].items()}
-    ranges |= {f"initial_state.{key}": limits for key, limits in description["initial_state"].items()}
+    sections = ("torque_limits", "commands", "initial_state")
+    ranges = {f"{section}.{key}": limits for section in sections for key, limits in description[section].items()}
     ranges |= {f"clip of {term['name']}": term["clip"] for term in description["observations"]["terms"]}
     ranges["actions.clip"] = description["actions"]["clip"]
     for path, limits in ranges.items():

@@ -33,10 +33,16 @@ from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import package_versions
 
 TORCHSCRIPT_FILE = "policy.pt"
-NUM_SAMPLES = 256
-"""Random observations on which the exported networks are compared."""
-TOLERANCE = 1e-5
-"""Largest difference between an exported number and the task's; relative for numbers larger than 1."""
+NUM_SAMPLES = 256  # random observations on which the exported networks are compared
+INITIAL_STATE = {
+    **{angle: f"init_{angle}" for angle in ("roll", "pitch", "yaw")},
+    "joint_position_scale": "init_dof_pos_scale",
+    "trunk_linear_velocity": "init_lin_vel",
+    "trunk_angular_velocity": "init_ang_vel",
+    "joint_velocity": "init_dof_vel",
+}
+"""Which of the task's settings each entry of ``initial_state`` is."""
+TOLERANCE = 1e-5  # largest difference between an exported number and the task's; relative for numbers larger than 1
 
 
 def nominal_cfg(cfg: Any) -> Any:
@@ -89,16 +95,10 @@ def export_policy(task: LeggedRobot, model: MLPModel, folder: Path, name: str, t
 
 
 def check_terms(task: LeggedRobot) -> None:
-    """Refuse terms of observations and actions that :class:`~legged_torque.deploy.policy.Policy` cannot compute.
-
-    Raises:
-        UserError: Naming the first one.
-    """
-    observations = [term.name for term in task.observations.policy_terms()]
-    actions = [term.name for term in task.action_terms()]
-    for kind, names in (("observation", observations), ("action", actions)):
+    """Raise a UserError at the first term that :class:`~legged_torque.deploy.policy.Policy` cannot compute."""
+    for kind, terms in (("observation", task.observations.policy_terms()), ("action", task.action_terms())):
         known = term_names(kind)
-        for name in names:
+        for name in [term.name for term in terms]:
             if name not in known:
                 raise UserError(f"{DESCRIPTION_FILE} has no {kind} term '{name}'; it has {', '.join(known)}")
 
@@ -125,25 +125,18 @@ def write_networks(model: MLPModel, folder: Path) -> None:
 
 def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str, Any]:
     """Return the contents of ``policy.yaml`` but for the network's checksum; arguments as of :func:`export_policy`."""
-    cfg, model = task.cfg, task.sim.mj_model
-    file = Path(cfg.asset.file)
+    cfg, asset, ranges = task.cfg, task.cfg.asset, task.cfg.commands.ranges
+    file = Path(asset.file)
     if file.is_absolute() and file.is_relative_to(RESOURCES_DIR):
         file = file.relative_to(RESOURCES_DIR.parent)
-    rand, ranges = cfg.domain_rand, cfg.commands.ranges
     return {
         "format_version": FORMAT_VERSION,
         "task": name,
-        "robot": {"name": file.stem, "file": file.as_posix(), "trunk": model.body(1).name},
+        "robot": {"name": file.stem, "file": file.as_posix(), "trunk": task.sim.mj_model.body(1).name},
         "versions": package_versions() | {"legged_torque": __version__},
         "training": training,
-        "network": {
-            "file": NETWORK_FILE,
-            "torchscript": TORCHSCRIPT_FILE,
-            "input": "obs",
-            "output": "actions",
-            "num_observations": task.obs_buf["policy"].shape[1],
-            "num_actions": task.num_actions,
-        },
+        "network": {"file": NETWORK_FILE, "torchscript": TORCHSCRIPT_FILE, "input": "obs", "output": "actions"}
+        | {"num_observations": task.obs_buf["policy"].shape[1], "num_actions": task.num_actions},
         "joint_order": list(task.dof_names),
         "nominal_pose": _by_joint(task, task.default_dof_pos),
         "nominal_trunk_height": cfg.rewards.base_height_target,
@@ -157,26 +150,11 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
             "decimation": cfg.control.decimation,
             "refresh_torques": cfg.control.refresh_torques,
         },
-        "commands": {
-            "lin_vel_x": list(ranges.lin_vel_x),
-            "lin_vel_y": list(ranges.lin_vel_y),
-            "ang_vel_yaw": list(ranges.ang_vel_yaw),
-            "resampling_probability": cfg.commands.resampling_probability,
-        },
-        "initial_state": {
-            "trunk_position": list(cfg.init_state.pos),
-            "roll": list(rand.init_roll),
-            "pitch": list(rand.init_pitch),
-            "yaw": list(rand.init_yaw),
-            "joint_position_scale": list(rand.init_dof_pos_scale),
-            "trunk_linear_velocity": list(rand.init_lin_vel),
-            "trunk_angular_velocity": list(rand.init_ang_vel),
-            "joint_velocity": list(rand.init_dof_vel),
-        },
-        "episode": {
-            "length": cfg.env.episode_length_s,
-            "ends_on_contact_of": list(cfg.asset.terminate_after_contacts_on),
-        },
+        "commands": {name: list(getattr(ranges, name)) for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")}
+        | {"resampling_probability": cfg.commands.resampling_probability},
+        "initial_state": {"trunk_position": list(cfg.init_state.pos)}
+        | {name: list(getattr(cfg.domain_rand, setting)) for name, setting in INITIAL_STATE.items()},
+        "episode": {"length": cfg.env.episode_length_s, "ends_on_contact_of": list(asset.terminate_after_contacts_on)},
     }
 
 
@@ -188,9 +166,7 @@ def _observation_terms(task: LeggedRobot) -> list[dict[str, Any]]:
             "name": term.name,
             "size": sizes[term.name],
             "scale": list(term.scale) if isinstance(term.scale, Sequence) else term.scale,
-            "frame": term.frame,
-            "unit": term.unit,
-            "meaning": term.meaning,
+            **{key: getattr(term, key) for key in ("frame", "unit", "meaning")},
             "clip": list(clip),
         }
         for term in task.observations.policy_terms()
@@ -213,11 +189,7 @@ def _action_terms(task: LeggedRobot) -> list[dict[str, Any]]:
 
 
 def check_networks(model: MLPModel, policy: Policy, folder: Path) -> float:
-    """Return the largest difference between the exported networks and the model on random observations.
-
-    Raises:
-        UserError: If it is too large.
-    """
+    """Return the largest difference of the exported networks on random observations; too large, it is a UserError."""
     obs = torch.randn(NUM_SAMPLES, model.obs_dim, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         expected = model.as_jit().cpu().eval()(obs).numpy()
@@ -230,15 +202,10 @@ def check_networks(model: MLPModel, policy: Policy, folder: Path) -> float:
 
 
 def check_task(task: LeggedRobot, policy: Policy) -> None:
-    """Compare observations and torques of the task with those of the exported policy in random states.
-
-    Raises:
-        UserError: If they differ.
-    """
+    """Raise a UserError if the exported policy's observations or torques differ from the task's in random states."""
     generator = torch.Generator().manual_seed(0)
 
     def draw(like: Tensor, scale: float) -> Tensor:
-        """Return normal random numbers in the shape of a tensor."""
         return scale * torch.randn(like.shape, generator=generator)
 
     qpos = draw(task.sim.qpos, 1.0)
@@ -259,10 +226,8 @@ def check_task(task: LeggedRobot, policy: Policy) -> None:
         for what, (ours, theirs) in pairs.items():
             difference = _difference(ours, theirs.cpu().numpy()) if ours.shape == theirs.shape else float("inf")
             if not difference <= TOLERANCE:
-                raise UserError(
-                    f"the {what} of {type(task).__name__} are not what {DESCRIPTION_FILE} can describe: they differ by "
-                    f"{difference:.3g}"
-                )
+                why = f"are not what {DESCRIPTION_FILE} can describe: they differ by {difference:.3g}"
+                raise UserError(f"the {what} of {type(task).__name__} {why}")
 
 
 def _difference(ours: np.ndarray, theirs: np.ndarray) -> float:

@@ -15,21 +15,13 @@ from legged_torque.utils.errors import UserError
 
 @dataclass
 class State:
-    """Measurements of a robot; joints in the policy's order.
+    """Measurements of a robot; joints in the policy's order."""
 
-    Attributes:
-        angular_velocity: Of the trunk, in its own frame [rad/s]. Shape: (3,).
-        joint_positions: Shape: (joints,) [rad].
-        joint_velocities: Shape: (joints,) [rad/s].
-        projected_gravity: Unit gravity vector in the trunk's frame; upright it is (0, 0, -1). Shape: (3,).
-        quaternion: Orientation of the trunk (w, x, y, z), in place of the gravity vector. Shape: (4,).
-    """
-
-    angular_velocity: np.ndarray
-    joint_positions: np.ndarray
-    joint_velocities: np.ndarray
-    projected_gravity: np.ndarray | None = None
-    quaternion: np.ndarray | None = None
+    angular_velocity: np.ndarray  # of the trunk, in its own frame [rad/s]; (3,)
+    joint_positions: np.ndarray  # [rad]; (joints,)
+    joint_velocities: np.ndarray  # [rad/s]; (joints,)
+    projected_gravity: np.ndarray | None = None  # unit vector in the trunk's frame; upright it is (0, 0, -1)
+    quaternion: np.ndarray | None = None  # the trunk's orientation (w, x, y, z), in place of the gravity vector; (4,)
 
     def gravity(self) -> np.ndarray:
         """Return the unit gravity vector in the trunk's frame. Shape: (3,)."""
@@ -78,11 +70,8 @@ class Policy:
         terms = self.description["observations"]["terms"]
         self._terms = [term["name"] for term in terms]
         sizes = [term["size"] for term in terms]
-        self._scale = np.concatenate([np.full(n, term["scale"], dtype) for n, term in zip(sizes, terms, strict=True)])
-        clips: list[np.ndarray] = [
-            np.tile(np.array(term["clip"], dtype), (n, 1)) for n, term in zip(sizes, terms, strict=True)
-        ]
-        self._low, self._high = np.concatenate(clips).T
+        self._scale = np.concatenate([np.full(term["size"], term["scale"], dtype) for term in terms])
+        self._clip: np.ndarray = np.repeat(np.array([term["clip"] for term in terms], dtype), sizes, axis=0).T
         self.session = load_network(network, self.description["network"])
         self.reset()
 
@@ -92,14 +81,10 @@ class Policy:
         self._history: np.ndarray | None = None
 
     def observation(self, state: State, command: np.ndarray) -> np.ndarray:
-        """Return the network's observations. Call it once per control step, since it keeps the history.
+        """Return the network's observations, the newest step first. Shape: (observations,).
 
-        Args:
-            state: Measurements.
-            command: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (3,).
-
-        Returns:
-            Shape: (observations,), the newest step first.
+        Call it once per control step, since it keeps the history. The command is v_x, v_y [m/s] and the yaw rate
+        [rad/s] in the trunk's frame. Shape: (3,).
         """
         values = {
             "projected_gravity": state.gravity(),
@@ -112,7 +97,7 @@ class Policy:
         now = np.concatenate([np.asarray(values[name], self.dtype) for name in self._terms])
         if now.shape != self._scale.shape:
             raise ValueError(f"a state and a command make {now.size} observations, not {self._scale.size}")
-        now = np.clip(now * self._scale, self._low, self._high)
+        now = np.clip(now * self._scale, *self._clip)
         if self._history is None:
             self._history = np.tile(now, self.description["observations"]["history_length"])
         else:
@@ -120,16 +105,9 @@ class Policy:
         return self._history.copy()
 
     def act(self, obs: np.ndarray) -> np.ndarray:
-        """Return the clipped mean actions for observations, and keep them as the last actions.
+        """Return the clipped mean actions for observations, and keep them as the last actions. Shape: (actions,).
 
-        Args:
-            obs: Shape: (observations,).
-
-        Returns:
-            Shape: (actions,).
-
-        Raises:
-            UserError: If an action is not finite; it must not reach a robot.
+        An action that is not finite raises a UserError: it must not reach a robot.
         """
         (actions,) = self.session.run(["actions"], {"obs": np.asarray(obs, np.float32)[np.newaxis]})
         if not np.isfinite(actions).all():
@@ -138,15 +116,9 @@ class Policy:
         return self.last_action.copy()
 
     def torques(self, actions: np.ndarray, joint_positions: np.ndarray, joint_velocities: np.ndarray) -> np.ndarray:
-        """Return joint torques for actions, clipped to the limits.
+        """Return joint torques [N m] for actions of :meth:`act`, clipped to the limits. Shape: (joints,).
 
-        Args:
-            actions: From :meth:`act`. Shape: (actions,).
-            joint_positions: Now. Shape: (joints,) [rad].
-            joint_velocities: Now. Shape: (joints,) [rad/s].
-
-        Returns:
-            Shape: (joints,) [N m].
+        Joint positions [rad] and velocities [rad/s] are the present ones. Shapes: (joints,).
         """
         actions = np.asarray(actions, self.dtype).reshape(len(self._action_terms), len(self.joint_order))
         total = np.zeros_like(self.nominal_pose)
@@ -171,15 +143,7 @@ class Policy:
 
 
 def load_network(file: Path, expected: dict[str, Any]) -> Any:
-    """Return an onnxruntime session on one thread.
-
-    Args:
-        file: The network.
-        expected: ``network`` of the description.
-
-    Raises:
-        UserError: If the file cannot be read or is not the network that was described.
-    """
+    """Return an onnxruntime session on one thread; a UserError if the file is not the ``network`` of a description."""
     try:
         import onnxruntime
     except ImportError:

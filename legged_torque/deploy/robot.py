@@ -31,14 +31,9 @@ class MujocoRobot:
     """
 
     def __init__(self, xml: str | Path, description: dict[str, Any]) -> None:
-        """Load a robot.
+        """Load the robot of an MJCF file, with or without a floor; ``description`` are the contents of ``policy.yaml``.
 
-        Args:
-            xml: MJCF file, with or without a floor.
-            description: Contents of ``policy.yaml``.
-
-        Raises:
-            UserError: If the file cannot be read, or lacks a joint or a motor that the policy needs.
+        A UserError if the file cannot be read, or lacks a joint or a motor that the policy needs.
         """
         self.notes: list[str] = []
         self.model = self._load(Path(xml))
@@ -70,11 +65,7 @@ class MujocoRobot:
         return self.data.qfrc_actuator[self._dofs]
 
     def step(self, torques: np.ndarray) -> None:
-        """Advance by one physics step.
-
-        Args:
-            torques: Shape: (joints,) [N m].
-        """
+        """Advance by one physics step with torques of shape (joints,) [N m]."""
         self.data.ctrl[self._motors] = torques / self._torque_per_ctrl
         mujoco.mj_step(self.model, self.data)
 
@@ -87,13 +78,10 @@ class MujocoRobot:
     def reset(
         self, position: np.ndarray, quat: np.ndarray, joint_positions: np.ndarray, velocities: tuple[np.ndarray, ...]
     ) -> None:
-        """Put the robot into a state, everything else as in the MJCF.
+        """Put the robot into a state, everything else as in the MJCF; joint positions are brought inside their limits.
 
-        Args:
-            position: Of the trunk. Shape: (3,) [m].
-            quat: Of the trunk (w, x, y, z). Shape: (4,).
-            joint_positions: They are brought inside the joint limits. Shape: (joints,) [rad].
-            velocities: Linear (world) [m/s] and angular (trunk) [rad/s], shapes (3,), and joint velocities (joints,).
+        Position [m], quaternion (w, x, y, z), and of ``velocities`` the linear one (world) [m/s] and the angular one
+        (trunk) [rad/s], are the trunk's; the third of ``velocities`` is that of the joints. Shape: (joints,) [rad/s].
         """
         mujoco.mj_resetData(self.model, self.data)
         self.position[:], self.quat[:] = position, quat
@@ -121,8 +109,7 @@ class MujocoRobot:
     def _ground_contacts(self) -> list[tuple[int, int, float]]:
         """Return number, geom of the robot, and the force's sign on it, of each contact with the ground."""
         result = []
-        for number in range(self.data.ncon):
-            contact = self.data.contact[number]
+        for number, contact in enumerate(self.data.contact):
             first, second = contact.geom
             if contact.exclude == 0 and self._is_ground[first] != self._is_ground[second]:
                 result.append((number, second, 1.0) if self._is_ground[first] else (number, first, -1.0))
@@ -147,9 +134,8 @@ class MujocoRobot:
     def _set_time_step(self, step: float) -> None:
         """Take the policy's physics step."""
         if not np.isclose(self.model.opt.timestep, step, rtol=1e-6):
-            self.notes.append(
-                f"time step: the MJCF has {self.model.opt.timestep:g} s, policy.yaml's {step:g} s is used"
-            )
+            old = self.model.opt.timestep
+            self.notes.append(f"time step: the MJCF has {old:g} s, policy.yaml's {step:g} s is used")
         self.model.opt.timestep = step
 
     def _find_root(self) -> None:
@@ -207,10 +193,8 @@ class MujocoRobot:
         names = [model.geom(i).name or model.body(model.geom_bodyid[i]).name for i in range(model.ngeom)]
         is_ending = np.array([any(part in name for part in ends_on_contact_of) for name in names]) & ~self._is_ground
         if ends_on_contact_of and not is_ending.any():
-            trunk = model.body(self.trunk).name
-            self.notes.append(
-                f"no geom's name contains {', '.join(ends_on_contact_of)}: those of '{trunk}' end an episode"
-            )
+            parts, trunk = ", ".join(ends_on_contact_of), model.body(self.trunk).name
+            self.notes.append(f"no geom's name contains {parts}: those of '{trunk}' end an episode")
             is_ending = model.geom_bodyid == self.trunk
         self._is_ending = is_ending
 
@@ -227,13 +211,10 @@ def _is_torque_motor(model: mujoco.MjModel, motor: int) -> bool:
 
 def _torque_range(model: mujoco.MjModel, motor: int, joint: int, scale: float) -> tuple[float, float]:
     """Return the lowest and highest torque that a motor can apply to its joint [N m]."""
-    low, high = -np.inf, np.inf
-    gear = model.actuator_gear[motor, 0]
-    for limited, limits in (
+    ranges = (
         (model.actuator_ctrllimited[motor], model.actuator_ctrlrange[motor] * scale),
-        (model.actuator_forcelimited[motor], model.actuator_forcerange[motor] * gear),
+        (model.actuator_forcelimited[motor], model.actuator_forcerange[motor] * model.actuator_gear[motor, 0]),
         (model.jnt_actfrclimited[joint], model.jnt_actfrcrange[joint]),
-    ):
-        if limited:
-            low, high = max(low, float(limits.min())), min(high, float(limits.max()))
-    return low, high
+    )
+    limits = [limits for is_limited, limits in ranges if is_limited] or [np.array([-np.inf, np.inf])]
+    return max(float(each.min()) for each in limits), min(float(each.max()) for each in limits)

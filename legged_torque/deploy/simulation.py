@@ -14,40 +14,26 @@ from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.utils.metrics import NUM_SUMS, step_sums
 
-PUSH_ADDED = 0.5
-"""Share of pushes that add a velocity; the others set one."""
+PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one
 
 
 @dataclass
 class Events:
-    """Commands and pushes.
+    """Commands and pushes."""
 
-    Attributes:
-        command: Fixed v_x, v_y [m/s] and yaw rate [rad/s]; None draws them as in training. Shape: (3,).
-        push_velocity: Pushes draw each axis of the trunk's velocity from -this to this [m/s].
-        push_probability: Probability of a push per control step.
-    """
-
-    command: tuple[float, float, float] | None = None
-    push_velocity: float = 0.0
-    push_probability: float = 0.0
+    command: tuple[float, float, float] | None = None  # fixed, [m/s, m/s, rad/s]; None draws them as in training
+    push_velocity: float = 0.0  # pushes draw each axis of the trunk's velocity from -this to this [m/s]
+    push_probability: float = 0.0  # of a push per control step
 
 
 class Simulation:
     """Runs a policy as in evaluation: random initial states and commands, pushes, new episodes.
 
-    Attributes:
-        command: The present command. Shape: (3,).
+    ``command`` is the present one. Shape: (3,).
     """
 
     def __init__(self, policy: Policy, robot: MujocoRobot, events: Events) -> None:
-        """Prepare; :meth:`run` starts an episode.
-
-        Args:
-            policy: The policy.
-            robot: The robot.
-            events: Commands and pushes.
-        """
+        """Prepare; :meth:`run` starts an episode."""
         self.policy, self.robot, self.events = policy, robot, events
         description = policy.description
         self._timing, self._start = description["timing"], description["initial_state"]
@@ -62,15 +48,12 @@ class Simulation:
         self._steps = 0
 
     def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:
-        """Run one robot.
+        """Run one robot for some control steps and return sums of metrics, see ``step_sums``. Shape: (NUM_SUMS,).
 
         Args:
             num_steps: Control steps.
-            seed: Seed of its random numbers, for ``np.random.default_rng``.
+            seed: For ``np.random.default_rng``.
             on_step: Called after every control step, e.g. to record it.
-
-        Returns:
-            Sums of the metrics, see :func:`~legged_torque.utils.metrics.step_sums`. Shape: (NUM_SUMS,).
         """
         self._rng = np.random.default_rng(seed)
         self._new_episode()

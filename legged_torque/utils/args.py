@@ -31,9 +31,8 @@ def add_task_args(parser: Parser) -> None:
 def add_train_args(parser: Parser) -> None:
     """Add what only training takes."""
     add_options(parser, *_TRAINING)
-    parser.add_argument(
-        "--headless", action="store_true", help="accepted for legged_gym's sake: training has no window"
-    )
+    hint = "accepted for legged_gym's sake: training has no window"
+    parser.add_argument("--headless", action="store_true", help=hint)
 
 
 def add_options(parser: Parser, *names: str) -> None:

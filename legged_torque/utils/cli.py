@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import gc
+import json
+import math
 import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from legged_torque.utils.errors import UserError, unknown_name
 
@@ -25,11 +27,7 @@ class Parser(argparse.ArgumentParser):
         raise UserError(message)
 
     def parse_args(self, args=None, namespace=None):
-        """Parse the command line.
-
-        Raises:
-            UserError: If it cannot be parsed.
-        """
+        """Parse the command line; an option that does not exist is a UserError."""
         namespace, unknown = self.parse_known_args(args, namespace)
         if unknown:
             options = [option for action in self._actions for option in action.option_strings]
@@ -57,12 +55,34 @@ def run_script(main: Callable[[], None]) -> None:
         sys.exit(1)
 
 
-def prepare_file(file: Path) -> None:
-    """Make the folder of a file that will be written when the work is done.
+def check_at_least(args: argparse.Namespace, lowest: int, *names: str) -> None:
+    """Raise a UserError if one of the named arguments is lower."""
+    for name in names:
+        if getattr(args, name) < lowest:
+            raise UserError(f"--{name} must be at least {lowest}, not {getattr(args, name)}")
 
-    Raises:
-        UserError: If that is not possible, or the file is a folder.
-    """
+
+def add_command_arg(parser: Parser) -> None:
+    """Add a fixed command of the robots."""
+    hint = "fixed command [m/s, m/s, rad/s]; default: drawn as in training"
+    parser.add_argument("--command", type=float, nargs=3, metavar=("X", "Y", "YAW"), help=hint)
+
+
+def write_json(file: Path, value: Any) -> None:
+    """Write a value with null in place of what is not a finite number, which JSON does not know."""
+
+    def finite(part: Any) -> Any:
+        if isinstance(part, dict):
+            return {key: finite(entry) for key, entry in part.items()}
+        if isinstance(part, list):
+            return [finite(entry) for entry in part]
+        return None if isinstance(part, float) and not math.isfinite(part) else part
+
+    file.write_text(json.dumps(finite(value), indent=1) + "\n", encoding="utf-8")
+
+
+def prepare_file(file: Path) -> None:
+    """Make the folder of a file that will be written when the work is done; a UserError if that is not possible."""
     if file.is_dir():
         raise UserError(f"cannot write '{file}': it is a folder")
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import inspect
 from typing import Any
@@ -9,9 +10,6 @@ from typing import Any
 import yaml
 
 from legged_torque.utils.errors import UserError, unknown_name
-
-_OF_EVERY_CLASS = ("__dict__", "__weakref__")
-"""What Python adds to each class by itself."""
 
 
 class Section:
@@ -29,11 +27,7 @@ class Section:
     """
 
     def __init_subclass__(cls) -> None:
-        """Check the names of a new class and let its nested classes inherit.
-
-        Raises:
-            UserError: If a name is neither known nor declared new, or is a setting here and a section there.
-        """
+        """Refuse unknown names of a new class with a UserError, and let its nested classes inherit."""
         super().__init_subclass__()
         _check_names(cls)
         names = [name for owner in reversed(cls.__mro__) for name in vars(owner)]
@@ -87,7 +81,8 @@ def _merge(cls: type[Section], name: str) -> type[Section]:
     bases = [base for base in bases if not any(other is not base and issubclass(other, base) for other in bases)]
     if own is None and len(bases) == 1:
         return bases[0]
-    members = {} if own is None else {key: value for key, value in vars(own).items() if key not in _OF_EVERY_CLASS}
+    of_every_class = ("__dict__", "__weakref__")  # Python adds them by itself
+    members = {} if own is None else {key: value for key, value in vars(own).items() if key not in of_every_class}
     members["__qualname__"] = f"{cls.__qualname__}.{name}"
     return type(name, tuple(bases), members)
 
@@ -106,23 +101,14 @@ def section_keys(section: Any) -> list[str]:
 
 def to_dict(section: Any) -> dict[str, Any]:
     """Return a configuration as nested dictionaries of plain values."""
-    result = {}
-    for key in section_keys(section):
-        value = getattr(section, key)
-        result[key] = to_dict(value) if isinstance(value, Section) else value
-    return result
+    values = {key: getattr(section, key) for key in section_keys(section)}
+    return {key: to_dict(value) if isinstance(value, Section) else value for key, value in values.items()}
 
 
 def update_from_dict(section: Any, values: dict[str, Any], path: str = "") -> None:
-    """Write nested dictionaries of values into a configuration.
+    """Write nested dictionaries of values into a configuration; ``path`` is where ``section`` itself stands.
 
-    Args:
-        section: The configuration, changed in place.
-        values: What to write; every key must exist.
-        path: Dotted path of ``section``, for messages.
-
-    Raises:
-        UserError: If a key does not exist or a value has the wrong type.
+    A key that does not exist, or a value of the wrong type, is a UserError.
     """
     if not isinstance(values, dict):
         raise UserError(f"config key '{path}' is a section with entries, it cannot be the value {values!r}")
@@ -131,11 +117,7 @@ def update_from_dict(section: Any, values: dict[str, Any], path: str = "") -> No
 
 
 def set_by_path(section: Any, dotted_path: str, value: Any) -> None:
-    """Set one entry, e.g. ``set_by_path(cfg, "rewards.scales.torques", -1e-4)``.
-
-    Raises:
-        UserError: If the path does not exist or the value has the wrong type.
-    """
+    """Set one entry, e.g. ``set_by_path(cfg, "rewards.scales.torques", -1e-4)``; errors as of update_from_dict."""
     set_entry(section, dotted_path.split("."), value, "")
 
 
@@ -163,11 +145,7 @@ def set_entry(section: Any, keys: list[str], value: Any, path: str) -> None:
 
 
 def convert(value: Any, old: Any, path: str) -> Any:
-    """Return ``value`` in the type of ``old``, the entry that it replaces.
-
-    Raises:
-        UserError: If that is not possible.
-    """
+    """Return ``value`` in the type of ``old``, the entry that it replaces; a UserError if that is not possible."""
     if isinstance(value, str) and not isinstance(old, str):
         value = parse_value(value)
     if old is None:
@@ -189,29 +167,15 @@ def convert(value: Any, old: Any, path: str) -> Any:
 
 
 def parse_value(text: str) -> Any:
-    """Return the value that a piece of text stands for, as YAML reads it, and also read ``1e-4`` as a number.
-
-    Raises:
-        UserError: If the text is not valid YAML.
-    """
+    """Return the value that a piece of text stands for, as YAML reads it, and also read ``1e-4`` as a number."""
     if "e" in text.lower():  # PyYAML reads 1e-4 as text, since it has no dot
-        try:
+        with contextlib.suppress(ValueError):
             return float(text)
-        except ValueError:
-            pass
     return parse_yaml(text, f"the value '{text}'")
 
 
 def parse_yaml(text: str, what: str) -> Any:
-    """Return what YAML text holds.
-
-    Args:
-        text: The YAML text.
-        what: What the text is, for the message.
-
-    Raises:
-        UserError: If the text is not valid YAML.
-    """
+    """Return what YAML text holds; if it is not valid, a UserError says ``what`` the text is."""
     try:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError) as error:  # a date such as 2026-99-99 is a ValueError

@@ -11,13 +11,9 @@ from legged_torque.utils.errors import UserError, unknown_name
 
 
 def resolve_device(device: str | None) -> str:
-    """Return the name of the device to use. Processes that train together take a GPU each.
+    """Return "cpu" or "cuda:N" for "auto" (or None), "cpu", "cuda" or "cuda:N".
 
-    Args:
-        device: "auto", "cpu", "cuda" or "cuda:N"; None is "auto".
-
-    Raises:
-        UserError: If there is no such device, or not one for each process.
+    Processes that train together take a GPU each; a UserError if there is no such device, or not one for each.
     """
     num_gpus = torch.cuda.device_count()
     available = ["cpu", *(f"cuda:{i}" for i in range(num_gpus))]

@@ -32,14 +32,7 @@ def local_rank() -> int:
 
 
 def join(device: str) -> None:
-    """Meet the other processes, unless that has happened already.
-
-    Args:
-        device: "cpu" or "cuda:N", where the tensors are that processes exchange.
-
-    Raises:
-        UserError: If the processes do not know where to meet.
-    """
+    """Meet the other processes, unless that has happened already, to exchange tensors on a device ("cpu", "cuda:N")."""
     if torch.distributed.is_initialized():
         return
     try:
@@ -49,11 +42,7 @@ def join(device: str) -> None:
 
 
 def average(tensors: list[Tensor]) -> None:
-    """Replace tensors by their means over all processes, in one exchange; can be captured in a CUDA graph.
-
-    Args:
-        tensors: Of any shapes, the same in all processes. Changed in place.
-    """
+    """Replace tensors by their means over all processes, in one exchange; can be captured in a CUDA graph."""
     flat = torch.cat([tensor.flatten() for tensor in tensors])
     torch.distributed.all_reduce(flat)
     flat /= torch.distributed.get_world_size()
@@ -62,12 +51,7 @@ def average(tensors: list[Tensor]) -> None:
 
 
 def any_process(condition: bool, device: str) -> bool:
-    """Return whether a condition holds in any process, and wait for all of them; a single process asks nobody.
-
-    Args:
-        condition: Whether it holds in this one.
-        device: As for :func:`join`.
-    """
+    """Return whether a condition holds in any process, and wait for all of them; a single process asks nobody."""
     if not torch.distributed.is_initialized():
         return condition
     flag = torch.tensor(float(condition), device=device)

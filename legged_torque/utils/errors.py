@@ -14,13 +14,7 @@ class UserError(Exception):
 
 
 def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
-    """Return the error for a name that does not exist.
-
-    Args:
-        kind: What the name stands for, e.g. "task".
-        given: The name that was given.
-        allowed: All names that exist.
-    """
+    """Return the error for a name that does not exist; ``kind`` is what it stands for, e.g. "task"."""
     allowed = sorted(allowed)
     match = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
     hint = f" did you mean '{match[0]}'?" if match else ""

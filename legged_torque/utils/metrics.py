@@ -15,6 +15,7 @@ world was reset are left out, but for the count of falls.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import ModuleType
@@ -22,29 +23,19 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-Array: TypeAlias = Any
-"""A numpy array or a torch tensor."""
+Array: TypeAlias = Any  # a numpy array or a torch tensor
 
 
 @dataclass(frozen=True)
 class Metric:
-    """How a metric is named and shown.
+    """How a metric is named and shown."""
 
-    Attributes:
-        name: Its name in files and on the terminal.
-        unit: Its unit; empty if it has none.
-        title: Its name in tables and figures. The paper's own name, if the metric is in Table I.
-        lower_is_better: Whether smaller values are better; None if neither direction is.
-        in_paper: Whether Table I of the paper has it.
-        digits: Decimals shown in tables; as many as the paper prints.
-    """
-
-    name: str
-    unit: str
-    title: str
-    lower_is_better: bool | None
-    in_paper: bool = False
-    digits: int = 4
+    name: str  # in files and on the terminal
+    unit: str  # empty if it has none
+    title: str  # its name in tables and figures; the paper's own name, if the metric is in Table I
+    lower_is_better: bool | None  # None if neither direction is better
+    in_paper: bool = False  # whether Table I of the paper has it
+    digits: int = 4  # decimals shown in tables; as many as the paper prints
 
     @property
     def label(self) -> str:
@@ -64,21 +55,14 @@ METRICS = (
 )
 """The metrics of an evaluation, the five of the paper first; each has its formula in :func:`ratios`."""
 
-UNITS = {metric.name: metric.unit for metric in METRICS}
-"""Unit of each metric."""
+UNITS = {metric.name: metric.unit for metric in METRICS}  # unit of each metric
 
-NUM_SUMS = 10
-"""Numbers that :func:`step_sums` returns for each world."""
+NUM_SUMS = 10  # numbers that step_sums returns for each world
 
 
 @dataclass
 class Estimate:
-    """A mean over worlds and steps.
-
-    Attributes:
-        mean: The mean; NaN where nothing was measured.
-        standard_error: Its standard error, from the differences between worlds; NaN with one world.
-    """
+    """A mean over worlds and steps, NaN where nothing was measured; its standard error is NaN with one world."""
 
     mean: float
     standard_error: float
@@ -87,10 +71,7 @@ class Estimate:
 def tracking_percentage(xp: ModuleType, error: Array, commands: Array) -> tuple[Array, Array]:
     """Return how much of its commands each world follows, and 1 where anything was commanded, else 0.
 
-    Args:
-        xp: ``numpy`` or ``torch``, whichever the arrays are of.
-        error: |v - v*|. Shape: (worlds, 3).
-        commands: v*. Shape: (worlds, 3). Those that are exactly 0 do not count.
+    ``xp`` is ``numpy`` or ``torch``. The error is |v - v*|; commands of exactly 0 do not count. Shapes: (worlds, 3).
     """
     counts = commands != 0.0
     relative = xp.where(counts, 1.0 - error / xp.where(counts, abs(commands), 1.0), 0.0)
@@ -128,10 +109,9 @@ def step_sums(
     """
     error = abs(commands - velocity)
     percentage, is_commanded = tracking_percentage(xp, error, commands)
-    ones, zeros = xp.ones_like(percentage), xp.zeros_like(percentage)
-    squares = error**2
-    xy, angular = squares[:, :2].sum(axis=1), squares[:, 2]
-    rows = xp.stack([ones, percentage, is_commanded, xy, angular, force, power, height, speed, zeros])
+    one, zero = xp.ones_like(percentage), xp.zeros_like(percentage)
+    xy, angular = (error[:, :2] ** 2).sum(axis=1), error[:, 2] ** 2
+    rows = xp.stack([one, percentage, is_commanded, xy, angular, force, power, height, speed, zero])
     rows = xp.where(ended, 0.0, rows)
     rows[-1] = fell
     return rows
@@ -140,10 +120,7 @@ def step_sums(
 def ratios(sums: Array, weight: float, control_step: float) -> dict[str, tuple[Array, Array]]:
     """Return numerator and denominator of each metric, per world. Shapes: (worlds,).
 
-    Args:
-        sums: Sums of :func:`step_sums`. Shape: (:data:`NUM_SUMS`, worlds).
-        weight: Of the robot, m g [N].
-        control_step: [s].
+    ``sums`` are those of :func:`step_sums`, ``weight`` is the robot's m g [N], and ``control_step`` is in seconds.
     """
     steps, percentage, commanded, xy, angular, force, power, height, speed, falls = sums
     return {
@@ -164,17 +141,12 @@ def estimates(of: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Esti
 
 
 def estimate(numerator: np.ndarray, denominator: np.ndarray) -> Estimate:
-    """Return a ratio of sums over worlds with its standard error, which takes worlds as independent (delta method).
-
-    Args:
-        numerator: Shape: (worlds,).
-        denominator: Shape: (worlds,).
-    """
+    """Return a ratio of sums over worlds with its standard error, which takes worlds as independent (delta method)."""
     total, count = denominator.sum(), len(numerator)
     if total == 0.0:
-        return Estimate(float("nan"), float("nan"))
+        return Estimate(math.nan, math.nan)
     mean = numerator.sum() / total
     if count == 1:
-        return Estimate(float(mean), float("nan"))
+        return Estimate(float(mean), math.nan)
     variance = np.square(numerator - mean * denominator).sum() * count / (count - 1)
     return Estimate(float(mean), float(np.sqrt(variance) / total))

@@ -8,12 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Mirroring:
-    """The left-right mirror image of a vector: entry i becomes ``signs[i]`` times entry ``order[i]``.
-
-    Attributes:
-        order: Which entry comes to each place.
-        signs: 1 or -1 for each place.
-    """
+    """The left-right mirror image of a vector: entry i becomes ``signs[i]``, 1 or -1, times entry ``order[i]``."""
 
     order: tuple[int, ...]
     signs: tuple[float, ...]
@@ -43,11 +38,7 @@ class Mirroring:
         return Mirroring(tuple(order), each.signs * len(self.order))
 
 
-SCALAR = Mirroring.of_signs(1.0)
-"""A number that is the same in the mirror."""
-VECTOR = Mirroring.of_signs(1.0, -1.0, 1.0)
-"""A vector (x, y, z) in the trunk's frame: a velocity, a force, a place."""
-AXIAL_VECTOR = Mirroring.of_signs(-1.0, 1.0, -1.0)
-"""An axial vector in the trunk's frame: an angular velocity, a moment."""
-PLANAR_VELOCITY = Mirroring.of_signs(1.0, -1.0, -1.0)
-"""v_x, v_y and yaw rate in the trunk's frame."""
+SCALAR = Mirroring.of_signs(1.0)  # a number that is the same in the mirror
+VECTOR = Mirroring.of_signs(1.0, -1.0, 1.0)  # a vector (x, y, z) in the trunk's frame: a velocity, a force, a place
+AXIAL_VECTOR = Mirroring.of_signs(-1.0, 1.0, -1.0)  # an axial vector there: an angular velocity, a moment
+PLANAR_VELOCITY = Mirroring.of_signs(1.0, -1.0, -1.0)  # v_x, v_y and yaw rate in the trunk's frame

@@ -11,9 +11,10 @@ from legged_torque.utils.errors import UserError, unknown_name
 
 DEFAULT_TASK = "a1_torque_multihead"
 DEFAULT_PRESET = "parallel"
+_SET = "change a setting by its dotted path, e.g. rewards.scales.torques=-1e-4; may be repeated"
 
 
-def _option(default: Any, help: str, **how: Any) -> Any:  # noqa: A002 (argparse's word)
+def _option(help: str, default: Any = None, **how: Any) -> Any:  # noqa: A002 (argparse's word)
     """Return a field that is also an argument of the command line; ``how`` is what ``add_argument`` takes."""
     return field(default=default, metadata={"help": help, **how})
 
@@ -22,55 +23,38 @@ def _option(default: Any, help: str, **how: Any) -> Any:  # noqa: A002 (argparse
 class Options:
     """The options that scripts share; None leaves a setting as it is. Fields tell what they mean by their help."""
 
-    task: str = _option(DEFAULT_TASK, "name of the task, see train.py --list; default: %(default)s")
+    task: str = _option("name of the task, see train.py --list; default: %(default)s", DEFAULT_TASK)
     device: str = _option(
-        "auto", "auto, cpu or cuda:N; auto takes the GPU if there is one, with torchrun one for each process"
+        "auto, cpu or cuda:N; auto takes the GPU if there is one, with torchrun one for each process", "auto"
     )
     num_envs: int | None = _option(
-        None, "number of worlds, with torchrun those of each process; default: that of the task", type=int
+        "number of worlds, with torchrun those of each process; default: that of the task", type=int
     )
-    seed: int | None = _option(None, "random seed; default: that of the training settings", type=int)
-    preset: str | None = _option(None, "training settings: parallel (the default) or paper (Table II)")
+    seed: int | None = _option("random seed; default: that of the training settings", type=int)
+    preset: str | None = _option("training settings: parallel (the default) or paper (Table II)")
     perturbation: str | None = _option(
-        None,
         "random parameters, pushes and noise: none, low, high, high_frequency or doubled; default: none, or what a "
-        "loaded run has",
+        "loaded run has"
     )
     ranges: str | None = _option(
-        None, "how far random parameters go: wide or narrow; default: wide, or what a loaded run has"
+        "how far random parameters go: wide or narrow; default: wide, or what a loaded run has"
     )
-    set: list[str] = field(
-        default_factory=list,
-        metadata={
-            "action": "append",
-            "metavar": "KEY=VALUE",
-            "help": "change a setting by its dotted path, e.g. rewards.scales.torques=-1e-4; may be repeated",
-        },
-    )
-    log_root: str | None = _option(None, "folder that keeps all experiments; default: ./logs")
-    experiment_name: str | None = _option(None, "folder of the runs below that; default: name of the task")
-    run_name: str | None = _option(None, "added to the name of the run's folder")
-    logger: str | None = _option(None, "where curves are written: tensorboard, wandb or none")
-    load_run: str | None = _option(None, "run to load: name of its folder or a path; default: the last one")
-    checkpoint: int | None = _option(None, "checkpoint to load; default: the last one", type=int)
-    resume: bool = _option(False, "continue a run, with its settings", action="store_true")
-    max_iterations: int | None = _option(None, "iterations in all; default: 110e6 environment steps", type=int)
+    set: list[str] = field(default_factory=list, metadata={"help": _SET, "action": "append", "metavar": "KEY=VALUE"})
+    log_root: str | None = _option("folder that keeps all experiments; default: ./logs")
+    experiment_name: str | None = _option("folder of the runs below that; default: name of the task")
+    run_name: str | None = _option("added to the name of the run's folder")
+    logger: str | None = _option("where curves are written: tensorboard, wandb or none")
+    load_run: str | None = _option("run to load: name of its folder or a path; default: the last one")
+    checkpoint: int | None = _option("checkpoint to load; default: the last one", type=int)
+    resume: bool = _option("continue a run, with its settings", False, action="store_true")
+    max_iterations: int | None = _option("iterations in all; default: 110e6 environment steps", type=int)
 
 
 def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: dict[str, Any] | None = None) -> None:
     """Change settings as the options ask; what is more explicit wins.
 
-    In this order: the preset, the number of worlds that suits the device, the settings of a loaded run, the
-    perturbation, the ranges, single options, ``set``.
-
-    Args:
-        env_cfg: Settings of the task, changed in place.
-        train_cfg: Settings of its training, changed in place.
-        options: What is asked for.
-        run_config: "env" and "train" of a loaded run.
-
-    Raises:
-        UserError: If an option makes no sense.
+    In this order: the preset, the number of worlds that suits the device, the settings of a loaded run ("env" and
+    "train" of ``run_config``), the perturbation, the ranges, single options, ``set``. One without sense is a UserError.
     """
     apply_preset(env_cfg, train_cfg, options.preset or DEFAULT_PRESET)
     if resolve_device(options.device) == "cpu":
@@ -82,14 +66,8 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
         apply_perturbation(env_cfg, options.perturbation)
     if options.ranges:
         _apply_named("ranges", env_cfg.parameter_ranges(), env_cfg, options.ranges)
-    given = {
-        "env.num_envs": options.num_envs,
-        "seed": options.seed,
-        "runner.experiment_name": options.experiment_name,
-        "runner.run_name": options.run_name,
-        "runner.logger": options.logger,
-    }
-    for path, value in given.items():
+    for path in ("env.num_envs", "seed", "runner.experiment_name", "runner.run_name", "runner.logger"):
+        value = getattr(options, path.rpartition(".")[2])
         if value is not None:
             set_entry_of_either(env_cfg, train_cfg, path, value)
     for item in options.set:
@@ -102,11 +80,7 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
 
 
 def apply_preset(env_cfg: Any, train_cfg: Any, name: str) -> None:
-    """Apply the named changes that the training settings offer as their presets.
-
-    Raises:
-        UserError: If there is no such preset.
-    """
+    """Apply the named changes that the training settings offer as their presets."""
     presets = train_cfg.presets()
     if name not in presets:
         raise unknown_name("preset", name, presets)
@@ -115,11 +89,7 @@ def apply_preset(env_cfg: Any, train_cfg: Any, name: str) -> None:
 
 
 def apply_perturbation(env_cfg: Any, name: str) -> None:
-    """Apply one of the named sets of random events that the task's settings offer.
-
-    Raises:
-        UserError: If there is no such set.
-    """
+    """Apply one of the named sets of random events that the task's settings offer; an unknown name is a UserError."""
     _apply_named("perturbation", env_cfg.perturbations(), env_cfg, name)
 
 
@@ -131,11 +101,7 @@ def _apply_named(kind: str, choices: dict[str, dict], env_cfg: BaseConfig, name:
 
 
 def set_entry_of_either(env_cfg: Any, train_cfg: Any, path: str, value: Any) -> None:
-    """Set an entry by its dotted path in the task's or the training's settings, whose sections differ in name.
-
-    Raises:
-        UserError: If neither has such an entry.
-    """
+    """Set an entry by its dotted path in the task's or the training's settings, whose sections differ in name."""
     section = path.split(".")[0]
     sections = {key: cfg for cfg in (env_cfg, train_cfg) for key in section_keys(cfg)}
     if section not in sections:

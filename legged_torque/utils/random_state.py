@@ -18,12 +18,7 @@ def random_state(device: str) -> dict[str, Tensor]:
 
 
 def restore_random_state(device: str, state: dict[str, Tensor]) -> None:
-    """Continue the streams; that of a GPU only on a GPU.
-
-    Args:
-        device: "cpu" or "cuda:N".
-        state: From :func:`random_state`.
-    """
+    """Continue the streams of :func:`random_state`; that of a GPU only on a GPU."""
     torch.set_rng_state(state["cpu"].cpu())
     if torch.device(device).type == "cuda" and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"].cpu(), device)
@@ -31,12 +26,7 @@ def restore_random_state(device: str, state: dict[str, Tensor]) -> None:
 
 @contextlib.contextmanager
 def own_random_numbers(device: str, state: dict[str, Tensor]) -> Iterator[None]:
-    """Let what happens inside draw from a stream of its own, and leave torch's streams as they were.
-
-    Args:
-        device: "cpu" or "cuda:N".
-        state: Where that stream stands, see :func:`random_state`; moved on in place.
-    """
+    """Let what happens inside draw from a stream of its own, whose state moves on, and leave torch's as they were."""
     outside = random_state(device)
     restore_random_state(device, state)
     try:
@@ -48,9 +38,7 @@ def own_random_numbers(device: str, state: dict[str, Tensor]) -> Iterator[None]:
 
 def seeded_state(device: str, seed: int) -> dict[str, Tensor]:
     """Return the state of streams that start from a seed; torch's own stay where they are."""
-    outside = random_state(device)
-    try:
+    state = random_state(device)
+    with own_random_numbers(device, state):
         torch.manual_seed(seed)
-        return random_state(device)
-    finally:
-        restore_random_state(device, outside)
+    return state

@@ -16,13 +16,10 @@ def without_renderer() -> None:
 
 
 def choose_offscreen_renderer() -> str | None:
-    """Set ``MUJOCO_GL`` to a renderer that needs no screen and whose library is installed.
+    """Set ``MUJOCO_GL`` to a renderer that needs no screen; return why there is none, or None if there is one.
 
-    What the user has set is taken if its library is there; otherwise EGL where there is a GPU, then Mesa's software
+    What the user has set is taken if its library is installed; otherwise EGL where there is a GPU, then Mesa's software
     renderer. If there is none, MuJoCo is told to import without one, so that everything else works.
-
-    Returns:
-        A line that says why there is no renderer, or None if there is one.
     """
     asked = os.environ.get("MUJOCO_GL", "").lower()
     if asked in _LIBRARIES:
@@ -34,5 +31,5 @@ def choose_offscreen_renderer() -> str | None:
         if ctypes.util.find_library(_LIBRARIES[name]):
             os.environ["MUJOCO_GL"] = name
             return None
-    os.environ["MUJOCO_GL"] = "disable"
+    without_renderer()
     return f"the library of {' or '.join(candidates)} is not installed ({INSTALL_HINT})"

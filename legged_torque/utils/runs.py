@@ -37,14 +37,9 @@ def claim_run_dir(run_dir: Path) -> Path:
 
 
 def find_run(log_root: Path, load_run: str | None) -> Path:
-    """Return the folder of a run.
+    """Return the folder of a run of an experiment, or raise a UserError if there is none.
 
-    Args:
-        log_root: Folder of the experiment.
-        load_run: Name of the run's folder, or a path to it; None is the newest one that has a checkpoint.
-
-    Raises:
-        UserError: If there is no such run.
+    ``load_run`` is the name of the run's folder, or a path to it; None is the newest one that has a checkpoint.
     """
     if load_run and Path(load_run).is_dir():
         return Path(load_run)
@@ -57,15 +52,7 @@ def find_run(log_root: Path, load_run: str | None) -> Path:
 
 
 def find_checkpoint(run_dir: Path, checkpoint: int | None) -> Path:
-    """Return the file of a checkpoint.
-
-    Args:
-        run_dir: Folder of the run.
-        checkpoint: Number of iterations after which it was saved; None is the last one.
-
-    Raises:
-        UserError: If there is no such checkpoint.
-    """
+    """Return the file of a run's checkpoint after some iterations, None being the last, or raise a UserError."""
     numbers = checkpoint_numbers(run_dir)
     if not numbers:
         raise UserError(f"there is no checkpoint in '{run_dir}'")
@@ -98,11 +85,7 @@ def save_config(run_dir: str | Path, config: dict[str, Any]) -> None:
 
 
 def load_config(run_dir: Path) -> dict[str, Any]:
-    """Return what :func:`save_config` has written.
-
-    Raises:
-        UserError: If the file is missing or broken.
-    """
+    """Return what :func:`save_config` has written; a UserError if the file is missing or broken."""
     file = run_dir / CONFIG_FILE
     if not file.is_file():
         raise UserError(f"the run '{run_dir}' has no {CONFIG_FILE}")

@@ -27,21 +27,13 @@ from legged_torque.utils.train_validation import check_train_cfg
 
 @dataclass
 class LoadedRun:
-    """A run of an earlier training.
-
-    Attributes:
-        folder: Its folder.
-        config: Contents of its ``config.yaml``.
-        env_cfg: Settings of its task, changed by the options.
-        train_cfg: Settings of its training, changed by the options.
-        checkpoint: The checkpoint that the options name.
-    """
+    """A run of an earlier training."""
 
     folder: Path
-    config: dict[str, Any]
-    env_cfg: Any
-    train_cfg: Any
-    checkpoint: Path
+    config: dict[str, Any]  # contents of its config.yaml
+    env_cfg: Any  # settings of its task, changed by the options
+    train_cfg: Any  # settings of its training, changed by the options
+    checkpoint: Path  # the one that the options name
 
     @property
     def iterations(self) -> int:
@@ -57,14 +49,7 @@ class TaskRegistry:
         self._tasks: dict[str, tuple[type[VecEnv], Any, Any]] = {}
 
     def register(self, name: str, task_class: type[VecEnv], env_cfg: BaseConfig, train_cfg: BaseConfig) -> None:
-        """Make a task known.
-
-        Args:
-            name: What ``--task`` calls it.
-            task_class: Created as ``task_class(env_cfg, device)``.
-            env_cfg: Settings of the task.
-            train_cfg: Settings of its training.
-        """
+        """Make a task known that is created as ``task_class(env_cfg, device)``."""
         self._tasks[name] = (task_class, env_cfg, train_cfg)
 
     def names(self) -> list[str]:
@@ -72,26 +57,13 @@ class TaskRegistry:
         return list(self._tasks)
 
     def get_task_class(self, name: str) -> type[VecEnv]:
-        """Return the class of a task.
-
-        Raises:
-            UserError: If there is no such task.
-        """
+        """Return the class of a task; an unknown name is a UserError."""
         return self._get(name)[0]
 
     def get_cfgs(
         self, name: str, args: Options | None = None, run_config: dict[str, Any] | None = None
     ) -> tuple[Any, Any]:
-        """Return copies of the settings of a task and of its training.
-
-        Args:
-            name: Name of the task.
-            args: Changes that a user asks for.
-            run_config: Settings of a loaded run, which ``args`` change.
-
-        Raises:
-            UserError: If there is no such task or an option makes no sense.
-        """
+        """Return copies of the settings of a task and its training, or of a loaded run's, as ``args`` change them."""
         env_cfg, train_cfg = (copy.deepcopy(cfg) for cfg in self._get(name)[1:])
         train_cfg.runner.experiment_name = train_cfg.runner.experiment_name or name
         if args is not None:
@@ -101,15 +73,9 @@ class TaskRegistry:
         return env_cfg, train_cfg
 
     def make_env(self, name: str, args: Options | None = None, env_cfg: Any | None = None) -> tuple[VecEnv, Any]:
-        """Create a task.
+        """Create a task on the device of ``args``; return it and its settings.
 
-        Args:
-            name: Name of the task.
-            args: Gives the device, and changes of the settings if ``env_cfg`` is not given.
-            env_cfg: Settings to use as they are; None takes the registered ones with ``args`` applied.
-
-        Returns:
-            The task and its settings.
+        ``env_cfg`` are settings to use as they are; None takes the registered ones with ``args`` applied.
         """
         task_class = self.get_task_class(name)
         if env_cfg is None:
@@ -124,18 +90,14 @@ class TaskRegistry:
         train_cfg: Any | None = None,
         log_root: str | Path | None = "default",
     ) -> tuple[OnPolicyRunner, Any]:
-        """Create the runner that trains or holds a policy.
+        """Create the runner that trains or holds a policy, and return it and its settings; nothing is written yet.
 
         Args:
             env: The task.
             name: Name of the task; may be left out if ``train_cfg`` is given.
             args: With ``resume``, the checkpoint that ``load_run`` and ``checkpoint`` name is loaded.
             train_cfg: Settings to use as they are; None takes the registered ones with ``args`` applied.
-            log_root: Folder of the experiment's runs; "default" is ``logs/<experiment name>`` in the current directory,
-                None keeps nothing.
-
-        Returns:
-            The runner and its settings. Nothing is written before training starts.
+            log_root: Folder of the experiment's runs; "default" is ``logs/<experiment name>``, None keeps nothing.
         """
         if train_cfg is None:
             if name is None:
@@ -156,8 +118,7 @@ class TaskRegistry:
     def load_run(self, options: Options) -> LoadedRun:
         """Return the run that the options name.
 
-        Raises:
-            UserError: If there is no such run or checkpoint, it is of another task, or its settings cannot be read.
+        A UserError if there is no such run or checkpoint, it is of another task, or its settings cannot be read.
         """
         _, train_cfg = self.get_cfgs(options.task)
         train_cfg.runner.experiment_name = options.experiment_name or train_cfg.runner.experiment_name
@@ -171,13 +132,8 @@ class TaskRegistry:
     def make_loaded(self, run: LoadedRun, options: Options, env_cfg: Any = None) -> tuple[VecEnv, OnPolicyRunner]:
         """Create the task of a run, and a runner that holds the policy of its checkpoint and keeps nothing.
 
-        Args:
-            run: The run.
-            options: Give the device.
-            env_cfg: Settings of the task in place of the run's.
-
-        Raises:
-            UserError: If the checkpoint cannot be read or is of another kind of policy.
+        ``env_cfg`` are settings of the task in place of the run's. A UserError if the checkpoint cannot be read or is
+        of another kind of policy.
         """
         env, _ = self.make_env(options.task, options, env_cfg or run.env_cfg)
         runner, _ = self.make_alg_runner(env, train_cfg=run.train_cfg, log_root=None)
@@ -209,20 +165,15 @@ def num_iterations(env: VecEnv, train_cfg: Any) -> int:
 
 def to_rsl_rl(train_cfg: Any) -> dict[str, Any]:
     """Return training settings in the layout that rsl_rl's runner takes."""
-    settings = to_dict(train_cfg)
-    return {**settings.pop("runner"), **settings, "logger": _logger_cfg(train_cfg.runner)}
-
-
-def _logger_cfg(runner: Any) -> dict[str, str]:
-    """Return rsl_rl's settings of the logging backend."""
-    backends = {
+    settings, runner = to_dict(train_cfg), train_cfg.runner
+    loggers = {
         "tensorboard": {"class_name": "tensorboard"},
         "wandb": {"class_name": "WandbLogWriter", "project_name": runner.wandb_project},
         "none": {"class_name": "legged_torque.learning.log_writer:NoLogWriter"},
     }
-    if runner.logger not in backends:
-        raise unknown_name("logger", runner.logger, backends)
-    return backends[runner.logger]
+    if runner.logger not in loggers:
+        raise unknown_name("logger", runner.logger, loggers)
+    return {**settings.pop("runner"), **settings, "logger": loggers[runner.logger]}
 
 
 def set_seed(seed: int) -> None:
@@ -230,5 +181,4 @@ def set_seed(seed: int) -> None:
     torch.manual_seed(seed + distributed.rank())
 
 
-task_registry = TaskRegistry()
-"""The registry that scripts use; :mod:`legged_torque.envs` fills it."""
+task_registry = TaskRegistry()  # the registry that scripts use; legged_torque.envs fills it

@@ -30,17 +30,11 @@ def connect(
     automatic: viser.GuiInputHandle[bool],
     ask: Callable[[list[float] | None], None],
 ) -> None:
-    """Let sliders choose values, and a checkbox whether they are chosen automatically.
-
-    Args:
-        sliders: Moving one unticks the checkbox.
-        automatic: The checkbox.
-        ask: Called with the values of the sliders, or None for automatic ones.
-    """
+    """Ask for the values of sliders, or for None while a checkbox is ticked; moving a slider unticks it."""
 
     def choose() -> None:
         automatic.value = False
-        ask([slider.value for slider in sliders])
+        toggle()
 
     def toggle() -> None:
         ask(None if automatic.value else [slider.value for slider in sliders])
@@ -54,13 +48,7 @@ class Controls:
     """The panel with all controls."""
 
     def __init__(self, server: viser.ViserServer, session: Session, scene: Scene) -> None:
-        """Build the panel.
-
-        Args:
-            server: The page.
-            session: The session.
-            scene: Its drawing.
-        """
+        """Build the panel."""
         self._gui, self._session, self._scene = server.gui, session, scene
         self._loaded: tuple[int, str, int] | None = None
         self._weights: dict[str, viser.GuiInputHandle[float]] = {}
@@ -92,7 +80,7 @@ class Controls:
             automatic.value = False
             for slider in sliders:
                 slider.value = 0.0
-            ask([slider.value for slider in sliders])
+            ask([0.0, 0.0, 0.0])
 
         connect(sliders, automatic, ask)
         stand.on_click(stop)
@@ -113,9 +101,8 @@ class Controls:
         gui = self._gui
         with gui.add_folder("Push"):
             direction = gui.add_dropdown("push", tuple(DIRECTIONS))
-            strength = gui.add_slider(
-                "strength [m/s]", 0.1, 2.0, 0.1, 0.8, hint="added to the trunk's velocity at once"
-            )
+            hint = "added to the trunk's velocity at once"
+            strength = gui.add_slider("strength [m/s]", 0.1, 2.0, 0.1, 0.8, hint=hint)
             push = gui.add_button("Push", icon="arrow-big-right")
         push.on_click(lambda event: self._session.push(math.radians(DIRECTIONS[direction.value]), strength.value))
 
@@ -126,10 +113,8 @@ class Controls:
             names = tuple(map(str, state.checkpoints)) or (str(state.checkpoint),)
             self.checkpoints = gui.add_dropdown("checkpoint", names, initial_value=str(state.checkpoint))
             newest = gui.add_checkbox("follow training", False, hint="load each new checkpoint as soon as it is saved")
-            perturbations = session.perturbations()
-            self.perturbation = gui.add_dropdown(
-                "perturbation", tuple(perturbations), hint="random parameters, pushes and noise; rebuilds the worlds"
-            )
+            hint = "random parameters, pushes and noise; rebuilds the worlds"
+            self.perturbation = gui.add_dropdown("perturbation", tuple(session.perturbations()), hint=hint)
 
         def load() -> None:
             newest.value = False
@@ -165,11 +150,7 @@ class Controls:
                 others.on_update(lambda event: setattr(scene, "shows_others", others.value))
 
     def update(self, state: SessionState) -> None:
-        """Show changes that no click has made: new checkpoints, what was loaded, what was refused.
-
-        Args:
-            state: The session's newest state.
-        """
+        """Show changes that no click has made: new checkpoints, what was loaded, what was refused."""
         names = tuple(map(str, sorted({*state.checkpoints, state.checkpoint})))
         if names != tuple(self.checkpoints.options):
             self.checkpoints.options = names

@@ -26,35 +26,17 @@ if TYPE_CHECKING:
 
 KEYS = """Keys: arrows up/down  v_x    arrows left/right  yaw rate    comma/period  v_y    0  stand still
       space  pause           R  reset                       P  push         Esc or Ctrl-C  end"""
-STEP = 0.1
-"""Change of a command per key press [m/s or rad/s]."""
-FRAME_INTERVAL = 1.0 / 60.0
-"""Seconds between drawings."""
-PUSH_SPEED, PUSH_ANGLE = 0.8, 1.5708
-"""A push: speed [m/s] and direction from the robot's front, to its left [rad]."""
+STEP = 0.1  # change of a command per key press [m/s or rad/s]
+FRAME_INTERVAL = 1.0 / 60.0  # seconds between drawings
+PUSH_SPEED, PUSH_ANGLE = 0.8, 1.5708  # a push: speed [m/s] and direction from the robot's front, to its left [rad]
 
 _SPACE, _COMMA, _PERIOD, _ZERO, _P, _R = 32, 44, 46, 48, 80, 82
 _RIGHT, _LEFT, _DOWN, _UP = 262, 263, 264, 265
-_COMMAND_KEYS = {
-    _UP: (0, STEP),
-    _DOWN: (0, -STEP),
-    _COMMA: (1, STEP),
-    _PERIOD: (1, -STEP),
-    _LEFT: (2, STEP),
-    _RIGHT: (2, -STEP),
-}
-"""Which command a key of GLFW changes, and by how much."""
+_COMMAND_KEYS = ((_UP, _DOWN), (_COMMA, _PERIOD), (_LEFT, _RIGHT))  # keys of GLFW that raise and lower each command
 
 
 def check_display(instead: str) -> None:
-    """Make sure that there is a screen to open a window on.
-
-    Args:
-        instead: What works without a screen, for the message.
-
-    Raises:
-        UserError: If there is none.
-    """
+    """Raise a UserError, which tells what works instead, if there is no screen to open a window on."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise UserError(f"MuJoCo's window needs a screen; {instead} works without one")
     if sys.platform == "darwin" and not sys.argv[0].endswith("mjpython"):
@@ -86,17 +68,14 @@ class Keyboard:
         self._session.set_command((x, y, yaw))
 
     def press(self, key: int) -> None:
-        """Ask for what a key means.
-
-        Args:
-            key: Key code of GLFW.
-        """
-        if key in _COMMAND_KEYS:
-            index, change = _COMMAND_KEYS[key]
-            low, high = self._limits[index]
-            self._command[index] = round(min(max(self._command[index] + change, low), high), 3)
-            self._set_command(*self._command)
-        elif key == _ZERO:
+        """Ask for what a key means; ``key`` is its code of GLFW."""
+        for index, keys in enumerate(_COMMAND_KEYS):
+            if key in keys:
+                change = STEP if key == keys[0] else -STEP
+                low, high = self._limits[index]
+                self._command[index] = round(min(max(self._command[index] + change, low), high), 3)
+                self._set_command(*self._command)
+        if key == _ZERO:
             self._set_command(0.0, 0.0, 0.0)
         elif key == _SPACE:
             self._is_paused = not self._is_paused
@@ -108,12 +87,7 @@ class Keyboard:
 
 
 def watch(session: Session, robot: Path) -> None:
-    """Show the first world in a window until it is closed, or until Ctrl-C.
-
-    Args:
-        session: The session; it steps in a thread of its own.
-        robot: MJCF of the robot, visual geoms included.
-    """
+    """Show the first world until the window is closed, or until Ctrl-C; the session steps in a thread of its own."""
     import mujoco.viewer  # needs a screen
 
     model = mujoco.MjModel.from_xml_path(str(robot))
@@ -121,9 +95,8 @@ def watch(session: Session, robot: Path) -> None:
     keyboard = Keyboard(session)
     print(KEYS, flush=True)
     before = set(threading.enumerate())
-    window = mujoco.viewer.launch_passive(
-        model, data, key_callback=keyboard.press, show_left_ui=False, show_right_ui=False
-    )
+    hidden = {"show_left_ui": False, "show_right_ui": False}
+    window = mujoco.viewer.launch_passive(model, data, key_callback=keyboard.press, **hidden)
     drawing = set(threading.enumerate()) - before
     with window:
         window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
@@ -142,14 +115,7 @@ def watch(session: Session, robot: Path) -> None:
 
 
 def draw(state: SessionState, window: mujoco.viewer.Handle, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Show the first world, and its command and velocity as text.
-
-    Args:
-        state: The session's newest state.
-        window: The window.
-        model: The robot.
-        data: Its state, which the window draws.
-    """
+    """Show the first world, and its command and velocity as text; the window draws ``data``."""
     if state.reading is None:
         return
     with window.lock():
@@ -169,10 +135,7 @@ def draw(state: SessionState, window: mujoco.viewer.Handle, model: mujoco.MjMode
 def simulation_window(simulation: Simulation) -> Iterator[Callable[[], None]]:
     """Open a window on a simulation; what is returned shows the state after a control step, in real time.
 
-    Closing the window counts as Ctrl-C.
-
-    Raises:
-        UserError: If there is no screen.
+    Closing the window counts as Ctrl-C. Without a screen a UserError is raised.
     """
     check_display("--video")
     import mujoco.viewer  # needs a screen

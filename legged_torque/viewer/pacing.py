@@ -8,30 +8,19 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 
-MAX_LAG = 0.25
-"""Seconds behind schedule after which a :class:`Pacer` starts a new schedule instead of catching up."""
+MAX_LAG = 0.25  # seconds behind schedule after which a new schedule starts instead of catching up
 
 
 class Pacer:
     """Starts control steps when they are due, and measures their actual rate.
 
-    Attributes:
-        speed: Wanted simulated seconds per second; 1 is real time.
+    ``speed`` is the wanted one in simulated seconds per second; 1 is real time.
     """
 
     def __init__(
-        self,
-        dt: float,
-        clock: Callable[[], float] = time.perf_counter,
-        sleep: Callable[[float], None] = time.sleep,
+        self, dt: float, clock: Callable[[], float] = time.perf_counter, sleep: Callable[[float], None] = time.sleep
     ) -> None:
-        """Start without a schedule: the first step is due at once.
-
-        Args:
-            dt: Simulated time of a step [s].
-            clock: Returns the time [s].
-            sleep: Waits for some seconds.
-        """
+        """Start without a schedule: the first step, of ``dt`` simulated seconds, is due at once."""
         self.speed = 1.0
         self._dt, self._clock, self._sleep = dt, clock, sleep
         self._due: float | None = None

@@ -13,26 +13,18 @@ from legged_torque.viewer.session import HISTORY_STEPS, Session
 from legged_torque.viewer.state import SessionState
 
 COMMAND, ACTUAL, APPLIED = "#1faa55", "#2f7df6", "#343a40"
-PARTS = ("#f08c00", "#2f7df6", "#ae3ec9", "#1faa55")
-"""Colors of the parts of torques."""
+PARTS = ("#f08c00", "#2f7df6", "#ae3ec9", "#1faa55")  # colors of the parts of torques
 REWARD, PENALTY = "#1faa55", "#e03131"
 VELOCITIES = ("v_x, forward [m/s]", "v_y, to the left [m/s]", "yaw rate, to the left [rad/s]")
-STRIDE = 2
-"""Plots show every second control step."""
-WIDTH = 380
-"""Of the panel [pixels]."""
+STRIDE = 2  # plots show every second control step
+WIDTH = 380  # of the panel [pixels]
 
 
 class Plots:
     """The panel with plots."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        """Build the panel, at the left of the page.
-
-        Args:
-            server: The page.
-            session: The session.
-        """
+        """Build the panel, at the left of the page."""
         gui, task, self._session = server.gui, session.task, session
         self._joints = [name.removesuffix("_joint") for name in task.dof_names]
         self._legs = joints_by_leg(self._joints, task.cfg.asset.mirrored_legs)
@@ -59,16 +51,11 @@ class Plots:
         panel.set_width(WIDTH)
 
     def update(self, state: SessionState) -> None:
-        """Draw everything anew.
-
-        Args:
-            state: The session's newest state.
-        """
-        if state.reading is None:
-            return
-        self._update_curves(state.time)
-        self._bars.content = self._torque_bars(state.reading, state.mixing)
-        self._rewards.content = reward_bars(state.rewards)
+        """Draw everything anew."""
+        if state.reading is not None:
+            self._update_curves(state.time)
+            self._bars.content = self._torque_bars(state.reading, state.mixing)
+            self._rewards.content = reward_bars(state.rewards)
 
     def _choose_leg(self) -> None:
         """Write the chosen leg's joints above the plots of torques."""
@@ -86,9 +73,7 @@ class Plots:
         if len(past) < 2:
             return
         time = np.array([reading.time - now for reading in past], np.float32)
-        velocities = np.array(
-            [[reading.commands[reading.world], reading.velocities[reading.world]] for reading in past]
-        )
+        velocities = np.array([(one.commands[one.world], one.velocities[one.world]) for one in past])
         for i, plot in enumerate(self._velocities):
             plot.data = (time, *velocities[:, :, i].T)
         torques = np.array([[*reading.torque_parts, reading.torques] for reading in past])
@@ -111,12 +96,7 @@ class Plots:
 
 
 def joints_by_leg(joints: Sequence[str], mirrored_legs: Sequence[Sequence[str]]) -> dict[str, list[int]]:
-    """Return the places of the joints of each leg, and those of no leg as "other".
-
-    Args:
-        joints: Names of the joints.
-        mirrored_legs: ``asset.mirrored_legs``.
-    """
+    """Return the places of the joints of each leg of ``asset.mirrored_legs``, and those of no leg as "other"."""
     legs = [leg for pair in mirrored_legs for leg in pair]
     result: dict[str, list[int]] = {}
     for place, name in enumerate(joints):
@@ -128,14 +108,7 @@ def joints_by_leg(joints: Sequence[str], mirrored_legs: Sequence[Sequence[str]])
 def add_plot(
     gui: viser.GuiApi, title: str, series: list[tuple[str, str]], limits: tuple[float, float] | None = None
 ) -> viser.GuiUplotHandle:
-    """Add a plot over the last seconds.
-
-    Args:
-        gui: The page's controls.
-        title: What is plotted, with its unit.
-        series: Name and color of each curve.
-        limits: Lowest and highest value; None takes those of the data.
-    """
+    """Add a plot over the last seconds: ``series`` are names and colors, ``limits`` of None those of the data."""
     lines = [{"label": name, "stroke": color, "width": 1.5, "points": {"show": False}} for name, color in series]
     seconds = HISTORY_STEPS // 50
     values = {"auto": True} if limits is None else {"auto": False, "range": limits}
@@ -153,20 +126,18 @@ def add_plot(
 def reward_bars(rewards: dict[str, float]) -> str:
     """Return weighted reward terms as bars, rewards in green and penalties in red."""
     largest = max(map(abs, rewards.values()), default=1.0) or 1.0
-    rows = []
-    for name, value in rewards.items():
-        bar = (value / largest, REWARD if value > 0 else PENALTY)
-        rows.append(row_html(name.replace("_", " "), [bar], f"{value:+.3f}", 116))
+    rows = [
+        row_html(name.replace("_", " "), [(value / largest, REWARD if value > 0 else PENALTY)], f"{value:+.3f}", 116)
+        for name, value in rewards.items()
+    ]
     return block_html(f"Weighted terms [1/s]; their sum: {sum(rewards.values()):+.3f}", rows)
 
 
 def legend_html(series: list[tuple[str, str]]) -> str:
     """Return names with colored dots."""
-    dots = (
-        f'<span style="margin-right:12px;white-space:nowrap"><span style="color:{color}">&#9679;</span> {name}</span>'
-        for name, color in series
-    )
-    return f'<div style="font-size:12px;padding:2px 10px">{"".join(dots)}</div>'
+    dot = '<span style="margin-right:12px;white-space:nowrap"><span style="color:{}">&#9679;</span> {}</span>'
+    dots = "".join(dot.format(color, name) for name, color in series)
+    return f'<div style="font-size:12px;padding:2px 10px">{dots}</div>'
 
 
 def block_html(title: str, rows: list[str]) -> str:
@@ -175,14 +146,7 @@ def block_html(title: str, rows: list[str]) -> str:
 
 
 def row_html(name: str, bars: list[tuple[float, str]], text: str, name_width: int = 52) -> str:
-    """Return a name, bars from a middle line, and a number.
-
-    Args:
-        name: The name.
-        bars: Length of each bar, from -1 to 1, and its color.
-        text: The number.
-        name_width: [pixels].
-    """
+    """Return a name, bars from a middle line (lengths from -1 to 1, and colors), and a number."""
     height = 12 // len(bars)
     drawn = ""
     for i, (value, color) in enumerate(bars):

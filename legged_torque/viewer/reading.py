@@ -14,37 +14,24 @@ from legged_torque.envs.base.legged_robot import LeggedRobot
 
 @dataclass(frozen=True)
 class Reading:
-    """A task after one control step, in the host's memory.
+    """A task after one control step, in the host's memory."""
 
-    Attributes:
-        time: Simulated time since the session's start [s].
-        world: The followed world.
-        qpos: Positions of all worlds, as ``sim.qpos``. Shape: (num_envs, nq).
-        commands: Commands of all worlds during the step [m/s, m/s, rad/s]. Shape: (num_envs, 3).
-        velocities: Actual v_x, v_y and yaw rates, in the trunks' frames. Shape: (num_envs, 3).
-        torques: Applied torques of the followed world in its last physics step [N m]. Shape: (num_dof,).
-        torque_parts: See :attr:`WatchedRobot.torque_parts`, of the followed world. Shape: (parts, num_dof).
-        rewards: Its weighted reward terms of this step, per second. Shape: (terms,).
-        resets: Number of worlds whose episode ended: [fallen or diverged, timed out].
-    """
-
-    time: float
-    world: int
-    qpos: np.ndarray
-    commands: np.ndarray
-    velocities: np.ndarray
-    torques: np.ndarray
-    torque_parts: np.ndarray
-    rewards: np.ndarray
-    resets: np.ndarray
+    time: float  # simulated time since the session's start [s]
+    world: int  # the followed world
+    qpos: np.ndarray  # positions of all worlds, as sim.qpos; (num_envs, nq)
+    commands: np.ndarray  # commands of all worlds during the step [m/s, m/s, rad/s]; (num_envs, 3)
+    velocities: np.ndarray  # actual v_x, v_y and yaw rates, in the trunks' frames; (num_envs, 3)
+    torques: np.ndarray  # applied torques of the followed world in its last physics step [N m]; (num_dof,)
+    torque_parts: np.ndarray  # those of WatchedRobot, of the followed world; (parts, num_dof)
+    rewards: np.ndarray  # its weighted reward terms of this step, per second; (terms,)
+    resets: np.ndarray  # number of worlds whose episode ended: [fallen or diverged, timed out]
 
 
 class WatchedRobot(LeggedRobot):
     """A task that keeps how much each weighted action term adds to the torques; made by :func:`watched`.
 
-    Attributes:
-        torque_parts: Torques of each action term that has a weight, times the motors' strength, before the limits
-            [N m]. Shape: (parts, num_envs, num_dof).
+    ``torque_parts`` are these parts, times the motors' strength, before the limits [N m].
+    Shape: (parts, num_envs, num_dof).
     """
 
     def _init_actions(self) -> None:
@@ -88,12 +75,7 @@ class TaskReader:
         self._sums.copy_(self._task.episode_sums)
 
     def read(self, time: float, world: int) -> Reading:
-        """Return what the last step did.
-
-        Args:
-            time: Simulated time since the session's start [s].
-            world: The followed world.
-        """
+        """Return what the last step did; arguments as of :class:`Reading`."""
         task = self._task
         before = torch.where(task.reset_buf, 0.0, self._sums)
         rewards = (task.episode_sums - before)[:, world] / task.dt
@@ -108,7 +90,6 @@ class TaskReader:
             torch.stack([task.reset_buf.sum() - timeouts, timeouts]),
         ]
         flat = torch.cat([part.reshape(-1).float() for part in parts]).cpu().numpy()
-        ends = np.cumsum([part.numel() for part in parts])
-        arrays = np.split(flat, ends[:-1])
+        arrays = np.split(flat, np.cumsum([part.numel() for part in parts])[:-1])
         shaped = [array.reshape(tuple(part.shape)) for array, part in zip(arrays, parts, strict=True)]
         return Reading(time, world, *shaped)

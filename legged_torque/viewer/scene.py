@@ -11,12 +11,9 @@ import viser
 from viser import transforms
 
 COMMAND_COLOR, VELOCITY_COLOR = (10, 150, 50), (20, 90, 230)
-VISUAL_GROUPS = (0, 1, 2)
-"""Groups of visual geoms; the others only collide."""
-SPACING = 2.0
-"""Distance between neighbouring worlds [m]."""
-ARROW_LENGTH = 0.5
-"""Length of the arrow of a velocity of 1 m/s [m]."""
+VISUAL_GROUPS = (0, 1, 2)  # groups of visual geoms; the others only collide
+SPACING = 2.0  # distance between neighbouring worlds [m]
+ARROW_LENGTH = 0.5  # length of the arrow of a velocity of 1 m/s [m]
 
 
 class Scene:
@@ -24,24 +21,14 @@ class Scene:
 
     Worlds are drawn side by side, though all start at the same place in the simulator. Everything is moved such that
     the followed robot stays where the page's camera looks; so users can turn and zoom freely.
-
-    Attributes:
-        is_following: Whether the camera follows.
-        shows_others: Whether the other worlds are drawn too.
     """
 
     def __init__(self, server: viser.ViserServer, robot: Path, num_envs: int) -> None:
-        """Build everything.
-
-        Args:
-            server: The page.
-            robot: MJCF of the robot, visual geoms included.
-            num_envs: Number of worlds.
-        """
+        """Build everything; ``robot`` is its MJCF, visual geoms included."""
         self._server = server
         self._model = mujoco.MjModel.from_xml_path(str(robot))
         self._data = mujoco.MjData(self._model)
-        self.is_following, self.shows_others = True, True
+        self.is_following, self.shows_others = True, True  # the camera follows; the other worlds are drawn
         self._places, self._offset = places(num_envs), np.zeros(3)
         self._ground = self._add_surroundings()
         self._bodies = {}
@@ -51,22 +38,13 @@ class Scene:
                 quats, positions = np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1)), np.zeros((num_envs, 3))
                 name = f"/{self._model.body(body).name}"
                 self._bodies[body] = server.scene.add_batched_glb(name, glb, quats, positions, lod="off")
-        self._arrows = [
-            server.scene.add_arrows(
-                f"/{name}", np.zeros((1, 2, 3)), color, shaft_radius=0.009, head_radius=0.024, head_length=0.05
-            )
-            for name, color in (("command", COMMAND_COLOR), ("velocity", VELOCITY_COLOR))
-        ]
+        colors = {"/command": COMMAND_COLOR, "/velocity": VELOCITY_COLOR}
+        sizes = {"shaft_radius": 0.009, "head_radius": 0.024, "head_length": 0.05}
+        nowhere = np.zeros((1, 2, 3))
+        self._arrows = [server.scene.add_arrows(name, nowhere, color, **sizes) for name, color in colors.items()]
 
     def update(self, qpos: np.ndarray, command: np.ndarray, velocity: np.ndarray, world: int) -> None:
-        """Draw a state.
-
-        Args:
-            qpos: Positions of all worlds. Shape: (num_envs, nq).
-            command: Command of the followed world [m/s, m/s, rad/s]. Shape: (3,).
-            velocity: Actual velocity of its trunk, in its own frame. Shape: (3,).
-            world: The followed world.
-        """
+        """Draw a state: positions of all worlds, command and velocity of the followed one, as of a Reading."""
         positions, quats = self._poses(qpos)
         shown = slice(None) if self.shows_others else slice(world, world + 1)
         if self.is_following:
@@ -144,22 +122,21 @@ def body_glb(model: mujoco.MjModel, body: int) -> bytes | None:
 
 def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     """Return a geom as triangles in its body's frame; edges of more than 40 degrees stay sharp."""
-    kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+    kinds, creation = mujoco.mjtGeom, trimesh.creation
+    kind, size = kinds(model.geom_type[geom]), model.geom_size[geom]
+    if kind == kinds.mjGEOM_MESH:
         part = model.mesh(model.geom_dataid[geom])
         vertices = model.mesh_vert[part.vertadr[0] :][: part.vertnum[0]]
         faces = model.mesh_face[part.faceadr[0] :][: part.facenum[0]]
         mesh = trimesh.Trimesh(vertices, faces)
-    elif kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        mesh = trimesh.creation.icosphere(subdivisions=3, radius=size[0])
-    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        mesh = trimesh.creation.capsule(height=2.0 * size[1], radius=size[0], count=(16, 16))
-    elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        mesh = trimesh.creation.cylinder(radius=size[0], height=2.0 * size[1], sections=40)
-    elif kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-        mesh = trimesh.creation.icosphere(subdivisions=3).apply_scale(size)
     else:
-        mesh = trimesh.creation.box(extents=2.0 * size)
+        makers = {
+            kinds.mjGEOM_SPHERE: lambda: creation.icosphere(subdivisions=3, radius=size[0]),
+            kinds.mjGEOM_CAPSULE: lambda: creation.capsule(height=2.0 * size[1], radius=size[0], count=(16, 16)),
+            kinds.mjGEOM_CYLINDER: lambda: creation.cylinder(radius=size[0], height=2.0 * size[1], sections=40),
+            kinds.mjGEOM_ELLIPSOID: lambda: creation.icosphere(subdivisions=3).apply_scale(size),
+        }
+        mesh = makers.get(kind, lambda: creation.box(extents=2.0 * size))()
     mesh = trimesh.graph.smooth_shade(mesh, angle=np.radians(40.0))
     pose = np.eye(4)
     pose[:3, :3] = transforms.SO3(model.geom_quat[geom]).as_matrix()

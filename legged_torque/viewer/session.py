@@ -25,16 +25,11 @@ from legged_torque.viewer.pacing import Pacer
 from legged_torque.viewer.reading import Reading, TaskReader, WatchedRobot, watched, weighted_terms
 from legged_torque.viewer.state import AS_LOADED, Command, SessionState
 
-HISTORY_STEPS = 500
-"""Control steps that are kept for plots: 10 s."""
-SCAN_INTERVAL = 1.0
-"""Seconds between looks for new checkpoints."""
-IDLE = 0.02
-"""Seconds between looks for requests while paused."""
-SLOWEST, FASTEST = 0.1, 1.0
-"""Limits of the speed, in simulated seconds per second."""
-SMOOTHING = 0.06
-"""Weight of the newest step in the shown reward terms: they are means over about a third of a second."""
+HISTORY_STEPS = 500  # control steps that are kept for plots: 10 s
+SCAN_INTERVAL = 1.0  # seconds between looks for new checkpoints
+IDLE = 0.02  # seconds between looks for requests while paused
+SLOWEST, FASTEST = 0.1, 1.0  # limits of the speed, in simulated seconds per second
+SMOOTHING = 0.06  # weight of the newest step in the shown reward terms: they are means over about a third of a second
 
 Arguments = ParamSpec("Arguments")
 
@@ -59,7 +54,7 @@ class Session:
         requests: Requests that have not been carried out yet.
         state: What is shown.
         history: The last steps of the followed world; copy it before iterating in another thread.
-        task: The task; only the stepping thread may touch its tensors.
+        task: Only the stepping thread may touch its tensors.
     """
 
     def __init__(
@@ -70,17 +65,9 @@ class Session:
         clock: Callable[[], float] = time.perf_counter,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Build the task, load the checkpoint and be ready to step.
+        """Build the task, load the checkpoint and be ready to step; raises a UserError if that cannot be loaded.
 
-        Args:
-            task_class: Class of the run's task.
-            run: The run; its folder is searched for new checkpoints.
-            device: "cpu" or "cuda:N".
-            clock: Returns the time [s].
-            sleep: Waits for some seconds.
-
-        Raises:
-            UserError: If the checkpoint cannot be loaded.
+        ``clock`` and ``sleep`` work in seconds; the folder of the run is searched for new checkpoints.
         """
         self._make_task = functools.partial(watched(task_class), device=device)
         self._cfg, self._run_dir = run.env_cfg, run.folder
@@ -193,12 +180,7 @@ class Session:
 
     @request
     def push(self, angle: float, speed: float) -> None:
-        """Add a horizontal velocity to every trunk at once.
-
-        Args:
-            angle: Direction from the robot's front, to its left [rad].
-            speed: [m/s].
-        """
+        """Add a horizontal velocity [m/s] to every trunk at once, in a direction from its front to its left [rad]."""
         w, x, y, z = self.task.base_quat.unbind(dim=1)
         heading = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) + angle
         velocity = speed * torch.stack([heading.cos(), heading.sin(), torch.zeros_like(heading)], dim=1)

@@ -19,31 +19,22 @@ from legged_torque.utils.rendering import INSTALL_HINT
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
 
-SIZE = (960, 540)
-"""Width and height of a video of one robot [pixels]."""
-GRID_SIZE = (1280, 720)
-"""About the width and height of a video of several robots [pixels]."""
+SIZE = (960, 540)  # width and height of a video of one robot [pixels]
+GRID_SIZE = (1280, 720)  # about the width and height of a video of several robots [pixels]
 COMMAND_COLOR = (0.1, 0.8, 0.2, 0.9)
 VELOCITY_COLOR = (0.1, 0.4, 1.0, 0.9)
-TRUNK = 1
-"""The trunk's body in the MJCF of a task."""
+TRUNK = 1  # the trunk's body in the MJCF of a task
 _TEXT_COLORS = {"plain": (255, 255, 255), "command": (110, 240, 130), "velocity": (130, 190, 255)}
 _BOX_COLOR = (20, 24, 30, 190)
 
 
 @dataclass
 class Moment:
-    """What one robot does after a control step.
+    """What one robot does after a control step; command and velocity are v_x, v_y [m/s] and yaw rate [rad/s]."""
 
-    Attributes:
-        qpos: State of the MJCF's joints.
-        command: Commanded v_x, v_y [m/s] and yaw rate [rad/s]. Shape: (3,).
-        velocity: The trunk's actual v_x, v_y and yaw rate, in its own frame. Shape: (3,).
-    """
-
-    qpos: np.ndarray
-    command: np.ndarray
-    velocity: np.ndarray
+    qpos: np.ndarray  # of the MJCF's joints
+    command: np.ndarray  # (3,)
+    velocity: np.ndarray  # of the trunk, in its own frame; (3,)
 
 
 class VideoRecorder:
@@ -55,12 +46,7 @@ class VideoRecorder:
         self._steps: list[list[Moment]] = []
 
     def save(self, file: Path, no_renderer: str | None) -> None:
-        """Draw and write the video and print where it is, or why there is none.
-
-        Args:
-            file: The mp4.
-            no_renderer: Why nothing can be drawn, see :func:`~legged_torque.utils.rendering.choose_offscreen_renderer`.
-        """
+        """Draw and write an mp4 and print where it is, or why there is none; ``no_renderer`` is one such reason."""
         try:
             if no_renderer:
                 raise UserError(no_renderer)
@@ -89,12 +75,7 @@ class TaskRecorder(VideoRecorder):
     """Records worlds of a task."""
 
     def __init__(self, task: LeggedRobot, num_worlds: int = 1) -> None:
-        """Prepare to record a task.
-
-        Args:
-            task: The task.
-            num_worlds: How many worlds, from the first one on; 1 is the one with the fastest command at the start.
-        """
+        """Prepare to record the first worlds of a task; a single one is that with the fastest command at the start."""
         super().__init__(mujoco.MjModel.from_xml_path(str(resource_path(task.cfg.asset.file))), TRUNK, task.dt)
         self._task = task
         self._worlds = list(range(num_worlds)) if num_worlds > 1 else []
@@ -103,9 +84,8 @@ class TaskRecorder(VideoRecorder):
         """Keep the state after a control step."""
         task = self._task
         self._worlds = self._worlds or [int(task.commands[:, :2].norm(dim=1).argmax())]
-        parts = [
-            part[self._worlds].double().cpu().numpy() for part in (task.sim.qpos, task.commands, task.planar_velocity())
-        ]
+        tensors = (task.sim.qpos, task.commands, task.planar_velocity())
+        parts = [tensor[self._worlds].double().cpu().numpy() for tensor in tensors]
         self._steps.append([Moment(*moment) for moment in zip(*parts, strict=True)])
 
 
@@ -147,21 +127,22 @@ def write_video(
         for number, moments in list(enumerate(steps, start=1))[::2]:
             tiles = []
             for moment in moments:
-                image = _draw(renderer, model, data, trunk, moment)
+                image = _draw(renderer, data, trunk, moment)
                 rows = _table(number * control_step, moment) if side == 1 else _line(moment)
                 tiles.append(add_overlay(image, rows))
             rows_of_tiles = [np.hstack(tiles[i : i + side]) for i in range(0, len(tiles), side)]
             writer.append_data(np.vstack(rows_of_tiles))
 
 
-def _draw(
-    renderer: mujoco.Renderer, model: mujoco.MjModel, data: mujoco.MjData, trunk: int, moment: Moment
-) -> np.ndarray:
+def _draw(renderer: mujoco.Renderer, data: mujoco.MjData, trunk: int, moment: Moment) -> np.ndarray:
     """Return the image of a robot and the arrows of its velocities. Shape: (height, width, 3)."""
     data.qpos[:] = moment.qpos
-    mujoco.mj_forward(model, data)
+    mujoco.mj_forward(renderer.model, data)
     position, rotation = data.xpos[trunk], data.xmat[trunk].reshape(3, 3)
-    renderer.update_scene(data, camera=_follow(position))
+    camera = mujoco.MjvCamera()  # looks at the robot from a fixed direction
+    camera.lookat[:] = (position[0], position[1], 0.25)
+    camera.distance, camera.azimuth, camera.elevation = 1.6, 130.0, -18.0
+    renderer.update_scene(data, camera)
     arrows = ((moment.command, COMMAND_COLOR, 0.24), (moment.velocity, VELOCITY_COLOR, 0.2))
     for vector, color, height in arrows:
         start = position + np.array([0.0, 0.0, height])
@@ -169,23 +150,13 @@ def _draw(
     return renderer.render()
 
 
-def _follow(position: np.ndarray) -> mujoco.MjvCamera:
-    """Return a camera that looks at the robot from a fixed direction."""
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = (position[0], position[1], 0.25)
-    camera.distance, camera.azimuth, camera.elevation = 1.6, 130.0, -18.0
-    return camera
-
-
 def _add_arrow(scene: mujoco.MjvScene, start: np.ndarray, vector: np.ndarray, color: tuple[float, ...]) -> None:
     """Draw a velocity [m/s] as an arrow, 0.5 m long for 1 m/s."""
     if np.linalg.norm(vector) < 1e-3 or scene.ngeom >= scene.maxgeom:
         return
-    geom = scene.geoms[scene.ngeom]
-    mujoco.mjv_initGeom(
-        geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.zeros(9), np.array(color, np.float32)
-    )
-    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.012, start, start + 0.5 * vector)
+    geom, kind = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_ARROW
+    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(color, np.float32))
+    mujoco.mjv_connector(geom, kind, 0.012, start, start + 0.5 * vector)
     scene.ngeom += 1
 
 
@@ -214,15 +185,11 @@ def _number(value: float) -> str:
 
 
 def add_overlay(image: np.ndarray, rows: list[tuple[str, list[str]]]) -> np.ndarray:
-    """Write rows of text into the upper left corner, bright on a translucent dark box.
+    """Return an image with rows of text in the upper left corner, bright on a translucent dark box.
 
     Args:
         image: Shape: (height, width, 3), 8 bits.
-        rows: Color ("plain", "command" or "velocity") and words of each; the first word is left-aligned, the others
-            are right-aligned.
-
-    Returns:
-        A new image.
+        rows: Color ("plain", "command" or "velocity") and words; the first is left-aligned, the others right-aligned.
     """
     from PIL import Image, ImageDraw, ImageFont
 

@@ -19,33 +19,15 @@ from legged_torque.viewer.scene import Scene
 from legged_torque.viewer.session import Session
 from legged_torque.viewer.state import SessionState
 
-FRAME_INTERVAL = 1.0 / 30.0
-"""Seconds between drawings of the robots."""
-PLOT_INTERVAL = 0.2
-"""Seconds between drawings of the plots and the status."""
+FRAME_INTERVAL = 1.0 / 30.0  # seconds between drawings of the robots
+PLOT_INTERVAL = 0.2  # seconds between drawings of the plots and the status
 
 
 class Page:
-    """Draws a session in a thread of its own, which never touches the task's tensors.
-
-    Attributes:
-        server: Server of the page.
-        controls: Panel with controls.
-    """
+    """Draws a session in a thread of its own, which never touches the task's tensors."""
 
     def __init__(self, session: Session, robot: Path, title: str, host: str, port: int) -> None:
-        """Serve the page.
-
-        Args:
-            session: The session.
-            robot: MJCF of the robot, visual geoms included.
-            title: Title of the page.
-            host: Address to serve at.
-            port: Port to serve at, or the next free one.
-
-        Raises:
-            UserError: If there is no such address.
-        """
+        """Serve the page at a port or the next free one; ``robot`` is its MJCF, visual geoms included."""
         self._session = session
         self.server = viser.ViserServer(host, free_port(host, port), label=title, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 125, 246))
@@ -88,20 +70,14 @@ class Page:
 
     def _notify(self, state: SessionState) -> None:
         """Show an error as a notification on the page."""
-        if state.message_number == self._message_shown:
-            return
-        self._message_shown = state.message_number
-        if state.is_error:
+        if state.is_error and state.message_number != self._message_shown:
             for client in self.server.get_clients().values():
                 client.add_notification("That did not work", state.message, color="red", auto_close_seconds=10)
+        self._message_shown = state.message_number
 
 
 def free_port(host: str, port: int) -> int:
-    """Return the first free port from ``port`` on; viser itself would wait forever at a wrong address.
-
-    Raises:
-        UserError: If nothing can be served at that address, or no port is free.
-    """
+    """Return the first free port from a port on, or raise a UserError: at a wrong address viser would wait forever."""
     for candidate in range(port, min(port + 100, 65536)):
         try:
             (family, _, _, _, address), *_ = socket.getaddrinfo(host, candidate, type=socket.SOCK_STREAM)
@@ -128,20 +104,11 @@ def status_html(state: SessionState) -> str:
 
 
 def watch(session: Session, robot: Path, title: str, host: str, port: int) -> None:
-    """Serve a page and step until Ctrl-C.
-
-    Args:
-        session: The session.
-        robot: MJCF of the robot, visual geoms included.
-        title: Title of the page.
-        host: Address to serve at.
-        port: Port to serve at, or the next free one.
-    """
+    """Serve a :class:`Page` and step until Ctrl-C."""
     page = Page(session, robot, title, host, port)
     if page.server.get_port() != port:
         print(f"Port {port} is taken.")
     print(f"See it walk: {page.url} (Ctrl-C ends)", flush=True)
-
     try:
         with stopping_on_ctrl_c(session.stop):
             session.run()
