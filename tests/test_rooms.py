@@ -1,0 +1,131 @@
+"""Rooms for other robots, motors and grounds: refusals by name, and new ones that need no change of tasks."""
+
+import pytest
+import torch
+from settings import error_of
+
+from legged_torque import RESOURCES_DIR
+from legged_torque.envs.base.asset import by_joint, load_asset, nominal_pose
+from legged_torque.envs.robots.a1 import A1Cfg
+from legged_torque.motors import MOTORS
+from legged_torque.motors.motors import Motors
+from legged_torque.terrain import TERRAINS
+from legged_torque.terrain.plane import Plane
+
+A1 = (RESOURCES_DIR / "robots/a1/a1.xml").read_text()
+LEGS = ("FR", "FL", "RR", "RL")
+
+
+def a1_with(path, text):
+    """Settings of the A1 with another file."""
+    (path / "robot.xml").write_text(text)
+    cfg = A1Cfg()
+    cfg.asset.file = str(path / "robot.xml")
+    return cfg
+
+
+# ------------------------------------------------------------------------------------------------ robots
+
+
+def test_motors_in_another_order_are_refused(tmp_path):
+    """Torques are sent in the order of the joints, so motors must be in the same order."""
+    swapped = A1.replace('joint="FR_hip_joint"', 'joint="?"').replace('joint="FL_hip_joint"', 'joint="FR_hip_joint"')
+    cfg = a1_with(tmp_path, swapped.replace('joint="?"', 'joint="FL_hip_joint"'))
+    assert swapped != A1 and "must be in the order of its joints, ['FR_hip_joint'" in error_of(load_asset, cfg)
+
+
+def test_motors_without_limits_are_refused(tmp_path):
+    """A limit that is given as ctrlrange alone is not taken for none."""
+    cfg = a1_with(tmp_path, A1.replace(' forcerange="-33.5 33.5"', ""))
+    assert "the motor of the joint 'FR_hip_joint'" in error_of(load_asset, cfg)
+
+
+def test_gains_by_joint():
+    """Numbers go by a part of the joints' names; joints without one and names without a joint are refused."""
+    names = [f"{leg}_{part}_joint" for leg in LEGS for part in ("hip", "calf")]
+    assert by_joint("gains", 3.0, names) == [3.0] * 8
+    assert by_joint("gains", {"hip": 1.0, "calf": 2.0}, names) == [1.0, 2.0] * 4
+    assert by_joint("gains", {"FR_hip": 5.0, "hip": 1.0, "calf": 2.0}, names)[:3] == [5.0, 2.0, 1.0]
+    assert "gains lacks the joint 'FR_calf_joint'" in error_of(by_joint, "gains", {"hip": 1.0}, names)
+    assert "did you mean" in error_of(by_joint, "gains", {"FR_hipp_joint": 1.0}, names)
+
+
+def test_order_of_the_pose():
+    """The nominal pose is written in the order of the file, which is that of all vectors of joints."""
+    assert nominal_pose({"a": 1.0, "b": 2.0}, ["a", "b"]) == [1.0, 2.0]
+    assert "must be in the order of the MJCF's joints: a, b" in error_of(nominal_pose, {"b": 2.0, "a": 1.0}, ["a", "b"])
+
+
+def test_robot_without_mirrored_legs(make_task):
+    """It can be simulated, but neither learns from mirror images nor has the symmetry term."""
+    settings = {"asset.mirrored_legs": []}
+    assert "rewards.scales.symmetry needs asset.mirrored_legs" in error_of(make_task, "a1_torque", 1, **settings)
+    task = make_task("a1_torque", 1, **settings, **{"rewards.scales.symmetry": 0.0})
+    task.step(torch.zeros(1, 12))
+    assert "'FR_hip_joint' has no counterpart" in error_of(lambda: task.mirror)
+
+
+# ------------------------------------------------------------------------------------------------ motors and ground
+
+
+class CurvedMotors(Motors):
+    """Motors whose limits fall linearly to 0 at 20 rad/s."""
+
+    def apply(self, wanted, dof_vel, out):
+        """Write the torque inside the limits of this speed."""
+        share = (1.0 - dof_vel.abs() / 20.0).clamp(min=0.0)
+        out.copy_(wanted.clamp(self.limits[0] * share, self.limits[1] * share))
+
+
+@pytest.mark.parametrize("name", ["a1_position", "a1_torque", "a1_torque_multihead"])
+def test_a_motor_model_comes_without_touching_tasks(make_task, monkeypatch, name):
+    """Registered under a name, it acts in every approach."""
+    monkeypatch.setitem(MOTORS, "curved", CurvedMotors)
+    task = make_task(name, 8, **{"motors.model": "curved", "control.decimation": 1})
+    for _ in range(5):
+        speeds = task.dof_vel.clone()
+        actions = 20.0 * torch.randn(8, task.num_actions)
+        wanted = task._compute_torques(actions)
+        task.step(actions)
+        alive = ~task.reset_buf
+        limits = 33.5 * (1.0 - speeds.abs() / 20.0).clamp(min=0.0)
+        torch.testing.assert_close(task.torques[alive], torch.clamp(wanted, -limits, limits)[alive])
+
+
+class Raised(Plane):
+    """Ground that is 0.1 m higher than where the physics has it, which only the task is told."""
+
+    def height_above(self, points):
+        """Return the height above it."""
+        return points[..., 2] - 0.1
+
+    def move_to_origin(self, mask, base_pos):
+        """Start one metre to the side."""
+        base_pos[:, 1] += mask.float()
+
+
+def test_a_ground_comes_without_touching_tasks(make_task, monkeypatch):
+    """Heights in rewards and observations are those above it, and episodes start where it says."""
+    monkeypatch.setitem(TERRAINS, "raised", Raised)
+    task = make_task("a1_torque", 4, **{"terrain.mesh_type": "raised"})
+    torch.testing.assert_close(task.base_height, task.base_pos[:, 2] - 0.1)
+    torch.testing.assert_close(task._reward_base_height(), (task.base_pos[:, 2] - 0.403).square())
+    torch.testing.assert_close(task.get_observations()["critic"][:, 48], task.base_pos[:, 2] - 0.1)
+    assert (task.base_pos[:, 1] == 1.0).all()
+
+
+def test_plane():
+    """Level ground at height 0."""
+    points = torch.randn(5, 3)
+    plane = Plane()
+    assert torch.equal(plane.height_above(points), points[:, 2]) and (plane.height(points) == 0.0).all()
+    assert torch.equal(plane.normal(points), torch.tensor([[0.0, 0.0, 1.0]]).expand(5, 3))
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "nearest"), [("motors.model", "idael", "ideal"), ("terrain.mesh_type", "plan", "plane")]
+)
+def test_unknown_rooms(make_task, setting, value, nearest):
+    """A name that does not exist is refused with the nearest one."""
+    line = error_of(make_task, "a1_torque", 1, **{setting: value})
+    assert f"unknown {setting} '{value}'; did you mean '{nearest}'?" in line
