@@ -26,10 +26,8 @@ from legged_torque.utils.random_state import own_random_numbers, seeded_state
 from legged_torque.utils.task_registry import task_registry
 from legged_torque.utils.threads import single_threaded
 
-Act = Callable[[LeggedRobot], Tensor]
-"""Returns the torques for a task's state [N m]. Shape: (num_envs, num_dof)."""
-STANDING_SECONDS = 5.0
-"""Time after which the learned policy must stand."""
+Act = Callable[[LeggedRobot], Tensor]  # returns the torques for a task's state [N m]; (num_envs, num_dof)
+STANDING_SECONDS = 5.0  # time after which the learned policy must stand
 
 
 @dataclass

@@ -22,8 +22,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-TRUNK_DOFS = 6
-"""Virtual joints in front of the actuated ones, which S_k removes."""
+TRUNK_DOFS = 6  # virtual joints in front of the actuated ones, which S_k removes
 
 
 @dataclass

@@ -104,10 +104,8 @@ class Summary:
         return stdev(self.values) / math.sqrt(len(self.values)) if len(self.values) > 1 else None
 
 
-Cells = dict[str, dict[str, Summary]]
-"""Summaries of a column by task and metric; metrics without a value are absent."""
-Table = dict[str, Cells]
-"""Summaries by column."""
+Cells = dict[str, dict[str, Summary]]  # summaries of a column by task and metric; metrics without a value are absent
+Table = dict[str, Cells]  # summaries by column
 
 
 def column_name(trained: str, evaluated: str) -> str:

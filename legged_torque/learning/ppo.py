@@ -13,8 +13,7 @@ from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
 
-MIN_LEARNING_RATE = 1e-5
-"""Lower bound of the adaptive learning rate, that of rsl_rl."""
+MIN_LEARNING_RATE = 1e-5  # lower bound of the adaptive learning rate, that of rsl_rl
 
 LOSS_NAMES = ("value", "surrogate", "entropy", "kl", "gradient_norm", "critic_gradient_norm", "skipped_updates")
 """What an update reports: means over the minibatches that were learned from, and how many were not."""

@@ -7,8 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-UNITS = ("physics_steps", "control_steps")
-"""What ``domain_rand.action_delay`` may count."""
+UNITS = ("physics_steps", "control_steps")  # what ``domain_rand.action_delay`` may count
 
 
 class ActionDelay:
