@@ -26,9 +26,6 @@ class OnDevicePPO(PPO):
     leaves the networks and the optimizer untouched and is counted. Processes that train together learn from minibatches
     of their own, average gradients and KL divergence, and so take the same step, or skip it, all of them; as in rsl_rl,
     each normalizes the advantages of its own rollout.
-
-    Attributes:
-        update_graph: The update from one minibatch.
     """
 
     optimizer: torch.optim.Adam
@@ -75,7 +72,7 @@ class OnDevicePPO(PPO):
         self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # where torch's own gradient scaler tells a fused optimizer to skip
         self._losses = torch.zeros(len(LOSS_NAMES), device=self.device)
         self._indices = torch.zeros(self._batch_size, dtype=torch.long, device=self.device)
-        self.update_graph = CudaGraph(self._update_minibatch, self.device)
+        self.update_graph = CudaGraph(self._update_minibatch, self.device)  # the update from one minibatch
 
     def learn_actor(self, enabled: bool) -> None:
         """Say whether the next updates train the policy too, or the value function alone."""
