@@ -12,11 +12,9 @@ def _find_dir(name: str) -> Path:
     return installed if installed.is_dir() else package.parent / name
 
 
-RESOURCES_DIR = _find_dir("resources")
-"""Folder of the robot models."""
+RESOURCES_DIR = _find_dir("resources")  # folder of the robot models
 
-SCRIPTS_DIR = _find_dir("scripts")
-"""Folder of the scripts."""
+SCRIPTS_DIR = _find_dir("scripts")  # folder of the scripts
 
 
 def resource_path(file: str | Path) -> Path:

@@ -9,7 +9,6 @@ os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or torch's profiler writes to
 
 import argparse
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from legged_torque.checks.benchmark import TRACED, MemoryMeter, is_out_of_memory
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.args import Parser, add_settings_args, options_of
-from legged_torque.utils.cli import prepare_file, run_script
+from legged_torque.utils.cli import check_at_least, prepare_file, run_script, write_json
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.paths import without_machine
@@ -90,7 +89,7 @@ def main() -> None:
             print(f"  most expensive {kind} of {TRACED} iterations, see {args.profile}:")
             print_kernels(row["kernels"])
         if args.json:
-            args.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+            write_json(args.json, result)
 
 
 def parse_args() -> argparse.Namespace:
@@ -106,10 +105,8 @@ def parse_args() -> argparse.Namespace:
     help_text = "also run N iterations and compare the first tenth with the last"
     parser.add_argument("--endurance", type=int, default=0, metavar="N", help=help_text)
     args = parser.parse_args()
-    if args.rounds < 1:
-        raise UserError(f"--rounds must be at least 1, not {args.rounds}")
-    if args.endurance < 0:
-        raise UserError(f"--endurance must be at least 0, not {args.endurance}")
+    check_at_least(args, 1, "rounds")
+    check_at_least(args, 0, "endurance")
     if args.profile and len(args.num_envs or [None]) > 1:
         raise UserError("--profile writes one trace: give one number of worlds")
     return args

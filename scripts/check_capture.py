@@ -11,9 +11,8 @@ from legged_torque.checks.capture import compare_capture, warm_up
 from legged_torque.envs import task_registry
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import run_script
+from legged_torque.utils.cli import check_at_least, run_script
 from legged_torque.utils.devices import device_name, resolve_device
-from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import set_seed
 
@@ -27,10 +26,8 @@ def main() -> None:
     help_text += "are as far apart; default: %(default)s"
     parser.add_argument("--tolerance", type=float, default=1e-2, help=help_text)
     args = parser.parse_args()
-    if args.iterations < 1:
-        raise UserError(f"--iterations must be at least 1, not {args.iterations}")
-    if not args.tolerance >= 0.0:
-        raise UserError(f"--tolerance must be at least 0, not {args.tolerance}")
+    check_at_least(args, 1, "iterations")
+    check_at_least(args, 0, "tolerance")
     device = resolve_device(args.device)
     print(f"{args.task} on {device_name(device)}: with CUDA graphs against without")
     if device == "cpu":

@@ -4,16 +4,14 @@ from legged_torque.utils.rendering import without_renderer
 
 without_renderer()  # before anything imports mujoco
 
-import json
 from pathlib import Path
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.metrics import measure
 from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import prepare_file, run_script
+from legged_torque.utils.cli import check_at_least, prepare_file, run_script, write_json
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
-from legged_torque.utils.errors import UserError
 from legged_torque.utils.paths import without_machine
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import set_seed
@@ -30,8 +28,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000, help=help_text)
     parser.add_argument("--json", type=Path, help="file to write; default: curve.json in the run's folder")
     args = parser.parse_args()
-    if args.steps < 1:
-        raise UserError(f"--steps must be at least 1, not {args.steps}")
+    check_at_least(args, 1, "steps")
     options = options_of(args)
     run = task_registry.load_run(options)
     file = args.json or run.folder / "curve.json"
@@ -47,17 +44,10 @@ def main() -> None:
         texts = [f"{name} {mean:.4f}" for name, mean in means.items()]
         print(f"{infos['total_timesteps']:>12,} steps", *texts, sep="  ")
     settings = {"num_envs": env.num_envs, "num_steps": args.steps, "actions": "mean", "env": to_dict(run.env_cfg)}
-    result = {
-        "task": args.task,
-        "seed": run.train_cfg.seed,
-        "trained_with": run.config["train"],
-        "trained_env": run.config["env"],
-        "device": device_name(env.device),
-        "evaluation": settings,
-        "versions": package_versions(),
-        "points": points,
-    }
-    file.write_text(json.dumps(without_machine(result), indent=1) + "\n", encoding="utf-8")
+    result = {"task": args.task, "seed": run.train_cfg.seed}
+    result |= {"trained_with": run.config["train"], "trained_env": run.config["env"]}
+    result |= {"device": device_name(env.device), "evaluation": settings, "versions": package_versions()}
+    write_json(file, without_machine(result | {"points": points}))
 
 
 if __name__ == "__main__":

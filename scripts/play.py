@@ -87,8 +87,7 @@ def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
 def roll_out(args: argparse.Namespace, env: LeggedRobot, runner: OnPolicyRunner, checkpoint: Path) -> None:
     """Roll out mean actions, print the metrics, save a video."""
     recorder = TaskRecorder(env, args.grid)
-    policy = runner.get_inference_policy(env.device)
-    metrics = measure(env, policy, args.steps, lambda commands: recorder.add_step())
+    metrics = measure(env, runner.get_inference_policy(env.device), args.steps, lambda commands: recorder.add_step())
     print(f"{checkpoint}, after {int(runner.logger.tot_timesteps):,} steps of training:")
     for name, value in metrics.means().items():
         print(f"  {name:<18} {value:8.4f} {UNITS[name]}")

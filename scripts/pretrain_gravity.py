@@ -3,7 +3,6 @@
 The policy is kept where ``train.py`` looks for it, which also makes it itself if it is missing.
 """
 
-import json
 from pathlib import Path
 
 from legged_torque.utils.rendering import without_renderer
@@ -13,7 +12,7 @@ without_renderer()  # before anything imports mujoco
 from legged_torque.envs import task_registry
 from legged_torque.learning.pretrained import make_pretrained, pretrained_file
 from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import prepare_file, run_script
+from legged_torque.utils.cli import prepare_file, run_script, write_json
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.progress import CompileProgress
 
@@ -40,7 +39,7 @@ def main() -> None:
     with CompileProgress():
         report = make_pretrained(file, args.task, env_cfg, train_cfg, device)
     if args.json:
-        args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        write_json(args.json, report)
     print(f"The policy is in {file}")
     print(f"Train from it: python scripts/train.py --task={args.task}")
 

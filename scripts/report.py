@@ -10,8 +10,7 @@ from legged_torque.experiments.figures import draw_all
 from legged_torque.experiments.report import missing_lines, report
 from legged_torque.experiments.results import read_experiment, summarize, write_tables
 from legged_torque.utils.args import Parser
-from legged_torque.utils.cli import prepare_file, run_script
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.cli import check_at_least, prepare_file, run_script
 
 
 def main() -> None:
@@ -22,8 +21,7 @@ def main() -> None:
     help_text = "step from which evaluations count; default: %(default).0f, where the paper's Table I begins to average"
     parser.add_argument("--from_step", type=float, default=90e6, help=help_text)
     args = parser.parse_args()
-    if not args.from_step >= 0:
-        raise UserError(f"--from_step must be at least 0, not {args.from_step}")
+    check_at_least(args, 0, "from_step")
     experiment = read_experiment(args.experiment)
     table = summarize(experiment, args.from_step)
     file = args.out / "report.md"

@@ -83,8 +83,7 @@ def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: 
     place = device_name(device) if num_processes == 1 else f"{num_processes} x {device_name(device)}"
     print(f"Training {options.task} on {place}: {num_processes * runner.env.num_envs} worlds, {total} iterations.")
     print(f"Curves: tensorboard --logdir {runner.log_dir}")
-    words = run_words(options.task, runner.log_dir)
-    print(f"See it learn: python scripts/play.py {words} --viewer web", flush=True)
+    print(f"See it learn: python scripts/play.py {run_words(options.task, runner.log_dir)} --viewer web", flush=True)
     settings = {"task": options.task, "preset": options.preset or DEFAULT_PRESET, "device": device}
     settings |= {"processes": num_processes, "max_iterations": total}
     save_config(runner.log_dir, settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})

@@ -18,10 +18,8 @@ from legged_torque.utils.errors import UserError
 
 ITERATIONS = 12
 """Enough for single precision, where forces were seen to be up to 3 N off; in double each more gains about a digit."""
-CENTERING = 0.1
-"""Factor by which each iteration is to reduce the complementarity."""
-TO_BOUNDARY = 0.99
-"""Share of the way to the nearest limit that a step may go."""
+CENTERING = 0.1  # factor by which each iteration is to reduce the complementarity
+TO_BOUNDARY = 0.99  # share of the way to the nearest limit that a step may go
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from torch import Tensor
 from legged_torque.sim.graph import prepare_device
 from legged_torque.utils.errors import UserError, unknown_name
 
-TRUNK = 1
-"""The trunk's body."""
+TRUNK = 1  # the trunk's body
 TRUNK_DOFS = 6
 """Virtual joints of the trunk: linear velocity in the world frame, then angular velocity in the trunk's frame."""
 

@@ -26,10 +26,8 @@ from legged_torque.utils.random_state import own_random_numbers, seeded_state
 from legged_torque.utils.task_registry import task_registry
 from legged_torque.utils.threads import single_threaded
 
-Act = Callable[[LeggedRobot], Tensor]
-"""Returns the torques for a task's state [N m]. Shape: (num_envs, num_dof)."""
-STANDING_SECONDS = 5.0
-"""Time after which the learned policy must stand."""
+Act = Callable[[LeggedRobot], Tensor]  # returns the torques for a task's state [N m]; (num_envs, num_dof)
+STANDING_SECONDS = 5.0  # time after which the learned policy must stand
 
 
 @dataclass
@@ -76,7 +74,10 @@ def pretrain(name: str, env_cfg: Any, train_cfg: Any, device: str) -> tuple[MLPM
         start = time.perf_counter()
         collection, errors = learn_to_stand(task, controller, actor, settings)
         seconds = time.perf_counter() - start
-        standing = standing_shares(task, controller, actor)
+        standing = {}
+        for who, act in {"controller": act_by_controller(controller), "policy": act_by_policy(actor)}.items():
+            place_on_ground(task, controller.dynamics)
+            standing[who] = measure_standing(task, act, STANDING_SECONDS).share
     print(f"Standing after 5 s: {' and '.join(f'the {who} {share:.1%}' for who, share in standing.items())}.")
     torques, residuals = histogram(collection.mean_torques, 40.0), histogram(collection.residuals, 5.0)
     report = {
@@ -132,11 +133,9 @@ def learn_to_stand(
 
 @dataclass
 class Followed:
-    """Configurations that were followed in closed loop, and the controller's opinion at each step, whoever was acting.
+    """Configurations followed in closed loop, and the controller's opinion at each step, whoever was acting."""
 
-    All shapes begin with (num_steps, configurations).
-    """
-
+    # All shapes begin with (num_steps, configurations).
     observations: Tensor  # what the policy sees. Shape: (..., size)
     actions: Tensor  # the controller's torques over the torque scale. Shape: (..., num_actions)
     mean_torques: Tensor  # mean absolute torque of the controller [N m]
@@ -199,10 +198,7 @@ def select(followed: list[Followed], settings: Any) -> Collection:
 
 
 def residual_share(controller: WholeBodyController, decided: WholeBodyTorques) -> Tensor:
-    """Return what the limits of the contacts leave out of the wanted wrench, as a share of the weight. Shape: (n,).
-
-    Moments count by the arm of the controller's settings.
-    """
+    """Return what the limits of the contacts leave out of the wanted wrench, as a share of the weight. Shape: (n,)."""
     model = controller.dynamics.mj_model
     weight = float(model.body_mass.sum() * abs(model.opt.gravity[2]))
     force, moment = decided.wrench_residual.split(3, dim=1)
@@ -274,15 +270,6 @@ def act_by_policy(actor: MLPModel) -> Act:
             return task.torque_scale * actor(task.get_observations())
 
     return torques
-
-
-def standing_shares(task: LeggedRobot, controller: WholeBodyController, actor: MLPModel) -> dict[str, float]:
-    """Return the shares of worlds in which each stands after 5 s from a random state, acting once per control step."""
-    shares = {}
-    for name, torques in {"controller": act_by_controller(controller), "policy": act_by_policy(actor)}.items():
-        place_on_ground(task, controller.dynamics)
-        shares[name] = measure_standing(task, torques, STANDING_SECONDS).share
-    return shares
 
 
 def histogram(values: Tensor, highest: float, bins: int = 50) -> dict[str, list[float]]:

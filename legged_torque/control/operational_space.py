@@ -22,8 +22,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-TRUNK_DOFS = 6
-"""Virtual joints in front of the actuated ones, which S_k removes."""
+TRUNK_DOFS = 6  # virtual joints in front of the actuated ones, which S_k removes
 
 
 @dataclass
@@ -49,20 +48,15 @@ class TaskSpace:
 
 
 def invert(matrix: Tensor) -> Tensor:
-    """Return the inverses of symmetric positive definite matrices. Shape: (..., m, m).
-
-    It is zero for a matrix that rounding made indefinite, as happens in single precision where a leg is stretched.
-    """
+    """Return the inverses of symmetric positive definite matrices. Shape: (..., m, m)."""
+    # It is zero for a matrix that rounding made indefinite, as happens in single precision where a leg is stretched.
     factor, info = torch.linalg.cholesky_ex(matrix)
     inverse = inverse_triangle(factor)
     return torch.where((info > 0)[..., None, None], 0.0, inverse.mT @ inverse)
 
 
 def inverse_triangle(factor: Tensor) -> Tensor:
-    """Return the inverses of lower triangular matrices. Shape: (..., m, m).
-
-    Unlike cholesky_inverse, a CUDA graph can capture it.
-    """
+    """Return inverses of lower triangular matrices; unlike cholesky_inverse also in a CUDA graph. Shape: (..., m, m)."""
     return torch.linalg.solve_triangular(factor, _eye(factor), upper=False)
 
 
@@ -120,10 +114,8 @@ def task_force(task: TaskSpace, acceleration: Tensor) -> Tensor:
 
 
 def posture_torques(task: TaskSpace, to_torques: Tensor, torques: Tensor) -> Tensor:
-    """Return N^T Gamma_0, the part of posture torques that does not disturb the task (eq. 5) [N m] (n, nv - 6).
-
-    N^T = 1 - J_k^T J_bar^T S_k^T, with J_k^T from :func:`torque_map`.
-    """
+    """Return N^T Gamma_0, the part of posture torques that does not disturb the task (eq. 5) [N m] (n, nv - 6)."""
+    # N^T = 1 - J_k^T J_bar^T S_k^T, with J_k^T from torque_map
     return torques - apply(to_torques, apply(task.inverse[:, :, TRUNK_DOFS:], torques))
 
 

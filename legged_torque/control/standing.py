@@ -17,16 +17,12 @@ from legged_torque.utils.config import update_from_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import apply_perturbation
 
-START_CLEARANCE = (0.0, 0.02)
-"""Lowest and highest clearance of the lowest foot at the start [m]."""
-MAX_DRAWS = 20
-"""How often states are drawn until no other part of the robot is below the ground."""
-LOWEST_HEIGHT = 0.2
-"""Lowest height of a standing robot's trunk [m]."""
+START_CLEARANCE = (0.0, 0.02)  # lowest and highest clearance of the lowest foot at the start [m]
+MAX_DRAWS = 20  # how often states are drawn until no other part of the robot is below the ground
+LOWEST_HEIGHT = 0.2  # lowest height of a standing robot's trunk [m]
 HIGHEST_GRAVITY_Z = -0.9
 """Highest z of the unit gravity vector in a standing robot's trunk frame: tilted by up to 26 degrees."""
-HIGHEST_SPEED = 0.3
-"""Highest speed of a standing robot's trunk [m/s]."""
+HIGHEST_SPEED = 0.3  # highest speed of a standing robot's trunk [m/s]
 
 
 @dataclass

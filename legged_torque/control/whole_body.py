@@ -92,7 +92,11 @@ class WholeBodyController:
         self._lowest, self._highest = torch.tensor(ranges, dtype=torch.float32, device=device)
         limits = ForceLimits(settings.friction, settings.lowest_force, settings.highest_force)
         self._distribute = ForceDistribution(limits, settings.arm, settings.force_regularization, device)
-        self._nominal_feet = self._feet_in_nominal_pose()
+        qpos = torch.zeros(dynamics.num_states, model.nq, device=device)
+        qpos[:, 3] = 1.0
+        qpos[:, TRUNK_DOFS + 1 :] = self._pose
+        dynamics.update(qpos, torch.zeros(dynamics.num_states, model.nv, device=device))
+        self._nominal_feet = dynamics.contact_points[0].clone()  # seen from the trunk [m]. Shape: (k, 3)
 
     @single_threaded()
     def __call__(self, qpos: Tensor, qvel: Tensor, mask: Tensor) -> WholeBodyTorques:
@@ -159,12 +163,3 @@ class WholeBodyController:
         feet = feet + robot.trunk_position.unsqueeze(1)
         feet[:, :, :2] += self.settings.capture_time * qvel[:, None, :2]
         return feet
-
-    def _feet_in_nominal_pose(self) -> Tensor:
-        """Return the contact points of the nominal pose, seen from the trunk [m]. Shape: (k, 3)."""
-        robot = self.dynamics
-        qpos = torch.zeros(robot.num_states, robot.mj_model.nq, device=robot.device)
-        qpos[:, 3] = 1.0
-        qpos[:, TRUNK_DOFS + 1 :] = self._pose
-        robot.update(qpos, torch.zeros(robot.num_states, robot.mj_model.nv, device=robot.device))
-        return robot.contact_points[0].clone()

@@ -109,8 +109,7 @@ def _check_schema(description: Any, where: str) -> None:
         import jsonschema
     except ImportError:
         raise missing_extra("jsonschema") from None
-    validator = jsonschema.Draft202012Validator(_schema())
-    error = jsonschema.exceptions.best_match(validator.iter_errors(description))
+    error = jsonschema.exceptions.best_match(jsonschema.Draft202012Validator(_schema()).iter_errors(description))
     if error is not None:
         path = ".".join(str(key) for key in error.absolute_path) or "the file"
         message = " ".join(error.message.split())

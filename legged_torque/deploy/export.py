@@ -106,7 +106,6 @@ def check_terms(task: LeggedRobot) -> None:
 def write_networks(model: MLPModel, folder: Path) -> None:
     """Write the mean policy as ONNX and TorchScript, normalization of observations included."""
     network = model.as_onnx(verbose=False).cpu().eval()
-    batch = {0: "batch"}
     with warnings.catch_warnings():
         # The older exporter needs 0.3 s instead of 6, writes the same nodes, and keeps everything in one file.
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -116,7 +115,7 @@ def write_networks(model: MLPModel, folder: Path) -> None:
             str(folder / NETWORK_FILE),
             input_names=["obs"],
             output_names=["actions"],
-            dynamic_axes={"obs": batch, "actions": batch},
+            dynamic_axes={"obs": {0: "batch"}, "actions": {0: "batch"}},
             opset_version=17,
             dynamo=False,
         )
@@ -126,6 +125,7 @@ def write_networks(model: MLPModel, folder: Path) -> None:
 def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str, Any]:
     """Return the contents of ``policy.yaml`` but for the network's checksum; arguments as of :func:`export_policy`."""
     cfg, asset, ranges = task.cfg, task.cfg.asset, task.cfg.commands.ranges
+    clip = float(cfg.normalization.clip_actions)
     file = Path(asset.file)
     if file.is_absolute() and file.is_relative_to(RESOURCES_DIR):
         file = file.relative_to(RESOURCES_DIR.parent)
@@ -141,7 +141,7 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
         "nominal_pose": _by_joint(task, task.default_dof_pos),
         "nominal_trunk_height": cfg.rewards.base_height_target,
         "observations": {"history_length": cfg.env.history_length, "terms": _observation_terms(task)},
-        "actions": {"clip": _both_ways(cfg.normalization.clip_actions), "terms": _action_terms(task)},
+        "actions": {"clip": [-clip, clip], "terms": _action_terms(task)},
         "gains": {"stiffness": _by_joint(task, task.p_gains[0]), "damping": _by_joint(task, task.d_gains[0])},
         "torque_limits": _by_joint(task, task.torque_limits.T),
         "timing": {
@@ -160,14 +160,14 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
 
 def _observation_terms(task: LeggedRobot) -> list[dict[str, Any]]:
     """Return the terms of the policy's observations in their order."""
-    clip, sizes = _both_ways(task.cfg.normalization.clip_observations), task.observations.sizes
+    clip, sizes = float(task.cfg.normalization.clip_observations), task.observations.sizes
     return [
         {
             "name": term.name,
             "size": sizes[term.name],
             "scale": list(term.scale) if isinstance(term.scale, Sequence) else term.scale,
             **{key: getattr(term, key) for key in ("frame", "unit", "meaning")},
-            "clip": list(clip),
+            "clip": [-clip, clip],
         }
         for term in task.observations.policy_terms()
     ]
@@ -250,13 +250,6 @@ def _by_joint(task: LeggedRobot, values: Tensor) -> dict[str, Any]:
     return dict(zip(task.dof_names, _plain(values), strict=True))
 
 
-def _both_ways(limit: float) -> list[float]:
-    """Return a symmetric range."""
-    return [-float(limit), float(limit)]
-
-
 def _plain(values: Tensor) -> Any:
     """Return a float32 tensor as nested lists of the shortest decimals that stand for its numbers."""
-    if values.dim():
-        return [_plain(value) for value in values]
-    return float(str(values.detach().cpu().numpy()))
+    return [_plain(value) for value in values] if values.dim() else float(str(values.detach().cpu().numpy()))

@@ -38,7 +38,10 @@ class MujocoRobot:
         self.notes: list[str] = []
         self.model = self._load(Path(xml))
         self.data = mujoco.MjData(self.model)
-        self._set_time_step(1.0 / description["timing"]["physics_frequency"])
+        old, step = self.model.opt.timestep, 1.0 / description["timing"]["physics_frequency"]
+        if not np.isclose(old, step, rtol=1e-6):
+            self.notes.append(f"time step: the MJCF has {old:g} s, policy.yaml's {step:g} s is used")
+        self.model.opt.timestep = step
         self._find_root()
         self._find_joints(description["joint_order"])
         self._find_motors(description)
@@ -99,8 +102,7 @@ class MujocoRobot:
 
     def contact_force(self) -> float:
         """Return the sum over geoms of the norm of the ground's net force in the last physics step [N]."""
-        forces = np.zeros((self.model.ngeom, 3))
-        force = np.zeros(6)
+        forces, force = np.zeros((self.model.ngeom, 3)), np.zeros(6)
         for number, geom, sign in self._ground_contacts():
             mujoco.mj_contactForce(self.model, self.data, number, force)
             forces[geom] += sign * self.data.contact[number].frame.reshape(3, 3).T @ force[:3]
@@ -130,13 +132,6 @@ class MujocoRobot:
             return spec.compile()
         except ValueError as error:
             raise UserError(f"cannot load the robot '{file}': {' '.join(str(error).split())}") from None
-
-    def _set_time_step(self, step: float) -> None:
-        """Take the policy's physics step."""
-        if not np.isclose(self.model.opt.timestep, step, rtol=1e-6):
-            old = self.model.opt.timestep
-            self.notes.append(f"time step: the MJCF has {old:g} s, policy.yaml's {step:g} s is used")
-        self.model.opt.timestep = step
 
     def _find_root(self) -> None:
         """Find the free joint of the trunk."""

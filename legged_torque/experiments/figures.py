@@ -53,8 +53,7 @@ CUT_AT = 3.0  # largest height of a panel of bars, in medians of the values that
 PAPER_MARKER: dict[str, Any] = {"marker": "D", "color": "none", "markerfacecolor": "white", "markeredgecolor": "black"}
 SETTINGS = {"font.size": 10, "hatch.linewidth": 0.6, "axes.axisbelow": True, "savefig.dpi": 150}
 
-Style = tuple[str, Any, str]
-"""Colour, line style and hatch."""
+Style = tuple[str, Any, str]  # colour, line style and hatch
 
 
 @dataclass

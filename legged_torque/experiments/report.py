@@ -75,8 +75,7 @@ def run_problems(run: CellResult, from_step: float) -> list[str]:
     if not run.rows:
         problems.append("no evaluation during training yet")
     elif not run.is_finished(run.steps):
-        share = run.steps / run.total_steps
-        problems.append(f"not finished, {run.steps / MILLION:.4g} of {total} ({share:.0%})")
+        problems.append(f"not finished, {run.steps / MILLION:.4g} of {total} ({run.steps / run.total_steps:.0%})")
     if run.rows and run.steps < from_step:
         end = f"ends before {from_step / MILLION:g} million steps"
         problems.append(f"{end}; its number is the mean of its last {LAST_SHARE:.0%}")

@@ -104,10 +104,8 @@ class Summary:
         return stdev(self.values) / math.sqrt(len(self.values)) if len(self.values) > 1 else None
 
 
-Cells = dict[str, dict[str, Summary]]
-"""Summaries of a column by task and metric; metrics without a value are absent."""
-Table = dict[str, Cells]
-"""Summaries by column."""
+Cells = dict[str, dict[str, Summary]]  # summaries of a column by task and metric; metrics without a value are absent
+Table = dict[str, Cells]  # summaries by column
 
 
 def column_name(trained: str, evaluated: str) -> str:
@@ -167,8 +165,7 @@ def summarize(experiment: Experiment, from_step: float) -> Table:
     table: Table = {}
     for column, (trained, evaluated) in experiment.columns().items():
         for task in experiment.plan.tasks:
-            runs = experiment.runs_of(task, trained)
-            counted = [(run, run.counted_rows(evaluated, from_step)) for run in runs]
+            counted = [(run, run.counted_rows(evaluated, from_step)) for run in experiment.runs_of(task, trained)]
             are_finished = all(run.is_finished(rows[-1]["steps"]) for run, rows in counted if rows)
             cell = table.setdefault(column, {}).setdefault(task, {})
             for name in (metric.name for metric in CURVE_METRICS):

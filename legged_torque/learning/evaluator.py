@@ -20,8 +20,7 @@ from legged_torque.utils.config import section_keys
 from legged_torque.utils.options import apply_perturbation
 from legged_torque.utils.random_state import own_random_numbers, seeded_state
 
-EVALUATIONS_FILE = "evaluations.csv"
-"""In a run's folder: a row per evaluation."""
+EVALUATIONS_FILE = "evaluations.csv"  # in a run's folder: a row per evaluation
 SETTLING_TIME = 2.0
 """Least simulated time before the first evaluation [s], in whole evaluations: all robots start from random states."""
 

@@ -13,8 +13,7 @@ from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
 
-MIN_LEARNING_RATE = 1e-5
-"""Lower bound of the adaptive learning rate, that of rsl_rl."""
+MIN_LEARNING_RATE = 1e-5  # lower bound of the adaptive learning rate, that of rsl_rl
 
 LOSS_NAMES = ("value", "surrogate", "entropy", "kl", "gradient_norm", "critic_gradient_norm", "skipped_updates")
 """What an update reports: means over the minibatches that were learned from, and how many were not."""
@@ -27,9 +26,6 @@ class OnDevicePPO(PPO):
     leaves the networks and the optimizer untouched and is counted. Processes that train together learn from minibatches
     of their own, average gradients and KL divergence, and so take the same step, or skip it, all of them; as in rsl_rl,
     each normalizes the advantages of its own rollout.
-
-    Attributes:
-        update_graph: The update from one minibatch.
     """
 
     optimizer: torch.optim.Adam
@@ -76,7 +72,7 @@ class OnDevicePPO(PPO):
         self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # where torch's own gradient scaler tells a fused optimizer to skip
         self._losses = torch.zeros(len(LOSS_NAMES), device=self.device)
         self._indices = torch.zeros(self._batch_size, dtype=torch.long, device=self.device)
-        self.update_graph = CudaGraph(self._update_minibatch, self.device)
+        self.update_graph = CudaGraph(self._update_minibatch, self.device)  # the update from one minibatch
 
     def learn_actor(self, enabled: bool) -> None:
         """Say whether the next updates train the policy too, or the value function alone."""

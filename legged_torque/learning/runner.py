@@ -20,8 +20,7 @@ from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.random_state import random_state, restore_random_state
 from legged_torque.utils.runs import checkpoint_file, claim_run_dir
 
-EVALUATION_SEED = 10_000
-"""Added to the seed of a training for that of its evaluations."""
+EVALUATION_SEED = 10_000  # added to the seed of a training for that of its evaluations
 
 
 class OnPolicyRunner(runners.OnPolicyRunner):

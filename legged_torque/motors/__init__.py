@@ -6,8 +6,7 @@ from legged_torque.motors.ideal import IdealMotors
 from legged_torque.motors.motors import Motors
 from legged_torque.utils.errors import unknown_name
 
-MOTORS: dict[str, type[Motors]] = {"ideal": IdealMotors}
-"""Models of motors, by ``motors.model``."""
+MOTORS: dict[str, type[Motors]] = {"ideal": IdealMotors}  # models of motors, by ``motors.model``
 
 
 def make_motors(model: str, num_envs: int, limits: Tensor) -> Motors:

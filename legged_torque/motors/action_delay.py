@@ -7,16 +7,11 @@ import math
 import torch
 from torch import Tensor
 
-UNITS = ("physics_steps", "control_steps")
-"""What ``domain_rand.action_delay`` may count."""
+UNITS = ("physics_steps", "control_steps")  # what ``domain_rand.action_delay`` may count
 
 
 class ActionDelay:
-    """Holds actions back, in each world for a time of its own that is drawn at every reset.
-
-    Attributes:
-        drawn: Delay in the unit of the settings; its whole part counts. Shape: (num_envs, 1).
-    """
+    """Holds actions back, in each world for a time of its own that is drawn at every reset."""
 
     def __init__(self, newest: Tensor, longest: int, unit: str, decimation: int) -> None:
         """Prepare; there is no delay until one is drawn, up to the longest in the unit, one of :data:`UNITS`.
@@ -29,7 +24,7 @@ class ActionDelay:
         self._newest = newest
         depth = math.ceil(longest * self._physics_steps / decimation)
         self._before = newest.new_zeros(depth, *newest.shape)
-        self.drawn = newest.new_zeros(len(newest), 1)
+        self.drawn = newest.new_zeros(len(newest), 1)  # in the unit; its whole part counts. Shape: (num_envs, 1)
 
     def keep(self) -> None:
         """Keep the newest actions, before they are overwritten."""

@@ -9,16 +9,12 @@ from torch import Tensor
 
 
 class Motors(ABC):
-    """One motor per joint in each world.
-
-    Attributes:
-        strength: Factor on the torques that are asked for, drawn at random. Shape: (num_envs, num_dof).
-        limits: Lowest and highest torques [N m]. Shape: (2, num_dof).
-    """
+    """One motor per joint in each world."""
 
     def __init__(self, num_envs: int, limits: Tensor) -> None:
-        """Create motors of full strength, see above."""
-        self.limits = limits
+        """Create motors of full strength."""
+        self.limits = limits  # lowest and highest torques [N m]. Shape: (2, num_dof)
+        # Factor on the torques that are asked for, drawn at random. Shape: (num_envs, num_dof).
         self.strength = torch.ones(num_envs, limits.shape[1], device=limits.device)
 
     @abstractmethod

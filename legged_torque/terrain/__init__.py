@@ -4,8 +4,7 @@ from legged_torque.terrain.plane import Plane
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.errors import unknown_name
 
-TERRAINS: dict[str, type[Terrain]] = {"plane": Plane}
-"""Kinds of ground, by ``terrain.mesh_type``."""
+TERRAINS: dict[str, type[Terrain]] = {"plane": Plane}  # kinds of ground, by ``terrain.mesh_type``
 
 
 def make_terrain(mesh_type: str) -> Terrain:

@@ -56,9 +56,9 @@ def run_script(main: Callable[[], None]) -> None:
 
 
 def check_at_least(args: argparse.Namespace, lowest: int, *names: str) -> None:
-    """Raise a UserError if one of the named arguments is lower."""
+    """Raise a UserError if one of the named arguments is lower, or NaN."""
     for name in names:
-        if getattr(args, name) < lowest:
+        if not getattr(args, name) >= lowest:
             raise UserError(f"--{name} must be at least {lowest}, not {getattr(args, name)}")
 
 

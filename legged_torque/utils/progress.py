@@ -26,14 +26,11 @@ class CompileProgress:
     The line reads "compiling physics kernels, once per machine: 12 modules, 34 s". It is rewritten every second in a
     terminal and repeated every ten seconds elsewhere. Nothing is shown if all kernels are in Warp's cache. A thread
     watches the folder of the cache, so Warp needs no change. The context may stay open for a whole training.
-
-    Attributes:
-        modules: Modules added to the cache since the context was opened.
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:
         """Prepare; nothing is watched yet."""
-        self.modules = 0
+        self.modules = 0  # added to the cache since the context was opened
         self._stream = stream or sys.stderr
         self._terminal = self._stream.isatty()
         self._interval = 1.0 if self._terminal else 10.0

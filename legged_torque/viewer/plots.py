@@ -59,8 +59,7 @@ class Plots:
 
     def _choose_leg(self) -> None:
         """Write the chosen leg's joints above the plots of torques."""
-        leg = self._leg.value
-        self._chosen = self._legs[leg]
+        self._chosen = self._legs[self._leg.value]
         for i, plot in enumerate(self._torques):
             plot.visible = i < len(self._chosen)
             if plot.visible:

@@ -49,12 +49,6 @@ class Session:
 
     Requests may come from any thread. The thread in :meth:`run` carries them out between two steps, so that nothing
     changes in the middle of one. :attr:`state` and :attr:`history` may be read from any thread.
-
-    Attributes:
-        requests: Requests that have not been carried out yet.
-        state: What is shown.
-        history: The last steps of the followed world; copy it before iterating in another thread.
-        task: Only the stepping thread may touch its tensors.
     """
 
     def __init__(
@@ -72,13 +66,14 @@ class Session:
         self._make_task = functools.partial(watched(task_class), device=device)
         self._cfg, self._run_dir = run.env_cfg, run.folder
         self._clock, self._sleep = clock, sleep
-        self.requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self.requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # not carried out yet
         self._stop = threading.Event()
         self._refused: dict[int, float] = {}
         self._next_scan = -math.inf
+        # The last steps of the followed world; copy it before iterating in another thread.
         self.history: deque[Reading] = deque(maxlen=HISTORY_STEPS)
-        self.state = SessionState()
-        self.task = self._make_task(self._cfg)
+        self.state = SessionState()  # what is shown
+        self.task = self._make_task(self._cfg)  # only the stepping thread may touch its tensors
         self._obs = self.task.get_observations()
         self._runner, _ = task_registry.make_alg_runner(self.task, train_cfg=run.train_cfg, log_root=None)
         self._pacer = Pacer(self.task.dt, clock, sleep)

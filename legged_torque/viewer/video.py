@@ -143,8 +143,7 @@ def _draw(renderer: mujoco.Renderer, data: mujoco.MjData, trunk: int, moment: Mo
     camera.lookat[:] = (position[0], position[1], 0.25)
     camera.distance, camera.azimuth, camera.elevation = 1.6, 130.0, -18.0
     renderer.update_scene(data, camera)
-    arrows = ((moment.command, COMMAND_COLOR, 0.24), (moment.velocity, VELOCITY_COLOR, 0.2))
-    for vector, color, height in arrows:
+    for vector, color, height in ((moment.command, COMMAND_COLOR, 0.24), (moment.velocity, VELOCITY_COLOR, 0.2)):
         start = position + np.array([0.0, 0.0, height])
         _add_arrow(renderer.scene, start, rotation @ [vector[0], vector[1], 0.0], color)
     return renderer.render()
