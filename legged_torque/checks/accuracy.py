@@ -20,10 +20,7 @@ def copy_state(sim: Simulator) -> PhysicsState:
 
 
 def reference_velocities(model: mujoco.MjModel, states: list[PhysicsState]) -> np.ndarray:
-    """Return the velocities after one ``mj_step`` in float64, with a converged solver, from every state of a simulator.
-
-    Velocities are in MuJoCo's layout. Shape: (len(states), num_envs, nv).
-    """
+    """Return velocities after one converged ``mj_step`` in float64 per state. Shape: (len(states), num_envs, nv)."""
     model = copy.copy(model)
     model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
     data = mujoco.MjData(model)

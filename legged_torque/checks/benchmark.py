@@ -203,10 +203,7 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
 
 
 def summarize(times: Times, physics: float, step: float, num_envs: int, num_steps: int) -> dict[str, Any]:
-    """Return medians, and the steps per second and ratios to physics alone that follow from them.
-
-    ``physics`` and ``step`` are those of :func:`time_physics` [ms], ``num_steps`` the control steps of a rollout.
-    """
+    """Return medians [ms], steps per second, and ratios to physics alone; ``num_steps`` are those of a rollout."""
     medians = {"physics": physics, "step": step} | {name: median(values) for name, values in times.items()}
     steps = {"physics": 1, "step": 1, "rollout": num_steps, "iteration": num_steps}
     return {
@@ -255,10 +252,8 @@ def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]
 
 
 def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict[str, Any]]:
-    """Return the most expensive of the profiler's averages: kernels and copies of a GPU, or torch's operators on a CPU.
-
-    On the CPU, the profiler does not see Warp's kernels. Milliseconds are without those of nested calls.
-    """
+    """Return the dearest of the profiler's averages: a GPU's kernels and copies, or torch's operators on a CPU."""
+    # Nested calls do not count ("self"); on the CPU, the profiler does not see Warp's kernels.
     kind, total = ("CUDA", "self_device_time_total") if cuda else ("CPU", "self_cpu_time_total")
     rows = [
         {"name": entry.key, "calls": entry.count, "total_ms": 1e-3 * getattr(entry, total)}

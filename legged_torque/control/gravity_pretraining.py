@@ -147,11 +147,7 @@ class Followed:
 def follow(
     task: LeggedRobot, controller: WholeBodyController, act: Act | None, num_configurations: int, num_steps: int
 ) -> Followed:
-    """Draw random configurations and follow each for some control steps, in worlds that are used again and again.
-
-    The controller's torques are noted; if ``act`` is given, it moves the robot instead. Torques hold for a control
-    step.
-    """
+    """Follow random configurations for some control steps; ``act`` moves them if given, otherwise the controller."""
     parts: list[list[Tensor]] = []
     for start in range(0, num_configurations, task.num_envs):
         place_on_ground(task, controller.dynamics)
@@ -162,7 +158,7 @@ def follow(
             observations = task.get_observations()["policy"]
             torques, residuals = decided.total, residual_share(controller, decided)
             steps.append([observations, torques / task.torque_scale, torques.abs().mean(dim=1), residuals, upright])
-            task.step((act(task) if act else torques) / task.torque_scale)
+            task.step((act(task) if act else torques) / task.torque_scale)  # they hold for a control step
             upright = upright & ~task.reset_buf
         count = min(task.num_envs, num_configurations - start)
         parts.append([torch.stack(numbers)[:, :count] for numbers in zip(*steps, strict=True)])

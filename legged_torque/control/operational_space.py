@@ -56,7 +56,7 @@ def invert(matrix: Tensor) -> Tensor:
 
 
 def inverse_triangle(factor: Tensor) -> Tensor:
-    """Return inverses of lower triangular matrices; unlike cholesky_inverse also in a CUDA graph. Shape: (..., m, m)."""
+    """Return inverses of lower triangular matrices; unlike cholesky_inverse in CUDA graphs too. Shape: (..., m, m)."""
     return torch.linalg.solve_triangular(factor, _eye(factor), upper=False)
 
 
@@ -80,10 +80,8 @@ def contact_space(inertia: Tensor, jacobians: Tensor, bias: Tensor, mask: Tensor
 
 
 def task_space(contacts: ContactSpace, jacobian: Tensor, coriolis: Tensor, gravity: Tensor) -> TaskSpace:
-    """Compute the contact-consistent dynamics of a task whose dJ/dt qvel is zero, such as the trunk's pose (eq. 2).
-
-    Shapes of J, Coriolis and centrifugal forces C, and gravity forces g: (n, m, nv), (n, nv), (n, nv).
-    """
+    """Compute the contact-consistent dynamics of a task whose dJ/dt qvel is zero, such as the trunk's pose (eq. 2)."""
+    # Shapes of J, Coriolis and centrifugal forces C, and gravity forces g: (n, m, nv), (n, nv), (n, nv).
     moved = jacobian @ contacts.mobility
     inertia = invert(moved @ jacobian.mT)
     inverse = inertia @ moved

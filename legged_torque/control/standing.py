@@ -76,15 +76,11 @@ def place_on_ground(
 
 
 def is_standing(task: LeggedRobot) -> Tensor:
-    """Return which worlds stand: high, level and slow, with nothing but feet on the ground. Shape: (num_envs,), bool.
-
-    Contacts are those of the last physics step. Whether a world has fallen before and was reset is not known here, see
-    :func:`measure_standing`.
-    """
+    """Return which worlds stand at the last physics step: high, level, slow, only on feet. Shape: (num_envs,), bool."""
     upright = (task.base_height > LOWEST_HEIGHT) & (task.projected_gravity[:, 2] < HIGHEST_GRAVITY_Z)
     only_feet = task.contacts.sum(dim=1) == task.feet_contact.sum(dim=1)
     slow = torch.linalg.vector_norm(task.base_lin_vel, dim=1) < HIGHEST_SPEED
-    return upright & only_feet & slow
+    return upright & only_feet & slow  # falls before are not known here, see measure_standing
 
 
 def measure_standing(task: LeggedRobot, torques: Callable[[LeggedRobot], Tensor], duration: float) -> StandingResult:

@@ -77,10 +77,7 @@ def to_yaml(description: dict[str, Any]) -> str:
 
 
 def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
-    """Check a description against the schema, and whether its parts fit together.
-
-    A UserError names the first wrong entry, and ``where`` it is.
-    """
+    """Check structure, values and how they fit together; a UserError names the first wrong entry, and ``where``."""
     _check_schema(description, where)
     for path, value in _numbers(description):
         if not math.isfinite(value):

@@ -105,12 +105,9 @@ class Policy:
         return self._history.copy()
 
     def act(self, obs: np.ndarray) -> np.ndarray:
-        """Return the clipped mean actions for observations, and keep them as the last actions. Shape: (actions,).
-
-        An action that is not finite raises a UserError: it must not reach a robot.
-        """
+        """Return clipped mean actions, kept as ``last_action``; a UserError if not finite. Shape: (actions,)."""
         (actions,) = self.session.run(["actions"], {"obs": np.asarray(obs, np.float32)[np.newaxis]})
-        if not np.isfinite(actions).all():
+        if not np.isfinite(actions).all():  # such actions must not reach a robot
             raise UserError("the network's actions are not finite: check the observations")
         self.last_action = np.clip(actions[0], *self._action_clip).astype(self.dtype)
         return self.last_action.copy()

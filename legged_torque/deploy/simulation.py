@@ -27,10 +27,7 @@ class Events:
 
 
 class Simulation:
-    """Runs a policy as in evaluation: random initial states and commands, pushes, new episodes.
-
-    ``command`` is the present one. Shape: (3,).
-    """
+    """Runs a policy as in evaluation: random initial states and commands, pushes, new episodes."""
 
     def __init__(self, policy: Policy, robot: MujocoRobot, events: Events) -> None:
         """Prepare; :meth:`run` starts an episode."""
@@ -44,7 +41,7 @@ class Simulation:
             ranges = [[value, value] for value in events.command]
         self._command_range = np.array(ranges, float).T
         self._resampling_probability = commands["resampling_probability"]
-        self.command = np.zeros(3)
+        self.command = np.zeros(3)  # the present one
         self._steps = 0
 
     def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:

@@ -38,10 +38,7 @@ class LearningCurve:
 
 
 def read_curves(file: Path) -> list[LearningCurve]:
-    """Read a JSON of ``learning_curve.py``, the ``evaluations.csv`` in a run's folder, or that of a report (.gz).
-
-    A report's file holds many trainings. UserError if the file cannot be read or holds something else.
-    """
+    """Read ``learning_curve.py``'s JSON, a run's ``evaluations.csv`` or a report's (.gz); a UserError if it is none."""
     training: dict[str, Any] = {}
     if file.suffix == ".json":
         training = read_data(file, {"task", "seed", "points"}, "learning_curve.py")
@@ -51,7 +48,7 @@ def read_curves(file: Path) -> list[LearningCurve]:
         if entries and "task" not in entries[0]:
             config = load_config(file.parent)
             training = {"task": config["task"], "seed": config["train"]["seed"]}
-    curves: dict[tuple, LearningCurve] = {}
+    curves: dict[tuple, LearningCurve] = {}  # a report's file holds many trainings
     try:
         for entry in entries:
             names = training or entry

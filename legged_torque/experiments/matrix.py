@@ -106,11 +106,7 @@ class CellState:
 
 
 def read_matrix(file: Path) -> Matrix:
-    """Read the description of a matrix, and check what train.py and evaluate.py would check only hours later.
-
-    Raises:
-        UserError: If it cannot be read, or a task, a perturbation or a setting is not valid.
-    """
+    """Read a matrix, and check what train.py and evaluate.py would check only hours later; UserError if it is wrong."""
     matrix = read_plan(file)
     for key, source in CELL_SETTINGS.items():
         if key in matrix.train:

@@ -50,11 +50,7 @@ class ExperimentRun:
         self._shown = 0.0  # when the live line was last updated [s]
 
     def run(self) -> int:
-        """Work until all cells are done or have failed, or the user asks to stop; return the exit status.
-
-        Raises:
-            KeyboardInterrupt: If the user asked to stop. No process is left running.
-        """
+        """Work until all cells are done or have failed; return the exit status. Asked to stop: KeyboardInterrupt."""
         print(f"{self._num_done} of {self._num_cells} cells are done in {self.out}", flush=True)
         passed_on, stop = 0, CountedStop()
         try:
@@ -68,7 +64,7 @@ class ExperimentRun:
                     self._show_live_line()
                     time.sleep(POLL)
         finally:
-            self._ask_to_stop()  # clean up after an exception
+            self._ask_to_stop()  # after an exception too no process is left running
             for job in self._jobs():
                 job.process.wait()
         print(f"{self._num_done} of {self._num_cells} cells are done.", flush=True)

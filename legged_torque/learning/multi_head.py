@@ -17,10 +17,7 @@ class MultiHeadMLP(nn.Module):
     def __init__(
         self, input_dim: int, output_dim: int, hidden_dims: list[int], head_hidden_dims: list[int], activation: str
     ) -> None:
-        """Create the general layers, and the hidden and output layers of both heads.
-
-        The output is positions, then torques, one of each per joint; an activation follows every hidden layer.
-        """
+        """Create general layers and both heads; the output is positions, then torques, one of each per joint."""
         super().__init__()
         num_dof = output_dim // 2
         self.trunk = MLP(input_dim, hidden_dims[-1], hidden_dims[:-1], activation, last_activation=activation)
@@ -50,10 +47,7 @@ class MultiHeadModel(MLPModel):
         distribution_cfg: dict | None = None,
         head_hidden_dims: tuple[int, ...] | list[int] = (128,),
     ) -> None:
-        """Create the model; arguments are those of rsl_rl's ``MLPModel``, and sizes of the hidden layers of each head.
-
-        A UserError if the number of actions is odd or a layer is missing.
-        """
+        """Create the model; arguments are those of rsl_rl's ``MLPModel``, and sizes of each head's hidden layers."""
         if output_dim % 2:
             raise UserError(f"a multi-head actor needs an even number of actions, env.num_actions is {output_dim}")
         if len(hidden_dims) < 2 or not head_hidden_dims:

@@ -40,12 +40,8 @@ class OnDevicePPO(PPO):
         max_learning_rate: float = 1e-2,
         **kwargs,
     ) -> None:
-        """Create the algorithm; arguments are those of rsl_rl's PPO, and an upper bound of an adaptive learning rate.
-
-        The optimizer is "adam" or "adamw", which torch can skip on the device. A setting that makes no sense is a
-        UserError.
-        """
-        if optimizer not in ("adam", "adamw"):
+        """Create the algorithm; arguments are rsl_rl's, and an upper bound of the adaptive learning rate."""
+        if optimizer not in ("adam", "adamw"):  # of these torch can skip a step on the device
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
         for name in ("rnd_cfg", "use_mixed_precision"):
             if kwargs.get(name):
@@ -89,11 +85,7 @@ class OnDevicePPO(PPO):
         self.storage.advantages = advantages.copy_(self.storage.advantages)
 
     def update(self) -> dict[str, float]:
-        """Learn from the stored rollout: every epoch goes through it in random order, a minibatch at a time.
-
-        Returns the numbers of :data:`LOSS_NAMES`, over all processes. Reading them is the only time that the host
-        waits.
-        """
+        """Learn from the rollout in random order, epoch by epoch; return :data:`LOSS_NAMES` over all processes."""
         self._losses.zero_()
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(self._batch_size * self.num_mini_batches, device=self.device)
@@ -104,7 +96,7 @@ class OnDevicePPO(PPO):
         self.storage.clear()
         if self.is_multi_gpu:
             distributed.average([self._losses])
-        losses = dict(zip(LOSS_NAMES, self._losses.tolist(), strict=True))
+        losses = dict(zip(LOSS_NAMES, self._losses.tolist(), strict=True))  # the only time that the host waits
         updates = self.num_learning_epochs * self.num_mini_batches - losses["skipped_updates"]
         return {name: loss if name == "skipped_updates" else loss / max(updates, 1) for name, loss in losses.items()}
 
@@ -119,15 +111,12 @@ class OnDevicePPO(PPO):
         return load_iteration
 
     def _update_normalization(self) -> None:
-        """Let models that normalize observations learn from the rollout; graphs need the tensors to stay the same.
-
-        rsl_rl's normalizer learns from the rollouts of all processes.
-        """
+        """Let models that normalize observations learn from the rollout; graphs need the tensors to stay the same."""
         observations = self.storage.observations.flatten(0, 1)
         for model in (self.actor, self.critic):
             if model.obs_normalization:
                 std = model.obs_normalizer._std
-                model.update_normalization(observations)
+                model.update_normalization(observations)  # from the rollouts of all processes
                 model.obs_normalizer._std = std.copy_(model.obs_normalizer._std)
 
     def _update_minibatch(self) -> None:

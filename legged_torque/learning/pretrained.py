@@ -43,10 +43,7 @@ def pretrained_file(task: str, train_cfg: Any, log_root: str | None = None) -> P
 
 
 def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> None:
-    """See that a file holds a pre-trained policy that fits a task, and make it on the device if it is missing.
-
-    A UserError if there is one, but its inputs or outputs mean something else.
-    """
+    """Make a task's pre-trained policy if its file is missing; a UserError if the file's does not fit the task."""
     if not file.exists():
         print(f"There is no pre-trained policy '{file}' yet; making it.", flush=True)
         make_pretrained(file, task, env_cfg, train_cfg, device)

@@ -112,14 +112,11 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             torch.distributed.destroy_process_group()
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Save all that training needs to continue; all processes that train together call it.
-
-        The file is either complete or absent; ``infos`` is more to keep, of plain values and tensors.
-        """
+        """Save all that training needs to continue, and ``infos``; all processes that train together call it."""
         state = self.alg.save()
         state["iter"] = self.current_learning_iteration
         state["infos"] = {
-            **(infos or {}),
+            **(infos or {}),  # plain values and tensors
             "task": self.env.state_dict(),
             "total_timesteps": self.logger.tot_timesteps,
             "seconds": self._seconds_before + self.logger.tot_time,

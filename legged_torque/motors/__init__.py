@@ -10,10 +10,7 @@ MOTORS: dict[str, type[Motors]] = {"ideal": IdealMotors}  # models of motors, by
 
 
 def make_motors(model: str, num_envs: int, limits: Tensor) -> Motors:
-    """Return the motors that ``motors.model`` asks for; a UserError if there is no such model.
-
-    ``limits`` are the lowest and highest torques [N m]. Shape: (2, num_dof).
-    """
+    """Return the motors of ``motors.model``; ``limits`` are lowest and highest torques [N m]. Shape: (2, num_dof)."""
     if model not in MOTORS:
         raise unknown_name("motors.model", model, MOTORS)
     return MOTORS[model](num_envs, limits)

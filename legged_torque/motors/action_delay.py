@@ -14,14 +14,10 @@ class ActionDelay:
     """Holds actions back, in each world for a time of its own that is drawn at every reset."""
 
     def __init__(self, newest: Tensor, longest: int, unit: str, decimation: int) -> None:
-        """Prepare; there is no delay until one is drawn, up to the longest in the unit, one of :data:`UNITS`.
-
-        ``newest`` is the buffer of the newest actions, which :meth:`keep` and :meth:`actions` read (num_envs,
-        num_actions).
-        """
+        """Prepare; no delay until one is drawn, up to ``longest`` in a unit of :data:`UNITS`."""
         self._decimation = decimation
         self._physics_steps = decimation if unit == "control_steps" else 1
-        self._newest = newest
+        self._newest = newest  # buffer of the newest actions, written elsewhere. Shape: (num_envs, num_actions)
         depth = math.ceil(longest * self._physics_steps / decimation)
         self._before = newest.new_zeros(depth, *newest.shape)
         self.drawn = newest.new_zeros(len(newest), 1)  # in the unit; its whole part counts. Shape: (num_envs, 1)

@@ -36,11 +36,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def run_script(main: Callable[[], None]) -> None:
-    """Run a script's main function; what is no bug of ours ends it without a traceback.
-
-    A user's mistake ends it with one line and exit status 2, Ctrl-C with 130, an output that nobody reads any more
-    (``| head``) with 1.
-    """
+    """Run a script's main function; what is no bug of ours ends it without a traceback."""
     gc.freeze()  # what has been imported stays: searching it for garbage at the end would take a second or two
     try:
         main()
@@ -50,7 +46,7 @@ def run_script(main: Callable[[], None]) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
-    except BrokenPipeError:
+    except BrokenPipeError:  # nobody reads the output any more (| head)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes what is left when it ends
         sys.exit(1)
 

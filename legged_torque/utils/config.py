@@ -69,13 +69,11 @@ def _check_names(cls: type[Section]) -> None:
 
 
 def _merge(cls: type[Section], name: str) -> type[Section]:
-    """Return the nested class ``name`` of ``cls`` with the sections of that name in all bases of ``cls`` as its bases.
-
-    What it names as bases itself comes first, unless it is among theirs anyway.
-    """
+    """Return the nested class ``name`` of ``cls``; its bases are the sections of that name in all bases of ``cls``."""
     own = vars(cls).get(name)
     inherited = [getattr(base, name) for base in cls.__bases__ if hasattr(base, name)]
     named = [] if own is None else [base for base in own.__bases__ if base not in (object, Section)]
+    # What it names as bases itself comes first, unless it is among theirs anyway.
     foreign = [base for base in named if not any(issubclass(section, base) for section in inherited)]
     bases = list(dict.fromkeys([*foreign, *inherited])) or [Section]
     bases = [base for base in bases if not any(other is not base and issubclass(other, base) for other in bases)]
@@ -106,10 +104,7 @@ def to_dict(section: Any) -> dict[str, Any]:
 
 
 def update_from_dict(section: Any, values: dict[str, Any], path: str = "") -> None:
-    """Write nested dictionaries of values into a configuration; ``path`` is where ``section`` itself stands.
-
-    A key that does not exist, or a value of the wrong type, is a UserError.
-    """
+    """Write nested dictionaries into a ``section``, which stands at ``path``; what does not fit is a UserError."""
     if not isinstance(values, dict):
         raise UserError(f"config key '{path}' is a section with entries, it cannot be the value {values!r}")
     for key, value in values.items():

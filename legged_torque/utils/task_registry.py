@@ -116,10 +116,7 @@ class TaskRegistry:
         return runner, train_cfg
 
     def load_run(self, options: Options) -> LoadedRun:
-        """Return the run that the options name.
-
-        A UserError if there is no such run or checkpoint, it is of another task, or its settings cannot be read.
-        """
+        """Return the run that the options name; a UserError if there is none, it is unreadable or of another task."""
         _, train_cfg = self.get_cfgs(options.task)
         train_cfg.runner.experiment_name = options.experiment_name or train_cfg.runner.experiment_name
         folder = find_run(experiment_dir(train_cfg, options.log_root), options.load_run)

@@ -133,10 +133,7 @@ def draw(state: SessionState, window: mujoco.viewer.Handle, model: mujoco.MjMode
 
 @contextlib.contextmanager
 def simulation_window(simulation: Simulation) -> Iterator[Callable[[], None]]:
-    """Open a window on a simulation; what is returned shows the state after a control step, in real time.
-
-    Closing the window counts as Ctrl-C. Without a screen a UserError is raised.
-    """
+    """Open a window on a simulation; what is returned shows the state after a control step, in real time."""
     check_display("--video")
     import mujoco.viewer  # needs a screen
 
@@ -145,7 +142,7 @@ def simulation_window(simulation: Simulation) -> Iterator[Callable[[], None]]:
 
         def show() -> None:
             if not window.is_running():
-                raise KeyboardInterrupt
+                raise KeyboardInterrupt  # closing the window counts as Ctrl-C
             window.sync()
             pacer.wait()
 

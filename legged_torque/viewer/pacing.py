@@ -12,16 +12,13 @@ MAX_LAG = 0.25  # seconds behind schedule after which a new schedule starts inst
 
 
 class Pacer:
-    """Starts control steps when they are due, and measures their actual rate.
-
-    ``speed`` is the wanted one in simulated seconds per second; 1 is real time.
-    """
+    """Starts control steps when they are due, and measures their actual rate."""
 
     def __init__(
         self, dt: float, clock: Callable[[], float] = time.perf_counter, sleep: Callable[[float], None] = time.sleep
     ) -> None:
         """Start without a schedule: the first step, of ``dt`` simulated seconds, is due at once."""
-        self.speed = 1.0
+        self.speed = 1.0  # the wanted one, in simulated seconds per second; 1 is real time
         self._dt, self._clock, self._sleep = dt, clock, sleep
         self._due: float | None = None
         self._begun: deque[float] = deque(maxlen=51)

@@ -28,14 +28,10 @@ class Reading:
 
 
 class WatchedRobot(LeggedRobot):
-    """A task that keeps how much each weighted action term adds to the torques; made by :func:`watched`.
-
-    ``torque_parts`` are these parts, times the motors' strength, before the limits [N m].
-    Shape: (parts, num_envs, num_dof).
-    """
+    """A task that keeps how much each weighted action term adds to the torques; made by :func:`watched`."""
 
     def _init_actions(self) -> None:
-        """Allocate the parts as well."""
+        """Allocate the parts: times the motors' strength, before the limits [N m]. (parts, num_envs, num_dof)."""
         super()._init_actions()
         self.torque_parts = torch.zeros(len(weighted_terms(self)), self.num_envs, self.num_dof, device=self.device)
 

@@ -56,13 +56,10 @@ class Session:
         task_class: type[LeggedRobot],
         run: LoadedRun,
         device: str,
-        clock: Callable[[], float] = time.perf_counter,
-        sleep: Callable[[float], None] = time.sleep,
+        clock: Callable[[], float] = time.perf_counter,  # [s]
+        sleep: Callable[[float], None] = time.sleep,  # [s]
     ) -> None:
-        """Build the task, load the checkpoint and be ready to step; raises a UserError if that cannot be loaded.
-
-        ``clock`` and ``sleep`` work in seconds; the folder of the run is searched for new checkpoints.
-        """
+        """Build the task, load the checkpoint and be ready to step; a UserError if that cannot be loaded."""
         self._make_task = functools.partial(watched(task_class), device=device)
         self._cfg, self._run_dir = run.env_cfg, run.folder
         self._clock, self._sleep = clock, sleep
