@@ -252,7 +252,7 @@ def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]
 
 
 def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict[str, Any]]:
-    """Return the dearest of the profiler's averages: a GPU's kernels and copies, or torch's operators on a CPU."""
+    """Return the most expensive kernels and copies of a GPU, or operators of torch on a CPU, from a profile."""
     # Nested calls do not count ("self"); on the CPU, the profiler does not see Warp's kernels.
     kind, total = ("CUDA", "self_device_time_total") if cuda else ("CPU", "self_cpu_time_total")
     rows = [

@@ -73,7 +73,11 @@ class WholeBodyController:
     def __init__(
         self, dynamics: RobotDynamics, nominal_pose: Sequence[float], settings: WholeBodySettings | None = None
     ) -> None:
-        """Prepare; each call updates ``dynamics``. A pose [rad], motor or setting that does not fit: UserError."""
+        """Prepare the constants; every call of the controller updates ``dynamics``, ``nominal_pose`` is in rad.
+
+        A UserError if the pose has another number of joints, a joint lacks a motor with force limits, or a setting
+        makes no sense.
+        """
         self.settings = settings = settings or WholeBodySettings()
         self.dynamics = dynamics
         model, device = dynamics.mj_model, dynamics.device
@@ -96,7 +100,11 @@ class WholeBodyController:
 
     @single_threaded()
     def __call__(self, qpos: Tensor, qvel: Tensor, mask: Tensor) -> WholeBodyTorques:
-        """Compute torques for many states on level ground at z = 0; ``mask`` (n, k), bool: contacts that touch it."""
+        """Compute the torques for many states at once, on level ground at z = 0.
+
+        ``qpos`` and ``qvel`` are as in :meth:`RobotDynamics.update`; ``mask`` (n, k), bool, says which contacts touch
+        the ground.
+        """
         robot = self.dynamics
         robot.update(qpos, qvel)
         bias = robot.coriolis + robot.gravity

@@ -47,7 +47,10 @@ class MultiHeadModel(MLPModel):
         distribution_cfg: dict | None = None,
         head_hidden_dims: tuple[int, ...] | list[int] = (128,),
     ) -> None:
-        """Create the model; arguments are those of rsl_rl's ``MLPModel``, and sizes of each head's hidden layers."""
+        """Create the model; arguments are those of rsl_rl's ``MLPModel``, and sizes of each head's hidden layers.
+
+        A UserError if the number of actions is odd or a layer is missing.
+        """
         if output_dim % 2:
             raise UserError(f"a multi-head actor needs an even number of actions, env.num_actions is {output_dim}")
         if len(hidden_dims) < 2 or not head_hidden_dims:

@@ -9,7 +9,10 @@ from torch import Tensor
 
 
 class Motors(ABC):
-    """One motor per joint in each world."""
+    """One motor per joint in each world.
+
+    A model is a subclass with :meth:`apply`, and its name in ``MOTORS``; tasks choose it by ``motors.model``.
+    """
 
     def __init__(self, num_envs: int, limits: Tensor) -> None:
         """Create motors of full strength."""
