@@ -74,9 +74,9 @@ def check_spaces(file: Path, env_cfg: Any, train_cfg: Any) -> None:
     """Refuse a pre-trained policy whose inputs, outputs or network are not those of a task, naming what differs."""
     of_file = read_pretrained(file)["spaces"]
     for name, value in spaces(env_cfg, train_cfg).items():
-        if of_file.get(name) != value:
+        if name in of_file and of_file[name] != value:  # files of older versions lack the nominal pose
             raise UserError(
-                f"the pre-trained policy '{file}' does not fit this task: its {name} is {of_file.get(name)!r}, here it "
+                f"the pre-trained policy '{file}' does not fit this task: its {name} is {of_file[name]!r}, here it "
                 f"is {value!r}; make another one in a file of its own: --set pretraining.file=FILE"
             )
 
