@@ -18,6 +18,7 @@ from legged_torque.utils.cli import add_command_arg, check_at_least, prepare_fil
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
+from legged_torque.utils.paths import portable_path
 from legged_torque.utils.runs import package_versions
 from legged_torque.utils.task_registry import set_seed
 
@@ -53,7 +54,12 @@ def main() -> None:
     print_breakdown(breakdown)
     if args.json:
         kept = "as in training"
-        result = {"task": args.task, "run": str(run.folder), "checkpoint": run.checkpoint.name, "steps": trained}
+        result = {
+            "task": args.task,
+            "run": portable_path(run.folder),
+            "checkpoint": run.checkpoint.name,
+            "steps": trained,
+        }
         result |= {"perturbation": args.perturbation or kept, "ranges": args.ranges or kept, "command": args.command}
         result |= {"num_envs": env.num_envs, "num_steps": args.steps, "seed": args.seed}
         result |= {"device": device_name(env.device), "versions": package_versions()}

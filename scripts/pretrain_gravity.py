@@ -14,6 +14,7 @@ from legged_torque.learning.pretrained import make_pretrained, pretrained_file
 from legged_torque.utils.args import Parser, add_build_args, options_of
 from legged_torque.utils.cli import prepare_file, run_script, write_json
 from legged_torque.utils.devices import device_name, resolve_device
+from legged_torque.utils.paths import without_machine
 from legged_torque.utils.progress import CompileProgress
 
 
@@ -39,7 +40,7 @@ def main() -> None:
     with CompileProgress():
         report = make_pretrained(file, args.task, env_cfg, train_cfg, device)
     if args.json:
-        write_json(args.json, report)
+        write_json(args.json, without_machine(report))
     print(f"The policy is in {file}")
     print(f"Train from it: python scripts/train.py --task={args.task}")
 

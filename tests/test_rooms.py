@@ -6,11 +6,15 @@ from settings import error_of
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.envs.base.asset import by_joint, load_asset, nominal_pose
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.base.observations import ObservationTerm
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.motors import MOTORS
 from legged_torque.motors.motors import Motors
+from legged_torque.sim.randomization import Parameter
 from legged_torque.terrain import TERRAINS
 from legged_torque.terrain.plane import Plane
+from legged_torque.utils.mirroring import SCALAR
 
 A1 = (RESOURCES_DIR / "robots/a1/a1.xml").read_text()
 LEGS = ("FR", "FL", "RR", "RL")
@@ -63,6 +67,49 @@ def test_robot_without_mirrored_legs(make_task):
     task = make_task("a1_torque", 1, **settings, **{"rewards.scales.symmetry": 0.0})
     task.step(torch.zeros(1, 12))
     assert "'FR_hip_joint' has no counterpart" in error_of(lambda: task.mirror)
+
+
+# ------------------------------------------------------------------------------------------------ terms and parameters
+
+
+@pytest.mark.parametrize(
+    ("term", "message"),
+    [
+        (("command", 3, SCALAR), "two observation terms are called 'command'"),
+        (("phase", 2, SCALAR), "observation 'phase' has 2 values, 2 scales and 1 in its mirror image"),
+        (("phase", 2, None, (1.0, 2.0, 3.0)), "observation 'phase' has 2 values, 3 scales and 2 in its mirror image"),
+    ],
+)
+def test_observation_terms_that_do_not_fit(term, message):
+    """A name twice, or another number of scales or mirrored values, would shift what the networks see."""
+    name, size, *rest = term
+
+    class Robot(LeggedRobot):
+        def observation_terms(self):
+            return [*super().observation_terms(), ObservationTerm(name, lambda: torch.zeros(2, size), *rest)]
+
+    cfg = A1Cfg()
+    cfg.env.num_envs = 2
+    assert error_of(Robot, cfg) == message
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda task: Parameter("mass", task.sim.field("body_mass"), [2]), "'mass' is kept in the model's 'body_mass'"),
+        (lambda task: Parameter("gain", task.p_gains, [0, 1], mirror=SCALAR), "'gain' must have 2 numbers"),
+    ],
+)
+def test_parameters_that_do_not_fit(make, message):
+    """One that changes the model unseen, or whose mirror image has another size, is refused by name."""
+
+    class Robot(LeggedRobot):
+        def random_parameters(self):
+            return [*super().random_parameters(), make(self)]
+
+    cfg = A1Cfg()
+    cfg.env.num_envs, cfg.domain_rand.randomize_parameters = 2, True
+    assert message in error_of(Robot, cfg)
 
 
 # ------------------------------------------------------------------------------------------------ motors and ground

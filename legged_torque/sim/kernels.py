@@ -2,12 +2,9 @@
 
 import warp as wp
 
-MAX_POSITION = 1e4
-"""Largest position [m, rad] of a world that is still believed."""
-MAX_VELOCITY = 1e4
-"""Largest velocity [m/s, rad/s] of a world that is still believed."""
-MAX_ACCELERATION = 1e10
-"""Largest acceleration [m/s^2, rad/s^2] of a world that is still believed."""
+MAX_POSITION = 1e4  # largest position [m, rad] of a world that is still believed
+MAX_VELOCITY = 1e4  # largest velocity [m/s, rad/s] of a world that is still believed
+MAX_ACCELERATION = 1e10  # largest acceleration [m/s^2, rad/s^2] of a world that is still believed
 
 Mask, Integers, Numbers = wp.array(dtype=wp.bool), wp.array(dtype=wp.int32), wp.array(dtype=wp.float32)
 Rows = wp.array2d(dtype=wp.float32)

@@ -9,8 +9,7 @@ import numpy as np
 
 from legged_torque.utils.errors import UserError, unknown_name
 
-CONTACT_DATA = 4
-"""Numbers per contact sensor: number of contacts, then the net force (x, y, z) in the world frame [N]."""
+CONTACT_DATA = 4  # numbers per contact sensor: number of contacts, then the net force (x, y, z) in the world frame [N]
 
 _DATASPEC = sum(1 << int(f) for f in (mujoco.mjtConDataField.mjCONDATA_FOUND, mujoco.mjtConDataField.mjCONDATA_FORCE))
 _REDUCE_NETFORCE = 3

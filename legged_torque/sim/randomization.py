@@ -15,8 +15,7 @@ from legged_torque.sim import kernels
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import Mirroring
 
-Range = tuple[float, float]
-"""Lowest and highest value."""
+Range = tuple[float, float]  # lowest and highest value
 
 
 @dataclass
@@ -40,8 +39,7 @@ class Parameter:
 
 _NUMBERS_PER_BODY = {"body_mass": 1, "body_inertia": 3, "body_ipos": 3, "body_iquat": 4, "body_pos": 3, "body_quat": 4}
 """Fields of the model on which the inverse weights of legs depend, apart from armatures."""
-_TRUNK = 1
-"""The trunk's body."""
+_TRUNK = 1  # the trunk's body
 
 
 def changes_legs(parameters: Sequence[Parameter]) -> bool:

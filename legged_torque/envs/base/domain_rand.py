@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.sim.randomization import Parameter, Range
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import SCALAR, VECTOR, Mirroring
 
 if TYPE_CHECKING:
@@ -17,8 +18,7 @@ MODEL_FIELDS = (
 )
 """Fields of the model of which each world has its own."""
 
-TRUNK = 1
-"""The trunk's body."""
+TRUNK = 1  # the trunk's body
 
 
 def initial_state(task: LeggedRobot) -> list[Parameter]:
@@ -119,7 +119,19 @@ def mirrors(drawn: list[Parameter], sizes: dict[str, int]) -> dict[str, Mirrorin
     ``sizes`` says how many numbers of its own each of the drawn parameters has.
     """
     own = [parameter for parameter in drawn if parameter.name in sizes]
+    for p in own:
+        if p.mirror and len(p.mirror.order) != sizes[p.name]:
+            raise UserError(f"the mirror image of the random parameter '{p.name}' must have {sizes[p.name]} numbers")
     return {p.name: p.mirror or (SCALAR if sizes[p.name] == 1 else None) for p in own}
+
+
+def check_fields(task: LeggedRobot, drawn: list[Parameter]) -> None:
+    """Refuse parameters in the model that do not name their field: what follows from it would stay as it was."""
+    fields = {task.sim.field(name).untyped_storage().data_ptr(): name for name in MODEL_FIELDS}
+    for parameter in drawn:
+        name = fields.get(parameter.field.untyped_storage().data_ptr())
+        if name != parameter.model_field:
+            raise UserError(f"the random parameter '{parameter.name}' is kept in the model's '{name}': use of_model")
 
 
 def of_model(task: LeggedRobot, name: str, field: str, columns: Sequence[int], **settings: Any) -> Parameter:

@@ -12,7 +12,7 @@ from legged_torque.envs.base.actions import ActionTerm, position_residual
 from legged_torque.envs.base.asset import by_joint, load_asset, nominal_pose
 from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.commands import UniformCommands
-from legged_torque.envs.base.domain_rand import MODEL_FIELDS, initial_state, mirrors, parameters
+from legged_torque.envs.base.domain_rand import MODEL_FIELDS, check_fields, initial_state, mirrors, parameters
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
 from legged_torque.envs.base.random_events import RandomEvents
@@ -288,6 +288,7 @@ class LeggedRobot(BaseTask):
         self.commands = self.command_generator.values
         self.init_angles = torch.zeros(self.num_envs, 3, device=self.device)
         drawn = self.random_parameters()
+        check_fields(self, drawn)
         self.events = RandomEvents(cfg, self.sim, self.command_generator, self.init_angles, initial_state(self), drawn)
         self.randomization = self.events.parameters
         self.parameter_mirrors = mirrors(drawn, self.randomization.sizes)

@@ -13,8 +13,7 @@ from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.utils import metrics
 
 COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")
-NUM_BINS = 4
-"""Into how many equal parts the range of each command is split."""
+NUM_BINS = 4  # into how many equal parts the range of each command is split
 
 
 class WalkingMetrics:

@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import AXIAL_VECTOR, PLANAR_VELOCITY, SCALAR, VECTOR, Mirroring
 
 if TYPE_CHECKING:
@@ -91,7 +92,10 @@ class Observations:
         self.terms = sorted(terms, key=lambda term: term.privileged)
         values = [term.value() for term in self.terms]
         device = values[0].device
-        self.sizes = {term.name: value.shape[1] for term, value in zip(self.terms, values, strict=True)}
+        self.sizes: dict[str, int] = {}
+        for term, value in zip(self.terms, values, strict=True):
+            _check(term, value.shape[1], self.sizes)
+            self.sizes[term.name] = value.shape[1]
         self._history_length, self._clip, self._add_noise = history_length, clip, add_noise
         scales = [_per_value(term.scale, self.sizes[term.name]) for term in self.terms]
         errors = [[term.noise * factor for factor in scale] for term, scale in zip(self.terms, scales, strict=True)]
@@ -139,6 +143,17 @@ class Observations:
         policy = [(term.name, term.mirror) for term in self.policy_terms()]
         critic = [(term.name, term.mirror) for term in self.terms]
         return {"policy": policy * self._history_length, "critic": critic}
+
+
+def _check(term: ObservationTerm, size: int, before: dict[str, int]) -> None:
+    """Raise a UserError if a term has a name twice, or other numbers of scales or mirrored values than of values."""
+    if term.name in before:
+        raise UserError(f"two observation terms are called '{term.name}'")
+    scales, mirrored = len(_per_value(term.scale, size)), len(term.mirror.order) if term.mirror else size
+    if (scales, mirrored) != (size, size):
+        raise UserError(
+            f"observation '{term.name}' has {size} values, {scales} scales and {mirrored} in its mirror image"
+        )
 
 
 def _per_value(value: float | Sequence[float], size: int) -> list[float]:

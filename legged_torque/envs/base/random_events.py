@@ -12,8 +12,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.randomization import Parameter, Randomization
 from legged_torque.sim.simulator import Simulator
 
-PUSH_ADDED = 0.5
-"""Share of pushes that add a velocity; the others set one."""
+PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one
 
 
 class RandomEvents:

@@ -17,10 +17,8 @@ from legged_torque.sim.fused.trunk import TrunkSystem, trunk_matrix, whole_inert
 from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types, mat66, vec6
 from legged_torque.sim.per_world import expand
 
-KINDS = 3
-"""Inverse weights per body: of its translation, of its rotation, of its joint."""
-ROWS = 3
-"""Rows of Jacobians per inverse weight, their mean: one per axis; the joint's is the same three times."""
+KINDS = 3  # inverse weights per body: of its translation, of its rotation, of its joint
+ROWS = 3  # rows of Jacobians per inverse weight, their mean: one per axis; the joint's is the same three times
 
 
 class DerivedConstants:

@@ -23,8 +23,7 @@ class Pose:
     lin_vel: wp.vec3
 
 
-Poses = wp.array(dtype=Pose)
-"""Of the trunk and of each body of a branch, by depth."""
+Poses = wp.array(dtype=Pose)  # of the trunk and of each body of a branch, by depth
 
 
 @wp.func

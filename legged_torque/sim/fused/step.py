@@ -20,8 +20,7 @@ from legged_torque.sim.fused.tree import read_tree
 from legged_torque.sim.fused.trunk import TrunkMotion, solve_trunk, trunk_residual, trunk_slopes, whole_body
 from legged_torque.sim.fused.types import branch_types, vec4
 
-BLOCK_DIM = 128
-"""Threads per block: the fastest of 32, 64 and 128 from 4096 worlds on."""
+BLOCK_DIM = 128  # threads per block: the fastest of 32, 64 and 128 from 4096 worlds on
 TOLERANCE = wp.constant(1.0e-9)
 """The solver stops when a step promises less than this decrease of the cost, in MuJoCo's units."""
 

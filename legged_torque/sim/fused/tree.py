@@ -7,8 +7,7 @@ import numpy as np
 
 from legged_torque.utils.errors import UserError
 
-MAX_BRANCHES = 16
-"""Threads of a world must fit into half a warp."""
+MAX_BRANCHES = 16  # threads of a world must fit into half a warp
 _CAPSULE_ENDS = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
 _BOX_CORNERS = [(float(x), float(y), float(z)) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]
 _GEOM_POINTS = {
