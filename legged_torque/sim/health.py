@@ -21,7 +21,7 @@ class Watched:
     kind: str  # "reward term", "observation" or "buffer"
     name: str
     numbers: Tensor  # kept at this address. Shape: (num_envs, any)
-    follow_state: bool = False  # whether they follow from the state, and are not to blame where it diverged
+    is_result: bool = False  # of the state and of other tensors, and not to blame where one of these was not finite
 
     @property
     def tag(self) -> str:
@@ -34,32 +34,31 @@ class Watched:
 
 
 class Health:
-    """Checks all tensors of all worlds in one kernel, inside the step's CUDA graph, and counts on the device."""
+    """Checks all tensors of all worlds in two kernels, inside the step's CUDA graph, and counts on the device."""
 
     def __init__(self, watched: Sequence[Watched], num_envs: int, device: str) -> None:
         """Prepare; what the first world has now takes the place of numbers that are not finite later."""
-        self._watched = list(watched)
-        self._defaults = [tensor.numbers[0].clone() for tensor in watched]  # contiguous; their memory must not be freed
-        rows = []
-        for tensor, defaults in zip(watched, self._defaults, strict=True):
-            row: Any = kernels.Numbers2d()
-            size = tensor.numbers.element_size()
-            row.address, row.defaults = tensor.numbers.data_ptr(), defaults.data_ptr()
-            row.world_stride, row.stride = (size * stride for stride in tensor.numbers.stride())
-            row.count, row.follow_state = len(defaults), tensor.follow_state
-            rows.append(row)
-        self._rows: wp.array = wp.array(rows, dtype=kernels.Numbers2d, device=device)
-        self._broken, self._diverged = torch.zeros(2, num_envs, dtype=torch.bool, device=device).unbind()
+        self._watched = sorted(watched, key=lambda tensor: tensor.is_result)
+        self._defaults = [tensor.numbers[0].clone() for tensor in self._watched]  # their memory must not be freed
+        rows = [address(*pair) for pair in zip(self._watched, self._defaults, strict=True)]
+        num_causes = sum(not tensor.is_result for tensor in watched)
+        self._causes: wp.array = wp.array(rows[:num_causes], dtype=kernels.Numbers2d, device=device)
+        self._results: wp.array = wp.array(rows[num_causes:], dtype=kernels.Numbers2d, device=device)
+        self._diverged, self._excused, self._nobody = torch.zeros(3, num_envs, dtype=torch.bool, device=device).unbind()
         self._counts = torch.zeros(len(rows), dtype=torch.int32, device=device)
-        self._device = device
 
     def check(self, diverged: Tensor) -> None:
         """Replace numbers that are not finite, and add their worlds to those that have diverged (num_envs,), bool."""
-        self._broken.zero_()
-        arrays = [wp.from_torch(tensor) for tensor in (diverged, self._broken, self._counts)]
-        wp.launch(kernels.mend, (len(self._watched), len(diverged)), [self._rows, *arrays], device=self._device)
-        diverged.logical_or_(self._broken)
+        num_causes = len(self._causes)
+        self._mend(self._causes, self._nobody, diverged, self._counts[:num_causes])
+        self._excused.copy_(diverged)
+        self._mend(self._results, self._excused, diverged, self._counts[num_causes:])
         self._diverged.logical_or_(diverged)
+
+    def _mend(self, rows: wp.array, *tensors: Tensor) -> None:
+        """Run the kernel on some of the tensors."""
+        arrays = [wp.from_torch(tensor) for tensor in tensors]
+        wp.launch(kernels.mend, (len(rows), len(self._nobody)), [rows, *arrays], device=rows.device)
 
     def read(self) -> tuple[float, dict[Watched, int]]:
         """Return what happened since the last call, over all processes that train together, and wait for the device.
@@ -75,3 +74,12 @@ class Health:
         share, *means = numbers.tolist()
         counts = [round(mean * distributed.world_size()) for mean in means]
         return share, {tensor: count for tensor, count in zip(self._watched, counts, strict=True) if count}
+
+
+def address(tensor: Watched, defaults: Tensor) -> Any:
+    """Return where a tensor's numbers are, and what takes their place."""
+    row: Any = kernels.Numbers2d()
+    size = tensor.numbers.element_size()
+    row.address, row.defaults, row.count = tensor.numbers.data_ptr(), defaults.data_ptr(), len(defaults)
+    row.world_stride, row.stride = (size * stride for stride in tensor.numbers.stride())
+    return row

@@ -116,12 +116,11 @@ class Numbers2d:
     stride: wp.uint64  # from number to number [bytes]
     count: wp.int32  # of the numbers of a world
     defaults: wp.uint64  # address of what takes the place of each
-    follow_state: wp.bool  # whether they are computed from the state, so that they say nothing new where that diverged
 
 
 @wp.kernel(enable_backward=False)
-def mend(tensors: wp.array(dtype=Numbers2d), diverged: Mask, broken: Mask, counts: Integers):
-    """Replace what is not finite in one tensor of one world; mark the world, and count it for the tensor."""
+def mend(tensors: wp.array(dtype=Numbers2d), excused: Mask, diverged: Mask, counts: Integers):
+    """Replace what is not finite in one tensor of one world; mark the world, and count it unless it is excused."""
     tensor, world = wp.tid()
     place = tensors[tensor]
     row = place.address + wp.uint64(world) * place.world_stride
@@ -133,6 +132,6 @@ def mend(tensors: wp.array(dtype=Numbers2d), diverged: Mask, broken: Mask, count
             number[0] = defaults[i]
             found = True
     if found:
-        broken[world] = True
-        if not (place.follow_state and diverged[world]):
+        diverged[world] = True
+        if not excused[world]:
             wp.atomic_add(counts, tensor, 1)

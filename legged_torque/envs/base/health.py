@@ -27,7 +27,7 @@ def watched(task: LeggedRobot) -> list[Watched]:
         "last_dof_vel": task.last_dof_vel,
         "episode_return": task.episode_return.unsqueeze(1),
         "episode_sums": task.episode_sums.T,
-        **{f"actions_before_{i + 1}": actions for i, actions in enumerate(task.action_delay.before)},
+        "delayed_actions": task.action_delay.before.flatten(1),
         "observation_history": task.obs_buf["policy"][:, task.observations.policy_size :],
     }
     per_world = {name: numbers for name, numbers in kept.items() if len(numbers) == task.num_envs}  # or worlds share it
@@ -37,7 +37,6 @@ def watched(task: LeggedRobot) -> list[Watched]:
     return [
         *(Watched("buffer", name, numbers) for name, numbers in per_world.items()),
         *(Watched("observation", term.name, numbers) for term, numbers in observations),
-        Watched("buffer", "torques", task.torques, follow_state=True),
-        *(Watched("reward term", name, numbers, follow_state=True) for name, numbers in rewards),
-        Watched("buffer", "reward", task.rew_buf.unsqueeze(1), follow_state=True),
+        Watched("buffer", "torques", task.torques, is_result=True),
+        *(Watched("reward term", name, numbers, is_result=True) for name, numbers in rewards),
     ]
