@@ -1,6 +1,6 @@
 """Numbers that are not finite cost their world its episode and nobody else anything; who is to blame is told."""
 
-import copy
+import functools
 import math
 import re
 from pathlib import Path
@@ -9,12 +9,13 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_robustness import WORLDS, Run, check
+from test_scripts import run_here
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.approaches.torque_curriculum import TorqueCurriculumRobot
 from legged_torque.envs.base.observations import ObservationTerm
+from legged_torque.envs.tasks import A1TorqueCurriculumCfg, A1TorqueCurriculumCfgPPO
 from legged_torque.learning.guard import PATIENCE
-from legged_torque.utils.cli import run_script
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import TrainingError
 from legged_torque.utils.mirroring import SCALAR
@@ -65,8 +66,7 @@ def names_of(task):
     return {str(tensor): count for tensor, count in task.health.read()[1].items()}
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-@pytest.mark.parametrize("settings", [0, 1], ids=["randomized", "fixed"])
+@pytest.mark.parametrize(("settings", "value"), [(0, math.nan), (1, math.inf)], ids=["randomized", "fixed"])
 @pytest.mark.parametrize("name", BUFFERS)
 def test_bad_buffer(make_task, healthy, name, settings, value):
     """The world starts anew and stays healthy, no bit of the others changes, and the buffer is named, once."""
@@ -140,19 +140,30 @@ class DividingRobot(TorqueCurriculumRobot):
         return [*super().observation_terms(), ObservationTerm("ratio", lambda: 1.0 / self.observation_divisor, SCALAR)]
 
 
+class BrokenRobot(DividingRobot):
+    """The same, with a reward that is never finite."""
+
+    def _init_buffers(self):
+        """Divide by zero."""
+        super()._init_buffers()
+        self.reward_divisor.zero_()
+
+
+class DividingCfg(A1TorqueCurriculumCfg):
+    """Settings of both."""
+
+    class rewards:
+        class scales:
+            ratio: float = 1e-3
+
+
 @pytest.fixture
-def make_dividing():
-    """Factory of such tasks."""
-
-    def make(num_envs=WORLDS, **overrides):
-        env_cfg = copy.deepcopy(task_registry.get_cfgs("a1_torque_curriculum")[0])
-        for path, value in {"env.num_envs": num_envs, **overrides}.items():
-            set_by_path(env_cfg, path, value)
-        env_cfg.rewards.scales.ratio = 1e-3
-        torch.manual_seed(3)
-        return DividingRobot(env_cfg)
-
-    return make
+def make_dividing(make_task, monkeypatch):
+    """Factory of such tasks, which are registered for the time of a test."""
+    for kind in (DividingRobot, BrokenRobot):
+        entry = (kind, DividingCfg(), A1TorqueCurriculumCfgPPO())
+        monkeypatch.setitem(task_registry._tasks, f"a1_{kind.__name__}", entry)
+    return functools.partial(make_task, "a1_DividingRobot", seed=3)
 
 
 def steps(task, num=4):
@@ -176,8 +187,8 @@ def assert_finite_and_same(results, expected, others):
 @pytest.mark.parametrize("value", [0.0, -0.0, math.nan])
 def test_reward_that_divides_by_zero(make_dividing, value):
     """The world ends in the same step, without a reward; that goes on as long as the term is bad."""
-    expected = steps(make_dividing())
-    task = make_dividing()
+    expected = steps(make_dividing(WORLDS))
+    task = make_dividing(WORLDS)
     task.reward_divisor[1] = value
     results = steps(task, 3)
     assert_finite_and_same(results, expected[:3], [0, 2])
@@ -193,7 +204,7 @@ def test_reward_that_divides_by_zero(make_dividing, value):
 
 def test_bad_reward_is_no_time_out(make_dividing):
     """An episode that ends for both reasons is one that ends for good: no value is bootstrapped."""
-    task = make_dividing()
+    task = make_dividing(WORLDS)
     task.episode_length_buf = torch.full((WORLDS,), task.max_episode_length - 1)
     task.reward_divisor[1] = 0.0
     *_, dones, time_outs = steps(task, 1)[0]
@@ -204,8 +215,8 @@ def test_bad_reward_is_no_time_out(make_dividing):
 def test_observation_that_divides_by_zero(make_dividing, history):
     """The policy sees 0 instead, and the world is reset in the step after."""
     overrides = {"env.history_length": history}
-    expected = steps(make_dividing(**overrides))
-    task = make_dividing(**overrides)
+    expected = steps(make_dividing(WORLDS, **overrides))
+    task = make_dividing(WORLDS, **overrides)
     task.observation_divisor[1] = 0.0
     first = steps(task, 1)
     assert_finite_and_same(first, expected[:1], [0, 2])
@@ -318,13 +329,10 @@ def test_stops_late_if_some_updates_are_made(make_runner, tmp_path):
     assert f"(learning rate {float(rate):g})" in why
 
 
-def test_exit_status(capsys):
-    """One line and status 1, which is not that of a user's mistake."""
-
-    def main():
-        raise TrainingError("training cannot learn: nothing is finite")
-
-    with pytest.raises(SystemExit) as end:
-        run_script(main)
-    assert end.value.code == 1
-    assert capsys.readouterr().err == "error: training cannot learn: nothing is finite\n"
+def test_exit_status(make_dividing, tmp_path):
+    """The script ends with one line and status 1, which is not that of a user's mistake, and leaves a checkpoint."""
+    words = ["--task=a1_BrokenRobot", "--device=cpu", "--num_envs=2", "--set=algorithm.num_mini_batches=2"]
+    status, output, error = run_here("train.py", *words, "--set=runner.num_steps_per_env=4", root=tmp_path)
+    assert status == 1 and "The run is in" not in output
+    assert re.fullmatch(r"error: training cannot learn: .*100%; not finite: reward term 'ratio' in 8 worlds\n", error)
+    assert [file.name for file in tmp_path.glob("logs/*/*/model_*.pt")] == [f"model_{PATIENCE}.pt"]

@@ -45,10 +45,10 @@ class TrainingGuard:
                 f"gradient, weight or moment would not have been finite (learning rate {rate:g})"
             )
         if self._diverging >= PATIENCE:
-            reasons.append(f"more than half of the worlds diverged in each of the last {PATIENCE}, now {share:.0%}")
+            reasons.append(f"more than half of the worlds diverged in each of {PATIENCE} iterations, now {share:.0%}")
         if reasons:
             names = ", ".join(f"{tensor} in {of_worlds(worlds)}" for tensor, worlds in found.items())
-            self.problem = "; ".join([*reasons, *([f"not finite in the last: {names}"] if names else [])])
+            self.problem = "; ".join([*reasons, *([f"not finite: {names}"] if names else [])])
         return {f"Health/not_finite/{tensor.tag}": float(worlds) for tensor, worlds in found.items()}
 
     def check(self) -> None:
