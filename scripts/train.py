@@ -17,7 +17,7 @@ from legged_torque.utils.args import Parser, add_task_args, add_train_args, opti
 from legged_torque.utils.cli import run_script
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name, resolve_device
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.options import DEFAULT_PRESET, Options
 from legged_torque.utils.progress import CompileProgress
 from legged_torque.utils.runs import save_config
@@ -68,7 +68,11 @@ def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
     if is_first:
         announce(runner, options, env_cfg, train_cfg, total)
-    runner.learn(remaining, init_at_random_ep_len=True)
+    try:
+        runner.learn(remaining, init_at_random_ep_len=True)
+    except TrainingError:
+        runner.close()
+        raise
     if is_first:
         print(f"The run is in {runner.log_dir}")
         for what, script in {"See it walk": "play", "Measure it": "evaluate", "Take it elsewhere": "export"}.items():

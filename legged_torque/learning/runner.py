@@ -12,6 +12,7 @@ import legged_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning import checkpoint
 from legged_torque.learning.evaluator import EVALUATIONS_FILE, TrainingEvaluator, append_row
+from legged_torque.learning.guard import TrainingGuard
 from legged_torque.learning.ppo import OnDevicePPO
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils import distributed
@@ -66,7 +67,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         """Train, and leave a checkpoint; Ctrl-C ends training after the current iteration, a second one at once.
 
         All processes that train together end after the same iteration, whichever of them is asked to stop. If episodes
-        start at random lengths, they do not all end at once.
+        start at random lengths, they do not all end at once. A TrainingError, after the checkpoint, if nothing can be
+        learned any more.
         """
         if init_at_random_ep_len:
             high = int(self.env.max_episode_length)
@@ -77,6 +79,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self.logger.init_logging_writer()
         start_it = self.current_learning_iteration
         total_it = start_it + num_learning_iterations
+        guard = TrainingGuard(self.env, self.alg)
         warmup = self.cfg["pretraining"]["critic_warmup_iterations"]
         with StopRequest() as stop:
             for _ in range(num_learning_iterations):
@@ -89,15 +92,18 @@ class OnPolicyRunner(runners.OnPolicyRunner):
                 collected = time.perf_counter()
                 self.alg.learn_actor(self.current_learning_iteration >= warmup)
                 losses = self.alg.update()
-                measured = self._evaluate(losses, start)
+                measured = self._evaluate(losses, start) | guard.add_iteration(losses["skipped_updates"])
                 learned = time.perf_counter()
                 times = {"collect_time": collected - start, "learn_time": learned - collected}
                 self._prepare_log(start_it, total_it, times, losses, measured)
                 self.current_learning_iteration += 1
+                if guard.problem:
+                    break
                 if self.current_learning_iteration % self.cfg["save_interval"] == 0:
                     self._save_checkpoint()
         self._save_checkpoint()  # writes the last log too
         self.logger.stop_logging_writer()
+        guard.check()
 
     def claim_log_dir(self) -> None:
         """Create the run's folder, under another name if a run that started in the same second has it already."""

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import TrainingError, UserError, unknown_name
 
 
 class Parser(argparse.ArgumentParser):
@@ -38,7 +38,8 @@ class Parser(argparse.ArgumentParser):
 def run_script(main: Callable[[], None]) -> None:
     """Run a script's main function; expected errors exit without a traceback.
 
-    Exit status 2 for a user's mistake, 130 for Ctrl-C, 1 for an output that nobody reads any more (``| head``).
+    Exit status 2 for a user's mistake, 130 for Ctrl-C, 1 for a training that cannot learn or an output that nobody
+    reads any more (``| head``).
     """
     gc.freeze()  # what has been imported stays: searching it for garbage at the end would take a second or two
     try:
@@ -46,6 +47,9 @@ def run_script(main: Callable[[], None]) -> None:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except TrainingError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)

@@ -13,6 +13,10 @@ class UserError(Exception):
     """
 
 
+class TrainingError(Exception):
+    """A training that cannot learn: one line that says why. Scripts print it and exit with status 1."""
+
+
 def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
     """Return the error for a name that does not exist; ``kind`` is what it stands for, e.g. "task"."""
     allowed = sorted(allowed)
