@@ -27,7 +27,6 @@ from legged_torque.utils.config import Section, flat, to_dict
 from legged_torque.utils.errors import UserError
 
 _FOREIGN = ("mujoco", "mujoco_warp", "torch", "warp")  # packages whose objects hold no state of a task
-_LEVEL = 1  # of zlib: 3 takes a quarter longer for 2% less
 _CHUNK = 2**20  # bytes that are compressed together, in a thread
 
 
@@ -128,7 +127,7 @@ def pack(tensors: dict[str, Tensor], num_worlds: int) -> dict[str, Any]:
     unique = list(places)
     with ThreadPoolExecutor() as threads:
         chunks = [b"".join(unique[i : i + step]) for i in range(0, len(unique), step)]
-        packed = list(threads.map(lambda chunk: zlib.compress(chunk, _LEVEL), chunks))
+        packed = list(threads.map(_compressed, chunks))
     return {
         "layout": [_layout(name, tensor) for name, tensor in tensors.items()],
         "places": torch.tensor(order, dtype=torch.int32),
@@ -174,6 +173,12 @@ def _planes(tensor: Tensor, num_worlds: int) -> Tensor:
     """Return the planes of a tensor. Shape: (bytes of a number, numbers of a world, num_worlds)."""
     rows = tensor.detach().movedim(tensor.shape.index(num_worlds), 0).reshape(num_worlds, -1).contiguous()
     return rows.view(torch.uint8).view(num_worlds, -1, tensor.element_size()).permute(2, 1, 0)
+
+
+def _compressed(chunk: bytes) -> bytes:
+    """Return bytes that zlib has compressed; of its strategies this one is the fastest here and leaves the least."""
+    stream = zlib.compressobj(1, strategy=zlib.Z_RLE)
+    return stream.compress(chunk) + stream.flush()
 
 
 def _decompressed(chunk: Tensor, most: int) -> bytes:
