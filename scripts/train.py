@@ -3,8 +3,10 @@
 On several GPUs of a machine: ``torchrun --standalone --nproc_per_node=2 scripts/train.py --task=a1_torque_multihead``.
 """
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
+end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 import sys

@@ -61,4 +61,5 @@ def leave_terminal() -> None:
 
 def end_on_interrupt() -> None:
     """Let Ctrl-C end the process without a traceback, while a script imports; ``run_script`` takes over from there."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
