@@ -1,7 +1,9 @@
 """Watch a trained policy walk: ``python scripts/play.py --task=a1_torque_multihead``, live with ``--viewer web``."""
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import choose_offscreen_renderer
 
+end_on_interrupt()
 NO_RENDERER = choose_offscreen_renderer()  # before anything imports mujoco
 
 import argparse

@@ -42,7 +42,7 @@ def runner(tmp_path):
         set_by_path(train_cfg, path, value)
     env = task_registry.get_task_class("a1_position")(env_cfg, "cpu")
     runner, _ = task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=tmp_path)
-    runner.claim_log_dir()
+    runner.claim_log_dir({})
     return runner
 
 

@@ -60,7 +60,7 @@ def train(folder):
     """Train, stop when the second process is asked to, save, and load in both processes."""
     runner = make_runner(folder / "logs")
     if distributed.rank() == 0:
-        runner.claim_log_dir()
+        runner.claim_log_dir({})
     start = everything(runner)
     runner.learn(2, init_at_random_ep_len=True)
     notes = {"start": start, "trained": everything(runner), "observations": runner.env.obs_buf["policy"].clone()}

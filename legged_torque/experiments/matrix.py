@@ -14,7 +14,7 @@ from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
-from legged_torque.utils.runs import checkpoint_numbers, load_config
+from legged_torque.utils.runs import checkpoint_number, load_config, newest_checkpoint
 
 SETTINGS_FILE = "experiment.yaml"  # copy of the description, in the folder of the results
 CELL_SETTINGS = {"seed": "seeds", "runner.experiment_name": "tasks, environments and seeds"}
@@ -174,12 +174,12 @@ def step_command(matrix: Matrix, cell: Cell, state: CellState, device: str) -> l
 def cell_state(cell: Cell) -> CellState:
     """Return the progress of a cell; UserError if its newest run with a checkpoint does not say how long it is."""
     for run_dir in sorted(cell.folder.glob("*/"), reverse=True):
-        numbers = checkpoint_numbers(run_dir)
-        if numbers:
+        newest = newest_checkpoint(run_dir)
+        if newest:
             total = load_config(run_dir).get("max_iterations")
             if type(total) is not int:
                 raise UserError(f"the settings of the run '{run_dir}' lack max_iterations")
-            return CellState(numbers[-1], total, cell.missing())
+            return CellState(checkpoint_number(newest), total, cell.missing())
     return CellState(0, None, cell.missing())
 
 

@@ -7,6 +7,7 @@ import gc
 import json
 import math
 import os
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -42,7 +43,11 @@ def run_script(main: Callable[[], None]) -> None:
     reads any more (``| head``).
     """
     gc.freeze()  # what has been imported stays: searching it for garbage at the end would take a second or two
+    if "mujoco" in sys.modules:  # which would write its warnings to a file in the current folder
+        sys.modules["mujoco"].set_mju_user_warning(lambda text: print(f"MuJoCo: {text}", file=sys.stderr))
     try:
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # see end_on_interrupt
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         main()
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)

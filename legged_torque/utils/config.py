@@ -103,6 +103,14 @@ def to_dict(section: Any) -> dict[str, Any]:
     return {key: to_dict(value) if isinstance(value, Section) else value for key, value in values.items()}
 
 
+def flat(values: Any, path: str = "") -> dict[str, Any]:
+    """Return nested dictionaries, which stand at ``path``, as one dictionary with dotted paths."""
+    if not isinstance(values, dict):
+        return {path: values}
+    parts = (flat(value, f"{path}.{key}" if path else str(key)) for key, value in values.items())
+    return {name: value for part in parts for name, value in part.items()}
+
+
 def update_from_dict(section: Any, values: dict[str, Any], path: str = "") -> None:
     """Write nested dictionaries into a ``section``, which stands at ``path``; what does not fit is a UserError."""
     if not isinstance(values, dict):

@@ -71,7 +71,7 @@ NotNegativeInterval = Annotated[list[float], Limits(lowest=0, ordered=True)]
 
 def check_section(section: Section, path: str = "") -> None:
     """Raise a UserError that names the first setting of a section, or below it, whose value is not allowed."""
-    hints = types_of(type(section))
+    hints = types_of(type(section))  # type: ignore[arg-type]  # mypy: a class is not seen as hashable
     for key in section_keys(section):
         value, dotted = getattr(section, key), f"{path}.{key}" if path else key
         if isinstance(value, Section):

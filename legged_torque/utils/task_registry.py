@@ -20,9 +20,17 @@ from legged_torque.utils import distributed
 from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.files import remove_stale_parts
 from legged_torque.utils.limits import check_section
 from legged_torque.utils.options import Options, apply_options
-from legged_torque.utils.runs import checkpoint_number, find_checkpoint, find_run, load_config, new_run_dir
+from legged_torque.utils.runs import (
+    checkpoint_number,
+    checkpoint_numbers,
+    find_checkpoint,
+    find_run,
+    load_config,
+    new_run_dir,
+)
 from legged_torque.utils.train_validation import check_train_cfg
 
 
@@ -114,7 +122,9 @@ class TaskRegistry:
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints its networks at length
             runner = runner_class(env, to_rsl_rl(train_cfg), log_dir, env.device)
         if args is not None and args.resume:
-            runner.resume(str(find_checkpoint(find_run(root or default, args.load_run), args.checkpoint)))
+            folder = find_run(root or default, args.load_run)
+            remove_stale_parts(folder)
+            runner.resume(str(find_checkpoint(folder, args.checkpoint)))
         return runner, train_cfg
 
     def load_run(self, options: Options) -> LoadedRun:
@@ -126,7 +136,10 @@ class TaskRegistry:
         if config["task"] != options.task:
             raise UserError(f"the run '{folder}' is of task '{config['task']}', not '{options.task}'")
         cfgs = self.get_cfgs(options.task, options, config)
-        return LoadedRun(folder, config, *cfgs, find_checkpoint(folder, options.checkpoint))
+        file = find_checkpoint(folder, options.checkpoint)
+        if options.checkpoint is None and checkpoint_number(file) != checkpoint_numbers(folder)[-1]:
+            print(f"Newer checkpoints than '{file}' are damaged; taking this one.")
+        return LoadedRun(folder, config, *cfgs, file)
 
     def make_loaded(self, run: LoadedRun, options: Options, env_cfg: Any = None) -> tuple[VecEnv, OnPolicyRunner]:
         """Create the task of a run, and a runner that holds the policy of its checkpoint and keeps nothing.
