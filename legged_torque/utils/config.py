@@ -5,11 +5,15 @@ from __future__ import annotations
 import contextlib
 import copy
 import inspect
+import itertools
 from typing import Any
 
 import yaml
 
 from legged_torque.utils.errors import UserError, unknown_name
+
+MAX_DEPTH, MAX_ENTRIES = 50, 100_000
+"""Levels of a YAML text, and values of a level; settings have about 6, and 100."""
 
 
 class Section:
@@ -170,8 +174,27 @@ def parse_value(text: str) -> Any:
 
 
 def parse_yaml(text: str, what: str) -> Any:
-    """Return what YAML text holds; if it is not valid, a UserError says ``what`` the text is."""
+    """Return what YAML text holds; if it is not valid, or larger than settings are, a UserError says ``what`` it is."""
     try:
-        return yaml.safe_load(text)
+        value = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError) as error:  # a date such as 2026-99-99 is a ValueError
         raise UserError(f"{what} is not valid YAML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise UserError(f"{what} is nested too deeply") from None
+    if not is_small(value):
+        raise UserError(f"{what} is nested too deeply, or holds more than settings do")
+    return value
+
+
+def is_small(value: Any) -> bool:
+    """Return whether nested lists and dictionaries have at most :data:`MAX_DEPTH` levels of :data:`MAX_ENTRIES` each.
+
+    YAML may name a part again and again, even inside of itself, so that a short text holds more than memory does.
+    """
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        parts = (part.values() if isinstance(part, dict) else part for part in level if isinstance(part, (dict, list)))
+        level = list(itertools.islice(itertools.chain.from_iterable(parts), MAX_ENTRIES + 1))
+        if not level or len(level) > MAX_ENTRIES:
+            return not level
+    return False

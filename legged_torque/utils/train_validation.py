@@ -6,7 +6,7 @@ import operator
 from pathlib import Path
 from typing import Any
 
-from rsl_rl.utils import resolve_callable, resolve_nn_activation
+from rsl_rl.utils import resolve_nn_activation
 
 from legged_torque.utils.errors import UserError, unknown_name
 
@@ -20,7 +20,6 @@ _AT_LEAST |= {"pretraining.critic_warmup_iterations": 0}
 _POSITIVE = [f"algorithm.{key}" for key in ("learning_rate", "max_learning_rate", "max_grad_norm", "clip_param")]
 _POSITIVE += ["actor.distribution_cfg.init_std"]
 _NAMES = {"algorithm.schedule": SCHEDULES, "actor.distribution_cfg.std_type": STD_TYPES}
-_WITH_CLASSES = ("actor.distribution_cfg", "runner", "algorithm", "actor", "critic")
 
 
 def check_train_cfg(train_cfg: Any) -> None:
@@ -42,7 +41,7 @@ def check_train_cfg(train_cfg: Any) -> None:
         raise UserError("pretraining.file is set, but nothing starts from it: the task's pretraining.function is empty")
     for key in ("run_name", "experiment_name"):
         value = getattr(train_cfg.runner, key)
-        if value and Path(value).name != value:
+        if value and (Path(value).name != value or value == ".." or not value.isprintable()):
             raise UserError(f"runner.{key} must be a name, not the path '{value}'")
     if not 0 <= train_cfg.seed < 2**63:
         raise UserError(f"seed must be from 0 to 2^63 - 1, not {train_cfg.seed}")
@@ -50,10 +49,8 @@ def check_train_cfg(train_cfg: Any) -> None:
         sizes = getattr(train_cfg, section).hidden_dims
         if not sizes or min(sizes) < 1:
             raise UserError(f"{section}.hidden_dims must be one size or more, each at least 1, not {sizes}")
-    resolvable = dict.fromkeys((f"{owner}.class_name" for owner in _WITH_CLASSES), resolve_callable)
-    resolvable |= dict.fromkeys(("actor.activation", "critic.activation"), resolve_nn_activation)
-    for path, resolve in resolvable.items():
+    for path in ("actor.activation", "critic.activation"):
         try:
-            resolve(value_of(path))
-        except (ValueError, ImportError, AttributeError) as error:
+            resolve_nn_activation(value_of(path))
+        except ValueError as error:
             raise UserError(f"{path}: {error}") from None

@@ -72,7 +72,8 @@ class Session:
         self.state = SessionState()  # what is shown
         self.task = self._make_task(self._cfg)  # only the stepping thread may touch its tensors
         self._obs = self.task.get_observations()
-        self._runner, _ = task_registry.make_alg_runner(self.task, train_cfg=run.train_cfg, log_root=None)
+        name = run.config.get("task")
+        self._runner, _ = task_registry.make_alg_runner(self.task, name, train_cfg=run.train_cfg, log_root=None)
         self._pacer = Pacer(self.task.dt, clock, sleep)
         self._load(run.iterations)
         self._policy = self._runner.get_inference_policy(device)
