@@ -65,17 +65,18 @@ def make_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device:
 def start_from(runner: OnPolicyRunner, file: Path) -> None:
     """Give the actor of a runner the network of a pre-trained policy, all but its standard deviation.
 
-    A UserError names the first parameter that the file lacks, or has in another shape or with values that are no
-    numbers; then the actor is as it was.
+    A UserError names the first parameter that the two do not have in the same shape, or that is not finite; then the
+    actor is as it was.
     """
     actor = runner.alg.actor
     state, pretrained = actor.state_dict(), read_pretrained(file)["actor_state_dict"]
-    for name in [name for name in state if not name.startswith(STANDARD_DEVIATION)]:
-        old, new = state[name], pretrained.get(name)
-        if not isinstance(new, Tensor) or new.shape != old.shape or not new.isfinite().all():
-            expected = f"finite numbers of shape {list(old.shape)}"
-            raise UserError(f"the pre-trained policy '{file}' does not fit: '{name}' must be {expected}")
-        state[name] = new
+    for name in dict.fromkeys((*state, *map(str, pretrained))):
+        if not name.startswith(STANDARD_DEVIATION):
+            old, new = state.get(name), pretrained.get(name)
+            if old is None or not isinstance(new, Tensor) or new.shape != old.shape or not new.isfinite().all():
+                why = f"its parameter '{name}' is missing, not of the actor's shape or not finite"
+                raise UserError(f"the pre-trained policy '{file}' does not fit this task: {why}")
+            state[name] = new
     actor.load_state_dict(state)
 
 
