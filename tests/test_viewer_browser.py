@@ -135,6 +135,22 @@ def test_page(session, page, browser, tmp_path):
     assert not complaints
 
 
+def test_token(session, browser):
+    """A page for other machines opens at its printed address alone, and then without the token as well."""
+    page = Page(session, resource_path(session.task.cfg.asset.file), "a1_torque_multihead", "0.0.0.0", 8490)
+    address, _, token = page.url.partition("?token=")
+    try:
+        for url, is_open in ((address, False), (page.url, True), (address, True)):
+            browser.get(url)
+            if is_open:
+                wait_for(lambda: "Command" in browser.find_element(By.TAG_NAME, "body").text)
+            else:
+                assert "with its token" in browser.find_element(By.TAG_NAME, "body").text
+    finally:
+        page.close()
+    assert len(token) == 32 and page.server.request_share_url() is None
+
+
 def test_taken_port(page):
     """The next free port is taken; an address that is not this machine's is told."""
     port = page.server.get_port()
