@@ -55,7 +55,8 @@ class Guard:
     @contextlib.contextmanager
     def at_the_door(self) -> Iterator[None]:
         """Let every server that is started meanwhile ask this guard first: viser has no setting for it."""
-        start = websockets.asyncio.server.serve
+        module: Any = websockets.asyncio.server  # for mypy, to which its attributes are fixed
+        start = module.serve
 
         def guarded(*args: Any, process_request: Callable[..., Any], **settings: Any) -> Any:
             def ask(connection: ServerConnection, request: Request) -> Response | None:
@@ -63,11 +64,11 @@ class Guard:
 
             return start(*args, process_request=ask, **settings)
 
-        websockets.asyncio.server.serve = guarded  # type: ignore[assignment,misc]
+        module.serve = guarded
         try:
             yield
         finally:
-            websockets.asyncio.server.serve = start  # type: ignore[misc]
+            module.serve = start
 
 
 def is_local(host: str) -> bool:
