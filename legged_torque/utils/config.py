@@ -182,17 +182,20 @@ def parse_yaml(text: str, what: str) -> Any:
     except RecursionError:
         raise UserError(f"{what} is nested too deeply") from None
     if not is_small(value):
-        raise UserError(f"{what} is nested too deeply, or holds more than settings do")
+        raise UserError(f"{what} is nested too deeply, or larger than settings are")
     return value
 
 
 def is_small(value: Any) -> bool:
     """Return whether nested lists and dictionaries have at most :data:`MAX_DEPTH` levels of :data:`MAX_ENTRIES` each.
 
-    YAML may name a part again and again, even inside of itself, so that a short text holds more than memory does.
+    YAML may name a part again and again, even inside of itself, so that a short text holds more than memory does. Whole
+    numbers must be small enough for a float.
     """
     level = [value]
     for _ in range(MAX_DEPTH):
+        if any(isinstance(part, int) and part.bit_length() > 1000 for part in level):
+            return False
         parts = (part.values() if isinstance(part, dict) else part for part in level if isinstance(part, (dict, list)))
         level = list(itertools.islice(itertools.chain.from_iterable(parts), MAX_ENTRIES + 1))
         if not level or len(level) > MAX_ENTRIES:
