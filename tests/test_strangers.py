@@ -1,5 +1,6 @@
 """Files of strangers, made to run code or to do harm: every script refuses them, and what they hold never runs."""
 
+import gzip
 import json
 import os
 import pickle
@@ -218,7 +219,8 @@ TEXTS = {
     "deep": ("[" * 1000 + "]" * 1000, "is nested too deeply"),
     "less_deep": ("[" * 60 + "]" * 60, "is nested too deeply"),
     "itself": ("&a [*a]", "is nested too deeply"),
-    "huge": (f"a: 0x{'f' * 9000}", "is nested too deeply, or larger"),
+    "huge": (f"a: 0x{'f' * 9000}", "is nested too deeply or larger"),
+    "long": ("# " + "x" * 1_000_000, "is nested too deeply or larger than settings are"),
     "many": ("\n".join(["a: &a0 [x]", *(f"b{i}: &a{i + 1} [{f'*a{i}, ' * 9}]" for i in range(12))]), "is nested too"),
 }
 """YAML that runs code, or takes all of the memory or the stack, and what is told."""
@@ -313,10 +315,11 @@ def test_figures(tmp_path, text):
 
 
 def test_curves_that_are_no_text(tmp_path):
-    """A compressed file that is damaged, and a field that is longer than any number, are told."""
+    """A compressed file that is damaged or unpacks to too much, and a field longer than any number, are told."""
     (tmp_path / "a.csv.gz").write_bytes(b"\x1f\x8b\x08\x00" + bytes(6) + b"\xff" * 50)
+    (tmp_path / "large.csv.gz").write_bytes(gzip.compress(b"\n" * 60_000_000, 1))
     (tmp_path / "a.csv").write_text("task,steps\n" + "9" * 200_000 + ",1\n")
-    for name in ("a.csv.gz", "a.csv"):
+    for name in ("a.csv.gz", "large.csv.gz", "a.csv"):
         result = run_here("plot_curves.py", name, "--out=figure.png", root=tmp_path)
         assert_told_in_one_line(result, f"cannot read '{name}'")
 

@@ -16,6 +16,7 @@ from legged_torque.utils.metrics import METRICS, Metric
 from legged_torque.utils.plotting import read_data
 from legged_torque.utils.runs import load_config
 
+MAX_BYTES = 50_000_000  # of a CSV file; a small compressed one may hold more than memory does
 MILLION = 1e6  # steps in a million, the unit of axes and texts
 CURVE_METRICS = (*METRICS, Metric("critic_gradient_norm", "", "Gradient norm of the critic", None))
 """The metrics of an evaluation during training."""
@@ -63,8 +64,11 @@ def read_curves(file: Path) -> list[LearningCurve]:
 def read_csv(file: Path) -> list[dict[str, Any]]:
     """Read a CSV file, compressed or not. A last line without its end was cut off by a kill and is left out."""
     try:
-        content = file.read_bytes()
-        text = (gzip.decompress(content) if file.suffix == ".gz" else content).decode("utf-8", errors="replace")
+        with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as stream:
+            content = stream.read(MAX_BYTES + 1)
+        if len(content) > MAX_BYTES:
+            raise UserError(f"cannot read '{file}': it has more than {MAX_BYTES} bytes, compressed or not")
+        text = content.decode("utf-8", errors="replace")
         return list(csv.DictReader(text.rpartition("\n")[0].splitlines()))
     except (OSError, EOFError, zlib.error, csv.Error) as error:
         raise UserError(f"cannot read '{file}': {error}") from None

@@ -12,8 +12,8 @@ import yaml
 
 from legged_torque.utils.errors import UserError, unknown_name
 
-MAX_DEPTH, MAX_ENTRIES = 50, 100_000
-"""Levels of a YAML text, and values of a level; settings have about 6, and 100."""
+MAX_LENGTH, MAX_DEPTH, MAX_ENTRIES = 1_000_000, 50, 100_000
+"""Characters and levels of a YAML text, and values of a level; settings have about 10 000, 6 and 100."""
 
 
 class Section:
@@ -176,14 +176,13 @@ def parse_value(text: str) -> Any:
 def parse_yaml(text: str, what: str) -> Any:
     """Return what YAML text holds; if it is not valid, or larger than settings are, a UserError says ``what`` it is."""
     try:
-        value = yaml.safe_load(text)
+        if len(text) <= MAX_LENGTH and is_small(value := yaml.safe_load(text)):
+            return value
     except (yaml.YAMLError, ValueError) as error:  # a date such as 2026-99-99 is a ValueError
         raise UserError(f"{what} is not valid YAML: {' '.join(str(error).split())}") from None
     except RecursionError:
-        raise UserError(f"{what} is nested too deeply") from None
-    if not is_small(value):
-        raise UserError(f"{what} is nested too deeply, or larger than settings are")
-    return value
+        pass
+    raise UserError(f"{what} is nested too deeply or larger than settings are")
 
 
 def is_small(value: Any) -> bool:
