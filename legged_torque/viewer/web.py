@@ -120,9 +120,7 @@ def watch(session: Session, robot: Path, title: str, host: str, port: int) -> No
     if page.server.get_port() != port:
         print(f"Port {port} is taken.")
     if page.guard.token:
-        print(
-            f"Warning: {host} is served to other machines, unencrypted. Whoever has this address can steer the robots."
-        )
+        print("Warning: other machines reach this page, unencrypted; whoever has its address can steer the robots.")
     print(f"See it walk: {page.url} (Ctrl-C ends)", flush=True)
     try:
         with stopping_on_ctrl_c(session.stop):
