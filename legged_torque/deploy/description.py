@@ -12,12 +12,12 @@ import yaml
 
 from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.limits import LARGEST
 
 DESCRIPTION_FILE = "policy.yaml"
 NETWORK_FILE = "policy.onnx"
 SCHEMA_FILE = Path(__file__).with_name("policy.schema.json")
 FORMAT_VERSION = 1
-MAX_NUMBER = 1e6  # largest number of a description in any unit: MuJoCo's states end at 1e10
 
 COMMENTS = {
     "format_version": "How to run policy.onnx on a robot; docs/deploy.md of legged_torque explains it.",
@@ -86,8 +86,8 @@ def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
     """Check structure, values and how they fit together; a UserError names the first wrong entry, and ``where``."""
     _check_schema(description, where)
     for path, value in _numbers(description):
-        if not abs(value) <= MAX_NUMBER and not path.startswith("training."):
-            raise UserError(f"{where}: {path} is not a finite number, or larger than any of a robot ({MAX_NUMBER:g})")
+        if not abs(value) <= LARGEST and not path.startswith("training."):
+            raise UserError(f"{where}: {path} is not a finite number, at most {LARGEST:g} either way")
     _check_joints(description, where)
     _check_terms(description, where)
     _check_ranges(description, where)

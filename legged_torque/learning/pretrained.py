@@ -16,7 +16,7 @@ from torch import Tensor
 
 from legged_torque.learning import checkpoint
 from legged_torque.learning.runner import OnPolicyRunner
-from legged_torque.utils.config import to_dict
+from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import all_experiments_dir
 
@@ -106,12 +106,5 @@ def spaces(env_cfg: Any, train_cfg: Any) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for part, paths in SPACES.items():
         for path in paths:
-            result |= flat(path, reduce(getitem, path.split("."), settings[part]))
+            result |= flat(reduce(getitem, path.split("."), settings[part]), path)
     return result
-
-
-def flat(path: str, value: Any) -> dict[str, Any]:
-    """Return nested settings as one dictionary with dotted paths."""
-    if not isinstance(value, dict):
-        return {path: value}
-    return {name: item for key, part in value.items() for name, item in flat(f"{path}.{key}", part).items()}

@@ -107,6 +107,14 @@ def to_dict(section: Any) -> dict[str, Any]:
     return {key: to_dict(value) if isinstance(value, Section) else value for key, value in values.items()}
 
 
+def flat(values: Any, path: str = "") -> dict[str, Any]:
+    """Return nested dictionaries, which stand at ``path``, as one dictionary with dotted paths."""
+    if not isinstance(values, dict):
+        return {path: values}
+    parts = (flat(value, f"{path}.{key}" if path else str(key)) for key, value in values.items())
+    return {name: value for part in parts for name, value in part.items()}
+
+
 def update_from_dict(section: Any, values: dict[str, Any], path: str = "") -> None:
     """Write nested dictionaries into a ``section``, which stands at ``path``; what does not fit is a UserError."""
     if not isinstance(values, dict):
@@ -147,7 +155,7 @@ def convert(value: Any, old: Any, path: str) -> Any:
     """Return ``value`` in the type of ``old``, the entry that it replaces; a UserError if that is not possible."""
     if isinstance(value, str) and not isinstance(old, str):
         value = parse_value(value)
-    if old is None:
+    if old is None or value is None:  # whether it may be null, its type says: see check_section
         return value
     if isinstance(old, bool) or isinstance(value, bool):
         matches = isinstance(old, bool) and isinstance(value, bool)

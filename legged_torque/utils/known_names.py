@@ -6,12 +6,12 @@ calling what they name would run any code that is installed. What a user's own t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 from rsl_rl.utils import resolve_callable
 
-from legged_torque.utils.config import BaseConfig, to_dict
+from legged_torque.utils.config import BaseConfig, flat, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 
 NAMING = ("class_name", "function", "_func")
@@ -36,11 +36,6 @@ def check_names(train_cfg: BaseConfig, registered: Iterable[Any]) -> None:
             raise UserError(f"{path}: {error}") from None
 
 
-def named(settings: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+def named(settings: dict[str, Any]) -> list[tuple[str, Any]]:
     """Return dotted path and value of every setting that names a class or a function, at any depth."""
-    for key, value in settings.items():
-        dotted = f"{path}.{key}" if path else str(key)
-        if str(key).endswith(NAMING):
-            yield dotted, value
-        elif isinstance(value, dict):
-            yield from named(value, dotted)
+    return [(path, name) for path, name in flat(settings).items() if path.endswith(NAMING)]

@@ -37,7 +37,7 @@ class Options:
         "loaded run has"
     )
     ranges: str | None = _option(
-        "how far random parameters go: wide or narrow; default: wide, or what a loaded run has"
+        "how far random parameters go: default or hard; default: those of the task, or what a loaded run has"
     )
     set: list[str] = field(default_factory=list, metadata={"help": _SET, "action": "append", "metavar": "KEY=VALUE"})
     log_root: str | None = _option("folder that keeps all experiments; default: ./logs")
@@ -60,6 +60,7 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
     if resolve_device(options.device) == "cpu":
         env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
     if run_config:
+        update_from_dict(env_cfg, env_cfg.of_older_runs())
         update_from_dict(env_cfg, run_config["env"])
         update_from_dict(train_cfg, run_config["train"])
     if options.perturbation:
