@@ -435,7 +435,8 @@ def test_weights_of_a_pretrained_policy(tmp_path, make_task, damage):
         value = {"shape": weights[name].T.contiguous(), "nan": weights[name] * float("nan"), "text": "0.5"}[damage]
         weights[name] = value
     checkpoint.write(tmp_path / "policy.pt", {"actor_state_dict": weights, "spaces": {}, "report": {}})
-    assert f"does not fit this task: its parameter '{name}'" in error_of(start_from, runner, tmp_path / "policy.pt")
+    told = error_of(start_from, runner, tmp_path / "policy.pt")
+    assert "policy.pt' " in told and name in told
     after = runner.alg.actor.state_dict()
     assert all(torch.equal(value, after[name]) for name, value in before.items())
 
