@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -151,6 +152,9 @@ def read_plan(file: Path) -> Matrix:
             raise UserError(f"experiment key '{key}' must be a list like {example}, not {entries!r}")
         if len(set(entries)) < len(entries):
             raise UserError(f"experiment key '{key}' holds something twice: {entries}")
+        for entry in entries:  # they name folders and figures
+            if key != "seeds" and not re.fullmatch(r"\w[\w.-]*", entry):
+                raise UserError(f"experiment key '{key}' must hold names, not {entry!r}")
     return matrix
 
 
@@ -187,7 +191,7 @@ def is_json(file: Path) -> bool:
     """Return whether a file exists and holds a JSON object."""
     try:
         return isinstance(json.loads(file.read_text(encoding="utf-8")), dict)
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):  # nested too deeply
         return False
 
 

@@ -146,6 +146,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         state["infos"] = {
             **(infos or {}),  # plain values and tensors
             "task": self.env.state_dict(),
+            "task_name": self.cfg.get("task"),
             "total_timesteps": self.logger.tot_timesteps,
             "seconds": self._seconds_before + self.logger.tot_time,
             "random_states": distributed.gather(random_state(self.device)),
@@ -161,11 +162,14 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         """Continue from a checkpoint: networks, optimizer, counters and with them all curricula; return its infos.
 
         Arguments are those of rsl_rl's runner, whose device is the default. A UserError if the file is not a checkpoint
-        or belongs to another kind of policy.
+        or belongs to another task or kind of policy.
         """
         state = checkpoint.read(Path(path), "checkpoint", map_location or self.device)
         try:
             checkpoint.check_counters(state, path)
+            of_task, task = state["infos"].get("task_name"), self.cfg.get("task")
+            if of_task and task and of_task != task:  # older checkpoints do not name theirs
+                raise UserError(f"checkpoint '{path}' is of task '{of_task}', not '{task}'")
             load_iteration = self.alg.load(state, load_cfg, strict)
             if load_iteration:
                 self.current_learning_iteration = state["iter"]

@@ -5,11 +5,15 @@ from __future__ import annotations
 import contextlib
 import copy
 import inspect
+import itertools
 from typing import Any
 
 import yaml
 
 from legged_torque.utils.errors import UserError, unknown_name
+
+MAX_LENGTH, MAX_DEPTH, MAX_ENTRIES = 1_000_000, 50, 100_000
+"""Characters and levels of a YAML text, and values of a level; settings have about 10 000, 6 and 100."""
 
 
 class Section:
@@ -178,8 +182,29 @@ def parse_value(text: str) -> Any:
 
 
 def parse_yaml(text: str, what: str) -> Any:
-    """Return what YAML text holds; if it is not valid, a UserError says ``what`` the text is."""
+    """Return what YAML text holds; if it is not valid, or larger than settings are, a UserError says ``what`` it is."""
     try:
-        return yaml.safe_load(text)
+        if len(text) <= MAX_LENGTH and is_small(value := yaml.safe_load(text)):
+            return value
     except (yaml.YAMLError, ValueError) as error:  # a date such as 2026-99-99 is a ValueError
         raise UserError(f"{what} is not valid YAML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        pass
+    raise UserError(f"{what} is nested too deeply or larger than settings are")
+
+
+def is_small(value: Any) -> bool:
+    """Return whether nested lists and dictionaries have at most :data:`MAX_DEPTH` levels of :data:`MAX_ENTRIES` each.
+
+    YAML may name a part again and again, even inside of itself, so that a short text holds more than memory does. Whole
+    numbers must be small enough for a float.
+    """
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        if any(isinstance(part, int) and part.bit_length() > 1000 for part in level):
+            return False
+        parts = (part.values() if isinstance(part, dict) else part for part in level if isinstance(part, (dict, list)))
+        level = list(itertools.islice(itertools.chain.from_iterable(parts), MAX_ENTRIES + 1))
+        if not level or len(level) > MAX_ENTRIES:
+            return not level
+    return False
