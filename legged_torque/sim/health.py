@@ -87,7 +87,7 @@ class Health:
 def address(tensor: Watched, defaults: Tensor) -> Any:
     """Return where a tensor's numbers are, and what takes their place."""
     row: Any = kernels.Numbers2d()
-    size = tensor.numbers.element_size()
     row.address, row.defaults, row.count = tensor.numbers.data_ptr(), defaults.data_ptr(), len(defaults)
-    row.world_stride, row.stride = (size * stride for stride in tensor.numbers.stride())
+    row.world_stride = tensor.numbers.stride(0) * tensor.numbers.element_size()
+    row.stride = tensor.numbers.stride(1)
     return row
