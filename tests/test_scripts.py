@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -254,7 +255,7 @@ def test_resume_in_a_folder_by_its_path(root, tmp_path):
     status, _, error = run_here("train.py", "--task=a1_position", "--device=cpu", *words, root=tmp_path)
     assert (status, error) == (0, "")
     (new,) = (tmp_path / "logs" / "a1_position").iterdir()
-    assert {path.name for path in new.iterdir() if path.is_file()} == {"config.yaml", "model_2.pt"}
+    assert {path.name for path in new.iterdir() if path.is_file()} == {"config.yaml", "model_2.pt", "worlds_2.pt"}
     state = torch.load(new / "model_2.pt", weights_only=True)
     assert (state["iter"], state["infos"]["total_timesteps"]) == (2, 2 * 2 * 4)
     train = yaml.safe_load((new / "config.yaml").read_text())["train"]
@@ -293,8 +294,18 @@ def test_late_mistake_in_a_process_of_its_own(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("after", [0.4, 1.2])
+def test_interrupt_while_starting(tmp_path, after):
+    """Ctrl-C before anything runs ends a script by that signal, without a word."""
+    process = start("train.py", *SMALL, root=tmp_path)
+    time.sleep(after)
+    process.send_signal(signal.SIGINT)
+    status, output, error = finish(process)
+    assert (status, output, error) == (-signal.SIGINT, "", "") and not list(tmp_path.iterdir())
+
+
 def test_train_stop_resume_play(tmp_path):
-    """Ctrl-C saves and ends with status 0, resuming goes on with all counters, and playing prints how it walks."""
+    """Ctrl-C saves and ends with status 130, resuming goes on with all counters, and playing prints how it walks."""
     task, logs = ["--task=a1_torque_multihead", "--device=cpu"], tmp_path / "logs" / "a1_torque_multihead"
     settings = {
         "runner.num_steps_per_env": 4,
@@ -309,9 +320,9 @@ def test_train_stop_resume_play(tmp_path):
             break
     process.send_signal(signal.SIGINT)
     status, output, error = finish(process)
-    assert status == 0 and "Traceback" not in error and "Stopping" in output + error
+    assert status == 130 and "Traceback" not in error and "Stopping" in output + error
     (first,) = logs.iterdir()
-    (checkpoint,) = first.glob("*.pt*")
+    (checkpoint,) = first.glob("model_*")
     count = int(checkpoint.stem.removeprefix("model_"))
     state = torch.load(checkpoint, weights_only=True)
     assert 2 <= count == state["iter"] and state["infos"]["total_timesteps"] == count * 8
