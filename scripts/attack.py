@@ -20,7 +20,7 @@ from pathlib import Path
 from legged_torque.checks.attack import attack, table
 from legged_torque.checks.attack_cases import all_cases
 from legged_torque.checks.attack_fixture import make_fixture, parsers, warm_up
-from legged_torque.utils.cli import Parser, check_at_least, prepare_file, run_script, write_json
+from legged_torque.utils.cli import Parser, check_at_least, check_output, run_script, write_json
 
 WORKERS = 2  # cases at a time
 SHOW_EVERY = 200  # cases
@@ -37,7 +37,7 @@ def main() -> None:
     if args.limit is not None:
         check_at_least(args, 1, "limit")
     if args.json:
-        prepare_file(args.json)
+        check_output(args.json)
     known = dict(parsers())
     warm_up()
     with tempfile.TemporaryDirectory(prefix="attack") as root:

@@ -17,7 +17,7 @@ from legged_torque.checks import attack_fixture as fixtures
 from legged_torque.checks.attack import Case
 from legged_torque.checks.attack_fixture import WORDS
 from legged_torque.envs import task_registry
-from legged_torque.utils.cli import Parser
+from legged_torque.utils.cli import Parser, finite
 from legged_torque.utils.config import to_dict
 
 NOT_FINITE = (".nan", ".inf", "-.inf")
@@ -167,20 +167,33 @@ def bad_words(action: argparse.Action) -> Iterator[tuple[str, bool]]:
         yield "0", False
         if action.dest == "num_envs":
             yield "3000000000", True
-    elif action.type is float:
+    elif action.type in (float, finite):
         yield from ((text, True) for text in ("", "x", "nan", "inf", "-inf"))
         yield from ((text, False) for text in ("-1", "1e300"))
     elif action.dest == "host":
         yield from ((text, False) for text in ("", "nowhere.invalid", LONG))
     elif action.dest == "set":
-        texts = ("", "=", "x", "=1", "seed", "a.b=1", "seed=", ".=1", "env=1", "env.=1", "env.num_envs.x=1", f"{LONG}=1")
+        texts = (
+            "",
+            "=",
+            "x",
+            "=1",
+            "seed",
+            "a.b=1",
+            "seed=",
+            ".=1",
+            "env=1",
+            "env.=1",
+            "env.num_envs.x=1",
+            f"{LONG}=1",
+        )
         yield from ((text, True) for text in (*texts, "env.num_envs=1:30", "env.num_envs=[[", "seed=!!python/name:os"))
     elif action.dest in ("run_name", "out") and action.option_strings:
         yield from ((text, True) for text in ("", LONG, "/dev/null/x", "/proc/x"))
         yield from ((text, False) for text in ("a\nb", "logs"))
     else:  # names, and files to read or to write
-        yield from ((text, True) for text in ("", LONG, "/dev/null/x", "no\nthing", "/proc/x/y"))
-        yield from ((text, False) for text in ("logs", "nothing", "..", "/dev/null", "metrics.json"))
+        yield from ((text, True) for text in ("", LONG, "/dev/null/x", "/proc/x/y"))
+        yield from ((text, False) for text in ("logs", "nothing", "..", "/dev/null", "metrics.json", "no\nthing"))
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------
@@ -189,12 +202,12 @@ def bad_words(action: argparse.Action) -> Iterator[tuple[str, bool]]:
 def file_case(file: str, script: str, what: str, value: Any, content: str | bytes, must_refuse: bool = True) -> Case:
     """Return the case of a script that reads a file of this content."""
     words = (*WORDS[script], *_MORE_WORDS.get((file, script), ()))
-    if file in (fixtures.DESCRIPTION, fixtures.NETWORK):
-        words = (file, *words[1:])
-    elif script == "plot_curves.py":
+    if file in (fixtures.DESCRIPTION, fixtures.NETWORK) or script == "plot_curves.py":
         words = (file, *words[1:])
     data = content if isinstance(content, bytes) else content.encode()
-    return Case(f"{script} {Path(file).name} {what} {str(value)[:30]}".strip(), script, words, must_refuse, {file: data})
+    return Case(
+        f"{script} {Path(file).name} {what} {str(value)[:30]}".strip(), script, words, must_refuse, {file: data}
+    )
 
 
 def entry_cases(fixture: Path, drawn: random.Random) -> Iterator[Case]:
@@ -207,7 +220,9 @@ def entry_cases(fixture: Path, drawn: random.Random) -> Iterator[Case]:
         paths = [path for path, _ in leaves(content)] + list(content)
         chosen = drawn.sample(list(itertools.product(paths, values)), min(60, len(paths) * len(values)))
         for path, value in chosen:
-            yield file_case(file, drawn.choice(scripts), path, value, _changed(content, path, value), False)
+            yield file_case(
+                file, drawn.choice(scripts), path, value, _changed(content, path, value, Path(file).suffix), False
+            )
         for name, text in {"deep": "[" * 3000, "empty": "", "list": "[1, 2]", "number": "5", "tabs": "\t:"}.items():
             yield file_case(file, scripts[0], name, "", text, name != "empty" or file.endswith(".json"))
 
@@ -226,11 +241,13 @@ def robot_cases(fixture: Path, drawn: random.Random) -> Iterator[Case]:
             parent.insert(at, child)
         entries = [(element, key) for element in tree.iter() for key in element.attrib]
         for element, key in drawn.sample(entries, 60):
-            old, bad = element.get(key), drawn.choice(["nan", "-1", "0", "1e30", "text", ""])
+            old, bad = element.attrib[key], drawn.choice(["nan", "-1", "0", "1e30", "text", ""])
             element.set(key, bad)
             what = f"{element.tag} {element.get('name') or element.get('class')} {key}={bad}"
-            yield file_case(fixtures.ROBOT, script, what, "", ElementTree.tostring(tree.getroot()), bad == "nan")
-            element.set(key, str(old))
+            is_number = old.strip("-0123456789. e") == ""
+            data = ElementTree.tostring(tree.getroot())
+            yield file_case(fixtures.ROBOT, script, what, "", data, bad == "nan" and is_number)
+            element.set(key, old)
 
 
 def damage_cases(fixture: Path, drawn: random.Random) -> Iterator[Case]:
@@ -254,12 +271,12 @@ def _entry(content: Any, path: str) -> Any:
     return content
 
 
-def _changed(content: Any, path: str, value: Any) -> str:
-    """Return the text of nested entries of which that at a dotted path has another value; all JSON is YAML as well."""
+def _changed(content: Any, path: str, value: Any, suffix: str = ".yaml") -> str:
+    """Return the YAML or JSON of nested entries of which that at a dotted path has another value."""
     content = json.loads(json.dumps(content))
     *parents, last = path.split(".")
     section = content
     for key in parents:
         section = section[key]
     section[last] = value
-    return json.dumps(content)
+    return json.dumps(content) if suffix == ".json" else yaml.safe_dump(content)

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from legged_torque.utils.cli import check_at_least
 from legged_torque.utils.config import BaseConfig, section_keys, set_by_path, update_from_dict
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, unknown_name
 
 DEFAULT_TASK = "a1_torque_multihead"
 DEFAULT_PRESET = "parallel"
+COUNTS = ("num_envs", "max_iterations")
 _SET = "change a setting by its dotted path, e.g. rewards.scales.torques=-1e-4; may be repeated"
 
 
@@ -59,9 +61,12 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
     apply_preset(env_cfg, train_cfg, options.preset or DEFAULT_PRESET)
     if resolve_device(options.device) == "cpu":
         env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
-    if run_config:
-        update_from_dict(env_cfg, run_config["env"])
-        update_from_dict(train_cfg, run_config["train"])
+    for part, cfg in {"env": env_cfg, "train": train_cfg}.items() if run_config else ():
+        if not isinstance(run_config[part], dict):
+            raise UserError(
+                f"config key '{part}' is a section with entries, it cannot be the value {run_config[part]!r}"
+            )
+        update_from_dict(cfg, run_config[part])
     if options.perturbation:
         apply_perturbation(env_cfg, options.perturbation)
     if options.ranges:
@@ -75,8 +80,7 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
         if not separator:
             raise UserError(f"--set takes KEY=VALUE, not '{item}'")
         set_entry_of_either(env_cfg, train_cfg, path, text)
-    if options.max_iterations is not None and options.max_iterations < 1:
-        raise UserError(f"--max_iterations must be at least 1, not {options.max_iterations}")
+    check_at_least(options, 1, *(name for name in COUNTS if getattr(options, name) is not None))
 
 
 def apply_preset(env_cfg: Any, train_cfg: Any, name: str) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from legged_torque.utils.config import parse_yaml
+from legged_torque.utils.config import Dumper, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 
 CONFIG_FILE = "config.yaml"
@@ -79,7 +79,7 @@ def checkpoint_numbers(run_dir: Path) -> list[int]:
 
 def save_config(run_dir: str | Path, config: dict[str, Any]) -> None:
     """Write the settings of a run and the versions of the packages that it uses."""
-    text = yaml.safe_dump({**config, "versions": package_versions()}, sort_keys=False)
+    text = yaml.dump({**config, "versions": package_versions()}, Dumper=Dumper, sort_keys=False)
     Path(run_dir).mkdir(parents=True, exist_ok=True)
     (Path(run_dir) / CONFIG_FILE).write_text(text, encoding="utf-8")
 
