@@ -69,7 +69,7 @@ def main() -> None:
         "versions": package_versions(),
         "preset": args.preset or "parallel",
         "perturbation": args.perturbation or "none",
-        "ranges": args.ranges or "wide",
+        "ranges": args.ranges or "default",
         "set": without_machine(args.set),
         "rounds": args.rounds,
         "rows": [],

@@ -236,7 +236,7 @@ def test_memory_of_a_gpu(monkeypatch):
     ("words", "message"),
     [
         ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
-        ("--num_envs 2 0", "num_envs must be at least 1, not 0"),
+        ("--num_envs 2 0", "num_envs must be from 1 to 10000000 (integer), not 0"),
         ("--rounds=0", "--rounds must be at least 1, not 0"),
         ("--endurance=-1", "--endurance must be at least 0, not -1"),
         ("--device=cup", "unknown device 'cup'; did you mean 'cpu'?"),

@@ -79,7 +79,7 @@ def order(stage):
 
 def test_order_and_commands(stage, tmp_path):
     """A seed comes before the next one; the scripts get the options of the cell and of the file."""
-    values = SMALL | {"seeds": [3, 1], "environments": {"low": ["low", "high"], "high": ["high"]}, "ranges": "narrow"}
+    values = SMALL | {"seeds": [3, 1], "environments": {"low": ["low", "high"], "high": ["high"]}, "ranges": "hard"}
     file, out = write(tmp_path / "m.yaml", values), tmp_path / "out"
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert (status, error) == (0, "")
@@ -91,7 +91,7 @@ def test_order_and_commands(stage, tmp_path):
         "--seed=3",
         "--perturbation=high",
         "--set=runner.total_steps=128",
-        "--ranges=narrow",
+        "--ranges=hard",
         "--device=cpu",
     ):
         assert f" {word}" in log.splitlines()[0]

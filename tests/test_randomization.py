@@ -1,6 +1,7 @@
 """Random parameters, pushes and sensor errors: each acts as in MuJoCo, and draws follow their definition."""
 
 import copy
+import math
 
 import mujoco
 import numpy as np
@@ -15,31 +16,32 @@ from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
 
 RANGES = {
-    "trunk_mass_offset": ("body_mass", (-0.8, 0.8)),
-    "trunk_mass_scale": ("body_mass", (0.75, 1.25)),
-    "trunk_com_offset": ("body_ipos", (-0.0025, 0.0025)),
-    "foot_radius": ("geom_size", (0.0195, 0.0205)),
+    "trunk_mass_offset": ("body_mass", (-1.0, 1.0)),
+    "trunk_com_offset": ("body_ipos", (-0.003, 0.003)),
+    "foot_radius": ("geom_size", (0.019, 0.021)),
     "foot_offset": ("geom_pos", (-0.0025, 0.0025)),
     "dof_damping": ("dof_damping", (0.0, 0.2)),
-    "dof_armature": ("dof_armature", (0.009, 0.02)),
-    "dof_stiffness": ("jnt_stiffness", (0.0, 0.5)),
-    "dof_frictionloss": ("dof_frictionloss", (0.0, 0.65)),
-    "ground_friction": ("geom_friction", (0.001, 2.0)),
-    "contact_stiffness": ("geom_solref", (500.0, 1500.0)),
-    "contact_damping": ("geom_solref", (30.0, 130.0)),
-    "gravity": ("gravity", (8.81, 10.81)),
+    "dof_armature": ("dof_armature", (0.008, 0.02)),
+    "dof_stiffness": ("jnt_stiffness", (0.0, 0.2)),
+    "dof_frictionloss": ("dof_frictionloss", (0.0, 0.4)),
+    "ground_friction": ("geom_friction", (0.8, 1.2)),
+    "contact_stiffness": ("geom_solref", (900.0, 1100.0)),
+    "contact_damping": ("geom_solref", (72.0, 88.0)),
+    "gravity": ("gravity", (9.51, 10.11)),
 }
-"""Field and range of design.md, section 8, for each parameter of robot and ground."""
-CONTROL = ("motor_strength", "joint_offset", "action_scale_offset", "stiffness_offset", "stiffness_scale")
-CONTROL += ("damping_offset", "damping_scale")
+"""Field and range of the published set ``default``, for each parameter of robot and ground."""
+FACTORS = ("motor_strength", "stiffness_scale", "damping_scale")
+CONTROL = (*FACTORS, *(f"{name}_per_joint" for name in FACTORS), "joint_offset", "action_scale_offset")
+CONTROL += ("stiffness_offset", "damping_offset")
+WIDE = {"trunk_mass_scale": [0.75, 1.25], "action_scale_offset": [-0.03, 0.03], "stiffness_offset": [-3.0, 3.0]}
+WIDE = {f"domain_rand.{name}": limits for name, limits in WIDE.items()}
 FIELDS = sorted({field for field, _ in RANGES.values()} | {"body_inertia"})
 ON = {"domain_rand.randomize_parameters": True}
-ALWAYS = {**ON, "domain_rand.keep_probability": 0.0}
 
 
 def only(*names):
-    """Settings that randomize these parameters and no others, in every draw."""
-    return ALWAYS | {"domain_rand.keep_fixed": [name for name in (*RANGES, *CONTROL) if name not in names]}
+    """Settings that randomize these parameters and no others."""
+    return ON | {"domain_rand.keep_fixed": [name for name in (*RANGES, *CONTROL) if name not in names]}
 
 
 def edited_model(sim, world):
@@ -84,9 +86,8 @@ def move_about(task):
 @pytest.mark.parametrize("name", [*RANGES, "all of them"])
 def test_worlds_move_as_their_models(make_task, name):
     """A world with drawn parameters moves as MuJoCo's model with these numbers, and otherwise than without them."""
-    settings = ALWAYS if name == "all of them" else only(name)
-    if name == "all of them":
-        settings = settings | {"domain_rand.ground_friction": [0.3, 2.0]}  # float32 is less exact below
+    wide = WIDE | {"domain_rand.ground_friction": [0.3, 2.0], "domain_rand.contact_damping": [30.0, 130.0]}
+    settings = ON | wide if name == "all of them" else only(name)
     task = make_task("a1_torque", 12, **settings, **{"sim.solver_iterations": 50, "sim.ls_iterations": 50})
     move_about(task)
     before = task.sim.qvel.clone()
@@ -109,7 +110,7 @@ def test_worlds_move_as_their_models(make_task, name):
 
 def test_derived_constants(make_task):
     """Inverse weights are those of mj_setConst, in the worlds that were drawn anew and only there."""
-    task = make_task("a1_torque", 6, **ALWAYS)
+    task = make_task("a1_torque", 6, **ON)
     check_constants(task.sim)
     before = {name: task.sim.field(name).clone() for name in (*FIELDS, "body_invweight0", "dof_invweight0")}
     mask = torch.tensor([True, False, True, False, False, False])
@@ -122,12 +123,12 @@ def test_derived_constants(make_task):
 
 def test_distributions(make_task):
     """Draws are uniform in their ranges (Kolmogorov-Smirnov), and no two parameters or worlds go together."""
-    task = make_task("a1_position", 1500, **ALWAYS, **{"domain_rand.keep_fixed": ["trunk_mass_scale"]})
+    task = make_task("a1_position", 1500, **ON, **{"domain_rand.action_scale_offset": [-0.03, 0.03]})
     sim, model = task.sim, task.sim.mj_model
     feet = [model.geom(name).id for name in task.foot_names]
     samples = {
         "trunk_mass_offset": sim.field("body_mass")[:, 1] - model.body_mass[1],
-        "trunk_com_offset": sim.field("body_ipos")[:, 1] - torch.tensor(model.body_ipos[1]),
+        "trunk_com_offset": sim.field("body_ipos")[:, 1, 0] - model.body_ipos[1, 0],
         "foot_radius": sim.field("geom_size")[:, feet[0], 0],
         "foot_offset": sim.field("geom_pos")[:, feet] - torch.tensor(model.geom_pos[feet]),
         "dof_damping": sim.field("dof_damping")[:, 6:],
@@ -140,12 +141,11 @@ def test_distributions(make_task):
         "gravity": -sim.field("gravity")[:, 2],
     }
     ranges = {name: RANGES[name][1] for name in samples}
-    samples |= {"motor_strength": task.motor_strength[:, 0], "joint_offset": task.joint_offset}
-    ranges |= {"motor_strength": (0.75, 1.25), "joint_offset": (-0.05, 0.05)}
+    samples["joint_offset"], ranges["joint_offset"] = task.joint_offset, (-0.01, 0.01)
     samples["action_scale_offset"], ranges["action_scale_offset"] = task.action_scale - 0.25, (-0.03, 0.03)
     for name, values in samples.items():
         assert uniformity(values, *ranges[name]) < 1.0, name
-    torch.testing.assert_close(samples["contact_damping"], 30.0 + (samples["contact_stiffness"] - 500.0) / 10.0)
+    torch.testing.assert_close(samples["contact_damping"], 72.0 + (samples["contact_stiffness"] - 900.0) * 0.08)
     del samples["contact_damping"]  # which goes with the stiffness
     table = torch.cat([values.double().flatten(1) if values.dim() > 1 else values.double().unsqueeze(1)
                        for values in samples.values()], dim=1)  # fmt: skip
@@ -157,9 +157,11 @@ def test_distributions(make_task):
 def test_what_goes_together(make_task):
     """Inertia changes with the mass, all kinds of friction with the first, torque scale with the action scale.
 
-    Motor strength, gains and the radius are the same for all joints and feet of a world.
+    The radius is the same for all feet, and the trunk's centre of mass moves alike on all axes. Without their factors
+    per joint, motor strength and gains are the same for all joints.
     """
-    task = make_task("a1_torque", 50, **ALWAYS)
+    without = {"domain_rand.keep_fixed": [f"{name}_per_joint" for name in FACTORS]}
+    task = make_task("a1_torque", 50, **ON, **WIDE, **without)
     model = task.sim.mj_model
     ratio = task.sim.field("body_mass")[:, 1] / model.body_mass[1]
     inertia = task.sim.field("body_inertia")[:, 1] / torch.tensor(model.body_inertia[1], dtype=torch.float32)
@@ -175,8 +177,8 @@ def test_what_goes_together(make_task):
 
 
 def test_kept_values(make_task):
-    """In 30% of the draws the joints keep their own values, all at once; all else is drawn always."""
-    task = make_task("a1_torque", 1000, **ON)
+    """In a share of the draws the joints keep their own values, all at once; all else is drawn always."""
+    task = make_task("a1_torque", 1000, **ON, **{"domain_rand.keep_probability": 0.3})
     fields = ("dof_armature", "dof_damping", "dof_frictionloss", "jnt_stiffness")
     kept = torch.stack(
         [
@@ -193,22 +195,24 @@ def test_kept_values(make_task):
 
 def test_critic_knows_what_was_drawn(make_task):
     """Its last observations are all drawn numbers, from -1, the lowest one, to 1; without draws, the robot's own."""
-    task = make_task("a1_position", 200, **ON)
+    task = make_task("a1_position", 200, **ON, **WIDE)
     sizes = task.randomization.sizes
     values = dict(zip(sizes, task.randomization.values.split([*sizes.values()], dim=1), strict=True))
-    lowest, highest = (4.713 - 0.8) * 0.75, (4.713 + 0.8) * 1.25
+    lowest, highest = (4.713 - 1.0) * 0.75, (4.713 + 1.0) * 1.25
+    trunk = task.sim.mj_model.body_ipos[1]
     for name, number, low, high in (
-        ("gravity", task.sim.field("gravity")[:, 2:], -10.81, -8.81),
+        ("gravity", task.sim.field("gravity")[:, 2:], -10.11, -9.51),
         ("trunk_mass", task.sim.field("body_mass")[:, 1:2], lowest, highest),
-        ("ground_friction", task.sim.field("geom_friction")[:, 0, :1], 0.001, 2.0),
-        ("dof_armature", task.sim.field("dof_armature")[:, 6:], 0.009, 0.02),
-        ("p_gains", task.p_gains[:, :1], 17.0 * 0.75, 23.0 * 1.25),
-        ("joint_offset", task.joint_offset, -0.05, 0.05),
+        ("ground_friction", task.sim.field("geom_friction")[:, 0, :1], 0.8, 1.2),
+        ("dof_armature", task.sim.field("dof_armature")[:, 6:], 0.008, 0.02),
+        ("p_gains", task.p_gains, 17.0 * 0.9 * 0.98, 23.0 * 1.1 * 1.02),
+        ("trunk_com", task.sim.field("body_ipos")[:, 1] - torch.tensor(trunk, dtype=torch.float32), -0.003, 0.003),
+        ("joint_offset", task.joint_offset, -0.01, 0.01),
     ):
         torch.testing.assert_close(values[name], 2.0 * (number - low) / (high - low) - 1.0, atol=1e-4, rtol=0)
-    assert torch.equal(task.get_observations()["critic"][:, -84:], task.randomization.values)
+    assert torch.equal(task.get_observations()["critic"][:, -117:], task.randomization.values)
     plain = make_task("a1_position", 2)
-    seen = plain.get_observations()["critic"][0, -84:].split([*sizes.values()])
+    seen = plain.get_observations()["critic"][0, -117:].split([*sizes.values()])
     values = dict(zip(sizes, seen, strict=True))
     assert values["dof_damping"].tolist() == [-1.0] * 12 and values["joint_offset"].tolist() == [0.0] * 12
     torch.testing.assert_close(values["gravity"], torch.tensor([0.0]), atol=1e-5, rtol=0)
@@ -236,18 +240,29 @@ def test_drawn_now_and_then(make_task):
 
 def test_torques_by_hand(make_task):
     """Motor strength, joint offset, scales and gains act in eq. 8 as written."""
-    task = make_task("a1_position", 5, **ALWAYS)
+    task = make_task("a1_position", 5, **ON, **WIDE)
     actions = torch.randn(5, 12)
     target = task.default_dof_pos + task.joint_offset + task.action_scale * actions
     expected = task.p_gains * (target - task.dof_pos) - task.d_gains * task.dof_vel
     torch.testing.assert_close(task._compute_torques(actions), expected)
-    assert (task.p_gains > 17.0 * 0.75).all() and (task.p_gains < 23.0 * 1.25).all() and task.p_gains.std() > 1.0
-    assert (task.d_gains > 0.4 * 0.75).all() and (task.d_gains < 0.6 * 1.25).all()
+    assert (task.p_gains > 17.0 * 0.88).all() and (task.p_gains < 23.0 * 1.13).all() and task.p_gains.std() > 1.0
+    assert (task.d_gains > 0.5 * 0.88).all() and (task.d_gains < 0.5 * 1.13).all()
+
+
+def test_factors_per_joint(make_task):
+    """Strength and gains have a factor for the world times one for each joint, both uniform, no two together."""
+    task = make_task("a1_position", 1500, **ON, **{"domain_rand.motor_strength": [1.0, 1.0]})
+    assert uniformity(task.motor_strength, 0.98, 1.02) < 1.0
+    assert (torch.corrcoef(task.motor_strength.T) - torch.eye(12)).abs().max() < 0.15
+    ratio = (task.p_gains / task.p_gains[:, :1]).log()  # of two factors per joint
+    assert 0.03 < ratio.max() <= math.log(1.02 / 0.98) + 1e-5 and -ratio.min() <= math.log(1.02 / 0.98) + 1e-5
+    world = (task.d_gains / 0.5).mean(dim=1)  # 12 joints average their factors to 1 within a percent or so
+    assert uniformity(world[world.sub(1.0).abs() < 0.08], 0.92, 1.08) < 1.0
 
 
 def test_pushes(make_task):
-    """A push sets a velocity or adds one, each half the time, uniformly, as often as set."""
-    settings = {"push_robots": True, "push_probability": 0.3, "push_velocity": [-2.0, 2.0]}
+    """A push sets a velocity, times a factor, or adds one, each half the time, uniformly, as often as set."""
+    settings = {"push_robots": True, "push_probability": 0.3, "push_velocity": [-2.0, 2.0], "push_set_factor": 1.5}
     task = make_task("a1_torque", 4000, **{f"domain_rand.{key}": value for key, value in settings.items()})
     task.sim.qvel[:, :3] = 10.0
     task.reset_buf.fill_(False)
@@ -257,7 +272,7 @@ def test_pushes(make_task):
     assert (velocity[~mask] == 10.0).all() and 0.27 < mask.float().mean() < 0.33
     added = velocity[mask][:, 0] > 5.0
     assert 0.44 < added.float().mean() < 0.56
-    assert uniformity(torch.where(added.unsqueeze(1), velocity[mask] - 10.0, velocity[mask]), -2.0, 2.0) < 1.0
+    assert uniformity(torch.where(added.unsqueeze(1), velocity[mask] - 10.0, velocity[mask] / 1.5), -2.0, 2.0) < 1.0
 
 
 def test_noise(make_task):
@@ -266,7 +281,7 @@ def test_noise(make_task):
     task = make_task("a1_position", 2000, **settings)
     clean = task.get_observations()["critic"][:, :45]
     error = task.get_observations()["policy"] - clean
-    limits = [0.05] * 3 + [0.2 * 0.25] * 3 + [0.0] * 3 + [0.01] * 12 + [1.5 * 0.05] * 12 + [0.0] * 12
+    limits = [0.05] * 3 + [0.1 * 0.25] * 3 + [0.0] * 3 + [0.01] * 12 + [0.5 * 0.05] * 12 + [0.0] * 12
     for i, limit in enumerate(limits):
         if limit == 0.0:
             assert (error[:, i] == 0.0).all()
@@ -280,45 +295,6 @@ def test_initial_velocities(make_task):
     task = make_task("a1_torque", 1000, **{f"domain_rand.{key}": value for key, value in ranges.items()})
     assert uniformity(task.dof_vel, -10.5, 10.5) < 1.0
     assert uniformity(task.sim.qvel[:, :3], -0.5, 0.5) < 1.0 and uniformity(task.base_ang_vel, -0.4, 0.4) < 1.0
-
-
-@pytest.mark.parametrize(
-    ("name", "velocity", "probability"),
-    [("low", 0.3, 0.002), ("high", 1.0, 0.002), ("high_frequency", 1.0, 0.006), ("doubled", 1.0, 0.012)],
-)
-def test_perturbations(name, velocity, probability):
-    """The paper's four environments, in training and over what a loaded run has; none takes all of it back."""
-    plain = to_dict(get_cfgs()[0])
-    cfg = get_cfgs(f"--perturbation={name}")[0]
-    rand = cfg.domain_rand
-    assert rand.randomize_parameters and rand.push_robots and cfg.noise.add_noise
-    assert (rand.push_velocity, rand.push_probability) == ([-velocity, velocity], probability)
-    assert (rand.init_dof_vel, rand.init_lin_vel, rand.init_ang_vel) == ([-10.5, 10.5], [-0.5, 0.5], [-0.5, 0.5])
-    run_config = {"env": to_dict(cfg), "train": {}}
-    assert get_cfgs(run_config=run_config)[0].domain_rand.push_probability == probability
-    assert get_cfgs("--perturbation=doubled", run_config=run_config)[0].domain_rand.push_probability == 0.012
-    without = get_cfgs("--perturbation=none", run_config=run_config)[0]
-    assert not (without.domain_rand.randomize_parameters or without.domain_rand.push_robots or without.noise.add_noise)
-    assert without.domain_rand.init_dof_vel == plain["domain_rand"]["init_dof_vel"] == [0.0, 0.0]
-
-
-def test_ranges():
-    """Narrow ranges lie inside the wide ones, go with any perturbation, stay with a run, and can be taken back."""
-    wide, narrow = (get_cfgs("--perturbation=low", *more)[0].domain_rand for more in ((), ("--ranges=narrow",)))
-    changed = {name: value for name, value in to_dict(narrow).items() if value != getattr(wide, name)}
-    assert changed["ground_friction"] == [0.8, 1.2] and changed["motor_strength"] == [0.9, 1.1] and len(changed) == 11
-    for name, (low, high) in changed.items():
-        assert getattr(wide, name)[0] < low <= high < getattr(wide, name)[1], name
-    run_config = {"env": to_dict(get_cfgs("--ranges=narrow")[0]), "train": {}}
-    assert get_cfgs("--perturbation=high", run_config=run_config)[0].domain_rand.ground_friction == [0.8, 1.2]
-    back = get_cfgs("--perturbation=low", "--ranges=wide", run_config=run_config)[0]
-    assert to_dict(back.domain_rand) == to_dict(wide)
-
-
-@pytest.mark.parametrize("option", ["--perturbation=hih", "--ranges=wid"])
-def test_unknown_names(option):
-    """They are told with those that there are."""
-    assert "did you mean" in error_of(get_cfgs, option)
 
 
 class ThighMassRobot(LeggedRobot):
@@ -343,7 +319,7 @@ def test_a_variant_draws_more():
     check_constants(task.sim)
     scaled = (ratio[:, 0] - 0.7) / 0.2
     torch.testing.assert_close(task.get_observations()["critic"][:, -1], scaled, atol=1e-4, rtol=0)
-    assert task.mirror("critic", task.get_observations()["critic"]).shape == (20, 138)
+    assert task.mirror("critic", task.get_observations()["critic"]).shape == (20, 171)
     ThighMassRobot.shared = False
     assert "'thigh_mass'" in error_of(lambda: ThighMassRobot(cfg).mirror)
 
@@ -360,28 +336,6 @@ def test_everything_at_once(make_task, task):
         obs, rewards, _, _ = world.step(torch.randn(16, world.num_actions))
         assert torch.isfinite(obs["policy"]).all() and torch.isfinite(rewards).all()
     assert not torch.equal(world.sim.field("body_mass"), masses)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("domain_rand.gravity", [10.0, 9.0]),
-        ("domain_rand.dof_damping", [-0.1, 0.2]),
-        ("domain_rand.trunk_mass_scale", [-0.5, 1.0]),
-        ("domain_rand.foot_radius", [0.02]),
-        ("domain_rand.push_probability", 1.1),
-        ("domain_rand.resampling_probability", -0.1),
-        ("domain_rand.keep_probability", 2.0),
-        ("domain_rand.keep_fixed", ["gravitation"]),
-        ("domain_rand.keep_fixed", ["init_roll"]),
-        ("domain_rand.keep_fixed", ["push_velocity"]),
-        ("noise.noise_scales.dof_vel", -1.0),
-    ],
-)
-def test_settings_that_make_no_sense(make_task, key, value):
-    """They are refused by their names."""
-    with pytest.raises(UserError, match=key.replace(".", r"\.")):
-        make_task("a1_torque", 1, **{key: value})
 
 
 def test_what_the_kernel_cannot_write_is_refused():

@@ -18,7 +18,7 @@ TASKS = ["a1_position", "a1_torque", "a1_torque_curriculum", "a1_torque_multihea
 GROUPS = ("policy", "critic", "actions")
 WORLDS, STEPS = 4, 4
 SAMPLES = WORLDS * STEPS
-DRAWN = 84
+DRAWN = 117
 """Numbers of a world that may be drawn at random."""
 
 
@@ -52,12 +52,18 @@ def mirror_critic(obs):
 
 
 def mirror_drawn(drawn):
-    """Mass, centre of mass, radius, feet; four per joint; four of the ground; an offset per joint; three more."""
-    trunk, feet, joints, ground, offsets, rest = drawn.split([5, 12, 48, 4, 12, 3], dim=1)
+    """Mass, centre of mass, radius, feet; four per joint; three of the ground; then those of the controller.
+
+    These are strength and offset per joint, the action scale, and two gains per joint.
+    """
+    trunk, feet, joints, ground, *control = drawn.split([5, 12, 48, 3, 12, 12, 1, 12, 12], dim=1)
+    strength, offsets, action_scale, *gains = control
+    strength, *gains = (values.reshape(-1, 4, 3)[:, [1, 0, 3, 2]].flatten(1) for values in (strength, *gains))
     feet = feet.reshape(-1, 4, 3)[:, [1, 0, 3, 2]] * torch.tensor([1.0, -1, 1])
     joints = joints.reshape(-1, 4, 4, 3)[:, :, [1, 0, 3, 2]]
     trunk = trunk * torch.tensor([1.0, 1, -1, 1, 1])
-    return torch.cat([trunk, feet.flatten(1), joints.flatten(1), ground, mirror_joints(offsets), rest], dim=1)
+    control = [strength, mirror_joints(offsets), action_scale, *gains]
+    return torch.cat([trunk, feet.flatten(1), joints.flatten(1), ground, *control], dim=1)
 
 
 BY_HAND = {"policy": mirror_policy, "critic": mirror_critic, "actions": mirror_joints}

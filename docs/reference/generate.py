@@ -20,6 +20,7 @@ from legged_torque import SCRIPTS_DIR
 from legged_torque.envs.approaches import multi_head, torque, torque_curriculum, torque_gravity
 from legged_torque.envs.base import legged_robot_config
 from legged_torque.envs.robots import a1
+from legged_torque.utils.limits import describe, types_of
 
 HERE = Path(__file__).parent
 CONFIGS = (
@@ -41,6 +42,8 @@ SETTINGS_HEAD = """# Settings
 
 Made by `python docs/reference/generate.py` from the config classes. `--set section.setting=value` changes a setting for
 one run, a subclass changes it for a task. Units are in brackets; a comment without a unit means a number without one.
+Every number must be finite, at most 1e9 either way; what else a setting must be stands beside its default in the code,
+and other values are refused.
 
 A class that is listed with few settings inherits all others from its base. A run's `config.yaml` holds every value that
 it was trained with.
@@ -58,11 +61,14 @@ def comments(source: str) -> dict[int, str]:
     return {token.start[0]: token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT}
 
 
-def rows(node: ast.ClassDef, path: str, source: str, notes: dict[int, str], known: dict[str, str]) -> list[str]:
+def rows(
+    node: ast.ClassDef, cls: type, path: str, source: str, notes: dict[int, str], known: dict[str, str]
+) -> list[str]:
     """Return the rows of a table: settings of a class and of the classes inside it.
 
     Args:
         node: The class.
+        cls: The same, as Python made it.
         path: Dotted path of its section, with a dot at the end.
         source: Source of its module.
         notes: Comments of the module by number of the line.
@@ -73,15 +79,16 @@ def rows(node: ast.ClassDef, path: str, source: str, notes: dict[int, str], know
         if isinstance(statement, ast.ClassDef):
             text = ast.get_docstring(statement) or notes.get(statement.lineno, "")
             if text:
-                result.append(f"| **`{path}{statement.name}`** | | {text.splitlines()[0].replace('``', '`')} |")
-            result += rows(statement, f"{path}{statement.name}.", source, notes, known)
+                result.append(f"| **`{path}{statement.name}`** | | | {text.splitlines()[0].replace('``', '`')} |")
+            result += rows(statement, getattr(cls, statement.name), f"{path}{statement.name}.", source, notes, known)
         for name, node_of_value in assignments(statement):
             value = " ".join((ast.get_source_segment(source, node_of_value) or "").split())
             value = value if len(value) <= 60 else f"{value[:57]}..."
             before = known.get(f"{path}{name}", known.get(name, ""))
             note = notes.get(getattr(statement, "end_lineno", 0), before).replace("|", "\\|")
             known[f"{path}{name}"] = note
-            result.append(f"| `{path}{name}` | `{value}` | {note} |")
+            allowed = describe(types_of(cls).get(name, object))
+            result.append(f"| `{path}{name}` | `{value}` | {allowed} | {note} |")
     return result
 
 
@@ -103,7 +110,8 @@ def settings_table(module: ModuleType, name: str, known: dict[str, str]) -> str:
     (node,) = (part for part in ast.parse(source).body if isinstance(part, ast.ClassDef) and part.name == name)
     bases = ", ".join(f"`{ast.unparse(base)}`" for base in node.bases)
     text = " ".join(re.sub(r":\w+:`~?[\w.]*?(\w+)`", r"`\1`", ast.get_docstring(node) or "").replace("``", "`").split())
-    table = ["| setting | default | meaning |", "|---|---|---|", *rows(node, "", source, comments(source), known)]
+    table = ["| setting | default | allowed | meaning |", "|---|---|---|---|"]
+    table += rows(node, getattr(module, name), "", source, comments(source), known)
     return "\n".join([f"## {name}", "", f"{text} Base: {bases}.", "", *table, ""])
 
 

@@ -8,6 +8,7 @@ import json
 import random
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from legged_torque.checks.attack import Case
 from legged_torque.checks.attack_fixture import WORDS
 from legged_torque.envs import task_registry
 from legged_torque.utils.cli import Parser, finite
-from legged_torque.utils.config import to_dict
+from legged_torque.utils.config import Section, section_keys
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.limits import check_value, types_of
 
 NOT_FINITE = (".nan", ".inf", "-.inf")
 LONG = "x" * 300
@@ -61,60 +64,74 @@ def all_cases(fixture: Path, parsers: Mapping[str, Parser], seed: int) -> list[C
 # ---- settings --------------------------------------------------------------------------------------------------------
 
 
-def settings() -> dict[str, tuple[str, Any]]:
-    """Return every setting of every task and its training by dotted path: the first task that has it, and its value."""
-    result: dict[str, tuple[str, Any]] = {}
+@dataclass(frozen=True)
+class Setting:
+    """A setting of a task or of its training."""
+
+    task: str  # the first one that has it
+    value: Any
+    hint: Any  # what it may be, see utils/limits.py
+
+    def allows(self, text: str) -> bool:
+        """Return whether a text stands for a value that is within the limits."""
+        try:
+            check_value("", text if isinstance(self.value, str) else yaml.safe_load(text), self.hint)
+        except UserError:
+            return False
+        return True
+
+
+def settings() -> dict[str, Setting]:
+    """Return every setting of every task and its training by dotted path."""
+    result: dict[str, Setting] = {}
     for task in task_registry.names():
         for cfg in task_registry.get_cfgs(task):
-            for path, value in leaves(to_dict(cfg)):
-                result.setdefault(path, (task, value))
+            for path, value, hint in each(cfg):
+                result.setdefault(path, Setting(task, value, hint))
     return result
 
 
-def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted path and the value of every entry of nested dictionaries that is none itself, or empty."""
-    if not isinstance(value, dict) or not value:
-        yield path, value
-        return
-    for key, entry in value.items():
-        yield from leaves(entry, f"{path}.{key}" if path else str(key))
+def each(section: Section, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield dotted path, value and type of every setting of a section and of those below."""
+    hints = types_of(type(section))
+    for key in section_keys(section):
+        value = getattr(section, key)
+        if isinstance(value, Section):
+            yield from each(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", value, hints.get(key, object)
 
 
-def bad_values(path: str, value: Any) -> Iterator[tuple[str, bool]]:
-    """Yield texts for a setting, and whether it is wrong to accept each."""
-    is_range = path.startswith(("domain_rand.", "commands.ranges.")) and (value is None or _is_numbers(value))
+def bad_values(setting: Setting) -> Iterator[tuple[str, bool]]:
+    """Yield texts for a setting, and whether it is wrong to accept each: beyond its limits it always is."""
+    value = setting.value
     if isinstance(value, bool):
-        yield from ((text, True) for text in ("2", "maybe", ".nan", "null", "[]", "{}"))
+        sure, others = ["2", "maybe", ".nan", "null", "[]", "{}", "yes", "on"], []
     elif isinstance(value, (int, float)):
-        yield from ((text, True) for text in (*NOT_FINITE, "text", "null", "[1.0]", "{a: 1}", "true"))
-        yield from ((text, False) for text in ("0", "-1", "1e30", "-1e30"))
-    elif is_range:
-        yield from ((text, True) for text in ("[.nan, 1.0]", "[0.0, .inf]", "[-.inf, 0.0]", "[2.0, 1.0]", "[1.0]"))
-        yield from ((text, True) for text in ("[0.0, 1.0, 2.0]", "text", "[a, b]", "1.0", "[]", "[[0.0, 1.0]]"))
-        yield from ((text, False) for text in ("[-1e30, 1e30]", "[-2.0, -1.0]", "null"))
-    elif isinstance(value, list) and _is_numbers(value):
-        numbers = [yaml.safe_dump([bad, *value[1:]], default_flow_style=True).strip() for bad in (float("nan"), "a")]
-        yield from ((text, True) for text in (*numbers, "text", "1.0", "[]", "null", "[[1]]", "[.inf]"))
-        yield from ((text, False) for text in ("[-1]", "[0]", "[1e30]"))
+        sure = [*NOT_FINITE, "text", "null", "[1.0]", "true", "1.0e+30", "-1.0e+30", "1:30", "9" * 30]
+        others = ["{a: 1}", "0", "-1", "0.5", "1000000000"]
+    elif "ordered=True" in repr(setting.hint):
+        sure = ["[.nan, 1.0]", "[0.0, .inf]", "[-.inf, 0.0]", "[2.0, 1.0]", "[1.0]", "[0.0, 1.0, 2.0]", "text"]
+        sure += ["[a, b]", "1.0", "[]", "[[0.0, 1.0]]", "[-1.0e+30, 1.0e+30]"]
+        others = ["[-2.0, -1.0]", "null"]
+    elif isinstance(value, list) and value and all(type(entry) in (int, float) for entry in value):
+        sure = ["[.nan]", "[a]", "text", "1.0", "[]", "null", "[[1]]", "[.inf]", "[1.0e+30]"]
+        others = ["[-1]", "[0]", "[0.5]"]
     elif isinstance(value, list):
-        yield from ((text, True) for text in ("text", "5", "null", "{a: 1}"))
-        yield from ((text, False) for text in ("[5]", "[nothing]", "[[a]]", "['']"))
+        sure, others = ["text", "5", "null", "{a: 1}", "[5]", "[.nan]"], ["[nothing]", "[[a]]", "['']"]
     elif isinstance(value, dict):
-        yield from ((text, True) for text in ("5", "text", "[]", "null"))
+        sure, others = ["5", "text", "[]", "null", "{a: .nan}", "{a: text}", "{a: [1]}"], ["{a: 1.0}", "{}"]
     else:
-        yield from ((text, False) for text in ("nothing", "''", LONG, "../up", "5", "a:b"))
-
-
-def _is_numbers(value: Any) -> bool:
-    """Return whether a value is a list of numbers."""
-    return isinstance(value, list) and bool(value) and all(type(entry) in (int, float) for entry in value)
+        sure, others = [], ["nothing", "''", LONG, "../up", "5", "a:b"]
+    yield from ((text, True) for text in sure)
+    yield from ((text, not setting.allows(text)) for text in others)
 
 
 def setting_cases() -> Iterator[Case]:
     """Yield every setting with bad values on the command line of a training."""
-    for path, (task, value) in settings().items():
-        for text, must_refuse in bad_values(path, value):
-            words = (*WORDS["train.py"], f"--task={task}", f"--set={path}={text}")
+    for path, setting in settings().items():
+        for text, must_refuse in bad_values(setting):
+            words = (*WORDS["train.py"], f"--task={setting.task}", f"--set={path}={text}")
             yield Case(f"set {path}={text[:40]}", "train.py", words, must_refuse)
 
 
@@ -132,10 +149,10 @@ def config_cases(fixture: Path) -> Iterator[Case]:
 
 def plan_cases() -> Iterator[Case]:
     """Yield every setting with bad values in the description of an experiment."""
-    for path, (task, value) in settings().items():
-        texts = [text for text, must_refuse in bad_values(path, value) if must_refuse][:3]
+    for path, setting in settings().items():
+        texts = [text for text, must_refuse in bad_values(setting) if must_refuse][:3]
         for bad in map(yaml.safe_load, texts):
-            plan = {"tasks": [task], "environments": {"none": ["none"]}, "seeds": [1], "train": {path: bad}}
+            plan = {"tasks": [setting.task], "environments": {"none": ["none"]}, "seeds": [1], "train": {path: bad}}
             yield file_case(fixtures.PLAN, "experiment.py", f"train.{path}", bad, yaml.safe_dump(plan))
     for path, bad in {"sim.engine": "nope", "env.num_actions": 5, "asset.file": "missing.xml"}.items():
         plan = {"tasks": ["a1_position"], "environments": {"none": ["none"]}, "seeds": [1], "train": {path: bad}}
@@ -194,6 +211,15 @@ def bad_words(action: argparse.Action) -> Iterator[tuple[str, bool]]:
     else:  # names, and files to read or to write
         yield from ((text, True) for text in ("", LONG, "/dev/null/x", "/proc/x/y"))
         yield from ((text, False) for text in ("logs", "nothing", "..", "/dev/null", "metrics.json", "no\nthing"))
+
+
+def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted path and the value of every entry of nested dictionaries that is none itself, or empty."""
+    if not isinstance(value, dict) or not value:
+        yield path, value
+        return
+    for key, entry in value.items():
+        yield from leaves(entry, f"{path}.{key}" if path else str(key))
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------

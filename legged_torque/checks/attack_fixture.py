@@ -54,7 +54,7 @@ WORDS = {
 _PLAN = {"tasks": ["a1_position"], "environments": {"none": ["none"]}, "seeds": [1]}
 
 
-class _Stop(Exception):
+class _StopError(Exception):
     """Ends a script when it reads its command line."""
 
 
@@ -65,12 +65,12 @@ def parsers() -> Iterator[tuple[str, Parser]]:
 
         def keep(parser: Parser, *_: object, found: list[Parser] = found) -> None:
             found.append(parser)
-            raise _Stop
+            raise _StopError
 
         with patch.object(Parser, "parse_args", keep), patch.dict(os.environ), patch.object(sys, "argv", [script]):
             try:
                 runpy.run_path(str(SCRIPTS_DIR / script), run_name="__main__")
-            except _Stop:
+            except _StopError:
                 yield script, found[0]
 
 

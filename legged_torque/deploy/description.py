@@ -57,7 +57,7 @@ def read(path: str | Path) -> tuple[dict[str, Any], Path]:
         raise UserError(f"there is no {DESCRIPTION_FILE} in '{folder}'")
     try:
         description = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, OSError) as error:
+    except (yaml.YAMLError, ValueError, OSError, RecursionError) as error:
         raise UserError(f"'{file}' is not valid YAML: {' '.join(str(error).split())}") from None
     check(description, f"'{file}'")
     network = path if is_network else folder / description["network"]["file"]

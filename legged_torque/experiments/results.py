@@ -149,7 +149,7 @@ def read_cell(cell: Cell) -> CellResult:
             values = json.loads(file.read_text(encoding="utf-8"))
             means = {name: estimate.get("mean") for name, estimate in values["metrics"].items()}
             row = to_row({"steps": values["steps"], **means})
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             result.notes.append(f"'{file}' cannot be read")
             continue
         result.devices.add(str(values.get("device")))

@@ -74,6 +74,7 @@ class Row:
     address: wp.uint64  # of the first world's number
     stride: wp.uint64  # from world to world [bytes]
     draw: wp.int32  # number of the random numbers that it takes
+    column_draw: wp.int32  # of the random number for the column's own factor, -1 without
     place: wp.int32  # in the values, -1 without
     base: wp.float32
     weight: wp.float32
@@ -81,6 +82,8 @@ class Row:
     offset_span: wp.float32
     scale_low: wp.float32
     scale_span: wp.float32
+    column_low: wp.float32
+    column_span: wp.float32
     own_value: wp.float32
     keep_probability: wp.float32
     middle: wp.float32
@@ -98,6 +101,8 @@ def draw(mask: Mask, seeds: Integers, rows: wp.array(dtype=Row), values: Rows):
         random = wp.rand_init(seeds[world], row.draw)
         offset = row.offset_low + row.offset_span * wp.randf(random)
         scale = row.scale_low + row.scale_span * wp.randf(random)
+        if row.column_draw >= 0:
+            scale *= row.column_low + row.column_span * wp.randf(wp.rand_init(seeds[world], row.column_draw))
         value = wp.clamp((row.base + row.weight * offset) * scale, row.lowest, row.highest)
         if wp.randf(wp.rand_init(seeds[world], 0)) < row.keep_probability:
             value = row.own_value

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import torch
@@ -20,7 +21,10 @@ Range = tuple[float, float]  # lowest and highest value
 
 @dataclass
 class Parameter:
-    """Numbers of each world that are drawn together: value = (base + weight x U(offset)) x U(scale)."""
+    """Numbers of each world that are drawn together.
+
+    Their value is (base + weight x U(offset)) x U(scale) x U(column_scale), U being uniform in a range.
+    """
 
     name: str  # key of its ranges in the settings
     field: Tensor  # where the numbers are kept, one row per world. Shape: (num_envs, any)
@@ -29,12 +33,21 @@ class Parameter:
     weight: Sequence[float] | float = 1.0  # factor on the offset, per column or for all
     offset: Range = (0.0, 0.0)
     scale: Range = (1.0, 1.0)
+    column_scale: Range | None = None  # a further factor, of each column even where the others are shared
     shared: bool = False  # whether all columns take the same offset and scale, or each its own
+    listed_by_column: bool = False  # whether a shared draw is listed as a number per column, as with column_scale
     same_draw_as: str | None = None  # name of an earlier parameter whose draws it takes
     may_keep: bool = False  # whether it keeps its value at the start in a share of the draws
     limits: tuple[Sequence[float], Sequence[float]] | None = None  # lowest and highest, per column, to clip draws to
     model_field: str | None = None  # name of the field of the model that ``field`` shows; None if it is none
-    mirror: Mirroring | None = None  # of the numbers drawn; None: one number is its own image, several are unknown
+    at_least: float = -math.inf  # what no draw may be below
+    mirror: Mirroring | None = None  # of the numbers listed; None: one number is its own image, several are unknown
+
+    @property
+    def num_listed(self) -> int:
+        """How many numbers :attr:`Randomization.values` has of it."""
+        is_one = self.shared and self.column_scale is None and not self.listed_by_column
+        return 1 if is_one else len(self.columns)
 
 
 _NUMBERS_PER_BODY = {"body_mass": 1, "body_inertia": 3, "body_ipos": 3, "body_iquat": 4, "body_pos": 3, "body_quat": 4}
@@ -78,14 +91,17 @@ class Randomization:
             start = first_draw.setdefault(parameter.same_draw_as or parameter.name, num_draws)
             is_new = start == num_draws
             if is_new:
-                self.sizes[parameter.name] = count
+                self.sizes[parameter.name] = parameter.num_listed
                 num_draws += count
+            column_draw = num_draws if parameter.column_scale else None
+            num_draws += len(parameter.columns) if parameter.column_scale else 0
             for i, (column, row) in enumerate(zip(parameter.columns, table(parameter, keep_probability), strict=True)):
                 row.address = parameter.field[:, column].data_ptr()
                 row.stride = parameter.field.stride(0) * parameter.field.element_size()
                 row.draw = start + (0 if parameter.shared else i)
+                row.column_draw = -1 if column_draw is None else column_draw + i
                 row.place = -1
-                if is_new and i < count:
+                if is_new and i < parameter.num_listed:
                     row.place = len(at_start)
                     at_start.append((row.own_value - row.middle) * row.per_half_range)
                 rows.append(row)
@@ -111,10 +127,11 @@ def check_field(parameter: Parameter) -> None:
 
 
 def table(parameter: Parameter, keep_probability: float) -> list[Any]:
-    """Return how each column of a parameter is drawn."""
+    """Return how each column of a parameter is drawn; a UserError if it can fall below what it may be."""
     defaults = parameter.field[0, list(parameter.columns)].tolist()
     bases = defaults if parameter.base is None else per_column(parameter.base, len(defaults))
     weights = per_column(parameter.weight, len(defaults))
+    column_scale = parameter.column_scale or (1.0, 1.0)
     lowest, highest = parameter.limits or ([-math.inf] * len(defaults), [math.inf] * len(defaults))
     rows = []
     for default, base, weight, low, high in zip(defaults, bases, weights, lowest, highest, strict=True):
@@ -123,8 +140,15 @@ def table(parameter: Parameter, keep_probability: float) -> list[Any]:
         row.base, row.weight, row.own_value = base, weight, default
         row.offset_low, row.offset_span = parameter.offset[0], parameter.offset[1] - parameter.offset[0]
         row.scale_low, row.scale_span = parameter.scale[0], parameter.scale[1] - parameter.scale[0]
+        row.column_low, row.column_span = column_scale[0], column_scale[1] - column_scale[0]
         row.keep_probability = keep_probability if parameter.may_keep else 0.0
-        corners = [(base + weight * offset) * scale for offset in parameter.offset for scale in parameter.scale]
+        offsets, scales = parameter.offset, product(parameter.scale, column_scale)
+        corners = [(base + weight * offset) * scale * own for offset, (scale, own) in product(offsets, scales)]
+        if min(corners) < parameter.at_least:
+            raise UserError(
+                f"random parameter '{parameter.name}' can be {min(corners):g} with the ranges given; it must be at "
+                f"least {parameter.at_least:g}"
+            )
         half_range = (max(corners) - min(corners)) / 2
         row.middle = (max(corners) + min(corners)) / 2
         row.per_half_range = 1.0 / half_range if half_range > 0.0 else 0.0

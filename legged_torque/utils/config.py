@@ -143,7 +143,7 @@ def convert(value: Any, old: Any, path: str) -> Any:
     """Return ``value`` in the type of ``old``, the entry that it replaces; a UserError if that is not possible."""
     if isinstance(value, str) and not isinstance(old, str):
         value = parse_value(value)
-    if old is None:
+    if old is None or value is None:  # whether it may be null, its type says: see check_section
         return value
     if isinstance(old, bool) or isinstance(value, bool):
         matches = isinstance(old, bool) and isinstance(value, bool)

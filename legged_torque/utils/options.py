@@ -39,7 +39,7 @@ class Options:
         "loaded run has"
     )
     ranges: str | None = _option(
-        "how far random parameters go: wide or narrow; default: wide, or what a loaded run has"
+        "how far random parameters go: default or hard; default: those of the task, or what a loaded run has"
     )
     set: list[str] = field(default_factory=list, metadata={"help": _SET, "action": "append", "metavar": "KEY=VALUE"})
     log_root: str | None = _option("folder that keeps all experiments; default: ./logs")
@@ -61,12 +61,12 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
     apply_preset(env_cfg, train_cfg, options.preset or DEFAULT_PRESET)
     if resolve_device(options.device) == "cpu":
         env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
-    for part, cfg in {"env": env_cfg, "train": train_cfg}.items() if run_config else ():
-        if not isinstance(run_config[part], dict):
-            raise UserError(
-                f"config key '{part}' is a section with entries, it cannot be the value {run_config[part]!r}"
-            )
-        update_from_dict(cfg, run_config[part])
+    if run_config:
+        update_from_dict(env_cfg, env_cfg.of_older_runs())
+        for part, cfg in {"env": env_cfg, "train": train_cfg}.items():
+            if not isinstance(run_config[part], dict):
+                raise UserError(f"config key '{part}' is a section with entries, not the value {run_config[part]!r}")
+            update_from_dict(cfg, run_config[part])
     if options.perturbation:
         apply_perturbation(env_cfg, options.perturbation)
     if options.ranges:

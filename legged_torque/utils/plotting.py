@@ -29,7 +29,7 @@ def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
     """Return the JSON object with these keys, or more, that ``script`` has written; UserError if it is none."""
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"cannot read '{file}': {error}") from None
     if not isinstance(data, dict) or not keys <= data.keys():
         raise UserError(f"'{file}' is not a file that {script} has written")

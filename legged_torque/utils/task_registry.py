@@ -20,6 +20,7 @@ from legged_torque.utils import distributed
 from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.limits import check_section
 from legged_torque.utils.options import Options, apply_options
 from legged_torque.utils.runs import checkpoint_number, find_checkpoint, find_run, load_config, new_run_dir
 from legged_torque.utils.train_validation import check_train_cfg
@@ -68,6 +69,7 @@ class TaskRegistry:
         train_cfg.runner.experiment_name = train_cfg.runner.experiment_name or name
         if args is not None:
             apply_options(env_cfg, train_cfg, args, run_config)
+            check_section(env_cfg)
             check_train_cfg(train_cfg)
             to_rsl_rl(train_cfg)  # refuses an unknown logger
         return env_cfg, train_cfg

@@ -9,6 +9,7 @@ from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO, LinearChange
 from legged_torque.utils.config import Section
+from legged_torque.utils.limits import Count, Sizes
 
 
 class MultiHeadRobot(LeggedRobot):
@@ -54,7 +55,7 @@ class TorqueMultiHeadCfg(LeggedRobotCfg):
 
     class control:
         class mixing(Section):
-            update_interval = 64_000  # [total steps]; weights change between rollouts only
+            update_interval: Count = 64_000  # [total steps]; weights change between rollouts only
 
             class pd(LinearChange):
                 start, end = 1.0, 0.0
@@ -80,4 +81,4 @@ class MultiHeadCfgPPO(LeggedRobotCfgPPO):
     class actor:
         class_name = "legged_torque.learning.multi_head:MultiHeadModel"  # Figure 2
         hidden_dims = [512, 256]  # shared by both heads
-        head_hidden_dims: list[int] = [128]  # of either head
+        head_hidden_dims: Sizes = [128]  # of either head

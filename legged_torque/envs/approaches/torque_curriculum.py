@@ -7,6 +7,7 @@ from torch import Tensor
 
 from legged_torque.envs.approaches.torque import TorqueCfg, TorqueCfgPPO, TorqueRobot
 from legged_torque.envs.base.legged_robot_config import LinearChange
+from legged_torque.utils.limits import Positive
 
 
 class TorqueCurriculumRobot(TorqueRobot):
@@ -24,7 +25,7 @@ class TorqueCurriculumCfg(TorqueCfg):
     """Settings of the torque curriculum: the reward for the pose fades, then tracking takes over."""
 
     class rewards:
-        nominal_position_temperature: float = 0.5  # gamma of the term
+        nominal_position_temperature: Positive = 0.5  # gamma of the term
 
         class scales:
             nominal_position: float = 1.0  # standing in the nominal pose

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
 
 from legged_torque.sim.randomization import Parameter, Range
 from legged_torque.utils.errors import UserError
@@ -19,6 +22,7 @@ MODEL_FIELDS = (
 """Fields of the model of which each world has its own."""
 
 TRUNK = 1  # the trunk's body
+LEAST_MASS = 0.01  # [kg] of a trunk
 
 
 def initial_state(task: LeggedRobot) -> list[Parameter]:
@@ -57,6 +61,7 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
     dofs, joints = range(6, model.nv), range(1, model.njnt)
     feet = [model.geom(name).id for name in task.foot_names]
     trunk = offset(cfg, "trunk_mass_offset") | scale(cfg, "trunk_mass_scale")
+    at_least = LEAST_MASS if cfg.randomize_parameters else -math.inf
     inertia_per_mass = list(model.body_inertia[TRUNK] / model.body_mass[TRUNK])
     joint_values = symmetry.joints and symmetry.joints.unsigned()
     foot_vectors = symmetry.feet and symmetry.feet.of_vectors(VECTOR)
@@ -64,13 +69,14 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
     def of_joints(name: str, field: str, columns: Any) -> Parameter:
         return of_model(task, name, field, columns, may_keep=True, mirror=joint_values, **absolute(cfg, name))
 
-    trunk_com, foot_offset = offset(cfg, "trunk_com_offset"), offset(cfg, "foot_offset")
+    trunk_com = offset(cfg, "trunk_com_offset") | {"shared": True, "listed_by_column": True, "mirror": VECTOR}
+    foot_offset = offset(cfg, "foot_offset")
     foot_radius = absolute(cfg, "foot_radius")
     inertia = {**trunk, "weight": inertia_per_mass, "shared": True, "same_draw_as": "trunk_mass"}
     return [
-        of_model(task, "trunk_mass", "body_mass", [TRUNK], **trunk),
+        of_model(task, "trunk_mass", "body_mass", [TRUNK], at_least=at_least, **trunk),
         of_model(task, "trunk_inertia", "body_inertia", entries(3, [TRUNK]), **inertia),
-        of_model(task, "trunk_com", "body_ipos", entries(3, [TRUNK]), mirror=VECTOR, **trunk_com),
+        of_model(task, "trunk_com", "body_ipos", entries(3, [TRUNK]), **trunk_com),
         of_model(task, "foot_radius", "geom_size", [3 * foot for foot in feet], shared=True, **foot_radius),
         of_model(task, "foot_offset", "geom_pos", entries(3, feet), mirror=foot_vectors, **foot_offset),
         of_joints("dof_damping", "dof_damping", dofs),
@@ -96,20 +102,30 @@ def ground_parameters(task: LeggedRobot) -> list[Parameter]:
 
 
 def control_parameters(task: LeggedRobot) -> list[Parameter]:
-    """Return what is drawn of the controller: one number for all joints, but each joint has an offset of its own."""
+    """Return what is drawn of the controller: numbers for all joints, offsets and further factors of each joint."""
     cfg, control = task.cfg.domain_rand, task.cfg.control
     joints, mirror = range(task.num_dof), task.symmetry.joints
+    least = 0.0 if cfg.randomize_parameters else -math.inf
     action_scale = offset(cfg, "action_scale_offset")
     torque_scale = action_scale | {"weight": control.torque_scale / control.action_scale}
-    stiffness = offset(cfg, "stiffness_offset") | scale(cfg, "stiffness_scale")
-    damping = offset(cfg, "damping_offset") | scale(cfg, "damping_scale")
+    strength = scale(cfg, "motor_strength")
+    stiffness = offset(cfg, "stiffness_offset") | scale(cfg, "stiffness_scale") | {"at_least": least}
+    damping = offset(cfg, "damping_offset") | scale(cfg, "damping_scale") | {"at_least": least}
+
+    def of_joints(name: str, factor: str, field: Tensor, drawn: dict[str, Any]) -> Parameter:
+        own = getattr(cfg, f"{factor}_per_joint")
+        if own is not None:
+            drawn |= {"column_scale": pair(own) if is_drawn(cfg, f"{factor}_per_joint") else (1.0, 1.0)}
+            drawn |= {"mirror": mirror and mirror.unsigned()}
+        return Parameter(name, field, joints, shared=True, **drawn)
+
     return [
-        Parameter("motor_strength", task.motors.strength, joints, shared=True, **scale(cfg, "motor_strength")),
+        of_joints("motor_strength", "motor_strength", task.motors.strength, strength),
         Parameter("joint_offset", task.joint_offset, joints, mirror=mirror, **offset(cfg, "joint_offset")),
-        Parameter("action_scale", task.action_scale, [0], **action_scale),
+        Parameter("action_scale", task.action_scale, [0], at_least=least, **action_scale),
         Parameter("torque_scale", task.torque_scale, [0], same_draw_as="action_scale", **torque_scale),
-        Parameter("p_gains", task.p_gains, joints, shared=True, **stiffness),
-        Parameter("d_gains", task.d_gains, joints, shared=True, **damping),
+        of_joints("p_gains", "stiffness_scale", task.p_gains, stiffness),
+        of_joints("d_gains", "damping_scale", task.d_gains, damping),
     ]
 
 

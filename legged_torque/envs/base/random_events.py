@@ -12,7 +12,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.randomization import Parameter, Randomization
 from legged_torque.sim.simulator import Simulator
 
-PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one
+PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one, times ``push_set_factor``
 
 
 class RandomEvents:
@@ -67,4 +67,7 @@ class RandomEvents:
         if self._settings.randomize_parameters:
             self.draw_parameters(new_parameters)
         if self._settings.push_robots:
-            self._sim.push(push, self._push_velocity.uniform_(*self._settings.push_velocity), add)
+            drawn = torch.empty_like(self._push_velocity).uniform_(*self._settings.push_velocity)
+            where_set = self._settings.push_set_factor * drawn
+            torch.where(add.unsqueeze(1), drawn, where_set, out=self._push_velocity)
+            self._sim.push(push, self._push_velocity, add)

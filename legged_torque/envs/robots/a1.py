@@ -32,18 +32,23 @@ class A1Cfg(LeggedRobotCfg):
         torque_scale = 4.0
 
     class domain_rand:
-        trunk_mass_offset = [-0.8, 0.8]
-        foot_radius = [0.0195, 0.0205]
+        trunk_mass_offset = [-1.0, 1.0]
+        foot_radius = [0.019, 0.021]
         dof_damping = [0.0, 0.2]
-        dof_armature = [0.009, 0.02]
-        dof_stiffness = [0.0, 0.5]
-        dof_frictionloss = [0.0, 0.65]
-        action_scale_offset = [-0.03, 0.03]
-        stiffness_offset = [-3.0, 3.0]
-        damping_offset = [-0.1, 0.1]
+        dof_armature = [0.008, 0.02]
+        dof_stiffness = [0.0, 0.2]
+        dof_frictionloss = [0.0, 0.4]
 
     class rewards:
         base_height_target = 0.303
+
+    def hard_ranges(self) -> dict[str, dict]:
+        """Return the hard ranges, with those of this robot's parts."""
+        hard = super().hard_ranges()
+        hard["domain_rand"] |= {"trunk_mass_offset": [-2.0, 2.0], "dof_damping": [0.0, 2.0]}
+        hard["domain_rand"] |= {"dof_armature": [0.008, 0.05], "dof_stiffness": [0.0, 0.5]}
+        hard["domain_rand"] |= {"dof_frictionloss": [0.0, 1.0]}
+        return hard
 
 
 class A1CfgPPO(LeggedRobotCfgPPO):

@@ -1,0 +1,159 @@
+"""The sets of random ranges and perturbations, and ranges that make no sense."""
+
+import math
+
+import pytest
+from settings import error_of, get_cfgs
+
+from legged_torque.utils.config import to_dict
+from legged_torque.utils.errors import UserError
+
+FACTORS = ("motor_strength", "stiffness_scale", "damping_scale")
+ON = {"domain_rand.randomize_parameters": True}
+NEW_SETTINGS = ("motor_strength_per_joint", "stiffness_scale_per_joint", "damping_scale_per_joint", "push_set_factor")
+
+
+@pytest.mark.parametrize(
+    ("name", "velocity", "probability"),
+    [("low", 0.3, 0.002), ("high", 1.0, 0.002), ("high_frequency", 1.0, 0.006), ("doubled", 1.0, 0.012)],
+)
+def test_perturbations(name, velocity, probability):
+    """The paper's four environments, in training and over what a loaded run has; none takes all of it back."""
+    plain = to_dict(get_cfgs()[0])
+    cfg = get_cfgs(f"--perturbation={name}")[0]
+    rand = cfg.domain_rand
+    assert rand.randomize_parameters and rand.push_robots and cfg.noise.add_noise
+    assert (rand.push_velocity, rand.push_probability) == ([-velocity, velocity], probability)
+    assert (rand.init_dof_vel, rand.init_lin_vel, rand.init_ang_vel) == ([-10.5, 10.5], [-0.5, 0.5], [-0.5, 0.5])
+    run_config = {"env": to_dict(cfg), "train": {}}
+    assert get_cfgs(run_config=run_config)[0].domain_rand.push_probability == probability
+    assert get_cfgs("--perturbation=doubled", run_config=run_config)[0].domain_rand.push_probability == 0.012
+    without = get_cfgs("--perturbation=none", run_config=run_config)[0]
+    assert not (without.domain_rand.randomize_parameters or without.domain_rand.push_robots or without.noise.add_noise)
+    assert without.domain_rand.init_dof_vel == plain["domain_rand"]["init_dof_vel"] == [0.0, 0.0]
+
+
+DEFAULT = {
+    "motor_strength": [0.9, 1.1],
+    "stiffness_scale": [0.9, 1.1],
+    "damping_scale": [0.9, 1.1],
+    **{f"{name}_per_joint": [0.98, 1.02] for name in FACTORS},
+    "joint_offset": [-0.01, 0.01],
+    "ground_friction": [0.8, 1.2],
+    "contact_stiffness": [900.0, 1100.0],
+    "contact_damping": [72.0, 88.0],
+    "gravity": [9.51, 10.11],
+    "trunk_mass_offset": [-1.0, 1.0],
+    "trunk_com_offset": [-0.003, 0.003],
+    "foot_radius": [0.019, 0.021],
+    "dof_damping": [0.0, 0.2],
+    "dof_armature": [0.008, 0.02],
+    "dof_stiffness": [0.0, 0.2],
+    "dof_frictionloss": [0.0, 0.4],
+    "push_set_factor": 1.1,
+    "keep_probability": 0.0,
+    "trunk_mass_scale": [1.0, 1.0],
+}
+HARD = {
+    "motor_strength": [0.5, 1.5],
+    "stiffness_scale": [0.5, 1.5],
+    "damping_scale": [0.5, 1.5],
+    **{f"{name}_per_joint": [0.95, 1.05] for name in FACTORS},
+    "joint_offset": [-0.05, 0.05],
+    "ground_friction": [0.001, 2.0],
+    "contact_stiffness": [500.0, 1500.0],
+    "contact_damping": [30.0, 130.0],
+    "gravity": [8.81, 10.81],
+    "trunk_mass_offset": [-2.0, 2.0],
+    "trunk_com_offset": [-0.01, 0.01],
+    "foot_radius": [0.019, 0.021],
+    "dof_damping": [0.0, 2.0],
+    "dof_armature": [0.008, 0.05],
+    "dof_stiffness": [0.0, 0.5],
+    "dof_frictionloss": [0.0, 1.0],
+    "push_set_factor": 1.5,
+    "keep_probability": 0.0,
+    "trunk_mass_scale": [1.0, 1.0],
+}
+"""The two published sets (spec, randomization_sets.md)."""
+
+
+@pytest.mark.parametrize(
+    ("words", "ranges", "errors"),
+    [
+        ([], DEFAULT, (0.01, 0.5, 0.1, 0.05)),
+        (["--ranges=default"], DEFAULT, (0.01, 0.5, 0.1, 0.05)),
+        (["--ranges=hard"], HARD, (0.01, 1.5, 0.2, 0.1)),
+    ],
+)
+def test_ranges(words, ranges, errors):
+    """They are the published ones, whole, over what a loaded run has, and go with any perturbation."""
+    old = get_cfgs("--perturbation=high")[0]
+    old.domain_rand.foot_radius, old.domain_rand.keep_probability = [0.0195, 0.0205], 0.3
+    old.domain_rand.stiffness_offset, old.noise.noise_scales.dof_pos = [-3.0, 3.0], 0.5
+    cfgs = [get_cfgs(*words, "--perturbation=low")[0]]
+    if words:
+        cfgs.append(get_cfgs(*words, run_config={"env": to_dict(old), "train": {}})[0])
+    for cfg in cfgs:
+        assert {name: getattr(cfg.domain_rand, name) for name in ranges} == ranges
+        assert cfg.domain_rand.stiffness_offset == [0.0, 0.0]
+        noise = cfg.noise.noise_scales
+        assert (noise.dof_pos, noise.dof_vel, noise.ang_vel, noise.gravity) == errors
+    assert cfgs[-1].domain_rand.push_velocity == ([-1.0, 1.0] if words else [-0.3, 0.3])
+
+
+def test_older_runs_keep_their_ranges():
+    """A run from before factors per joint and on pushes has none of them."""
+    env = to_dict(get_cfgs("--perturbation=low")[0])
+    for name in NEW_SETTINGS:
+        del env["domain_rand"][name]
+    env["domain_rand"]["ground_friction"] = [0.001, 2.0]
+    rand = get_cfgs(run_config={"env": env, "train": {}})[0].domain_rand
+    assert [getattr(rand, name) for name in NEW_SETTINGS] == [None, None, None, 1.0]
+    assert rand.ground_friction == [0.001, 2.0]
+
+
+@pytest.mark.parametrize("option", ["--perturbation=hih", "--ranges=defalt"])
+def test_unknown_names(option):
+    """They are told with those that there are."""
+    assert "did you mean" in error_of(get_cfgs, option)
+
+
+@pytest.mark.parametrize(
+    ("name", "limits", "message"),
+    [
+        ("trunk_mass_offset", [-5.0, 1.0], "'trunk_mass' can be -0.287 with the ranges given"),
+        ("stiffness_offset", [-21.0, 0.0], "'p_gains' can be -1.1"),
+        ("damping_offset", [-0.6, 0.0], "'d_gains' can be -0.1"),
+        ("action_scale_offset", [-0.3, 0.0], "'action_scale' can be -0.05"),
+    ],
+)
+def test_sums_that_make_no_sense(make_task, name, limits, message):
+    """What a range leads to with the robot's own value is refused if it is negative, where it is drawn."""
+    make_task("a1_torque", 1, **{f"domain_rand.{name}": limits})
+    assert message in error_of(make_task, "a1_torque", 1, **ON, **{f"domain_rand.{name}": limits})
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("domain_rand.gravity", [10.0, 9.0]),
+        ("domain_rand.dof_damping", [-0.1, 0.2]),
+        ("domain_rand.trunk_mass_scale", [-0.5, 1.0]),
+        ("domain_rand.gravity", [9.0, math.nan]),
+        ("domain_rand.joint_offset", [-math.inf, 0.1]),
+        ("domain_rand.motor_strength_per_joint", []),
+        ("domain_rand.foot_radius", [0.02]),
+        ("domain_rand.push_probability", 1.1),
+        ("domain_rand.resampling_probability", -0.1),
+        ("domain_rand.keep_probability", 2.0),
+        ("domain_rand.keep_fixed", ["gravitation"]),
+        ("domain_rand.keep_fixed", ["init_roll"]),
+        ("domain_rand.keep_fixed", ["push_velocity"]),
+        ("noise.noise_scales.dof_vel", -1.0),
+    ],
+)
+def test_settings_that_make_no_sense(make_task, key, value):
+    """They are refused by their names."""
+    with pytest.raises(UserError, match=key.replace(".", r"\.")):
+        make_task("a1_torque", 1, **{key: value})
