@@ -56,8 +56,9 @@ def main() -> None:
                 print(f"{len(results)} of {len(cases)}", flush=True)
     print(table(results))
     if args.json:
-        entries = [[result.case.name, result.outcome, result.is_good, result.error] for result in results]
-        write_json(args.json, {"seed": args.seed, "cases": entries})
+        keys = ("name", "script", "words", "outcome", "is_good", "error")
+        rows = [(r.case.name, r.case.script, list(r.case.words), r.outcome, r.is_good, r.error) for r in results]
+        write_json(args.json, {"seed": args.seed, "cases": [dict(zip(keys, row, strict=True)) for row in rows]})
     sys.exit(not all(result.is_good for result in results))
 
 
