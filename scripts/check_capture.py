@@ -1,7 +1,9 @@
 """Check that training does the same with and without CUDA graphs: ``python scripts/check_capture.py``."""
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
+end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 import sys

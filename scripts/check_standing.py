@@ -5,8 +5,10 @@ Robots start from random states with the lowest foot just above the ground (``le
 
 import copy
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
+end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 from legged_torque.control.dynamics import RobotDynamics

@@ -1,7 +1,9 @@
 """Measure a checkpoint: ``python scripts/evaluate.py --task=a1_position --perturbation=high``."""
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
+end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 from dataclasses import asdict

@@ -3,8 +3,10 @@
 Finished cells are skipped and interrupted ones resumed: to continue an experiment, repeat the command.
 """
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
+end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 import sys

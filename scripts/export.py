@@ -1,7 +1,9 @@
 """Export a checkpoint for a robot: ``python scripts/export.py --task=a1_torque_multihead``."""
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
+end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 from pathlib import Path

@@ -1,7 +1,9 @@
 """Measure every checkpoint of a run with mean actions: ``python scripts/learning_curve.py --task=a1_position``."""
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
+end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 from pathlib import Path

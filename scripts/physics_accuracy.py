@@ -1,7 +1,9 @@
 """Compare solver settings with converged mj_step on a walking robot: ``python scripts/physics_accuracy.py``."""
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
+end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 import torch

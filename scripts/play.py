@@ -1,7 +1,9 @@
 """Watch a trained policy walk: ``python scripts/play.py --task=a1_torque_multihead``, live with ``--viewer web``."""
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import choose_offscreen_renderer
 
+end_on_interrupt()
 NO_RENDERER = choose_offscreen_renderer()  # before anything imports mujoco
 
 import argparse
@@ -41,7 +43,8 @@ def main() -> None:
     hint = """none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's
         window; default: %(default)s"""
     parser.add_argument("--viewer", choices=NUM_ENVS, default="none", help=hint)
-    parser.add_argument("--host", default="127.0.0.1", help="address of the page; default: %(default)s, this machine")
+    hint = "address of the page; default: %(default)s, this machine alone; others need the printed token"
+    parser.add_argument("--host", default="127.0.0.1", help=hint)
     parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
     args = parser.parse_args()
     check_at_least(args, 1, "steps")

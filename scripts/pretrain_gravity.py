@@ -5,8 +5,10 @@ The policy is kept where ``train.py`` looks for it, which also makes it itself i
 
 from pathlib import Path
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
+end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 from legged_torque.envs import task_registry

@@ -1,7 +1,9 @@
 """Report on an experiment: ``python scripts/report.py logs/experiments/paper --out my_report``."""
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
+end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 from pathlib import Path

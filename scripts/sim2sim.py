@@ -5,8 +5,10 @@ Needs neither torch nor Warp.
 
 import sys
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import choose_offscreen_renderer
 
+end_on_interrupt()
 NO_RENDERER = None if "--viewer" in sys.argv else choose_offscreen_renderer()  # before anything imports mujoco
 
 import argparse

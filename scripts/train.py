@@ -3,10 +3,13 @@
 On several GPUs of a machine: ``torchrun --standalone --nproc_per_node=2 scripts/train.py --task=a1_torque_multihead``.
 """
 
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
+end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
+import sys
 from typing import Any
 
 from legged_torque.envs import task_registry
@@ -17,10 +20,10 @@ from legged_torque.utils.args import Parser, add_task_args, add_train_args, opti
 from legged_torque.utils.cli import check_output, run_script
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name, resolve_device
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.options import DEFAULT_PRESET, Options
 from legged_torque.utils.progress import CompileProgress
-from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, save_config
+from legged_torque.utils.runs import CONFIG_FILE, new_run_dir
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, set_seed
 
 
@@ -70,25 +73,30 @@ def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
     if is_first:
         announce(runner, options, env_cfg, train_cfg, total)
-    runner.learn(remaining, init_at_random_ep_len=True)
+    try:
+        runner.learn(remaining, init_at_random_ep_len=True)
+    except TrainingError:
+        runner.close()
+        raise
     if is_first:
         print(f"The run is in {runner.log_dir}")
         for what, script in {"See it walk": "play", "Measure it": "evaluate", "Take it elsewhere": "export"}.items():
             print(f"{what}: python scripts/{script}.py {run_words(options.task, runner.log_dir)}")
     runner.close()
+    if runner.stopped_by:
+        sys.exit(128 + runner.stopped_by)  # as shells tell it: 130 after Ctrl-C
 
 
 def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: Any, total: int) -> None:
     """Create the run's folder with its settings, and print where it is and how to watch it."""
-    runner.claim_log_dir()
     device, num_processes = runner.env.device, distributed.world_size()
+    settings = {"task": options.task, "preset": options.preset or DEFAULT_PRESET, "device": device}
+    settings |= {"processes": num_processes, "max_iterations": total}
+    runner.claim_log_dir(settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     place = device_name(device) if num_processes == 1 else f"{num_processes} x {device_name(device)}"
     print(f"Training {options.task} on {place}: {num_processes * runner.env.num_envs} worlds, {total} iterations.")
     print(f"Curves: tensorboard --logdir {runner.log_dir}")
     print(f"See it learn: python scripts/play.py {run_words(options.task, runner.log_dir)} --viewer web", flush=True)
-    settings = {"task": options.task, "preset": options.preset or DEFAULT_PRESET, "device": device}
-    settings |= {"processes": num_processes, "max_iterations": total}
-    save_config(runner.log_dir, settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
 
 
 def run_words(task: str, run_dir: str) -> str:

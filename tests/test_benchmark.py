@@ -43,7 +43,7 @@ def runner(tmp_path):
         set_by_path(train_cfg, path, value)
     env = task_registry.get_task_class("a1_position")(env_cfg, "cpu")
     runner, _ = task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=tmp_path)
-    runner.claim_log_dir()
+    runner.claim_log_dir({})
     return runner
 
 
@@ -236,7 +236,7 @@ def test_memory_of_a_gpu(monkeypatch):
     ("words", "message"),
     [
         ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
-        ("--num_envs 2 0", "num_envs must be from 1 to 10000000 (integer), not 0"),
+        ("--num_envs 2 0", "num_envs must be from 1 to 10000000, not 0"),
         ("--rounds=0", "--rounds must be at least 1, not 0"),
         ("--endurance=-1", "--endurance must be at least 0, not -1"),
         ("--device=cup", "unknown device 'cup'; did you mean 'cpu'?"),

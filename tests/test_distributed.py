@@ -18,8 +18,10 @@ from test_ppo import make_ppo, record_rollout, state_of
 from test_random_stream import upcoming
 
 from legged_torque.envs import task_registry
+from legged_torque.learning.guard import PATIENCE
 from legged_torque.utils import distributed
 from legged_torque.utils.devices import resolve_device
+from legged_torque.utils.errors import TrainingError
 from legged_torque.utils.task_registry import num_iterations, set_seed
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -58,7 +60,7 @@ def train(folder):
     """Train, stop when the second process is asked to, save, and load in both processes."""
     runner = make_runner(folder / "logs")
     if distributed.rank() == 0:
-        runner.claim_log_dir()
+        runner.claim_log_dir({})
     start = everything(runner)
     runner.learn(2, init_at_random_ep_len=True)
     notes = {"start": start, "trained": everything(runner), "observations": runner.env.obs_buf["policy"].clone()}
@@ -81,8 +83,24 @@ def train(folder):
     notes["continued_stream"] = upcoming()
     resumed.learn(1)
     notes["resumed"] = everything(resumed)
+    notes["given_up"] = give_up()
     runner.close()
     return notes
+
+
+def give_up():
+    """Train with bad commands from the second iteration on: in one world of the first process, in both of the other."""
+    runner = make_runner(None)
+    update = runner.alg.update
+
+    def update_and_spoil():
+        runner.env.commands[: 1 + distributed.rank()] = torch.nan
+        return update()
+
+    runner.alg.update = update_and_spoil
+    with pytest.raises(TrainingError) as error:
+        runner.learn(100)
+    return {"iterations": runner.current_learning_iteration, "reason": str(error.value)}
 
 
 def average():
@@ -184,6 +202,15 @@ def test_each_continues_its_random_numbers(together):
     assert not torch.isclose(both[0]["saved_stream"], both[1]["saved_stream"]).any()
     state = torch.load(next(folder.glob("logs/*/model_2.pt")), weights_only=True)
     assert [list(streams) for streams in state["infos"]["random_states"]] == [["cpu"], ["cpu"]]
+
+
+def test_both_give_up(together):
+    """They judge the worlds of both, of which three of four are bad, after the same iteration; one of them tells."""
+    _, (first, second), output = together
+    assert first["given_up"] == second["given_up"]
+    assert first["given_up"]["iterations"] == 1 + PATIENCE
+    assert "75%" in first["given_up"]["reason"] and "buffer 'commands' in 3 worlds" in first["given_up"]["reason"]
+    assert output.count("Warning: buffer 'commands' was not finite in 3 worlds") == 1
 
 
 def union_gradients():

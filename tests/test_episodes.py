@@ -120,7 +120,7 @@ def test_reset_clears_what_belongs_to_the_episode(make_task):
     for buffer in (task.feet_air_time, task.sim.qvel, task.sim.qacc_warmstart, task.contacts, task.base_lin_vel):
         assert (buffer[0] == 0).all()
     assert (task.contacts[1] != 0).any() and (task.sim.qvel[1] != 0).any()
-    assert (obs["policy"][0, 21:] == 0).all() and (obs["critic"][0, -88:-84] == 0).all()
+    assert (obs["policy"][0, 21:] == 0).all() and (obs["critic"][0, -121:-117] == 0).all()
 
 
 def test_reset_of_all_worlds(make_task):

@@ -174,7 +174,7 @@ def test_dry_run(name, tmp_path):
         ({"ranges": 3}, "unknown ranges '3'"),
         ({"train": {"runner.total_step": 1}}, "config key 'runner.total_step'; did you mean 'runner.total_steps'?"),
         ({"train": {"runner.total_steps": "many"}}, "'runner.total_steps' takes a value like"),
-        ({"train": {"env.num_envs": 0}}, "num_envs must be from 1 to 10000000 (integer), not 0"),
+        ({"train": {"env.num_envs": 0}}, "num_envs must be from 1 to 10000000, not 0"),
         ({"train": {"seed": 3}}, "train.seed cannot be set: it comes from seeds"),
         ({"evaluation": {"num_env": 3}}, "unknown evaluation key 'num_env'; did you mean 'num_envs'?"),
         ({"evaluation": {"num_steps": 0}}, "evaluation.num_steps must be a whole number of at least 1, not 0"),

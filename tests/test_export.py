@@ -315,6 +315,23 @@ def test_replaces_an_export(make_task, exported, tmp_path):
     assert (folder / "notes.txt").read_text() == "mine" and list(tmp_path.iterdir()) == [folder]
 
 
+def test_exports_of_older_versions(exported, tmp_path):
+    """Their networks do not say what their inputs and outputs mean, and are used as ``policy.yaml`` says."""
+    onnx = pytest.importorskip("onnx")
+    folder = shutil.copytree(exported, tmp_path / "out")
+    network = onnx.load(folder / "policy.onnx")
+    assert {entry.key for entry in network.metadata_props} == {"joint_order", "nominal_pose", "observations", "actions"}
+    del network.metadata_props[:]
+    onnx.save(network, folder / "policy.onnx")
+    text = (folder / "policy.yaml").read_text()
+    (folder / "policy.yaml").write_text(
+        re.sub(r", sha256: \w+|\n  sha256: \w+", "", text.replace("scale: 4.0", "scale: 5.0"))
+    )
+    obs = np.full(57, 0.1, np.float32)
+    np.testing.assert_array_equal(Policy(folder).act(obs), Policy(exported).act(obs))
+    assert Policy(folder).description["actions"]["terms"][1]["scale"] == 5.0
+
+
 def test_nominal_settings():
     """A run with randomization is exported with the gains and scales of its settings."""
     cfg, _ = task_registry.get_cfgs("a1_position")

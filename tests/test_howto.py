@@ -80,7 +80,7 @@ def test_observation(run_page):
     task = make("a1_feeling_torque", "noise.add_noise=true", num_envs=256)
     for _ in range(3):
         obs = task.step(torch.randn(256, 12))[0]
-    assert obs["policy"].shape[1] == 57 and obs["critic"].shape[1] == 45 + 12 + 8 + 84 + 1
+    assert obs["policy"].shape[1] == 57 and obs["critic"].shape[1] == 45 + 12 + 8 + 117 + 1
     columns = task.observations.policy_columns("torque")
     assert columns == list(range(45, 57))
     torch.testing.assert_close(obs["critic"][:, columns], 0.03 * task.torques)

@@ -27,13 +27,13 @@ def test_observation_layout(make_task, name, num_actions):
     assert task.contacts[0].nonzero().flatten().tolist() == [0, 1, 2, FEET[0], FEET[3]] and task.contacts.max() == 1
     task.compute_observations()
     obs = task.get_observations()
-    assert obs["policy"].shape == (2, 33 + num_actions) and obs["critic"].shape == (2, 125 + num_actions)
+    assert obs["policy"].shape == (2, 33 + num_actions) and obs["critic"].shape == (2, 158 + num_actions)
     for world, commands in enumerate(([1.0, -0.5, 0.25], [-2.0, 1.5, -0.125])):
         policy = [0.0, -1.0, 0.0, 0.25, -0.5, 1.0, *commands]
         policy += [*(q[world] - NOMINAL), *(0.05 * qd[world]), *action[world]]
         critic = [0.4, 0.6, 0.2, 0.35, 1.0, 0.0, 0.0, 1.0]
         np.testing.assert_allclose(obs["policy"][world], policy, atol=2e-6)
-        np.testing.assert_allclose(obs["critic"][world, :-84], policy + critic, atol=2e-6)
+        np.testing.assert_allclose(obs["critic"][world, :-117], policy + critic, atol=2e-6)
 
 
 def test_history(make_task):
@@ -42,7 +42,7 @@ def test_history(make_task):
     task.base_pos[:, 2] = 5.0
     task.episode_length_buf = torch.tensor([0, 0, 1])
     first = task.get_observations()
-    assert first["policy"].shape == (3, 135) and first["critic"].shape == (3, 137)
+    assert first["policy"].shape == (3, 135) and first["critic"].shape == (3, 170)
     torch.testing.assert_close(first["policy"], first["policy"][:, :45].repeat(1, 3))
     seen = [first["policy"][:, :45]]
     for _ in range(3):

@@ -1,5 +1,6 @@
 """Updates that must not happen: numbers that are not finite."""
 
+import copy
 import math
 
 import pytest
@@ -123,3 +124,74 @@ def test_learning_rate_ignores_an_undefined_divergence():
     poison(alg.storage, "policy", math.nan)
     assert alg.update()["skipped_updates"] == 1
     assert float(alg.learning_rate) == pytest.approx(SETTINGS["learning_rate"], rel=1e-6)
+
+
+def spoil_learning_rate(value):
+    """What makes the learning rate a bad one."""
+    return lambda alg: alg.learning_rate.fill_(value)
+
+
+def spoil_moment(name, value):
+    """What makes one number of Adam's moments, or a counter of its steps, a bad one."""
+
+    def spoil(alg):
+        entry = list(alg.optimizer.state.values())[2]  # of the actor's first bias
+        entry[name].view(-1)[-1] = value
+
+    return spoil
+
+
+SPOILS = {
+    "rate is nan": spoil_learning_rate(math.nan),
+    "rate is inf": spoil_learning_rate(math.inf),
+    "rate is huge": spoil_learning_rate(3e38),
+    "moment is nan": spoil_moment("exp_avg", math.nan),
+    "moment is inf": spoil_moment("exp_avg_sq", math.inf),
+    "moment is negative": spoil_moment("exp_avg_sq", -1.0),
+    "counter is -1": spoil_moment("step", -1.0),
+}
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "adamw"])
+@pytest.mark.parametrize("name", SPOILS)
+def test_updates_that_spoil_weights_or_moments_are_undone(name, optimizer):
+    """All of the iteration is undone, to the bit, and counted; with good numbers learning goes on as if unspoiled."""
+    alg, twin = make_ppo(optimizer=optimizer), make_ppo(optimizer=optimizer)
+    for each in (alg, twin):
+        record_rollout(each, seed=1)
+        torch.manual_seed(4)
+        each.update()
+    good = copy.deepcopy(alg.save())
+    SPOILS[name](alg)
+    before = state_of(alg)
+    record_rollout(alg, seed=2)
+    report = alg.update()
+    assert report["skipped_updates"] == 4
+    assert all(math.isfinite(number) for number in report.values())
+    for key, value in state_of(alg).items():
+        assert torch.equal(value.nan_to_num(), before[key].nan_to_num()), key
+    assert all(torch.isfinite(value).all() for value in parameters(alg).values())
+    alg.load(good, None, True)
+    alg.learning_rate.fill_(SETTINGS["learning_rate"])
+    for each in (alg, twin):
+        record_rollout(each, seed=3)
+        torch.manual_seed(5)
+        assert each.update()["skipped_updates"] == 0
+    assert_same_state(state_of(alg), state_of(twin), rtol=0.0, atol=0.0)
+
+
+def test_undone_first_update():
+    """Where there are no moments yet, they are 0 again afterwards, and the next update is the first one."""
+    alg, twin = make_ppo(), make_ppo()
+    record_rollout(alg, seed=1)
+    alg.learning_rate.fill_(math.nan)
+    before = {name: value.clone() for name, value in parameters(alg).items()}
+    assert alg.update()["skipped_updates"] == 4
+    assert all(torch.equal(before[name], value) for name, value in parameters(alg).items())
+    assert steps_taken(alg) == 0
+    alg.learning_rate.fill_(SETTINGS["learning_rate"])
+    for each in (alg, twin):
+        record_rollout(each, seed=3)
+        torch.manual_seed(5)
+        each.update()
+    assert_same_state(state_of(alg), state_of(twin), rtol=0.0, atol=0.0)

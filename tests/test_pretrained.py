@@ -153,7 +153,7 @@ def test_a_task_without_pretraining(tmp_path):
         ("num_rounds=0", "pretraining.num_rounds must be at least 1, not 0"),
         ("num_epochs=-1", "pretraining.num_epochs must be at least 1, not -1"),
         ("batch_size=0", "pretraining.batch_size must be at least 1, not 0"),
-        ("learning_rate=0", "pretraining.learning_rate must be greater than 0, not 0"),
+        ("learning_rate=0", "pretraining.learning_rate must be greater than 0 and at most 1, not 0"),
         ("max_mean_torque=0", "pretraining.max_mean_torque must be greater than 0, not 0"),
         ("max_residual=-1", "pretraining.max_residual must be greater than 0, not -1"),
         ("num_configurations=3", "pretraining.num_rounds is 4, more than there are configurations"),

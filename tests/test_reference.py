@@ -51,7 +51,7 @@ def test_every_logged_number_is_explained(tmp_path, make_task):
     _, train_cfg = task_registry.get_cfgs("a1_torque_multihead", Options(device="cpu", set=settings))
     task = make_task("a1_torque_multihead", 4, **{"env.episode_length_s": 0.1})
     runner, _ = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=tmp_path)
-    runner.claim_log_dir()
+    runner.claim_log_dir({})
     runner.learn(4)
     (run,) = tmp_path.iterdir()
     events = EventAccumulator(str(run))

@@ -14,15 +14,16 @@ TASK = "a1_torque_curriculum"  # the one with the most reward terms
 class Run:
     """Four steps as warm-up, one in which something may be broken, and ten more, under the same random actions."""
 
-    def __init__(self, make_task, break_state=None, break_action=None):
+    def __init__(self, make_task, break_state=None, break_action=None, **overrides):
         """Run a fresh task.
 
         Args:
             make_task: The factory.
             break_state: Called with the task before the fifth step.
             break_action: Called with the actions of the fifth step.
+            overrides: Settings by dotted path.
         """
-        self.task = task = make_task(TASK, WORLDS, seed=3)
+        self.task = task = make_task(TASK, WORLDS, seed=3, **overrides)
         generator = torch.Generator().manual_seed(7)
         task.base_pos[:, 2] = 0.3  # on the ground soon, so that warm starts matter
         self.records = []

@@ -101,7 +101,7 @@ MISTAKES = [
     ("--set=control.stiffness", "--set takes KEY=VALUE, not 'control.stiffness'"),
     ("--set=control.stiffness=stiff", "config key 'control.stiffness' takes a value like 20.0, not 'stiff'"),
     ("--set=control.decimation=2.5", "config key 'control.decimation' takes a value like 4, not 2.5"),
-    ("--set=control.decimation=0", "control.decimation must be at least 1, not 0"),
+    ("--set=control.decimation=0", "control.decimation must be from 1 to 1000, not 0"),
     ("--set=control.decimation=[", "the value '[' is not valid YAML"),
     ("--set=sim.dt=0", "sim.dt must be greater than 0"),
     (
@@ -113,12 +113,12 @@ MISTAKES = [
     ("--device=gpu", "unknown device 'gpu'; did you mean 'cpu'?"),
     ("--device=cuda:99", "there is no device 'cuda:99'; available: cpu"),
     ("--preset=papr", "unknown preset 'papr'; did you mean 'paper'?"),
-    ("--logger=tensorbord", "unknown logger 'tensorbord'; did you mean 'tensorboard'?"),
+    ("--logger=tensorbord", "unknown runner.logger 'tensorbord'; did you mean 'tensorboard'?"),
     ("--num_env=3", "unknown option '--num_env=3'; did you mean '--num_envs'?"),
     ("--resum", "unknown option '--resum'; did you mean '--resume'?"),
     ("resume", "unknown option 'resume'"),
-    ("--num_envs=0", "num_envs must be from 1 to 10000000 (integer), not 0"),
-    ("--num_envs=-1", "num_envs must be from 1 to 10000000 (integer), not -1"),
+    ("--num_envs=0", "num_envs must be from 1 to 10000000, not 0"),
+    ("--num_envs=-1", "num_envs must be from 1 to 10000000, not -1"),
     ("--num_envs=few", "argument --num_envs: invalid int value: 'few'"),
     ("--max_iterations=0", "--max_iterations must be at least 1, not 0"),
     ("--resume --load_run=2026", "unknown run '2026'"),
@@ -193,7 +193,7 @@ def test_mistakes_when_training(root, words, message):
             "--experiment_name=a1_position --task=a1_multihead",
             "is of task 'a1_position', not 'a1_multihead'",
         ),
-        ("play.py", "--num_envs=0", "num_envs must be from 1 to 10000000 (integer), not 0"),
+        ("play.py", "--num_envs=0", "num_envs must be from 1 to 10000000, not 0"),
         ("play.py", "--steps=0", "--steps must be at least 1, not 0"),
         ("play.py", "--grid=5", "--grid must be 1, 4, 9, 16 or 25, not 5"),
         ("play.py", "--grid=0", "--grid must be 1, 4, 9, 16 or 25, not 0"),
@@ -289,7 +289,7 @@ def test_nobody_reads_on(tmp_path):
 def test_late_mistake_in_a_process_of_its_own(tmp_path):
     """A mistake that shows only when the simulator is there is one line too, and leaves no folder."""
     result = finish(start("train.py", *SMALL, "--logger=tensorbord", root=tmp_path))
-    assert_told_in_one_line(result, "unknown logger 'tensorbord'; did you mean 'tensorboard'?")
+    assert_told_in_one_line(result, "unknown runner.logger 'tensorbord'; did you mean 'tensorboard'?")
     assert not list(tmp_path.iterdir())
 
 

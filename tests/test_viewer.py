@@ -1,6 +1,7 @@
 """A session that is watched live: what can be asked of it takes effect between steps, and mistakes do no harm."""
 
 import argparse
+import dataclasses
 import math
 import runpy
 import shutil
@@ -363,6 +364,28 @@ def test_speed_of_a_session(make_session):
         start = clock.now
         ticks(session, 3)
         assert session.state.speed == speed == pytest.approx(3 * session.task.dt / (clock.now - start))
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, 1e30])
+def test_numbers_that_no_slider_sends(make_session, number):
+    """A page of somebody else's making may send them: they are refused in red, and nothing changes."""
+    session, _, _ = make_session()
+    session.set_paused(True)
+    session.tick()
+    before, velocities = session.state, session.task.sim.qvel.clone()
+    asked = {
+        "a command": lambda: session.set_command((0.1, number, 0.0)),
+        "a push": lambda: session.push(0.0, number),
+        "a speed": lambda: session.set_speed(number),
+        "a weight": lambda: session.set_mixing([0.5, number]),
+    }
+    for count, (what, ask) in enumerate(asked.items(), start=1):
+        ask()
+        session.tick()
+        assert session.state.message.startswith(what) and session.state.is_error
+        shown = {"message": session.state.message, "is_error": True, "message_number": before.message_number + count}
+        assert dataclasses.replace(before, **shown) == session.state
+    assert torch.equal(session.task.sim.qvel, velocities) and session.task.commands.isfinite().all()
 
 
 def test_keys(make_session):

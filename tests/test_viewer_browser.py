@@ -1,5 +1,6 @@
 """The viewer's page in a real browser: the robot is drawn, a slider changes its speed, and nothing is complained of."""
 
+import re
 import shutil
 import threading
 import time
@@ -22,7 +23,7 @@ from legged_torque.envs import task_registry
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import LoadedRun
 from legged_torque.viewer.session import Session
-from legged_torque.viewer.web import Page, free_port
+from legged_torque.viewer.web import Page, free_port, watch
 
 TIMEOUT = 120.0
 """Seconds that the page may take for something: a software renderer draws about a frame a second."""
@@ -133,6 +134,32 @@ def test_page(session, page, browser, tmp_path):
     wait_for(lambda: abs(session.state.reading.velocities[:, 0]).max() < 0.1)
     complaints = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
     assert not complaints
+
+
+def test_token(session, browser):
+    """A page for other machines opens at its printed address alone, and then without the token as well."""
+    page = Page(session, resource_path(session.task.cfg.asset.file), "a1_torque_multihead", "0.0.0.0", 8490)
+    address, _, token = page.url.partition("?token=")
+    try:
+        for url, is_open in ((address, False), (page.url, True), (address, True)):
+            browser.get(url)
+            if is_open:
+                wait_for(lambda: "Command" in browser.find_element(By.TAG_NAME, "body").text)
+            else:
+                assert "with its token" in browser.find_element(By.TAG_NAME, "body").text
+    finally:
+        page.close()
+    assert len(token) == 32 and page.server.request_share_url() is None
+
+
+@pytest.mark.parametrize(("host", "is_open"), [("127.0.0.1", False), ("0.0.0.0", True)])
+def test_what_is_printed(session, capsys, host, is_open):
+    """The address, with a token and a warning if other machines reach it."""
+    session.stop()  # so that watching ends at once
+    watch(session, resource_path(session.task.cfg.asset.file), "a1_torque_multihead", host, 8495)
+    printed = capsys.readouterr().out
+    assert re.search(r"^See it walk: http://127\.0\.0\.1:\d+(/\?token=\w{32})? ", printed, re.MULTILINE)
+    assert ("Warning: other machines reach this page" in printed) == ("?token=" in printed) == is_open
 
 
 def test_taken_port(page):

@@ -110,7 +110,7 @@ def measure(
             set_seed(train_cfg.seed)
             task = task_registry.get_task_class(task_name)(env_cfg, memory.device)
             runner, _ = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=folder)
-            runner.claim_log_dir()
+            runner.claim_log_dir({})
             wp.synchronize_device(memory.device)
             mark()
             time_iterations(runner, WARM_UP, mark)

@@ -10,7 +10,9 @@ from typing import Any
 
 import yaml
 
+from legged_torque.utils.config import Dumper, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.limits import LARGEST
 
 DESCRIPTION_FILE = "policy.yaml"
 NETWORK_FILE = "policy.onnx"
@@ -56,11 +58,15 @@ def read(path: str | Path) -> tuple[dict[str, Any], Path]:
     if not file.is_file():
         raise UserError(f"there is no {DESCRIPTION_FILE} in '{folder}'")
     try:
-        description = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, OSError, RecursionError) as error:
-        raise UserError(f"'{file}' is not valid YAML: {' '.join(str(error).split())}") from None
+        text = file.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise UserError(f"'{file}' is not valid YAML: {error}") from None
+    description = parse_yaml(text, f"'{file}'")
     check(description, f"'{file}'")
-    network = path if is_network else folder / description["network"]["file"]
+    name = description["network"]["file"]
+    if Path(name).name != name:
+        raise UserError(f"'{file}': network.file must be the name of a file beside it, not '{name}'")
+    network = path if is_network else folder / name
     if not network.is_file():
         raise UserError(f"there is no network '{network}'")
     return description, network
@@ -72,7 +78,9 @@ def to_yaml(description: dict[str, Any]) -> str:
     for key, value in description.items():
         comment = "".join(f"# {line}\n" for line in COMMENTS.get(key, "").splitlines())
         flow = None if isinstance(value, (dict, list)) else False  # one line for what holds only plain values
-        parts.append(comment + yaml.safe_dump({key: value}, sort_keys=False, width=100, default_flow_style=flow))
+        parts.append(
+            comment + yaml.dump({key: value}, Dumper=Dumper, sort_keys=False, width=100, default_flow_style=flow)
+        )
     return "\n".join(parts)
 
 
@@ -80,14 +88,19 @@ def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
     """Check structure, values and how they fit together; a UserError names the first wrong entry, and ``where``."""
     _check_schema(description, where)
     for path, value in _numbers(description):
-        if not math.isfinite(value):
-            raise UserError(f"{where}: {path} is not a finite number")
+        if not abs(value) <= LARGEST and not path.startswith("training."):
+            raise UserError(f"{where}: {path} is not a finite number, at most {LARGEST:g} either way")
     _check_joints(description, where)
     _check_terms(description, where)
     _check_ranges(description, where)
     timing = description["timing"]
     if not math.isclose(timing["physics_frequency"], timing["control_frequency"] * timing["decimation"], rel_tol=1e-6):
         raise UserError(f"{where}: timing.physics_frequency is not control_frequency times decimation")
+
+
+def interface(description: dict[str, Any]) -> dict[str, str]:
+    """Return what a network's inputs and outputs mean, as texts that are kept with the network, by their keys."""
+    return {key: json.dumps(description[key]) for key in ("joint_order", "nominal_pose", "observations", "actions")}
 
 
 def term_names(kind: str) -> list[str]:
@@ -167,7 +180,7 @@ def _numbers(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
         entries = value.items() if isinstance(value, dict) else enumerate(value)
         for key, entry in entries:
             yield from _numbers(entry, f"{path}.{key}" if path else str(key))
-    elif isinstance(value, float):
+    elif isinstance(value, (int, float)):
         yield path, value
 
 

@@ -23,6 +23,7 @@ from legged_torque.deploy.description import (
     FORMAT_VERSION,
     NETWORK_FILE,
     check,
+    interface,
     missing_extra,
     term_names,
     to_yaml,
@@ -81,7 +82,7 @@ def export_policy(task: LeggedRobot, model: MLPModel, folder: Path, name: str, t
         raise UserError(f"'{folder}' is not a folder")
     part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        write_networks(model, part)
+        write_networks(model, part, interface(description))
         description["network"]["sha256"] = hashlib.sha256((part / NETWORK_FILE).read_bytes()).hexdigest()
         check(description)
         (part / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
@@ -103,8 +104,13 @@ def check_terms(task: LeggedRobot) -> None:
                 raise UserError(f"{DESCRIPTION_FILE} has no {kind} term '{name}'; it has {', '.join(known)}")
 
 
-def write_networks(model: MLPModel, folder: Path) -> None:
-    """Write the mean policy as ONNX and TorchScript, normalization of observations included."""
+def write_networks(model: MLPModel, folder: Path, meaning: dict[str, str]) -> None:
+    """Write the mean policy as ONNX and TorchScript, normalization of observations included.
+
+    The ONNX network keeps its :func:`~legged_torque.deploy.description.interface`, the ``meaning``.
+    """
+    import onnx
+
     network = model.as_onnx(verbose=False).cpu().eval()
     with warnings.catch_warnings():
         # The older exporter needs 0.3 s instead of 6, writes the same nodes, and keeps everything in one file.
@@ -119,6 +125,9 @@ def write_networks(model: MLPModel, folder: Path) -> None:
             opset_version=17,
             dynamo=False,
         )
+        exported = onnx.load(folder / NETWORK_FILE)
+        onnx.helper.set_model_props(exported, meaning)
+        onnx.save(exported, folder / NETWORK_FILE)
         torch.jit.script(model.as_jit().cpu().eval()).save(str(folder / TORCHSCRIPT_FILE))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from legged_torque.deploy.description import missing_extra, read
+from legged_torque.deploy.description import interface, missing_extra, read
 from legged_torque.utils.errors import UserError
 
 
@@ -72,7 +72,7 @@ class Policy:
         sizes = [term["size"] for term in terms]
         self._scale = np.concatenate([np.full(term["size"], term["scale"], dtype) for term in terms])
         self._clip: np.ndarray = np.repeat(np.array([term["clip"] for term in terms], dtype), sizes, axis=0).T
-        self.session = load_network(network, self.description["network"])
+        self.session = load_network(network, self.description)
         self.reset()
 
     def reset(self) -> None:
@@ -139,13 +139,13 @@ class Policy:
         return values
 
 
-def load_network(file: Path, expected: dict[str, Any]) -> Any:
-    """Return an onnxruntime session on one thread; a UserError if the file is not the ``network`` of a description."""
+def load_network(file: Path, description: dict[str, Any]) -> Any:
+    """Return an onnxruntime session on one thread; a UserError if the file is not the network of a description."""
     try:
         import onnxruntime
     except ImportError:
         raise missing_extra("onnxruntime") from None
-    content = file.read_bytes()
+    content, expected = file.read_bytes(), description["network"]
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
@@ -162,4 +162,8 @@ def load_network(file: Path, expected: dict[str, Any]) -> Any:
             raise UserError(f"'{file}': {kind} '{nodes[0].name}' has shape {nodes[0].shape}, not [batch, {size}]")
     if hashlib.sha256(content).hexdigest() != expected.get("sha256", hashlib.sha256(content).hexdigest()):
         raise UserError(f"'{file}' is not the network that was exported with its policy.yaml (sha256 differs)")
+    kept = session.get_modelmeta().custom_metadata_map  # empty in exports of older versions
+    for key, meaning in interface(description).items():
+        if kept.get(key, meaning) != meaning:
+            raise UserError(f"'{file}' was exported with other {key} than those of its policy.yaml, which was changed")
     return session

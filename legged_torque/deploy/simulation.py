@@ -12,6 +12,7 @@ import numpy as np
 
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import NUM_SUMS, step_sums
 
 PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one
@@ -47,6 +48,8 @@ class Simulation:
     def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:
         """Run one robot for some control steps and return sums of metrics, see ``step_sums``. Shape: (NUM_SUMS,).
 
+        A UserError if they are not finite.
+
         Args:
             num_steps: Control steps.
             seed: For ``np.random.default_rng``.
@@ -55,11 +58,14 @@ class Simulation:
         self._rng = np.random.default_rng(seed)
         self._new_episode()
         sums = np.zeros(NUM_SUMS)
-        for _ in range(num_steps):
-            command = self.command.copy()
-            self._control_step()
-            sums += self._finish_step(command)
-            on_step()
+        with np.errstate(over="ignore", invalid="ignore"):  # told below, in one line
+            for _ in range(num_steps):
+                command = self.command.copy()
+                self._control_step()
+                sums += self._finish_step(command)
+                on_step()
+        if not np.isfinite(sums).all():
+            raise UserError("the simulation has diverged, its metrics are no numbers: check policy.yaml and the MJCF")
         return sums
 
     def _control_step(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import gzip
 import math
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ from legged_torque.utils.metrics import METRICS, Metric
 from legged_torque.utils.plotting import read_data
 from legged_torque.utils.runs import load_config
 
+MAX_BYTES = 50_000_000  # of a CSV file; a small compressed one may hold more than memory does
 MILLION = 1e6  # steps in a million, the unit of axes and texts
 CURVE_METRICS = (*METRICS, Metric("critic_gradient_norm", "", "Gradient norm of the critic", None))
 """The metrics of an evaluation during training."""
@@ -40,21 +42,21 @@ class LearningCurve:
 def read_curves(file: Path) -> list[LearningCurve]:
     """Read ``learning_curve.py``'s JSON, a run's ``evaluations.csv`` or a report's (.gz); a UserError if it is none."""
     training: dict[str, Any] = {}
-    if file.suffix == ".json":
-        training = read_data(file, {"task", "seed", "points"}, "learning_curve.py")
-        entries = training["points"]
-    else:
-        entries = read_csv(file)
-        if entries and "task" not in entries[0]:
-            config = load_config(file.parent)
-            training = {"task": config["task"], "seed": config["train"]["seed"]}
     curves: dict[tuple, LearningCurve] = {}  # a report's file holds many trainings
     try:
+        if file.suffix == ".json":
+            training = read_data(file, {"task", "seed", "points"}, "learning_curve.py")
+            entries = training["points"]
+        else:
+            entries = read_csv(file)
+            if entries and "task" not in entries[0]:
+                config = load_config(file.parent)
+                training = {"task": config["task"], "seed": config["train"]["seed"]}
         for entry in entries:
             names = training or entry
-            key = (names["task"], int(names["seed"]), names.get("environment", ""))
+            key = (str(names["task"]), int(names["seed"]), str(names.get("environment", "")))
             curves.setdefault(key, LearningCurve(*key)).rows.append(to_row(entry))
-    except (LookupError, ValueError, TypeError, AttributeError) as error:
+    except (LookupError, ValueError, TypeError, AttributeError, OverflowError) as error:
         raise UserError(f"'{file}' does not hold learning curves: {error!r}") from None
     return list(curves.values())
 
@@ -62,11 +64,14 @@ def read_curves(file: Path) -> list[LearningCurve]:
 def read_csv(file: Path) -> list[dict[str, Any]]:
     """Read a CSV file, compressed or not. A last line without its end was cut off by a kill and is left out."""
     try:
-        content = file.read_bytes()
-        text = (gzip.decompress(content) if file.suffix == ".gz" else content).decode("utf-8", errors="replace")
-    except (OSError, EOFError) as error:
+        with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as stream:
+            content = stream.read(MAX_BYTES + 1)
+        if len(content) > MAX_BYTES:
+            raise UserError(f"cannot read '{file}': it has more than {MAX_BYTES} bytes, compressed or not")
+        text = content.decode("utf-8", errors="replace")
+        return list(csv.DictReader(text.rpartition("\n")[0].splitlines()))
+    except (OSError, EOFError, zlib.error, csv.Error) as error:
         raise UserError(f"cannot read '{file}': {error}") from None
-    return list(csv.DictReader(text.rpartition("\n")[0].splitlines()))
 
 
 def read_rows(file: Path, notes: list[str]) -> list[Row]:
@@ -77,7 +82,7 @@ def read_rows(file: Path, notes: list[str]) -> list[Row]:
             if None in line or None in line.values():
                 raise ValueError("too many or too few cells")
             rows.append(to_row(line))
-        except (LookupError, ValueError):
+        except (LookupError, ValueError, OverflowError):
             notes.append(f"line {number} of '{file}' cannot be read")
     return rows
 

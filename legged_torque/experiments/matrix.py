@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -15,7 +16,7 @@ from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
-from legged_torque.utils.runs import checkpoint_numbers, load_config
+from legged_torque.utils.runs import checkpoint_number, load_config, newest_checkpoint
 
 SETTINGS_FILE = "experiment.yaml"  # copy of the description, in the folder of the results
 CELL_SETTINGS = {
@@ -158,6 +159,9 @@ def read_plan(file: Path) -> Matrix:
             raise UserError(f"experiment key '{key}' must be a list like {example}, not {entries!r}")
         if len(set(entries)) < len(entries):
             raise UserError(f"experiment key '{key}' holds something twice: {entries}")
+        for entry in entries:  # they name folders and figures
+            if key != "seeds" and not re.fullmatch(r"\w[\w.-]*", entry):
+                raise UserError(f"experiment key '{key}' must hold names, not {entry!r}")
     return matrix
 
 
@@ -181,12 +185,12 @@ def step_command(matrix: Matrix, cell: Cell, state: CellState, device: str) -> l
 def cell_state(cell: Cell) -> CellState:
     """Return the progress of a cell; UserError if its newest run with a checkpoint does not say how long it is."""
     for run_dir in sorted(cell.folder.glob("*/"), reverse=True):
-        numbers = checkpoint_numbers(run_dir)
-        if numbers:
+        newest = newest_checkpoint(run_dir)
+        if newest:
             total = load_config(run_dir).get("max_iterations")
             if type(total) is not int:
                 raise UserError(f"the settings of the run '{run_dir}' lack max_iterations")
-            return CellState(numbers[-1], total, cell.missing())
+            return CellState(checkpoint_number(newest), total, cell.missing())
     return CellState(0, None, cell.missing())
 
 
@@ -194,7 +198,7 @@ def is_json(file: Path) -> bool:
     """Return whether a file exists and holds a JSON object."""
     try:
         return isinstance(json.loads(file.read_text(encoding="utf-8")), dict)
-    except (OSError, ValueError, RecursionError):
+    except (OSError, ValueError, RecursionError):  # nested too deeply
         return False
 
 

@@ -215,12 +215,13 @@ def setup_lines(experiment: Experiment, from_step: float, out: Path) -> list[str
     """Return machines, versions, the plan and the commands that repeat the experiment."""
     devices = sorted({device for run in experiment.runs for device in run.devices})
     configs = [config for run in experiment.runs for config in run.configs]
-    versions = {", ".join(f"{k} {v}" for k, v in (config.get("versions") or {}).items()) for config in configs}
+    packages = [config["versions"] for config in configs if isinstance(config.get("versions"), dict)]
+    versions = {", ".join(f"{name} {version}" for name, version in entry.items()) for entry in packages}
     plan = (experiment.folder / SETTINGS_FILE).read_text(encoding="utf-8", errors="replace")
     folder, report_folder = portable_path(experiment.folder), portable_path(out)
     return [
         f"- Devices, as named in settings and results: {', '.join(devices) or 'unknown'}",
-        *(f"- Versions: {text or 'unknown'}" for text in sorted(versions)),
+        *(f"- Versions: {text}" for text in sorted(versions) or ["unknown"]),
         "- Plan (`experiment.yaml`); all settings of a training are in its `config.yaml`:",
         f"\n```yaml\n{plan.rstrip()}\n```\n",
         "To repeat it:",

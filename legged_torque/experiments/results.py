@@ -47,10 +47,11 @@ class CellResult:
         """Steps of the whole training according to its settings, or else the paper's."""
         try:
             config = self.configs[-1]
-            rollout = config["env"]["env"]["num_envs"] * config["train"]["runner"]["num_steps_per_env"]
-            return config["max_iterations"] * rollout * config.get("processes", 1)
+            rollout = config["env"]["env"]["num_envs"], config["train"]["runner"]["num_steps_per_env"]
+            factors = (config["max_iterations"], *rollout, config.get("processes", 1))
         except (IndexError, KeyError, TypeError):
             return PAPER_STEPS
+        return math.prod(factors) if all(type(factor) is int for factor in factors) else PAPER_STEPS
 
     def is_finished(self, steps: float) -> bool:
         """Return whether fewer steps are left than lie between two evaluations."""
@@ -149,7 +150,7 @@ def read_cell(cell: Cell) -> CellResult:
             values = json.loads(file.read_text(encoding="utf-8"))
             means = {name: estimate.get("mean") for name, estimate in values["metrics"].items()}
             row = to_row({"steps": values["steps"], **means})
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
             result.notes.append(f"'{file}' cannot be read")
             continue
         result.devices.add(str(values.get("device")))

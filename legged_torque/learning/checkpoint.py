@@ -1,33 +1,70 @@
-"""Files of tensors: written atomically, read without running code of theirs."""
+"""Files of tensors: written atomically, checked, and read without running code of theirs."""
 
 from __future__ import annotations
 
-import os
+import hashlib
+import io
+import math
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import is_whole_archive, write_whole
 
 
-def write(file: Path, content: dict[str, Any]) -> None:
-    """Write tensors and plain values; the file is either complete or absent, whoever else writes it."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f"{file.name}.{os.getpid()}.part")
-    try:
-        torch.save(content, part)
-        os.replace(part, file)
-    finally:
-        part.unlink(missing_ok=True)
+def write(file: Path, content: dict[str, Any]) -> str:
+    """Write tensors and plain values, and return the :func:`digest` of the file.
+
+    The file is either complete or absent, whoever else writes it; a UserError if it cannot be written.
+    """
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    write_whole(file, buffer.getvalue())
+    return hashlib.sha256(buffer.getvalue()).hexdigest()
 
 
 def read(file: Path, what: str, device: str) -> Any:
-    """Return what :func:`write` has written, on a device; a UserError that names ``what`` if it cannot be read."""
+    """Return what :func:`write` has written, on a device; a UserError that names ``what`` if it cannot be used.
+
+    That is, if it is damaged, is no file of tensors and plain values, or holds a number that is not finite.
+    """
     try:
-        return torch.load(file, weights_only=True, map_location=device)
+        content = torch.load(file, weights_only=True, map_location=device)
     except Exception as error:  # torch raises about anything for a file that is not its own
         raise UserError(f"'{file}' is not a readable {what}: {last_line(error)}") from None
+    if not is_whole_archive(file):
+        raise UserError(f"'{file}' is not a readable {what}: it is damaged")
+    bad = not_finite(content)
+    if bad:
+        raise UserError(f"'{file}' is not a usable {what}: {bad} holds numbers that are not finite")
+    return content
+
+
+def check_counters(state: dict[str, Any], file: str) -> None:
+    """Refuse a checkpoint whose counters are no numbers, by UserError."""
+    infos = state["infos"]
+    counters = {"iter": state["iter"]} | {key: infos[key] for key in ("total_timesteps", "seconds")}
+    for name, value in counters.items():
+        kinds = (int, float) if name == "seconds" else (int,)
+        if type(value) not in kinds or not 0 <= value < math.inf:
+            raise UserError(f"'{file}' is not a usable checkpoint: its {name} is {value!r}")
+
+
+def digest(file: Path) -> str:
+    """Return a number by which a file is known, as text; empty if there is no such file."""
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
+
+
+def not_finite(content: Any, name: str = "") -> str:
+    """Return the name of the first tensor in nested containers that is not finite; empty if there is none."""
+    if isinstance(content, Tensor):
+        is_finite = not content.is_floating_point() or bool(torch.isfinite(content).all())
+        return "" if is_finite else name or "the tensor"
+    parts = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    return next(filter(None, (not_finite(part, f"{name}.{key}" if name else str(key)) for key, part in parts)), "")
 
 
 def last_line(error: Exception) -> str:

@@ -15,8 +15,10 @@ from torch import Tensor
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import WalkingMetrics
+from legged_torque.learning.worlds import pack, unpack, world_tensors
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils.config import section_keys
+from legged_torque.utils.files import told_by_name
 from legged_torque.utils.options import apply_perturbation
 from legged_torque.utils.random_state import own_random_numbers, seeded_state
 
@@ -64,6 +66,17 @@ class TrainingEvaluator:
             self._graph()
         return self._metrics.means()
 
+    def state(self) -> dict[str, Any]:
+        """Return what a file of tensors must hold for evaluations to go on: the worlds and their random numbers."""
+        worlds = pack(world_tensors(self._env), self._env.num_envs)
+        return {"worlds": worlds, "random_state": self._random_state}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from a :meth:`state`; a UserError, and nothing changed, if it does not fit."""
+        unpack(state["worlds"], world_tensors(self._env), self._env.num_envs)
+        self._random_state.update(state["random_state"])
+        self._settling_runs = 0
+
     def _run(self) -> None:
         """Let the policy act; runs as a CUDA graph."""
         with torch.no_grad():
@@ -86,9 +99,9 @@ def evaluation_cfg(cfg: Any, num_envs: int, perturbation: str = "") -> Any:
 
 
 def append_row(file: Path, row: dict[str, float]) -> None:
-    """Append a row to a CSV file, after a header if the file is new."""
+    """Append a row to a CSV file, after a header if the file is new; a UserError if it cannot be written."""
     is_new = not file.exists()
-    with file.open("a", newline="", encoding="utf-8") as stream:
+    with told_by_name(file), file.open("a", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, row, lineterminator="\n")
         if is_new:
             writer.writeheader()

@@ -23,7 +23,8 @@ class OnDevicePPO(PPO):
     """PPO whose minibatch update has fixed shapes and never waits for the host, so that it replays as a CUDA graph.
 
     The losses are rsl_rl's. The adaptive learning rate is a tensor. A minibatch whose gradient norm is not finite
-    leaves the networks and the optimizer untouched and is counted. Processes that train together learn from minibatches
+    leaves the networks and the optimizer untouched and is counted. If a weight or a moment is not finite after an
+    iteration, all its minibatches are undone and counted. Processes that train together learn from minibatches
     of their own, average gradients and KL divergence, and so take the same step, or skip it, all of them; as in rsl_rl,
     each normalizes the advantages of its own rollout.
     """
@@ -87,6 +88,7 @@ class OnDevicePPO(PPO):
     def update(self) -> dict[str, float]:
         """Learn from the rollout in random order, epoch by epoch; return :data:`LOSS_NAMES` over all processes."""
         self._losses.zero_()
+        before = flattened(self._state())
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(self._batch_size * self.num_mini_batches, device=self.device)
             for indices in order.split(self._batch_size):
@@ -96,8 +98,14 @@ class OnDevicePPO(PPO):
         self.storage.clear()
         if self.is_multi_gpu:
             distributed.average([self._losses])
-        losses = dict(zip(LOSS_NAMES, self._losses.tolist(), strict=True))  # the only time that the host waits
-        updates = self.num_learning_epochs * self.num_mini_batches - losses["skipped_updates"]
+        is_finite = torch.isfinite(flattened(self._state())).all()
+        *values, learned = torch.cat([self._losses, is_finite.unsqueeze(0)]).tolist()  # the only time the host waits
+        losses = dict(zip(LOSS_NAMES, values, strict=True))
+        num_updates = self.num_learning_epochs * self.num_mini_batches
+        if not learned:
+            self._restore(before)
+            losses = dict.fromkeys(LOSS_NAMES, 0.0) | {"skipped_updates": float(num_updates)}
+        updates = num_updates - losses["skipped_updates"]
         return {name: loss if name == "skipped_updates" else loss / max(updates, 1) for name, loss in losses.items()}
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
@@ -109,6 +117,18 @@ class OnDevicePPO(PPO):
             group["lr"] = self.learning_rate
         self.update_graph.reset()  # the optimizer's tensors are new
         return load_iteration
+
+    def _state(self) -> list[Tensor]:
+        """Return the weights, and the optimizer's moments and counters, which do not exist before the first step."""
+        kept = [value for entry in self.optimizer.state.values() for value in entry.values()]
+        return [*(parameter.data for parameter in self._parameters), *kept]
+
+    def _restore(self, before: Tensor) -> None:
+        """Undo an update; ``before`` are the numbers of :meth:`_state` in front of it."""
+        state = self._state()
+        before = torch.cat([before, before.new_zeros(sum(map(torch.numel, state)) - len(before))])  # as they start
+        for tensor, numbers in zip(state, before.split([tensor.numel() for tensor in state]), strict=True):
+            tensor.copy_(numbers.view_as(tensor))
 
     def _update_normalization(self) -> None:
         """Let models that normalize observations learn from the rollout; graphs need the tensors to stay the same."""
@@ -199,3 +219,8 @@ class OnDevicePPO(PPO):
             change = (values - batch.values).clamp(-self.clip_param, self.clip_param)
             error = torch.max(error, (batch.values + change - batch.returns).square())
         return error.mean()
+
+
+def flattened(tensors: list[Tensor]) -> Tensor:
+    """Return the numbers of several tensors behind each other."""
+    return torch.cat([tensor.flatten() for tensor in tensors])

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from rsl_rl.utils import resolve_callable
+from torch import Tensor
 
 from legged_torque.learning import checkpoint
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.cli import check_output
-from legged_torque.utils.config import to_dict
+from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import all_experiments_dir
 
@@ -64,11 +65,20 @@ def make_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device:
 
 
 def start_from(runner: OnPolicyRunner, file: Path) -> None:
-    """Give the actor of a runner the network of a pre-trained policy, all but its standard deviation."""
+    """Give the actor of a runner the network of a pre-trained policy, all but its standard deviation.
+
+    A UserError names the first parameter that the two do not have in the same shape, or that is not finite; then the
+    actor is as it was.
+    """
     actor = runner.alg.actor
-    state = actor.state_dict()
-    pretrained = read_pretrained(file)["actor_state_dict"]
-    state.update((key, value) for key, value in pretrained.items() if not key.startswith(STANDARD_DEVIATION))
+    state, pretrained = actor.state_dict(), read_pretrained(file)["actor_state_dict"]
+    for name in dict.fromkeys((*state, *map(str, pretrained))):
+        if not name.startswith(STANDARD_DEVIATION):
+            old, new = state.get(name), pretrained.get(name)
+            if old is None or not isinstance(new, Tensor) or new.shape != old.shape or not new.isfinite().all():
+                why = f"its parameter '{name}' is missing, not of the actor's shape or not finite"
+                raise UserError(f"the pre-trained policy '{file}' does not fit this task: {why}")
+            state[name] = new
     actor.load_state_dict(state)
 
 
@@ -76,7 +86,7 @@ def check_spaces(file: Path, env_cfg: Any, train_cfg: Any) -> None:
     """Refuse a pre-trained policy whose inputs, outputs or network are not those of a task, naming what differs."""
     of_file = read_pretrained(file)["spaces"]
     for name, value in spaces(env_cfg, train_cfg).items():
-        if name in of_file and of_file[name] != value:  # files of older versions lack the nominal pose
+        if name in of_file and repr(of_file[name]) != repr(value):  # files of older versions lack the nominal pose
             raise UserError(
                 f"the pre-trained policy '{file}' does not fit this task: its {name} is {of_file[name]!r}, here it "
                 f"is {value!r}; make another one in a file of its own: --set pretraining.file=FILE"
@@ -86,7 +96,8 @@ def check_spaces(file: Path, env_cfg: Any, train_cfg: Any) -> None:
 def read_pretrained(file: Path) -> dict[str, Any]:
     """Return what a file of a pre-trained policy holds; a UserError if it is not one."""
     content = checkpoint.read(file, "pre-trained policy", "cpu")
-    if not isinstance(content, dict) or not {"actor_state_dict", "spaces", "report"} <= content.keys():
+    parts = ("actor_state_dict", "spaces", "report")
+    if not isinstance(content, dict) or not all(isinstance(content.get(part), dict) for part in parts):
         raise UserError(f"'{file}' is not a pre-trained policy")
     return content
 
@@ -97,12 +108,5 @@ def spaces(env_cfg: Any, train_cfg: Any) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for part, paths in SPACES.items():
         for path in paths:
-            result |= flat(path, reduce(getitem, path.split("."), settings[part]))
+            result |= flat(reduce(getitem, path.split("."), settings[part]), path)
     return result
-
-
-def flat(path: str, value: Any) -> dict[str, Any]:
-    """Return nested settings as one dictionary with dotted paths."""
-    if not isinstance(value, dict):
-        return {path: value}
-    return {name: item for key, part in value.items() for name, item in flat(f"{path}.{key}", part).items()}

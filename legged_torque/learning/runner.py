@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 from rsl_rl import runners
@@ -12,10 +14,23 @@ import legged_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning import checkpoint
 from legged_torque.learning.evaluator import EVALUATIONS_FILE, TrainingEvaluator, append_row
+from legged_torque.learning.guard import TrainingGuard
+from legged_torque.learning.log_writer import NoLogWriter
 from legged_torque.learning.ppo import OnDevicePPO
+from legged_torque.learning.worlds import (
+    check_identity,
+    identity,
+    pack,
+    read_worlds,
+    remove_other_worlds,
+    unpack,
+    world_tensors,
+    write_worlds,
+)
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.files import told_by_name
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.random_state import random_state, restore_random_state
 from legged_torque.utils.runs import checkpoint_file, claim_run_dir
@@ -54,8 +69,12 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self.logger.device = "cpu"  # where numbers are averaged that are on the host anyway
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         self.log_dir = log_dir
+        self.stopped_by = 0  # number of the signal that has ended the last training; 0: none
         self._seconds_before = 0.0  # training time before this process
+        self._saved_iteration = -1  # that of the last checkpoint
+        self._worlds_go_on = False  # whether they are those of a checkpoint
         self._unwritten_log: dict | None = None
+        self._nobody_reads: BrokenPipeError | None = None  # why nothing can be printed any more
         env.num_processes = self.gpu_world_size
         env.step_graph.enabled = self.alg.update_graph.enabled = self.cfg["capture"]
         enabled = self.cfg["capture"] and self.cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS
@@ -66,21 +85,24 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         """Train, and leave a checkpoint; Ctrl-C ends training after the current iteration, a second one at once.
 
         All processes that train together end after the same iteration, whichever of them is asked to stop. If episodes
-        start at random lengths, they do not all end at once.
+        start at random lengths, they do not all end at once; those of a checkpoint go on as they are. A TrainingError,
+        after the checkpoint, if nothing can be learned any more.
         """
-        if init_at_random_ep_len:
+        if init_at_random_ep_len and not self._worlds_go_on:
             high = int(self.env.max_episode_length)
             self.env.episode_length_buf = torch.randint_like(self.env.episode_length_buf, high=high)
         self.alg.train_mode()
         if self.is_distributed:
             self.alg.broadcast_parameters()
-        self.logger.init_logging_writer()
+        with told_by_name(Path(self.log_dir or "")):
+            self.logger.init_logging_writer()
         start_it = self.current_learning_iteration
         total_it = start_it + num_learning_iterations
+        guard = TrainingGuard(self.env, self.alg)
         warmup = self.cfg["pretraining"]["critic_warmup_iterations"]
         with StopRequest() as stop:
             for _ in range(num_learning_iterations):
-                if distributed.any_process(stop.requested, self.device):
+                if distributed.any_process(stop.requested or self._nobody_reads is not None, self.device):
                     break
                 start = time.perf_counter()
                 self.collect_rollout()
@@ -89,20 +111,26 @@ class OnPolicyRunner(runners.OnPolicyRunner):
                 collected = time.perf_counter()
                 self.alg.learn_actor(self.current_learning_iteration >= warmup)
                 losses = self.alg.update()
-                measured = self._evaluate(losses, start)
+                measured = self._evaluate(losses, start) | guard.add_iteration(losses["skipped_updates"])
                 learned = time.perf_counter()
                 times = {"collect_time": collected - start, "learn_time": learned - collected}
                 self._prepare_log(start_it, total_it, times, losses, measured)
                 self.current_learning_iteration += 1
+                if guard.problem:
+                    break
                 if self.current_learning_iteration % self.cfg["save_interval"] == 0:
                     self._save_checkpoint()
-        self._save_checkpoint()  # writes the last log too
+            self._save_checkpoint()  # writes the last log too
+        self.stopped_by = stop.number
         self.logger.stop_logging_writer()
+        if self._nobody_reads:
+            raise self._nobody_reads
+        guard.check()
 
-    def claim_log_dir(self) -> None:
-        """Create the run's folder, under another name if a run that started in the same second has it already."""
+    def claim_log_dir(self, config: dict[str, Any]) -> None:
+        """Create the run's folder with its settings, numbered if a run that started in the same second has its name."""
         assert self.log_dir is not None, "nothing is kept of this training"
-        self.log_dir = self.logger.log_dir = str(claim_run_dir(Path(self.log_dir)))
+        self.log_dir = self.logger.log_dir = str(claim_run_dir(Path(self.log_dir), config))
 
     def close(self) -> None:
         """Leave the processes that train together, if there are any; training is over then."""
@@ -118,6 +146,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         state["infos"] = {
             **(infos or {}),  # plain values and tensors
             "task": self.env.state_dict(),
+            "task_name": self.cfg.get("task"),
             "total_timesteps": self.logger.tot_timesteps,
             "seconds": self._seconds_before + self.logger.tot_time,
             "random_states": distributed.gather(random_state(self.device)),
@@ -133,10 +162,14 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         """Continue from a checkpoint: networks, optimizer, counters and with them all curricula; return its infos.
 
         Arguments are those of rsl_rl's runner, whose device is the default. A UserError if the file is not a checkpoint
-        or belongs to another kind of policy.
+        or belongs to another task or kind of policy.
         """
         state = checkpoint.read(Path(path), "checkpoint", map_location or self.device)
         try:
+            checkpoint.check_counters(state, path)
+            of_task, task = state["infos"].get("task_name"), self.cfg.get("task")
+            if of_task and task and of_task != task:  # older checkpoints do not name theirs
+                raise UserError(f"checkpoint '{path}' is of task '{of_task}', not '{task}'")
             load_iteration = self.alg.load(state, load_cfg, strict)
             if load_iteration:
                 self.current_learning_iteration = state["iter"]
@@ -148,8 +181,18 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         return state["infos"]
 
     def resume(self, path: str) -> None:
-        """Continue a training from its checkpoint, random numbers included; a UserError if it has none."""
-        self.continue_random_numbers(self.load(path))
+        """Continue a training from its checkpoint, random numbers included; a UserError if it has none.
+
+        If the worlds of the checkpoint are missing or do not fit, they start anew, and a line says why.
+        """
+        infos = self.load(path)
+        try:
+            self._restore_worlds(Path(path), infos.get("worlds"))
+        except UserError as error:
+            self._evaluator = None
+            if self.gpu_global_rank == 0:
+                print(f"The worlds start anew: {error}.")
+        self.continue_random_numbers(infos)
 
     def continue_random_numbers(self, infos: dict) -> None:
         """Go on with the random numbers of the run that a checkpoint is from, instead of repeating them.
@@ -205,16 +248,22 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             return {}
         start = time.perf_counter()
         seconds = self._seconds_before + self.logger.tot_time + start - iteration_start
-        if self._evaluator is None:
-            seed = self.cfg["seed"] + EVALUATION_SEED
-            self._evaluator = TrainingEvaluator(self.env, self.alg.actor, settings, seed)
+        self._evaluator = self._evaluator or self._make_evaluator()
         metrics = self._evaluator.evaluate()
         row = {"steps": steps, "iteration": self.current_learning_iteration + 1, "seconds": seconds, **metrics}
         row["critic_gradient_norm"] = losses["critic_gradient_norm"]
         assert self.log_dir is not None  # there is a writer only where something is kept
-        append_row(Path(self.log_dir) / EVALUATIONS_FILE, row)
+        try:
+            append_row(Path(self.log_dir) / EVALUATIONS_FILE, row)
+        except UserError as error:  # training goes on: what is learned is worth more
+            print(f"Warning: an evaluation is not kept: {error}.", file=sys.stderr)
         logged = {f"Evaluation/{name}": value for name, value in metrics.items()}
         return {**logged, "Perf/evaluation_time": time.perf_counter() - start}
+
+    def _make_evaluator(self) -> TrainingEvaluator:
+        """Build what evaluates the policy."""
+        seed = self.cfg["seed"] + EVALUATION_SEED
+        return TrainingEvaluator(self.env, self.alg.actor, self.cfg["evaluation"], seed)
 
     def _prepare_log(self, start_it: int, total_it: int, times: dict, losses: dict, measured: dict) -> None:
         """Read the numbers of one iteration from the device, for :meth:`_write_log`."""
@@ -233,16 +282,60 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self._unwritten_log = {**progress, **policy, "loss_dict": losses, "rnd_weight": None}
 
     def _write_log(self) -> None:
-        """Log the previous iteration; takes milliseconds."""
-        if self._unwritten_log:
-            self.logger.log(**self._unwritten_log)
-            self._unwritten_log = None
+        """Log the previous iteration; takes milliseconds. What goes wrong is told, and training goes on without it."""
+        log, self._unwritten_log = self._unwritten_log, None
+        if not log:
+            return
+        try:
+            self.logger.log(**log)
+        except BrokenPipeError as error:  # | head: as good as Ctrl-C
+            self._nobody_reads = error
+        except Exception as error:  # what writes curves raises about anything
+            print(f"Warning: no more curves are written: {checkpoint.last_line(error)}.", file=sys.stderr)
+            self.logger.writer = NoLogWriter("")
+            self.logger.ep_extras.clear()
 
     def _save_checkpoint(self) -> None:
         """Save into the run's folder with all that was logged, and warn if the simulator had too little room."""
         self._write_log()
-        if self.log_dir is not None:
-            self.save(str(checkpoint_file(Path(self.log_dir), self.current_learning_iteration)))
+        if self.log_dir is not None and self._saved_iteration != self.current_learning_iteration:
+            file = checkpoint_file(Path(self.log_dir), self.current_learning_iteration)
+            self.save(str(file), {"worlds": self._save_worlds(file)})
+            self._saved_iteration = self.current_learning_iteration
+            if self.gpu_global_rank == 0:
+                remove_other_worlds(file)
         warning = self.env.sim.check_buffers()
         if warning:
             print(f"Warning: {warning}.")
+
+    def _save_worlds(self, file: Path) -> str:
+        """Write the worlds of all processes, which belong to a checkpoint, and return their digest."""
+        mine = {
+            "worlds": pack(world_tensors(self.env), self.env.num_envs),
+            "evaluation": self._evaluator and self._evaluator.state(),
+            "returns": torch.tensor(self.logger.rewbuffer, dtype=torch.float64),
+            "lengths": torch.tensor(self.logger.lenbuffer, dtype=torch.float64),
+        }
+        processes = distributed.gather(mine)
+        if self.gpu_global_rank > 0:
+            return ""
+        return write_worlds(file, {**identity(self.env, self.cfg["evaluation"]), "processes": processes})
+
+    def _restore_worlds(self, file: Path, digest: str | None) -> None:
+        """Go on with the worlds that belong to a checkpoint; a UserError, and no world changed, if they do not fit."""
+        content = read_worlds(file, digest)
+        try:
+            check_identity(content, identity(self.env, self.cfg["evaluation"]))
+            processes = content["processes"]
+            if len(processes) != self.gpu_world_size:
+                raise UserError(f"{len(processes)} processes have trained, now there are {self.gpu_world_size}")
+            mine = processes[self.gpu_global_rank]
+            if mine["evaluation"]:
+                self._evaluator = self._make_evaluator()
+                self._evaluator.load_state(mine["evaluation"])
+            unpack(mine["worlds"], world_tensors(self.env), self.env.num_envs)
+            self.logger.rewbuffer.extend(mine["returns"].tolist())
+            self.logger.lenbuffer.extend(mine["lengths"].tolist())
+        except (RuntimeError, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+            raise UserError(f"their file is not as it should be: {checkpoint.last_line(error)}") from None
+        self._worlds_go_on = True

@@ -19,24 +19,24 @@ class ActionDelay:
         self._physics_steps = decimation if unit == "control_steps" else 1
         self._newest = newest  # buffer of the newest actions, written elsewhere. Shape: (num_envs, num_actions)
         depth = math.ceil(longest * self._physics_steps / decimation)
-        self._before = newest.new_zeros(depth, *newest.shape)
+        # Older ones, the newest first. Shape: (num_envs, control steps, num_actions).
+        self.before = newest.new_zeros(len(newest), depth, newest.shape[1])
         self.drawn = newest.new_zeros(len(newest), 1)  # in the unit; its whole part counts. Shape: (num_envs, 1)
 
     def keep(self) -> None:
         """Keep the newest actions, before they are overwritten."""
-        if len(self._before):
-            self._before.copy_(torch.cat([self._newest.unsqueeze(0), self._before[:-1]]))
+        if self.before.numel():
+            self.before.copy_(torch.cat([self._newest.unsqueeze(1), self.before[:, :-1]], dim=1))
 
     def reset(self, mask: Tensor) -> None:
         """Forget the actions of the worlds in ``mask``. Shape: (num_envs,), bool."""
-        if len(self._before):
-            self._before.masked_fill_(mask.view(1, -1, 1), 0.0)
+        self.before.masked_fill_(mask.view(-1, 1, 1), 0.0)
 
     def actions(self, physics_step: int) -> Tensor:
         """Return the actions that have reached the motors by this physics step. Shape: (num_envs, num_actions)."""
-        if not len(self._before):
+        if not self.before.numel():
             return self._newest
         missing = self.drawn.floor() * self._physics_steps - physics_step
-        age = (missing / self._decimation).ceil().long()
-        history = torch.cat([self._newest.unsqueeze(0), self._before])
-        return history.gather(0, age.unsqueeze(0).expand(1, *self._newest.shape)).squeeze(0)
+        age = (missing / self._decimation).ceil().long().clamp(0, self.before.shape[1])  # NaN becomes any number
+        history = torch.cat([self._newest.unsqueeze(1), self.before], dim=1)
+        return history.gather(1, age.unsqueeze(2).expand(-1, 1, self._newest.shape[1])).squeeze(1)

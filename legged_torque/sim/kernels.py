@@ -110,3 +110,33 @@ def draw(mask: Mask, seeds: Integers, rows: wp.array(dtype=Row), values: Rows):
         target[0] = value
         if row.place >= 0:
             values[world, row.place] = (value - row.middle) * row.per_half_range
+
+
+@wp.struct
+class Numbers2d:
+    """Numbers of every world, wherever they are in memory."""
+
+    address: wp.uint64  # of the first world's first number
+    world_stride: wp.uint64  # from world to world [bytes]
+    stride: wp.uint64  # from number to number [bytes]
+    count: wp.int32  # of the numbers of a world
+    defaults: wp.uint64  # address of what takes the place of each
+
+
+@wp.kernel(enable_backward=False)
+def mend(tensors: wp.array(dtype=Numbers2d), excused: Mask, diverged: Mask, counts: Integers):
+    """Replace what is not finite in one tensor of one world; mark the world, and count it unless it is excused."""
+    tensor, world = wp.tid()
+    place = tensors[tensor]
+    row = place.address + wp.uint64(world) * place.world_stride
+    defaults = wp.array(ptr=place.defaults, shape=(place.count,), dtype=wp.float32)
+    found = bool(False)  # a variable; Warp would take False for a constant
+    for i in range(place.count):
+        number = wp.array(ptr=row + wp.uint64(i) * place.stride, shape=(1,), dtype=wp.float32)
+        if not wp.isfinite(number[0]):
+            number[0] = defaults[i]
+            found = True
+    if found:
+        diverged[world] = True
+        if not excused[world]:
+            wp.atomic_add(counts, tensor, 1)

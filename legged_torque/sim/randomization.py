@@ -67,6 +67,7 @@ class Randomization:
     Nothing waits for the host and nothing changes its address, so that it may run inside a CUDA graph.
 
     Attributes:
+        parameters: What is drawn.
         sizes: How many numbers of their own the parameters have, by name; those that take others' draws are left out.
         values: These numbers as they are now, from -1, the lowest one possible, to 1. Shape: (num_envs, their sum).
     """
@@ -78,7 +79,7 @@ class Randomization:
 
         Parameters that may keep their values at the start do so in a share of draws, ``keep_probability``.
         """
-        self._fields = [parameter.field for parameter in parameters]  # their memory must not be freed
+        self.parameters = list(parameters)  # the memory of their fields must not be freed
         self._without_rows = [parameter.name for parameter in parameters if len(parameter.field) != num_envs]
         self.sizes: dict[str, int] = {}
         rows: list[kernels.Row] = []

@@ -88,6 +88,8 @@ class Simulator:
         self.diverged = wp.to_torch(self._diverged)
         sensors = wp.to_torch(self.data.sensordata).view(num_envs, -1, CONTACT_DATA)
         self.contact_found, self.contact_force = sensors[:, :, 0], sensors[:, :, 1:]
+        derived = ("body_invweight0", "dof_invweight0") if per_world else ()
+        self.derived = [self.field(name) for name in derived]  # what update_constants has written, to be saved
 
     def field(self, name: str) -> Tensor:
         """Return a writable field of the model, one that was asked for ``per_world``. Shape: (num_envs, ...)."""

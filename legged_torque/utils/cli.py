@@ -8,13 +8,14 @@ import gc
 import json
 import math
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from legged_torque.utils.errors import UserError, is_out_of_memory, unknown_name
+from legged_torque.utils.errors import TrainingError, UserError, is_out_of_memory, unknown_name
 
 MAX_NAME = 255  # bytes of the name of a file, on the usual systems
 
@@ -47,15 +48,22 @@ class Parser(argparse.ArgumentParser):
 def run_script(main: Callable[[], None]) -> None:
     """Run a script's main function; expected errors exit without a traceback.
 
-    Exit status 2 for a user's mistake, a file that cannot be used or too little memory, 130 for Ctrl-C, 1 for an output
-    that nobody reads any more (``| head``).
+    Exit status 2 for a user's mistake, a file that cannot be used or too little memory, 130 for Ctrl-C, 1 for a training
+    that cannot learn or an output that nobody reads any more (``| head``).
     """
     gc.freeze()  # what has been imported stays: searching it for garbage at the end would take a second or two
+    if "mujoco" in sys.modules:  # which would write its warnings to a file in the current folder
+        sys.modules["mujoco"].set_mju_user_warning(lambda text: print(f"MuJoCo: {text}", file=sys.stderr))
     try:
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # see end_on_interrupt
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         main()
     except UserError as error:
         print("error:", " ".join(str(error).splitlines()), file=sys.stderr)
         sys.exit(2)
+    except TrainingError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import copy
 import inspect
+import itertools
 import re
 from typing import Any, ClassVar
 
 import yaml
 
 from legged_torque.utils.errors import UserError, unknown_name
+
+MAX_LENGTH, MAX_DEPTH, MAX_ENTRIES = 1_000_000, 50, 100_000
+"""Characters and levels of a YAML text, and values of a level; settings have about 10 000, 6 and 100."""
 
 
 class Section:
@@ -103,6 +107,14 @@ def to_dict(section: Any) -> dict[str, Any]:
     return {key: to_dict(value) if isinstance(value, Section) else value for key, value in values.items()}
 
 
+def flat(values: Any, path: str = "") -> dict[str, Any]:
+    """Return nested dictionaries, which stand at ``path``, as one dictionary with dotted paths."""
+    if not isinstance(values, dict):
+        return {path: values}
+    parts = (flat(value, f"{path}.{key}" if path else str(key)) for key, value in values.items())
+    return {name: value for part in parts for name, value in part.items()}
+
+
 def update_from_dict(section: Any, values: dict[str, Any], path: str = "") -> None:
     """Write nested dictionaries into a ``section``, which stands at ``path``; what does not fit is a UserError."""
     if not isinstance(values, dict):
@@ -169,13 +181,32 @@ def parse_value(text: str) -> Any:
 
 
 def parse_yaml(text: str, what: str) -> Any:
-    """Return what YAML text holds, see :class:`Loader`; if it is not valid, a UserError says ``what`` the text is."""
+    """Return what YAML text holds, as :class:`Loader` reads it; a UserError says that ``what`` it is is not valid or too large."""
     try:
-        return yaml.load(text, Loader)
-    except RecursionError:
-        raise UserError(f"{what} is nested too deeply") from None
+        if len(text) <= MAX_LENGTH and is_small(value := yaml.load(text, Loader)):
+            return value
     except (yaml.YAMLError, ValueError) as error:  # a whole number of 5000 digits is a ValueError
         raise UserError(f"{what} is not valid YAML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        pass
+    raise UserError(f"{what} is nested too deeply or larger than settings are")
+
+
+def is_small(value: Any) -> bool:
+    """Return whether nested lists and dictionaries have at most :data:`MAX_DEPTH` levels of :data:`MAX_ENTRIES` each.
+
+    YAML may name a part again and again, even inside of itself, so that a short text holds more than memory does. Whole
+    numbers must be small enough for a float.
+    """
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        if any(isinstance(part, int) and part.bit_length() > 1000 for part in level):
+            return False
+        parts = (part.values() if isinstance(part, dict) else part for part in level if isinstance(part, (dict, list)))
+        level = list(itertools.islice(itertools.chain.from_iterable(parts), MAX_ENTRIES + 1))
+        if not level or len(level) > MAX_ENTRIES:
+            return not level
+    return False
 
 
 class Loader(yaml.SafeLoader):

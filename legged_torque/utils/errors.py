@@ -15,6 +15,14 @@ class UserError(Exception):
     Scripts print the line and exit with status 2; no traceback is shown.
     """
 
+    def __init__(self, message: object) -> None:
+        """Write what cannot be printed as its code: names in a stranger's file may hold line ends or worse."""
+        super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(message)))
+
+
+class TrainingError(Exception):
+    """A training that cannot learn: one line that says why. Scripts print it and exit with status 1."""
+
 
 def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
     """Return the error for a name that does not exist; ``kind`` is what it stands for, e.g. "task"."""

@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import stat
 import threading
 from types import FrameType
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Ctrl-C, the system's request to end, and a terminal that is closed."""
+
 
 class StopRequest:
-    """While this context is open, the first Ctrl-C or SIGTERM only asks to stop; the second one stops at once."""
+    """While this context is open, the first signal of :data:`SIGNALS` only asks to stop; the second stops at once.
+
+    A terminal that closes may send its signal twice, which still only asks; under ``nohup`` it is not listened to.
+    """
 
     requested = False  # whether a signal has asked to stop
+    number = 0  # of that signal
 
     def __enter__(self) -> StopRequest:
         """Take over the signals; only a process's main thread can do so."""
         self._old = {}
         if threading.current_thread() is threading.main_thread():
-            self._old = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+            ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            taken = [number for number in SIGNALS if not (number is signal.SIGHUP and ignored)]
+            self._old = {number: signal.signal(number, self._receive) for number in taken}
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -25,10 +36,30 @@ class StopRequest:
         for number, handler in self._old.items():
             signal.signal(number, handler)
 
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        """Let nothing be written to a terminal that is gone, and handle the signal."""
+        if number == signal.SIGHUP:
+            leave_terminal()
+        self._handle(number, frame)
+
     def _handle(self, number: int, frame: FrameType | None) -> None:
         """Note the first signal; interrupt at the second."""
-        if self.requested:
+        if self.requested and number != signal.SIGHUP:
             raise KeyboardInterrupt
-        self.requested = True
+        self.requested, self.number = True, self.number or number
         # print fails inside another print
         os.write(2, b"\nStopping after this iteration and saving; once more to stop at once.\n")
+
+
+def leave_terminal() -> None:
+    """Drop from now on what would be written to a terminal, where every attempt fails once it is closed."""
+    for stream in (1, 2):
+        with contextlib.suppress(OSError):
+            if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty is false for one that is closed
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+
+
+def end_on_interrupt() -> None:
+    """Let Ctrl-C end the process without a traceback, while a script imports; ``run_script`` takes over from there."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)

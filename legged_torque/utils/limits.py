@@ -6,6 +6,7 @@ A type of Python's own allows what its name says, with numbers of ordinary size 
 
 from __future__ import annotations
 
+import functools
 import inspect
 import math
 import types
@@ -70,7 +71,7 @@ NotNegativeInterval = Annotated[list[float], Limits(lowest=0, ordered=True)]
 
 def check_section(section: Section, path: str = "") -> None:
     """Raise a UserError that names the first setting of a section, or below it, whose value is not allowed."""
-    hints = types_of(type(section))
+    hints = types_of(type(section))  # type: ignore[arg-type]  # mypy: a class is not seen as hashable
     for key in section_keys(section):
         value, dotted = getattr(section, key), f"{path}.{key}" if path else key
         if isinstance(value, Section):
@@ -87,10 +88,11 @@ def check_value(name: str, value: Any, hint: Any) -> None:
             raise UserError(f"{name} must be {size}, not {value}")
     if _fits(value, hint):
         return
-    base = get_args(hint)[0] if get_origin(hint) is Annotated else hint
-    if get_origin(base) is Literal and isinstance(value, str):
-        raise unknown_name(name, value, get_args(base))
-    raise UserError(f"{name} must be {describe(hint)}, not {value!r}")
+    if get_origin(hint) is Literal and isinstance(value, str):
+        raise unknown_name(name, value, get_args(hint))
+    parts = get_args(hint) if get_origin(hint) is Annotated else ()
+    is_type_right = parts and _fits(value, parts[0])
+    raise UserError(f"{name} must be {parts[1] if is_type_right else describe(hint)}, not {value!r}")
 
 
 def describe(hint: Any) -> str:
@@ -112,6 +114,7 @@ def describe(hint: Any) -> str:
     return names.get(hint, "")
 
 
+@functools.cache
 def types_of(section: type) -> dict[str, Any]:
     """Return the types that a section and its bases declare for their settings; a UserError if one is not known."""
     hints: dict[str, Any] = {}

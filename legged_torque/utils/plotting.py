@@ -29,7 +29,7 @@ def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
     """Return the JSON object with these keys, or more, that ``script`` has written; UserError if it is none."""
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # nested too deeply
         raise UserError(f"cannot read '{file}': {error}") from None
     if not isinstance(data, dict) or not keys <= data.keys():
         raise UserError(f"'{file}' is not a file that {script} has written")
@@ -38,6 +38,8 @@ def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
 
 def save_figure(figure: Figure, file: Path) -> None:
     """Write a figure in the format that the file's ending names; UserError if that is unknown or cannot be written."""
+    if not file.suffix:  # matplotlib would add one, and write beside a folder of the name
+        raise UserError(f"cannot write '{file}': a figure needs a name that ends in .png, .svg or .pdf")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(file, dpi=130)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.metadata
+import itertools
 import platform
 from datetime import datetime
 from pathlib import Path
@@ -12,6 +14,7 @@ import yaml
 
 from legged_torque.utils.config import Dumper, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.files import is_whole_archive, part_of, remove_stale_parts, told_by_name, write_whole
 
 CONFIG_FILE = "config.yaml"
 _CHECKPOINT = "model_"
@@ -24,41 +27,60 @@ def new_run_dir(log_root: Path, run_name: str) -> Path:
     return log_root / (f"{name}_{run_name}" if run_name else name)
 
 
-def claim_run_dir(run_dir: Path) -> Path:
-    """Create a run's folder and return it, with a number added if another run that started just now has taken it."""
-    candidate, number = run_dir, 1
-    while True:
-        try:
-            candidate.mkdir(parents=True)
-            return candidate
-        except FileExistsError:
-            number += 1
-            candidate = run_dir.with_name(f"{run_dir.name}_{number}")
+def claim_run_dir(run_dir: Path, config: dict[str, Any]) -> Path:
+    """Create a run's folder with its settings and return it; a UserError if it cannot be written.
+
+    A number is added if another run that started just now has taken the name. No folder is ever without its settings.
+    """
+    with told_by_name(run_dir):
+        remove_stale_parts(run_dir.parent)
+        part, candidate = part_of(run_dir), run_dir
+        save_config(part, config)
+        for number in itertools.count(2):
+            try:
+                return part.rename(candidate)
+            except OSError as error:
+                if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+                    raise
+                candidate = run_dir.with_name(f"{run_dir.name}_{number}")
+    raise AssertionError("there is always another number")
 
 
 def find_run(log_root: Path, load_run: str | None) -> Path:
     """Return the folder of a run of an experiment, or raise a UserError if there is none.
 
-    ``load_run`` is the name of the run's folder, or a path to it; None is the newest one that has a checkpoint.
+    ``load_run`` is the name of the run's folder, or a path to it; None is the newest one that has a whole checkpoint.
     """
     if load_run and Path(load_run).is_dir():
         return Path(load_run)
-    runs = sorted(path.name for path in log_root.glob("*") if list(path.glob(f"{_CHECKPOINT}*.pt")))
+    runs = sorted(path.name for path in log_root.glob("*") if checkpoint_numbers(path))
     if not runs:
         raise UserError(f"there is no run with a checkpoint in '{log_root}'; train first")
     if load_run and load_run not in runs:
         raise unknown_name("run", load_run, runs)
-    return log_root / (load_run or runs[-1])
+    whole = (name for name in reversed(runs) if newest_checkpoint(log_root / name))
+    return log_root / (load_run or next(whole, runs[-1]))
 
 
 def find_checkpoint(run_dir: Path, checkpoint: int | None) -> Path:
-    """Return the file of a run's checkpoint after some iterations, None being the last, or raise a UserError."""
+    """Return the file of a run's checkpoint after some iterations, or raise a UserError.
+
+    None is the last one that is whole, or the last one if none is.
+    """
     numbers = checkpoint_numbers(run_dir)
     if not numbers:
         raise UserError(f"there is no checkpoint in '{run_dir}'")
     if checkpoint is not None and checkpoint not in numbers:
         raise unknown_name("checkpoint", str(checkpoint), map(str, numbers))
-    return checkpoint_file(run_dir, numbers[-1] if checkpoint is None else checkpoint)
+    if checkpoint is None:
+        return newest_checkpoint(run_dir) or checkpoint_file(run_dir, numbers[-1])
+    return checkpoint_file(run_dir, checkpoint)
+
+
+def newest_checkpoint(run_dir: Path) -> Path | None:
+    """Return the file of a run's last checkpoint that is not damaged, or None."""
+    files = (checkpoint_file(run_dir, number) for number in reversed(checkpoint_numbers(run_dir)))
+    return next(filter(is_whole_archive, files), None)
 
 
 def checkpoint_file(run_dir: Path, iterations: int) -> Path:
@@ -78,20 +100,24 @@ def checkpoint_numbers(run_dir: Path) -> list[int]:
 
 
 def save_config(run_dir: str | Path, config: dict[str, Any]) -> None:
-    """Write the settings of a run and the versions of the packages that it uses."""
-    text = yaml.dump({**config, "versions": package_versions()}, Dumper=Dumper, sort_keys=False)
-    Path(run_dir).mkdir(parents=True, exist_ok=True)
-    (Path(run_dir) / CONFIG_FILE).write_text(text, encoding="utf-8")
+    """Write the settings of a run and the versions of the packages that it uses, between YAML's marks of a document."""
+    content = {**config, "versions": package_versions()}
+    text = yaml.dump(content, Dumper=Dumper, sort_keys=False, explicit_start=True, explicit_end=True)
+    write_whole(Path(run_dir) / CONFIG_FILE, text.encode())
 
 
 def load_config(run_dir: Path) -> dict[str, Any]:
-    """Return what :func:`save_config` has written; a UserError if the file is missing or broken."""
+    """Return what :func:`save_config` has written; a UserError if the file is missing, broken or not whole."""
     file = run_dir / CONFIG_FILE
     if not file.is_file():
         raise UserError(f"the run '{run_dir}' has no {CONFIG_FILE}")
-    config = parse_yaml(file.read_text(encoding="utf-8", errors="replace"), f"'{file}'")
+    text = file.read_text(encoding="utf-8", errors="replace")
+    config = parse_yaml(text, f"'{file}'")
     if not isinstance(config, dict) or not {"task", "env", "train"} <= config.keys():
         raise UserError(f"'{file}' lacks the entries task, env and train")
+    # files of older versions have no marks; their last entry is that of the versions
+    if not text.endswith("\n...\n") if text.startswith("---") else not isinstance(config.get("versions"), dict):
+        raise UserError(f"'{file}' is not whole: its end is missing")
     return config
 
 

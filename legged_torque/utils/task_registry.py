@@ -7,6 +7,7 @@ import copy
 import importlib.util
 import io
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,18 @@ from legged_torque.utils import distributed
 from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.files import remove_stale_parts
+from legged_torque.utils.known_names import check_names
 from legged_torque.utils.limits import check_section
 from legged_torque.utils.options import Options, apply_options
-from legged_torque.utils.runs import checkpoint_number, find_checkpoint, find_run, load_config, new_run_dir
+from legged_torque.utils.runs import (
+    checkpoint_number,
+    checkpoint_numbers,
+    find_checkpoint,
+    find_run,
+    load_config,
+    new_run_dir,
+)
 from legged_torque.utils.train_validation import check_train_cfg
 
 
@@ -69,6 +79,7 @@ class TaskRegistry:
         train_cfg.runner.experiment_name = train_cfg.runner.experiment_name or name
         if args is not None:
             apply_options(env_cfg, train_cfg, args, run_config)
+            check_names(train_cfg, [registered for _, _, registered in self._tasks.values()])
             check_section(env_cfg)
             check_train_cfg(train_cfg)
             to_rsl_rl(train_cfg)  # refuses an unknown logger
@@ -96,7 +107,7 @@ class TaskRegistry:
 
         Args:
             env: The task.
-            name: Name of the task; may be left out if ``train_cfg`` is given.
+            name: Name of the task, which checkpoints keep and must agree in; may be left out if ``train_cfg`` is given.
             args: With ``resume``, the checkpoint that ``load_run`` and ``checkpoint`` name is loaded.
             train_cfg: Settings to use as they are; None takes the registered ones with ``args`` applied.
             log_root: Folder of the experiment's runs; "default" is ``logs/<experiment name>``, None keeps nothing.
@@ -111,10 +122,13 @@ class TaskRegistry:
             raise UserError("--logger wandb needs the extra: pip install -e .[wandb]")
         log_dir = str(new_run_dir(root, train_cfg.runner.run_name)) if root else None
         runner_class = resolve_callable(train_cfg.runner.class_name)
+        os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"  # checkpoints run no code, whoever's runner loads them
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints its networks at length
-            runner = runner_class(env, to_rsl_rl(train_cfg), log_dir, env.device)
+            runner = runner_class(env, to_rsl_rl(train_cfg) | {"task": name}, log_dir, env.device)
         if args is not None and args.resume:
-            runner.resume(str(find_checkpoint(find_run(root or default, args.load_run), args.checkpoint)))
+            folder = find_run(root or default, args.load_run)
+            remove_stale_parts(folder)
+            runner.resume(str(find_checkpoint(folder, args.checkpoint)))
         return runner, train_cfg
 
     def load_run(self, options: Options) -> LoadedRun:
@@ -126,7 +140,10 @@ class TaskRegistry:
         if config["task"] != options.task:
             raise UserError(f"the run '{folder}' is of task '{config['task']}', not '{options.task}'")
         cfgs = self.get_cfgs(options.task, options, config)
-        return LoadedRun(folder, config, *cfgs, find_checkpoint(folder, options.checkpoint))
+        file = find_checkpoint(folder, options.checkpoint)
+        if options.checkpoint is None and checkpoint_number(file) != checkpoint_numbers(folder)[-1]:
+            print(f"Newer checkpoints than '{file}' are damaged; taking this one.")
+        return LoadedRun(folder, config, *cfgs, file)
 
     def make_loaded(self, run: LoadedRun, options: Options, env_cfg: Any = None) -> tuple[VecEnv, OnPolicyRunner]:
         """Create the task of a run, and a runner that holds the policy of its checkpoint and keeps nothing.
@@ -135,7 +152,7 @@ class TaskRegistry:
         of another kind of policy.
         """
         env, _ = self.make_env(options.task, options, env_cfg or run.env_cfg)
-        runner, _ = self.make_alg_runner(env, train_cfg=run.train_cfg, log_root=None)
+        runner, _ = self.make_alg_runner(env, options.task, train_cfg=run.train_cfg, log_root=None)
         runner.load(str(run.checkpoint))
         return env, runner
 
@@ -153,6 +170,8 @@ def experiment_dir(train_cfg: Any, log_root: str | None = None) -> Path:
 
 def all_experiments_dir(log_root: str | None = None) -> Path:
     """Return the folder that holds all experiments: ``log_root``, or ``logs/`` in the current directory."""
+    if log_root == "":
+        raise UserError("--log_root must be a folder, not empty")
     return Path(log_root or "logs")
 
 

@@ -29,6 +29,7 @@ HISTORY_STEPS = 500  # control steps that are kept for plots: 10 s
 SCAN_INTERVAL = 1.0  # seconds between looks for new checkpoints
 IDLE = 0.02  # seconds between looks for requests while paused
 SLOWEST, FASTEST = 0.1, 1.0  # limits of the speed, in simulated seconds per second
+LARGEST = 100.0  # of all numbers in requests: velocities [m/s, rad/s], angles [rad] and weights
 SMOOTHING = 0.06  # weight of the newest step in the shown reward terms: they are means over about a third of a second
 
 Arguments = ParamSpec("Arguments")
@@ -42,6 +43,12 @@ def request(method: Callable[Concatenate[Session, Arguments], None]) -> Callable
         self.requests.put(functools.partial(method, self, *args, **kwargs))
 
     return ask
+
+
+def check_numbers(what: str, *numbers: float) -> None:
+    """Refuse, by UserError, what a page may send in place of its sliders' numbers: NaN, or more than a robot knows."""
+    if not all(abs(number) <= LARGEST for number in numbers):
+        raise UserError(f"{what} must be of numbers up to {LARGEST:g}, not {', '.join(map(str, numbers))}")
 
 
 class Session:
@@ -72,7 +79,8 @@ class Session:
         self.state = SessionState()  # what is shown
         self.task = self._make_task(self._cfg)  # only the stepping thread may touch its tensors
         self._obs = self.task.get_observations()
-        self._runner, _ = task_registry.make_alg_runner(self.task, train_cfg=run.train_cfg, log_root=None)
+        name = run.config.get("task")
+        self._runner, _ = task_registry.make_alg_runner(self.task, name, train_cfg=run.train_cfg, log_root=None)
         self._pacer = Pacer(self.task.dt, clock, sleep)
         self._load(run.iterations)
         self._policy = self._runner.get_inference_policy(device)
@@ -167,12 +175,14 @@ class Session:
     @request
     def set_command(self, command: Command | None) -> None:
         """Command v_x, v_y [m/s] and a yaw rate [rad/s] in all worlds; None draws commands as in training."""
+        check_numbers("a command", *(command or ()))
         self._show(command=command)
         self._apply_command()
 
     @request
     def push(self, angle: float, speed: float) -> None:
         """Add a horizontal velocity [m/s] to every trunk at once, in a direction from its front to its left [rad]."""
+        check_numbers("a push", angle, speed)
         w, x, y, z = self.task.base_quat.unbind(dim=1)
         heading = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) + angle
         velocity = speed * torch.stack([heading.cos(), heading.sin(), torch.zeros_like(heading)], dim=1)
@@ -196,6 +206,7 @@ class Session:
     @request
     def set_speed(self, speed: float) -> None:
         """Set the simulated seconds per second, from :data:`SLOWEST` to :data:`FASTEST`."""
+        check_numbers("a speed", speed)
         self._pacer.speed = min(max(speed, SLOWEST), FASTEST)
         self._pacer.restart()
         self._show(speed=self._pacer.speed)
@@ -210,6 +221,7 @@ class Session:
     @request
     def set_mixing(self, weights: Sequence[float] | None) -> None:
         """Set the weights of the action terms in ``state.mixing``, in their order; None sets them as in training."""
+        check_numbers("a weight", *(weights or ()))
         mixing = self.state.mixing if weights is None else dict(zip(self.state.mixing, weights, strict=True))
         self._show(mixing=mixing, is_mixing_set=weights is not None)
         self._apply_mixing()

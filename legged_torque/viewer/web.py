@@ -12,6 +12,7 @@ from pathlib import Path
 import viser
 
 from legged_torque.utils.errors import UserError
+from legged_torque.viewer.access import Guard
 from legged_torque.viewer.controls import Controls
 from legged_torque.viewer.pacing import stopping_on_ctrl_c
 from legged_torque.viewer.plots import Plots
@@ -23,13 +24,22 @@ FRAME_INTERVAL = 1.0 / 30.0  # seconds between drawings of the robots
 PLOT_INTERVAL = 0.2  # seconds between drawings of the plots and the status
 
 
+class PrivateServer(viser.ViserServer):
+    """A server that opens no way in from the internet, which viser does for any page that asks."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """Refuse."""
+        return None
+
+
 class Page:
     """Draws a session in a thread of its own, which never touches the task's tensors."""
 
     def __init__(self, session: Session, robot: Path, title: str, host: str, port: int) -> None:
         """Serve the page at a port or the next free one; ``robot`` is its MJCF, visual geoms included."""
-        self._session = session
-        self.server = viser.ViserServer(host, free_port(host, port), label=title, verbose=False)
+        self._session, self.guard = session, Guard(host)
+        with self.guard.at_the_door():
+            self.server = PrivateServer(host, free_port(host, port), label=title, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 125, 246))
         self._scene = Scene(self.server, robot, session.task.num_envs)
         self.controls = Controls(self.server, session, self._scene)
@@ -42,9 +52,10 @@ class Page:
 
     @property
     def url(self) -> str:
-        """Address of the page for a browser on this machine."""
-        host = self.server.get_host()
-        return f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{self.server.get_port()}"
+        """Address of the page for a browser on this machine, with the token if one is needed."""
+        host, token = self.server.get_host(), self.guard.token
+        address = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{self.server.get_port()}"
+        return f"{address}/?token={token}" if token else address
 
     def close(self) -> None:
         """Stop drawing and serving."""
@@ -108,6 +119,8 @@ def watch(session: Session, robot: Path, title: str, host: str, port: int) -> No
     page = Page(session, robot, title, host, port)
     if page.server.get_port() != port:
         print(f"Port {port} is taken.")
+    if page.guard.token:
+        print("Warning: other machines reach this page, unencrypted; whoever has its address can steer the robots.")
     print(f"See it walk: {page.url} (Ctrl-C ends)", flush=True)
     try:
         with stopping_on_ctrl_c(session.stop):

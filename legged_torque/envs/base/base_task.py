@@ -26,7 +26,7 @@ class BaseTask(VecEnv):
         time_out_buf: Those of them whose time was over. Shape: (num_envs,), bool.
         episode_return: Sum of the rewards of the episode so far. Shape: (num_envs,).
         total_steps: Environment steps so far over all worlds of all processes: t of eq. 1. Scalar, int64.
-        num_diverged: Worlds that were reset since their state was not finite. Scalar, int64.
+        num_diverged: Worlds that were reset since something in them was not finite. Scalar, int64.
     """
 
     obs_buf: TensorDict
@@ -54,8 +54,12 @@ class BaseTask(VecEnv):
         return self.get_observations(), self.rew_buf, self.reset_buf, self.extras
 
     def get_observations(self) -> TensorDict:
-        """Return a copy of the current observations: groups "policy" and "critic", each (num_envs, size)."""
-        return self.obs_buf.clone()
+        """Return a copy of the current observations: groups "policy" and "critic", each (num_envs, size).
+
+        Numbers that are not finite are 0 in it; their worlds are reset in the next step.
+        """
+        groups = {name: self.obs_buf[name].nan_to_num() for name in ("policy", "critic")}
+        return TensorDict(groups, [self.num_envs], device=self.device)
 
     def reset(self) -> TensorDict:
         """Start a new episode in every world and return the observations."""

@@ -13,6 +13,7 @@ from legged_torque.envs.base.asset import by_joint, load_asset, nominal_pose
 from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.commands import UniformCommands
 from legged_torque.envs.base.domain_rand import MODEL_FIELDS, check_fields, initial_state, mirrors, parameters
+from legged_torque.envs.base.health import watched
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
 from legged_torque.envs.base.random_events import RandomEvents
@@ -22,6 +23,7 @@ from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.motors import make_motors
 from legged_torque.motors.action_delay import ActionDelay
+from legged_torque.sim.health import Health
 from legged_torque.sim.randomization import Parameter, changes_legs
 from legged_torque.sim.simulator import Simulator
 from legged_torque.terrain import make_terrain
@@ -74,6 +76,7 @@ class LeggedRobot(BaseTask):
         seen = (cfg.env.history_length, cfg.normalization.clip_observations, cfg.noise.add_noise)
         self.observations = Observations(self.observation_terms(), *seen, self.num_envs)
         self.obs_buf = self.observations.buffers
+        self.health = Health(watched(self), self.num_envs, self.device)
         self.reset()
 
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
@@ -114,7 +117,6 @@ class LeggedRobot(BaseTask):
         """Physics, rewards, resets and observations of one control step."""
         self.sim.clear_diverged()
         self.sim.flag_diverged()
-        self.sim.diverged.logical_or_(~torch.isfinite(self._given_actions).all(dim=1))
         clip = self.cfg.normalization.clip_actions
         self.action_delay.keep()
         self.actions.copy_(self._given_actions.nan_to_num().clamp(-clip, clip))
@@ -168,13 +170,23 @@ class LeggedRobot(BaseTask):
         torch.ge(self._episode_length_buf, self.max_episode_length, out=self.time_out_buf)
         self.time_out_buf.logical_and_(~self.reset_buf)
         self.reset_buf.logical_or_(self.time_out_buf)
-        self.num_diverged += self.sim.diverged.sum()
 
     def compute_reward(self) -> None:
         """Compute the sum of all terms (Table III); 0 for worlds that diverged, or without terms."""
         if self.reward_names:
-            self.rew_buf.copy_(self.rewards.compute(self.total_steps, self.sim.diverged))
-            self.episode_return += self.rew_buf
+            self.rew_buf.copy_(self.rewards.compute(self.total_steps))
+        self.end_broken_worlds()
+        self.rewards.add_to_episode(self.sim.diverged)
+        self.episode_return += self.rew_buf
+
+    def end_broken_worlds(self) -> None:
+        """Count worlds in which anything is not finite as diverged, and end their episodes without a reward."""
+        diverged = self.sim.diverged
+        self.health.check(diverged)
+        self.num_diverged += diverged.sum()
+        self.reset_buf.logical_or_(diverged)
+        self.time_out_buf.logical_and_(~diverged)
+        self.rew_buf.masked_fill_(diverged, 0.0)
 
     def reward_weights(self) -> Tensor:
         """Return the weights of the terms at this moment of training, Delta t included. Shape: (terms,)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -82,7 +83,9 @@ class Observations:
     Attributes:
         terms: The terms: those of the policy, then those of the critic alone.
         sizes: Numbers of each term, by name.
-        buffers: Groups "policy", with noise and history, and "critic", without. Shapes: (num_envs, size).
+        policy_size: Numbers that the policy sees of one step.
+        buffers: Groups "policy", with noise and history, and "critic", without; NaN where a term was not finite.
+            Shapes: (num_envs, size).
     """
 
     def __init__(
@@ -100,9 +103,9 @@ class Observations:
         scales = [_per_value(term.scale, self.sizes[term.name]) for term in self.terms]
         errors = [[term.noise * factor for factor in scale] for term, scale in zip(self.terms, scales, strict=True)]
         self._scales = torch.tensor([*chain(*scales)], dtype=torch.float32, device=device)
-        self._policy_size = sum(self.sizes[term.name] for term in self.policy_terms())
-        self._noise = torch.tensor([*chain(*errors)][: self._policy_size], dtype=torch.float32, device=device)
-        sizes = {"policy": self._policy_size * history_length, "critic": len(self._scales)}
+        self.policy_size = sum(self.sizes[term.name] for term in self.policy_terms())
+        self._noise = torch.tensor([*chain(*errors)][: self.policy_size], dtype=torch.float32, device=device)
+        sizes = {"policy": self.policy_size * history_length, "critic": len(self._scales)}
         groups = {name: torch.zeros(num_envs, size, device=device) for name, size in sizes.items()}
         self.buffers = TensorDict(groups, batch_size=[num_envs], device=device)
 
@@ -115,7 +118,7 @@ class Observations:
         names = [term.name for term in self.policy_terms()]
         start = sum(self.sizes[before] for before in names[: names.index(name)])
         columns = range(start, start + self.sizes[name])
-        return [step * self._policy_size + column for step in range(self._history_length) for column in columns]
+        return [step * self.policy_size + column for step in range(self._history_length) for column in columns]
 
     def compute(self, is_new: Tensor) -> None:
         """Compute the observations of this moment.
@@ -123,7 +126,8 @@ class Observations:
         Where an episode has just started, as ``is_new`` says, the history starts with copies. Shape: (num_envs,), bool.
         """
         critic = torch.cat([term.value() for term in self.terms], dim=1) * self._scales
-        policy = critic[:, : self._policy_size]
+        critic = critic.nan_to_num(nan=math.nan, posinf=math.nan, neginf=math.nan)  # not clipped: it must be noticed
+        policy = critic[:, : self.policy_size]
         if self._add_noise:
             policy = torch.addcmul(policy, self._noise, torch.empty_like(policy).uniform_(-1.0, 1.0))
         policy = policy.clamp(-self._clip, self._clip)

@@ -16,6 +16,7 @@ class Rewards:
 
     Attributes:
         names: Names of the terms.
+        terms: Weighted terms of the last step. Shape: (terms, num_envs).
         episode_sums: Weighted sums of each term over the episode so far. Shape: (terms, num_envs).
         only_positive: Whether the sum is clipped at 0 from below.
     """
@@ -35,7 +36,7 @@ class Rewards:
         ``functions`` return each term's values, one per world.
         """
         self.names = list(functions)
-        self.episode_sums = torch.zeros(len(self.names), num_envs, device=device)
+        self.terms, self.episode_sums = torch.zeros(2, len(self.names), num_envs, device=device).unbind()
         self._functions = list(functions.values())
         self.only_positive = only_positive
         self._scales = torch.tensor([scales[name] for name in self.names], dtype=torch.float32, device=device) * dt
@@ -45,14 +46,14 @@ class Rewards:
         """Return the weights at a moment of training (scalar, int64). Shape: (terms,)."""
         return self._scales * self._curriculum(total_steps)
 
-    def compute(self, total_steps: Tensor, diverged: Tensor) -> Tensor:
-        """Return the sum of all terms and add them to the sums of the episode. Shape: (num_envs,).
-
-        ``total_steps`` are those of training so far, a scalar; where the state has diverged, terms are 0.
-        """
-        terms = torch.stack([function() for function in self._functions])
-        terms = torch.where(diverged, 0.0, terms)
-        terms *= self.weights(total_steps).unsqueeze(1)
-        self.episode_sums += terms
-        total = terms.sum(dim=0)
+    def compute(self, total_steps: Tensor) -> Tensor:
+        """Compute all terms and return their sum; ``total_steps`` are those of training so far. Shape: (num_envs,)."""
+        torch.stack([function() for function in self._functions], out=self.terms)
+        self.terms *= self.weights(total_steps).unsqueeze(1)
+        total = self.terms.sum(dim=0)
         return total.clamp(min=0.0) if self.only_positive else total
+
+    def add_to_episode(self, diverged: Tensor) -> None:
+        """Add the terms to the sums of the episode, as 0 in worlds that have diverged. Shape: (num_envs,), bool."""
+        self.terms.masked_fill_(diverged, 0.0)
+        self.episode_sums += self.terms

@@ -43,8 +43,8 @@ class TaskLog:
 
         Per finished episode: "Episode_Reward/<term>", divided by the length of a full episode [s] as in legged_gym,
         "return" and "length"; absent if none has finished. Per step: "Tracking/error_xy" [m^2/s^2],
-        "Tracking/error_yaw" [rad^2/s^2]. "Health/diverged_worlds": worlds that were reset because their state was not
-        finite.
+        "Tracking/error_yaw" [rad^2/s^2]. "Health/diverged_worlds": worlds that were reset because anything in them was
+        not finite.
         """
         sums = dict(zip(self._names, self._sums.tolist(), strict=True))
         self._sums.zero_()

@@ -1,0 +1,118 @@
+"""Every setting says what it may be, and other values are refused by its name."""
+
+import math
+from typing import Annotated, Literal
+
+import pytest
+from settings import TASKS, error_of, flatten, get_cfgs
+
+from legged_torque.envs.base.validation import check_env_cfg
+from legged_torque.utils.config import Section, section_keys, set_by_path, to_dict
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.limits import Count, Interval, Limits, Positive, check_section, check_value, describe, types_of
+from legged_torque.utils.train_validation import check_train_cfg
+
+
+def sections(section, path=""):
+    """A section and all below it, with their paths."""
+    yield path, section
+    for key in section_keys(section):
+        if isinstance(getattr(section, key), Section):
+            yield from sections(getattr(section, key), f"{path}{key}.")
+
+
+def with_bad_number(value, bad):
+    """A setting's value with a bad number in place of its numbers; None if it has none."""
+    if isinstance(value, dict):
+        return dict.fromkeys(value, bad) or None
+    if isinstance(value, list):
+        return [bad] * len(value) if value and isinstance(value[0], (int, float)) else None
+    return bad if isinstance(value, (int, float)) and not isinstance(value, bool) else None
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_setting_has_a_type(task):
+    """It stands beside the default, in the class or one of its bases."""
+    for cfg in get_cfgs(task=task):
+        for path, section in sections(cfg):
+            settings = [key for key in section_keys(section) if not isinstance(getattr(section, key), Section)]
+            assert set(settings) <= types_of(type(section)).keys(), path
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30, True, "text", [], {}])
+def test_no_number_may_be_anything(task, bad):
+    """A number that is not finite or absurdly large, or something else in its place, is refused by its name."""
+    checked = 0
+    for i, check in enumerate((check_env_cfg, check_train_cfg)):
+        cfg = get_cfgs(task=task)[i]
+        for path, value in flatten(to_dict(cfg)).items():
+            wrong = with_bad_number(value, bad)
+            if wrong is None or path.startswith("init_state.default_joint_angles."):
+                continue
+            with pytest.raises(UserError, match=path.split(".")[-1]):
+                set_by_path(cfg, path, wrong)
+                check(cfg)
+            set_by_path(cfg, path, value)
+            checked += 1
+    assert checked > 100
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *("sim.dt=0", "sim.dt=10", "control.action_scale=0", "control.stiffness=-1", "env.episode_length_s=1e7"),
+        *("algorithm.gamma=5", "algorithm.gamma=-1", "algorithm.lam=1.1", "normalization.clip_actions=-1"),
+        *("actor.hidden_dims=[-1]", "actor.hidden_dims=[]", "algorithm.learning_rate=0", "actor.hidden_dims=[1.5]"),
+        *("domain_rand.keep_fixed=[5]", "domain_rand.foot_radius=[]", "domain_rand.foot_radius=[0.02]"),
+        *("domain_rand.gravity=[10, 9]", "domain_rand.ground_friction=[-1, 1]", "domain_rand.push_velocity=null"),
+        *("domain_rand.action_delay=[0.5, 1]", "domain_rand.action_delay=[-1, 1]", "noise.add_noise=1"),
+        *("commands.ranges.lin_vel_x=[1]", "commands.resampling_probability=1.5", "sim.engine=fusedd"),
+        *("rewards.curriculum.tracking_lin_vel.t_start=20000000", "algorithm.max_learning_rate=1e-5"),
+        *("evaluation.interval=-1", "runner.save_interval=0", "seed=-1", "algorithm.schedule=adaptiv"),
+    ],
+)
+def test_values_without_sense(change):
+    """They are refused by the name of the setting, with what is allowed."""
+    message = error_of(lambda: check_env_cfg(get_cfgs(f"--set={change}")[0]))
+    assert change.partition("=")[0].rpartition(".")[2] in message
+    assert any(word in message for word in ("must be", "takes", "did you mean"))
+
+
+def test_a_variants_own_settings():
+    """A type that a variant declares holds for its subclasses too; null is allowed where the type says so."""
+
+    class Variant(Section):
+        rate: Positive = 1.0
+        number: Count | None = None
+        kind: Literal["a", "b"] = "a"
+        sizes: Annotated[dict[str, float], Limits(0, 2)] = {"x": 1.0}  # noqa: RUF012
+        limits: Interval = [0, 1]  # noqa: RUF012
+
+    class Other(Variant):
+        rate = -1.0
+
+    check_section(Variant())
+    assert error_of(check_section, Other(), "variant") == "variant.rate must be greater than 0, not -1.0"
+    for name, value in {"number": 0, "kind": "c", "sizes": {"x": 3.0}, "limits": [1, 0], "rate": None}.items():
+        changed = Variant()
+        setattr(changed, name, value)
+        assert error_of(check_section, changed).startswith((f"{name} must be ", f"unknown {name} "))
+
+
+@pytest.mark.parametrize(
+    ("hint", "words"),
+    [
+        (Positive, "greater than 0"),
+        (Annotated[int, Limits(1, 10_000_000)], "from 1 to 10000000 (integer)"),
+        (Count | None, "at least 1 (integer) or null"),
+        (Interval, "[minimum, maximum]"),
+        (Annotated[list[float], Limits(-1, length=3)], "3 numbers, at least -1"),
+        (Literal["a", "b"], "a or b"),
+        (list[str], "list of text"),
+    ],
+)
+def test_words(hint, words):
+    """What is allowed is told in the same words everywhere."""
+    assert describe(hint) == words
+    assert words in error_of(check_value, "x", object(), hint) or hint == Literal["a", "b"]
