@@ -90,6 +90,7 @@ def root(tmp_path_factory):
     for name, content in {"text": b"this is no checkpoint\n", "half": checkpoint[: len(checkpoint) // 2]}.items():
         copy = shutil.copytree(run, root / "logs" / f"{name}_checkpoint" / run.name)
         (copy / "model_2.pt").write_bytes(content)
+        (copy / "model_1.pt").unlink()
     return root
 
 
@@ -132,7 +133,7 @@ MISTAKES = [
     ("--resume --experiment_name=no_config", "has no config.yaml"),
     ("--resume --experiment_name=unknown_key", "unknown config key 'env.num_env'; did you mean 'env.num_envs'?"),
     ("--resume --experiment_name=wrong_type", "'rewards.scales.torques' takes a value like -0.0002, not 'little'"),
-    ("--resume --experiment_name=no_section", "is a section with entries, it cannot be the value 3"),
+    ("--resume --experiment_name=no_section", "config key 'env' is a section with entries, not the value 3"),
     ("--resume --experiment_name=text_checkpoint", "model_2.pt' is not a readable checkpoint"),
     ("--resume --experiment_name=half_checkpoint", "model_2.pt' is not a readable checkpoint"),
     ("--resume --experiment_name=a1_position --task=a1_torque", "is of task 'a1_position', not 'a1_torque'"),
@@ -206,7 +207,7 @@ def test_mistakes_when_training(root, words, message):
         ("play.py", "--set=control.stifness=1", "did you mean 'control.stiffness'?"),
         ("learning_curve.py", "--steps=0", "--steps must be at least 1, not 0"),
         ("learning_curve.py", "--load_run=2026", "unknown run '2026'"),
-        ("learning_curve.py", "--num_envs=2 --json=/dev/null/a", "cannot make the folder '/dev/null': File exists"),
+        ("learning_curve.py", "--num_envs=2 --json=/dev/null/a", "cannot write '/dev/null/a': Not a directory"),
         ("evaluate.py", "--json=/dev", "cannot write '/dev': it is a folder"),
     ],
 )
@@ -233,6 +234,7 @@ def test_run_folder(root):
     assert {path.name.split(".tfevents")[0] for path in run.iterdir() if path.is_file()} == {
         "model_1.pt",
         "model_2.pt",
+        "worlds_2.pt",
         "events.out",
         "config.yaml",
     }
@@ -254,7 +256,7 @@ def test_resume_in_a_folder_by_its_path(root, tmp_path):
     status, _, error = run_here("train.py", "--task=a1_position", "--device=cpu", *words, root=tmp_path)
     assert (status, error) == (0, "")
     (new,) = (tmp_path / "logs" / "a1_position").iterdir()
-    assert {path.name for path in new.iterdir() if path.is_file()} == {"config.yaml", "model_2.pt"}
+    assert {path.name for path in new.iterdir() if path.is_file()} == {"config.yaml", "model_2.pt", "worlds_2.pt"}
     state = torch.load(new / "model_2.pt", weights_only=True)
     assert (state["iter"], state["infos"]["total_timesteps"]) == (2, 2 * 2 * 4)
     train = yaml.safe_load((new / "config.yaml").read_text())["train"]
@@ -294,7 +296,7 @@ def test_late_mistake_in_a_process_of_its_own(tmp_path):
 
 
 def test_train_stop_resume_play(tmp_path):
-    """Ctrl-C saves and ends with status 0, resuming goes on with all counters, and playing prints how it walks."""
+    """Ctrl-C saves and ends with status 130, resuming goes on with all counters, and playing prints how it walks."""
     task, logs = ["--task=a1_torque_multihead", "--device=cpu"], tmp_path / "logs" / "a1_torque_multihead"
     settings = {
         "runner.num_steps_per_env": 4,
@@ -309,9 +311,9 @@ def test_train_stop_resume_play(tmp_path):
             break
     process.send_signal(signal.SIGINT)
     status, output, error = finish(process)
-    assert status == 0 and "Traceback" not in error and "Stopping" in output + error
+    assert status == 130 and "Traceback" not in error and "Stopping" in output + error
     (first,) = logs.iterdir()
-    (checkpoint,) = first.glob("*.pt*")
+    (checkpoint,) = first.glob("model_*.pt*")
     count = int(checkpoint.stem.removeprefix("model_"))
     state = torch.load(checkpoint, weights_only=True)
     assert 2 <= count == state["iter"] and state["infos"]["total_timesteps"] == count * 8

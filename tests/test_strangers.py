@@ -219,7 +219,7 @@ TEXTS = {
     "deep": ("[" * 1000 + "]" * 1000, "is nested too deeply"),
     "less_deep": ("[" * 60 + "]" * 60, "is nested too deeply"),
     "itself": ("&a [*a]", "is nested too deeply"),
-    "huge": (f"a: 0x{'f' * 9000}", "is nested too deeply or larger"),
+    "huge": (f"a: {'9' * 400}", "is nested too deeply or larger"),
     "long": ("# " + "x" * 1_000_000, "is nested too deeply or larger than settings are"),
     "many": ("\n".join(["a: &a0 [x]", *(f"b{i}: &a{i + 1} [{f'*a{i}, ' * 9}]" for i in range(12))]), "is nested too"),
 }

@@ -28,6 +28,7 @@ LONG = "x" * 300
 READERS = {
     fixtures.CONFIG: ("evaluate.py", "export.py", "play.py", "learning_curve.py", "physics_accuracy.py", "train.py"),
     fixtures.CHECKPOINT: ("evaluate.py", "export.py", "play.py", "learning_curve.py", "train.py"),
+    fixtures.WORLDS: ("train.py",),
     fixtures.PRETRAINED: ("check_standing.py", "train.py"),
     fixtures.DESCRIPTION: ("sim2sim.py",),
     fixtures.NETWORK: ("sim2sim.py",),
@@ -48,6 +49,7 @@ DAMAGES = 12  # truncations, and as many flipped bits, of a file for each of its
 _MORE_WORDS = {
     (fixtures.CONFIG, "train.py"): ("--resume", "--max_iterations=2"),
     (fixtures.CHECKPOINT, "train.py"): ("--resume", "--max_iterations=2"),
+    (fixtures.WORLDS, "train.py"): ("--resume", "--max_iterations=2"),
     (fixtures.PRETRAINED, "train.py"): ("--task=a1_torque_gravity",),
     (fixtures.ROBOT, "train.py"): (f"--set=asset.file={fixtures.ROBOT}",),
     (fixtures.ROBOT, "sim2sim.py"): (f"--xml={fixtures.ROBOT}",),

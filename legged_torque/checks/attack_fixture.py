@@ -21,6 +21,7 @@ from legged_torque.utils.options import Options
 
 RUN = "logs/a1_position/run"
 CONFIG, CHECKPOINT, EVALUATIONS = f"{RUN}/config.yaml", f"{RUN}/model_1.pt", f"{RUN}/evaluations.csv"
+WORLDS = f"{RUN}/worlds_1.pt"
 PRETRAINED = "logs/pretrained/a1_torque_gravity.pt"
 DESCRIPTION, NETWORK = "exported/policy.yaml", "exported/policy.onnx"
 ROBOT, PLAN, RESULTS = "robot.xml", "plan.yaml", "results"
@@ -49,6 +50,7 @@ WORDS = {
     "benchmark.py": (*_SMALL, "--rounds=1"),
     "check_capture.py": _SMALL,
     "check_standing.py": _SMALL,
+    "check_reproducible.py": (*_SMALL, "--iterations=1", "--resumes=0"),
 }
 """Command lines that are valid in the folder of :func:`make_fixture`, with as little work as possible."""
 _PLAN = {"tasks": ["a1_position"], "environments": {"none": ["none"]}, "seeds": [1]}

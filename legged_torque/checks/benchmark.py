@@ -245,6 +245,7 @@ def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]
     schedule = torch.profiler.schedule(wait=0, warmup=1, active=TRACED, repeat=1)
     with torch.profiler.profile(activities=activities, schedule=schedule) as profiler:
         time_iterations(runner, 1 + TRACED, lambda number: profiler.step() if number else None)
+    file.parent.mkdir(parents=True, exist_ok=True)
     profiler.export_chrome_trace(str(file))
     return most_expensive(profiler.key_averages(), cuda)
 

@@ -48,8 +48,8 @@ class Parser(argparse.ArgumentParser):
 def run_script(main: Callable[[], None]) -> None:
     """Run a script's main function; expected errors exit without a traceback.
 
-    Exit status 2 for a user's mistake, a file that cannot be used or too little memory, 130 for Ctrl-C, 1 for a training
-    that cannot learn or an output that nobody reads any more (``| head``).
+    Exit status 2 for a user's mistake, a file that cannot be used or too little memory, 130 for Ctrl-C, 1 for a
+    training that cannot learn or an output that nobody reads any more (``| head``).
     """
     gc.freeze()  # what has been imported stays: searching it for garbage at the end would take a second or two
     if "mujoco" in sys.modules:  # which would write its warnings to a file in the current folder

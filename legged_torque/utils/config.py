@@ -181,7 +181,7 @@ def parse_value(text: str) -> Any:
 
 
 def parse_yaml(text: str, what: str) -> Any:
-    """Return what YAML text holds, as :class:`Loader` reads it; a UserError says that ``what`` it is is not valid or too large."""
+    """Return what YAML text holds, see :class:`Loader`; a UserError says ``what`` is no YAML or too large."""
     try:
         if len(text) <= MAX_LENGTH and is_small(value := yaml.load(text, Loader)):
             return value
