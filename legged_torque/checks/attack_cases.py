@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import io
 import itertools
 import json
 import random
+import struct
 import xml.etree.ElementTree as ElementTree
+import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,7 +47,7 @@ READERS = {
 }
 """Every kind of file, and the scripts that read it."""
 SEALED = (fixtures.CHECKPOINT, fixtures.PRETRAINED, fixtures.NETWORK)
-"""Files that know a checksum: any damage must be refused."""
+"""Files with checksums: data that has changed must be refused."""
 DAMAGES = 12  # truncations, and as many flipped bits, of a file for each of its readers
 _MORE_WORDS = {
     (fixtures.CONFIG, "train.py"): ("--resume", "--max_iterations=2"),
@@ -289,7 +292,20 @@ def damage_cases(fixture: Path, drawn: random.Random) -> Iterator[Case]:
             place, bit = drawn.randrange(len(content)), drawn.randrange(8)
             flipped = bytearray(content)
             flipped[place] ^= 1 << bit
-            yield file_case(file, script, "bit", f"{place}.{bit}", bytes(flipped), file in SEALED)
+            is_sealed = file in SEALED and is_data(content, place)
+            yield file_case(file, script, "bit", f"{place}.{bit}", bytes(flipped), is_sealed)
+
+
+def is_data(content: bytes, place: int) -> bool:
+    """Return whether a place of a file is data of it, and not the filling between the parts of an archive."""
+    if not zipfile.is_zipfile(io.BytesIO(content)):
+        return True
+    for info in zipfile.ZipFile(io.BytesIO(content)).infolist():
+        start = info.header_offset  # of 30 bytes, of which the last four tell how much stands before the data
+        begin = start + 30 + sum(struct.unpack("<HH", content[start + 26 : start + 30]))
+        if begin <= place < begin + info.file_size:
+            return True
+    return False
 
 
 def _entry(content: Any, path: str) -> Any:
