@@ -14,13 +14,13 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from legged_torque.checks.benchmark import TRACED, MemoryMeter, is_out_of_memory, measure
+from legged_torque.checks.benchmark import TRACED, MemoryMeter, measure
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.args import Parser, add_settings_args, options_of
-from legged_torque.utils.cli import check_at_least, prepare_file, run_script, write_json
+from legged_torque.utils.cli import check_at_least, check_output, run_script, write_json
 from legged_torque.utils.devices import device_name, resolve_device
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, is_out_of_memory
 from legged_torque.utils.paths import without_machine
 from legged_torque.utils.runs import package_versions
 
@@ -59,7 +59,7 @@ def main() -> None:
         sizes.append(task_registry.get_cfgs(args.task, options))
         check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
     for file in filter(None, (args.json, args.profile)):
-        prepare_file(file)
+        check_output(file)
     memory = MemoryMeter(device)
     of_gpu = "GPU memory of torch and Warp together, without the CUDA context"
     print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")

@@ -13,7 +13,8 @@ import tempfile
 from pathlib import Path
 
 from legged_torque.checks.reproducible import Training, compare, kill_often
-from legged_torque.utils.args import Parser, add_build_args
+from legged_torque.envs import task_registry
+from legged_torque.utils.args import Parser, add_build_args, options_of
 from legged_torque.utils.cli import check_at_least, run_script
 from legged_torque.utils.errors import UserError
 
@@ -36,6 +37,7 @@ def main() -> None:
     check_at_least(args, 0, "resumes", "kills")
     if args.resumes >= args.iterations:
         raise UserError(f"--resumes must be less than --iterations, which is {args.iterations}, not {args.resumes}")
+    task_registry.get_cfgs(args.task, options_of(args))  # mistakes are told before anything is trained
     with tempfile.TemporaryDirectory() as folder:
         sys.exit(0 if check(args, Path(folder)) else 1)
 

@@ -6,7 +6,6 @@ from legged_torque.utils.rendering import without_renderer
 end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
-import math
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,9 +15,8 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.metrics import COMMANDS, CommandBreakdown, measure
 from legged_torque.learning.evaluator import evaluation_cfg
 from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import add_command_arg, check_at_least, prepare_file, run_script, write_json
+from legged_torque.utils.cli import add_command_arg, check_at_least, check_output, run_script, write_json
 from legged_torque.utils.devices import device_name
-from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.paths import portable_path
 from legged_torque.utils.runs import package_versions
@@ -35,12 +33,10 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file to write")
     args = parser.parse_args()
     check_at_least(args, 1, "steps")
-    if args.command and not all(map(math.isfinite, args.command)):
-        raise UserError(f"--command must be finite, not {args.command}")
+    if args.json:
+        check_output(args.json)
     options = options_of(args)
     run = task_registry.load_run(options)
-    if args.json:
-        prepare_file(args.json)
     env_cfg = evaluation_cfg(run.env_cfg, run.env_cfg.env.num_envs)
     for name, value in zip(COMMANDS, args.command or (), strict=False):
         setattr(env_cfg.commands.ranges, name, [value, value])

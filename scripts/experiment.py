@@ -13,10 +13,10 @@ import sys
 from pathlib import Path
 
 from legged_torque.experiments.job import find_workers
-from legged_torque.experiments.matrix import cell_state, check_same, read_matrix
+from legged_torque.experiments.matrix import SETTINGS_FILE, cell_state, check_same, read_matrix
 from legged_torque.experiments.run import ExperimentRun, claim_folder
 from legged_torque.utils.args import Parser
-from legged_torque.utils.cli import run_script
+from legged_torque.utils.cli import check_output, run_script
 
 
 def main() -> None:
@@ -31,6 +31,7 @@ def main() -> None:
     args = parser.parse_args()
     matrix = read_matrix(args.file)
     out = (args.out or Path("logs", "experiments", args.file.stem)).resolve()
+    check_output(out / SETTINGS_FILE)
     workers = find_workers(args.device, args.jobs)
     if args.dry_run:
         check_same(matrix, out)

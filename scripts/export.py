@@ -8,10 +8,11 @@ without_renderer()  # before anything imports mujoco
 
 from pathlib import Path
 
+from legged_torque.deploy.description import DESCRIPTION_FILE
 from legged_torque.deploy.export import export_policy, nominal_cfg
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, run_script
+from legged_torque.utils.cli import Parser, check_output, run_script
 
 
 def main() -> None:
@@ -20,6 +21,8 @@ def main() -> None:
     add_task_args(parser)
     parser.add_argument("--out", type=Path, help="folder to write; default: exported_<checkpoint> in the run's folder")
     args = parser.parse_args()
+    if args.out:
+        check_output(args.out / DESCRIPTION_FILE)
     options = options_of(args)
     run = task_registry.load_run(options)
     env, runner = task_registry.make_loaded(run, options, nominal_cfg(run.env_cfg))

@@ -11,7 +11,7 @@ from pathlib import Path
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.metrics import measure
 from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import check_at_least, prepare_file, run_script, write_json
+from legged_torque.utils.cli import check_at_least, check_output, run_script, write_json
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.paths import without_machine
@@ -34,7 +34,7 @@ def main() -> None:
     options = options_of(args)
     run = task_registry.load_run(options)
     file = args.json or run.folder / "curve.json"
-    prepare_file(file)
+    check_output(file)
     env, _ = task_registry.make_env(args.task, options, run.env_cfg)
     runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=run.train_cfg, log_root=None)
     points = []

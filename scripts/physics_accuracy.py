@@ -12,7 +12,7 @@ from legged_torque.checks.accuracy import copy_state, reference_velocities, velo
 from legged_torque.envs import task_registry
 from legged_torque.sim.simulator import Simulator
 from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import run_script
+from legged_torque.utils.cli import check_at_least, run_script
 from legged_torque.utils.task_registry import set_seed
 
 SETTINGS = [(engine, *numbers) for engine in ("fused", "mujoco_warp") for numbers in ((10, 20), (5, 8), (3, 6))]
@@ -27,6 +27,7 @@ def main() -> None:
     help_text = "control steps to walk; one physics step of each is compared"
     parser.add_argument("--steps", type=int, default=100, help=help_text)
     args = parser.parse_args()
+    check_at_least(args, 1, "steps")
     options = options_of(args)
     run = task_registry.load_run(options)
     set_seed(args.seed)

@@ -18,7 +18,7 @@ from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import measure
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, check_at_least, run_script
+from legged_torque.utils.cli import Parser, check_at_least, check_output, run_script
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
@@ -51,6 +51,8 @@ def main() -> None:
     if not 1 <= args.port <= 65535:
         raise UserError(f"--port must be from 1 to 65535, not {args.port}")
     choose_worlds(args)
+    if args.video:
+        check_output(args.video)
     options = options_of(args)
     run = task_registry.load_run(options)
     set_seed(args.seed)

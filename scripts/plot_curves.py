@@ -5,7 +5,7 @@ from pathlib import Path
 from legged_torque.experiments.curves import read_curves
 from legged_torque.experiments.figures import draw_single_curves
 from legged_torque.utils.args import Parser
-from legged_torque.utils.cli import run_script
+from legged_torque.utils.cli import check_output, run_script
 from legged_torque.utils.plotting import save_figure
 
 
@@ -16,6 +16,7 @@ def main() -> None:
     parser.add_argument("files", type=Path, nargs="+", help=help_text)
     parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
     args = parser.parse_args()
+    check_output(args.out)
     save_figure(draw_single_curves([curve for file in args.files for curve in read_curves(file)]), args.out)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.utils.args import Parser
-from legged_torque.utils.cli import run_script
+from legged_torque.utils.cli import check_output, run_script
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.plotting import load_pyplot, read_data, save_figure
 
@@ -23,6 +23,7 @@ def main() -> None:
     parser.add_argument("file", type=Path, help="report of pretrain_gravity.py --json")
     parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
     args = parser.parse_args()
+    check_output(args.out)
     figure, axes = load_pyplot().subplots(1, 4, figsize=(17, 4), layout="constrained")
     report = read_data(args.file, {"histograms", "settings", "rms_error", "standing"}, "pretrain_gravity.py")
     try:

@@ -24,7 +24,7 @@ from legged_torque.envs.base import domain_rand
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.sim.randomization import Parameter, per_column
 from legged_torque.utils.args import add_build_args, options_of
-from legged_torque.utils.cli import Parser, run_script
+from legged_torque.utils.cli import Parser, check_output, run_script
 from legged_torque.utils.plotting import load_pyplot, save_figure
 from legged_torque.utils.task_registry import set_seed
 
@@ -90,6 +90,7 @@ def main() -> None:
     parser.set_defaults(task="a1_position", perturbation="low", num_envs=2000)
     parser.add_argument("--out", type=Path, required=True, help="picture to write (png, svg, pdf)")
     args = parser.parse_args()
+    check_output(args.out)
     options = options_of(args)
     env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     set_seed(train_cfg.seed)

@@ -14,7 +14,7 @@ without_renderer()  # before anything imports mujoco
 from legged_torque.envs import task_registry
 from legged_torque.learning.pretrained import make_pretrained, pretrained_file
 from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import prepare_file, run_script, write_json
+from legged_torque.utils.cli import check_output, run_script, write_json
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.paths import without_machine
 from legged_torque.utils.progress import CompileProgress
@@ -37,7 +37,7 @@ def main() -> None:
     env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     file, device = pretrained_file(options.task, train_cfg, options.log_root), resolve_device(options.device)
     if args.json:
-        prepare_file(args.json)
+        check_output(args.json)
     print(f"Pre-training {args.task} on {device_name(device)}.", flush=True)
     with CompileProgress():
         report = make_pretrained(file, args.task, env_cfg, train_cfg, device)

@@ -12,7 +12,7 @@ from legged_torque.experiments.figures import draw_all
 from legged_torque.experiments.report import missing_lines, report
 from legged_torque.experiments.results import read_experiment, summarize, write_tables
 from legged_torque.utils.args import Parser
-from legged_torque.utils.cli import check_at_least, prepare_file, run_script
+from legged_torque.utils.cli import check_at_least, check_output, run_script
 
 
 def main() -> None:
@@ -24,10 +24,11 @@ def main() -> None:
     parser.add_argument("--from_step", type=float, default=90e6, help=help_text)
     args = parser.parse_args()
     check_at_least(args, 0, "from_step")
+    file = args.out / "report.md"
+    check_output(file)
     experiment = read_experiment(args.experiment)
     table = summarize(experiment, args.from_step)
-    file = args.out / "report.md"
-    prepare_file(file)
+    args.out.mkdir(parents=True, exist_ok=True)
     figures = draw_all(experiment, table, args.out)
     file.write_text(report(experiment, table, args.from_step, figures, args.out), encoding="utf-8")
     write_tables(experiment, table, args.out)

@@ -13,7 +13,6 @@ NO_RENDERER = None if "--viewer" in sys.argv else choose_offscreen_renderer()  #
 
 import argparse
 import contextlib
-import math
 from pathlib import Path
 
 import mujoco
@@ -23,7 +22,15 @@ from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Events, Simulation
-from legged_torque.utils.cli import Parser, add_command_arg, check_at_least, prepare_file, run_script, write_json
+from legged_torque.utils.cli import (
+    Parser,
+    add_command_arg,
+    check_at_least,
+    check_output,
+    finite,
+    run_script,
+    write_json,
+)
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS, Estimate, estimates, ratios
 from legged_torque.viewer.native import simulation_window
@@ -39,26 +46,25 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--robots", type=int, default=16, help="robots, one after another; default: %(default)s")
     add_command_arg(parser)
     hint = "largest velocity of a push per axis [m/s]; default: none"
-    parser.add_argument("--push_velocity", type=float, default=0.0, help=hint)
-    parser.add_argument("--push_probability", type=float, help="probability of a push per control step; default: 0.002")
+    parser.add_argument("--push_velocity", type=finite, default=0.0, help=hint)
+    parser.add_argument(
+        "--push_probability", type=finite, help="probability of a push per control step; default: 0.002"
+    )
     parser.add_argument("--seed", type=int, default=1, help="random seed; default: %(default)s")
     parser.add_argument("--video", type=Path, help="mp4 of the first robot")
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
     args = parser.parse_args()
     check_at_least(args, 1, "steps", "robots")
-    if args.seed < 0:
-        raise UserError(f"--seed must not be negative, it is {args.seed}")
+    check_at_least(args, 0, "seed", "push_velocity")
     if args.push_probability is not None and not args.push_velocity:
         raise UserError("--push_probability needs --push_velocity")
     if args.push_probability is None:
         args.push_probability = 0.002 if args.push_velocity else 0.0
     if not 0.0 <= args.push_probability <= 1.0:
         raise UserError(f"--push_probability must be from 0 to 1, not {args.push_probability}")
-    if not math.isfinite(args.push_velocity) or args.push_velocity < 0.0:
-        raise UserError(f"--push_velocity must not be negative, it is {args.push_velocity}")
-    if args.command and not np.isfinite(args.command).all():
-        raise UserError(f"--command must be three finite numbers, not {args.command}")
+    for file in filter(None, (args.json, args.video)):
+        check_output(file)
     return args
 
 
@@ -69,8 +75,6 @@ def main() -> None:
     xml = args.xml or resource_path(policy.description["robot"]["file"])
     robot = MujocoRobot(xml, policy.description)
     events = Events(args.command, args.push_velocity, args.push_probability)
-    if args.json:
-        prepare_file(args.json)
     simulation = Simulation(policy, robot, events)
     recorder = SimulationRecorder(simulation) if args.video else None
     sums = []

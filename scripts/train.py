@@ -17,13 +17,14 @@ from legged_torque.learning.pretrained import find_pretrained, pretrained_file, 
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils import distributed
 from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of
-from legged_torque.utils.cli import run_script
+from legged_torque.utils.cli import check_output, run_script
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.options import DEFAULT_PRESET, Options
 from legged_torque.utils.progress import CompileProgress
-from legged_torque.utils.task_registry import num_iterations, set_seed
+from legged_torque.utils.runs import CONFIG_FILE, new_run_dir
+from legged_torque.utils.task_registry import experiment_dir, num_iterations, set_seed
 
 
 def main() -> None:
@@ -48,6 +49,8 @@ def main() -> None:
         raise UserError("--load_run and --checkpoint need --resume")
     else:
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+    folder = experiment_dir(train_cfg, options.log_root)
+    check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)
     set_seed(train_cfg.seed)
     with CompileProgress():
         train(options, env_cfg, train_cfg)

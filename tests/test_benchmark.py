@@ -12,9 +12,10 @@ import torch
 from test_scripts import assert_told_in_one_line, run_here
 
 from legged_torque.checks import benchmark
-from legged_torque.checks.benchmark import MemoryMeter, is_out_of_memory, most_expensive, summarize
+from legged_torque.checks.benchmark import MemoryMeter, most_expensive, summarize
 from legged_torque.envs import LeggedRobot, task_registry
 from legged_torque.utils.config import set_by_path
+from legged_torque.utils.errors import is_out_of_memory
 
 SETTINGS = {"runner.num_steps_per_env": 3, "algorithm.num_learning_epochs": 1, "algorithm.num_mini_batches": 1}
 CHANGES = [f"{key}={value}" for key, value in SETTINGS.items()]

@@ -91,6 +91,7 @@ def root(tmp_path_factory):
     for name, content in {"text": b"this is no checkpoint\n", "half": checkpoint[: len(checkpoint) // 2]}.items():
         copy = shutil.copytree(run, root / "logs" / f"{name}_checkpoint" / run.name)
         (copy / "model_2.pt").write_bytes(content)
+        (copy / "model_1.pt").unlink()
     return root
 
 
@@ -133,7 +134,7 @@ MISTAKES = [
     ("--resume --experiment_name=no_config", "has no config.yaml"),
     ("--resume --experiment_name=unknown_key", "unknown config key 'env.num_env'; did you mean 'env.num_envs'?"),
     ("--resume --experiment_name=wrong_type", "'rewards.scales.torques' takes a value like -0.0002, not 'little'"),
-    ("--resume --experiment_name=no_section", "is a section with entries, it cannot be the value 3"),
+    ("--resume --experiment_name=no_section", "config key 'env' is a section with entries, not the value 3"),
     ("--resume --experiment_name=text_checkpoint", "model_2.pt' is not a readable checkpoint"),
     ("--resume --experiment_name=half_checkpoint", "model_2.pt' is not a readable checkpoint"),
     ("--resume --experiment_name=a1_position --task=a1_torque", "is of task 'a1_position', not 'a1_torque'"),
@@ -207,7 +208,7 @@ def test_mistakes_when_training(root, words, message):
         ("play.py", "--set=control.stifness=1", "did you mean 'control.stiffness'?"),
         ("learning_curve.py", "--steps=0", "--steps must be at least 1, not 0"),
         ("learning_curve.py", "--load_run=2026", "unknown run '2026'"),
-        ("learning_curve.py", "--num_envs=2 --json=/dev/null/a", "cannot make the folder '/dev/null': File exists"),
+        ("learning_curve.py", "--num_envs=2 --json=/dev/null/a", "cannot write '/dev/null/a': Not a directory"),
         ("evaluate.py", "--json=/dev", "cannot write '/dev': it is a folder"),
     ],
 )
@@ -234,6 +235,7 @@ def test_run_folder(root):
     assert {path.name.split(".tfevents")[0] for path in run.iterdir() if path.is_file()} == {
         "model_1.pt",
         "model_2.pt",
+        "worlds_2.pt",
         "events.out",
         "config.yaml",
     }
@@ -322,7 +324,7 @@ def test_train_stop_resume_play(tmp_path):
     status, output, error = finish(process)
     assert status == 130 and "Traceback" not in error and "Stopping" in output + error
     (first,) = logs.iterdir()
-    (checkpoint,) = first.glob("model_*")
+    (checkpoint,) = first.glob("model_*.pt")
     count = int(checkpoint.stem.removeprefix("model_"))
     state = torch.load(checkpoint, weights_only=True)
     assert 2 <= count == state["iter"] and state["infos"]["total_timesteps"] == count * 8

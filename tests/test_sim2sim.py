@@ -309,13 +309,13 @@ def test_script(exported, tmp_path):
 MISTAKES = [
     ("--steps=0", "--steps must be at least 1, not 0"),
     ("--robots=0", "--robots must be at least 1, not 0"),
-    ("--seed=-1", "--seed must not be negative"),
+    ("--seed=-1", "--seed must be at least 0, not -1"),
     ("--push_probability=0.1", "--push_probability needs --push_velocity"),
     ("--push_velocity=1 --push_probability=2", "--push_probability must be from 0 to 1"),
-    ("--push_velocity=nan", "--push_velocity must not be negative"),
+    ("--push_velocity=nan", "argument --push_velocity: it must be finite, not nan"),
     ("--step=3", "unknown option '--step=3'; did you mean '--steps'?"),
     ("--viewer", "MuJoCo's window needs a screen; --video works without one"),
-    ("--xml=nothing.xml", "there is no MJCF file 'nothing.xml'"),
+    ("--xml=nothing.xml", "cannot load the robot 'nothing.xml': there is no such file"),
 ]
 
 

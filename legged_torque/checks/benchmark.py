@@ -33,8 +33,6 @@ PHYSICS_STEPS = 5
 GPU_CALLS = 20  # calls per timing on a GPU, where a single one is short; on the CPU one call is timed
 ACTION_SCALE = 0.5  # standard deviation of the random actions while env.step is timed
 TOP_KERNELS = 10  # kernels listed from a trace
-OUT_OF_MEMORY = ("out of memory", "Failed to allocate", "can't allocate memory")
-"""Parts of the messages of CUDA, Warp and torch on the CPU when memory has run out."""
 _MIB = 2**20
 _MS = 1e3
 
@@ -247,6 +245,7 @@ def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]
     schedule = torch.profiler.schedule(wait=0, warmup=1, active=TRACED, repeat=1)
     with torch.profiler.profile(activities=activities, schedule=schedule) as profiler:
         time_iterations(runner, 1 + TRACED, lambda number: profiler.step() if number else None)
+    file.parent.mkdir(parents=True, exist_ok=True)
     profiler.export_chrome_trace(str(file))
     return most_expensive(profiler.key_averages(), cuda)
 
@@ -261,13 +260,3 @@ def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict[str, Any]]:
         if entry.device_type.name == kind and not entry.is_user_annotation
     ]
     return sorted(rows, key=lambda row: row["total_ms"], reverse=True)[:TOP_KERNELS]
-
-
-def is_out_of_memory(error: BaseException | None) -> bool:
-    """Return whether an error, or one that led to it, says that memory has run out."""
-    while error is not None:
-        is_told = isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY)
-        if is_told or isinstance(error, MemoryError):
-            return True
-        error = error.__cause__ or error.__context__
-    return False

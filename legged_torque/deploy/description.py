@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from legged_torque.utils.config import parse_yaml
+from legged_torque.utils.config import Dumper, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import LARGEST
 
@@ -78,7 +78,9 @@ def to_yaml(description: dict[str, Any]) -> str:
     for key, value in description.items():
         comment = "".join(f"# {line}\n" for line in COMMENTS.get(key, "").splitlines())
         flow = None if isinstance(value, (dict, list)) else False  # one line for what holds only plain values
-        parts.append(comment + yaml.safe_dump({key: value}, sort_keys=False, width=100, default_flow_style=flow))
+        parts.append(
+            comment + yaml.dump({key: value}, Dumper=Dumper, sort_keys=False, width=100, default_flow_style=flow)
+        )
     return "\n".join(parts)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from legged_torque.deploy.policy import State
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.mjcf import loading
 
 _WARNINGS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 _JOINTS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
@@ -121,17 +122,13 @@ class MujocoRobot:
 
     def _load(self, file: Path) -> mujoco.MjModel:
         """Compile the file, and add a floor if it has none."""
-        if not file.is_file():
-            raise UserError(f"there is no MJCF file '{file}'")
-        try:
+        with loading(file):
             spec = mujoco.MjSpec.from_file(str(file))
             grounds = [geom for geom in spec.worldbody.geoms if geom.contype or geom.conaffinity]
             if not grounds:
                 spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05])
                 self.notes.append("the MJCF has no floor: a plane at height 0 is added")
             return spec.compile()
-        except ValueError as error:
-            raise UserError(f"cannot load the robot '{file}': {' '.join(str(error).split())}") from None
 
     def _find_root(self) -> None:
         """Find the free joint of the trunk."""

@@ -23,6 +23,7 @@ from legged_torque.experiments.matrix import Cell, CellState
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 
+MAX_JOBS = 1000
 _TAIL = 65536  # bytes that are read from the end of a log
 _ITERATION = re.compile(r"Learning iteration (\d+)/(\d+)")
 _LIBC = ctypes.CDLL(None)
@@ -121,6 +122,8 @@ def find_workers(device: str, jobs: int | None) -> list[Worker]:
     first = resolve_device(device)  # does not create a CUDA context
     if jobs is not None and jobs < 1:
         raise UserError(f"--jobs must be at least 1, not {jobs}")
+    if jobs is not None and jobs > MAX_JOBS:
+        raise UserError(f"--jobs must be at most {MAX_JOBS}, not {jobs}")
     if first == "cpu":
         jobs, variables = jobs or 1, {}
         if jobs > 1 and "OMP_NUM_THREADS" not in os.environ:  # they share the cores

@@ -11,6 +11,7 @@ from typing import Any
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
+from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
@@ -18,7 +19,11 @@ from legged_torque.utils.options import Options
 from legged_torque.utils.runs import checkpoint_number, load_config, newest_checkpoint
 
 SETTINGS_FILE = "experiment.yaml"  # copy of the description, in the folder of the results
-CELL_SETTINGS = {"seed": "seeds", "runner.experiment_name": "tasks, environments and seeds"}
+CELL_SETTINGS = {
+    "seed": "seeds",
+    "runner.experiment_name": "tasks, environments and seeds",
+    "env.num_actions": "the tasks",
+}
 """Settings that ``train`` must not change, and the keys that they come from."""
 EVALUATION = {"num_envs": 256, "num_steps": 2000}
 """Worlds and control steps of an evaluation, unless the description has others."""
@@ -117,6 +122,8 @@ def read_matrix(file: Path) -> Matrix:
         options = Options(device="cpu", seed=cell.seed, perturbation=cell.environment, ranges=ranges, set=words)
         env_cfg, _ = task_registry.get_cfgs(cell.task, options)
         check_env_cfg(env_cfg)
+        if cell.seed == matrix.seeds[0]:
+            load_asset(env_cfg)
         for name in cell.evaluated_in:
             if name not in env_cfg.perturbations():
                 raise unknown_name("perturbation", name, env_cfg.perturbations())

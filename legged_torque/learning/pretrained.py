@@ -16,6 +16,7 @@ from torch import Tensor
 
 from legged_torque.learning import checkpoint
 from legged_torque.learning.runner import OnPolicyRunner
+from legged_torque.utils.cli import check_output
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import all_experiments_dir
@@ -56,6 +57,7 @@ def make_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device:
     """Make a task's pre-trained policy, and return what its making reports; a UserError if it has no pre-training."""
     if not train_cfg.pretraining.function:
         raise UserError(f"task '{task}' has no pre-training: its pretraining.function is empty")
+    check_output(file)
     actor, report = resolve_callable(train_cfg.pretraining.function)(task, env_cfg, train_cfg, device)
     content = {"actor_state_dict": actor.state_dict(), "spaces": spaces(env_cfg, train_cfg), "report": report}
     checkpoint.write(file, content)

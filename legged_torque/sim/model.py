@@ -7,23 +7,23 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.mjcf import loading
 
 CONTACT_DATA = 4  # numbers per contact sensor: number of contacts, then the net force (x, y, z) in the world frame [N]
 
+FLOOR = "floor"  # name of the geom that robots stand on
 _DATASPEC = sum(1 << int(f) for f in (mujoco.mjtConDataField.mjCONDATA_FOUND, mujoco.mjtConDataField.mjCONDATA_FORCE))
 _REDUCE_NETFORCE = 3
 
 
 def read_spec(file: Path) -> mujoco.MjSpec:
     """Read a MJCF file; a UserError if it is missing or cannot be read."""
-    try:
+    with loading(file):
         return mujoco.MjSpec.from_file(str(file))
-    except ValueError as error:
-        raise UserError(f"cannot load the robot '{file}': {' '.join(str(error).split())}") from None
 
 
-def collision_geoms(spec: mujoco.MjSpec, floor: str = "floor") -> list[str]:
+def collision_geoms(spec: mujoco.MjSpec, floor: str = FLOOR) -> list[str]:
     """Return the names of the geoms that can touch the ground, in the file's order."""
     geoms = [geom.name for geom in spec.geoms if geom.name and (geom.contype or geom.conaffinity)]
     return [name for name in geoms if name != floor]
@@ -37,7 +37,7 @@ def indices_matching(names: list[str], parts: list[str]) -> list[int]:
     return [i for i, name in enumerate(names) if any(part in name for part in parts)]
 
 
-def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = "floor") -> mujoco.MjModel:
+def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = FLOOR) -> mujoco.MjModel:
     """Compile the model to simulate: without what is only there to be seen, and with contact sensors.
 
     The contacts of each of ``contact_geoms`` with the floor are sensed, by a sensor each, in this order. They are the

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import gc
 import json
 import math
 import os
 import signal
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from legged_torque.utils.errors import TrainingError, UserError, unknown_name
+from legged_torque.utils.errors import TrainingError, UserError, is_out_of_memory, unknown_name
+
+MAX_NAME = 255  # bytes of the name of a file, on the usual systems
 
 
 class Parser(argparse.ArgumentParser):
@@ -28,8 +32,13 @@ class Parser(argparse.ArgumentParser):
         raise UserError(message)
 
     def parse_args(self, args=None, namespace=None):
-        """Parse the command line; an option that does not exist is a UserError."""
-        namespace, unknown = self.parse_known_args(args, namespace)
+        """Parse the command line; an option that does not exist, or a value that is empty, is a UserError."""
+        words = sys.argv[1:] if args is None else list(args)
+        for before, word in zip(["", *words], words, strict=False):
+            name, equals, value = word.partition("=") if word.startswith("--") else (before, "", word)
+            if not value and (equals or not word):
+                raise UserError(f"the value of {name} is empty" if name else "an argument is empty")
+        namespace, unknown = self.parse_known_args(words, namespace)
         if unknown:
             options = [option for action in self._actions for option in action.option_strings]
             raise unknown_name("option", unknown[0], options)
@@ -39,8 +48,8 @@ class Parser(argparse.ArgumentParser):
 def run_script(main: Callable[[], None]) -> None:
     """Run a script's main function; expected errors exit without a traceback.
 
-    Exit status 2 for a user's mistake, 130 for Ctrl-C, 1 for a training that cannot learn or an output that nobody
-    reads any more (``| head``).
+    Exit status 2 for a user's mistake, a file that cannot be used or too little memory, 130 for Ctrl-C, 1 for a
+    training that cannot learn or an output that nobody reads any more (``| head``).
     """
     gc.freeze()  # what has been imported stays: searching it for garbage at the end would take a second or two
     if "mujoco" in sys.modules:  # which would write its warnings to a file in the current folder
@@ -50,7 +59,7 @@ def run_script(main: Callable[[], None]) -> None:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         main()
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print("error:", " ".join(str(error).splitlines()), file=sys.stderr)
         sys.exit(2)
     except TrainingError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -61,39 +70,66 @@ def run_script(main: Callable[[], None]) -> None:
     except BrokenPipeError:  # nobody reads the output any more (| head)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes what is left when it ends
         sys.exit(1)
+    except Exception as error:
+        if isinstance(error, OSError) and error.filename is not None:
+            print(f"error: {error.strerror}: {str(error.filename)!r}", file=sys.stderr)
+        elif is_out_of_memory(error):
+            reason = str(error).strip().splitlines() or ["nothing is left"]
+            print("error: this does not fit in memory, lower --num_envs:", reason[0], file=sys.stderr)
+        else:
+            raise
+        sys.exit(2)
 
 
-def check_at_least(args: argparse.Namespace, lowest: int, *names: str) -> None:
-    """Raise a UserError if one of the named arguments is lower, or NaN."""
+def check_at_least(args: object, lowest: int, *names: str) -> None:
+    """Raise a UserError if one of the named arguments is lower, NaN, infinite or too large to count."""
     for name in names:
-        if not getattr(args, name) >= lowest:
-            raise UserError(f"--{name} must be at least {lowest}, not {getattr(args, name)}")
+        value = getattr(args, name)
+        if not value >= lowest:
+            raise UserError(f"--{name} must be at least {lowest}, not {value}")
+        if value >= 2**31:
+            raise UserError(f"--{name} is too large: {value}")
+
+
+def finite(text: str) -> float:
+    """Return the number that an argument gives, as its ``type``; NaN and infinity are refused."""
+    if not math.isfinite(float(text)):
+        raise argparse.ArgumentTypeError(f"it must be finite, not {text}")
+    return float(text)
 
 
 def add_command_arg(parser: Parser) -> None:
     """Add a fixed command of the robots."""
     hint = "fixed command [m/s, m/s, rad/s]; default: drawn as in training"
-    parser.add_argument("--command", type=float, nargs=3, metavar=("X", "Y", "YAW"), help=hint)
+    parser.add_argument("--command", type=finite, nargs=3, metavar=("X", "Y", "YAW"), help=hint)
 
 
 def write_json(file: Path, value: Any) -> None:
     """Write a value with null in place of what is not a finite number, which JSON does not know."""
 
-    def finite(part: Any) -> Any:
+    def without_nan(part: Any) -> Any:
         if isinstance(part, dict):
-            return {key: finite(entry) for key, entry in part.items()}
+            return {key: without_nan(entry) for key, entry in part.items()}
         if isinstance(part, list):
-            return [finite(entry) for entry in part]
+            return [without_nan(entry) for entry in part]
         return None if isinstance(part, float) and not math.isfinite(part) else part
 
-    file.write_text(json.dumps(finite(value), indent=1) + "\n", encoding="utf-8")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(without_nan(value), indent=1) + "\n", encoding="utf-8")
 
 
-def prepare_file(file: Path) -> None:
-    """Make the folder of a file that will be written when the work is done; a UserError if that is not possible."""
-    if file.is_dir():
-        raise UserError(f"cannot write '{file}': it is a folder")
+def check_output(file: Path) -> None:
+    """Raise a UserError if a file cannot be written when the work is done; nothing is created or changed yet."""
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
+        if file.is_dir():
+            raise UserError(f"cannot write '{file}': it is a folder")
+        if file.exists():
+            file.open("ab").close()
+        else:
+            folder = next(parent for parent in file.absolute().parents if parent.exists())
+            with tempfile.TemporaryFile(dir=folder):
+                too_long = max(len(os.fsencode(part)) for part in file.parts) > MAX_NAME
+            if too_long:
+                raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
     except OSError as error:
-        raise UserError(f"cannot make the folder '{file.parent}': {error.strerror}") from None
+        raise UserError(f"cannot write '{file}': {error.strerror}") from None

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import inspect
 import itertools
-from typing import Any
+import re
+from typing import Any, ClassVar
 
 import yaml
 
@@ -160,7 +160,7 @@ def convert(value: Any, old: Any, path: str) -> Any:
     if isinstance(old, bool) or isinstance(value, bool):
         matches = isinstance(old, bool) and isinstance(value, bool)
     elif isinstance(old, float) and isinstance(value, int):
-        return float(value)
+        return float(str(value))  # too large a number is infinite, not an error
     elif isinstance(old, int) and isinstance(value, float):
         matches = value.is_integer()
         value = int(value) if matches else value
@@ -168,25 +168,24 @@ def convert(value: Any, old: Any, path: str) -> Any:
         matches = isinstance(value, type(old))
     if matches and isinstance(old, list) and old and len({type(item) for item in old}) == 1:
         value = [convert(item, old[0], f"{path}[{i}]") for i, item in enumerate(value)]
+    if matches and isinstance(old, dict) and len({type(item) for item in old.values()}) == 1:
+        value = {key: convert(item, next(iter(old.values())), f"{path}.{key}") for key, item in value.items()}
     if not matches:
         raise UserError(f"config key '{path}' takes a value like {old!r}, not {value!r}")
     return value
 
 
 def parse_value(text: str) -> Any:
-    """Return the value that a piece of text stands for, as YAML reads it, and also read ``1e-4`` as a number."""
-    if "e" in text.lower():  # PyYAML reads 1e-4 as text, since it has no dot
-        with contextlib.suppress(ValueError):
-            return float(text)
+    """Return the value that a piece of text stands for, see :func:`parse_yaml`."""
     return parse_yaml(text, f"the value '{text}'")
 
 
 def parse_yaml(text: str, what: str) -> Any:
-    """Return what YAML text holds; if it is not valid, or larger than settings are, a UserError says ``what`` it is."""
+    """Return what YAML text holds, see :class:`Loader`; a UserError says ``what`` is no YAML or too large."""
     try:
-        if len(text) <= MAX_LENGTH and is_small(value := yaml.safe_load(text)):
+        if len(text) <= MAX_LENGTH and is_small(value := yaml.load(text, Loader)):
             return value
-    except (yaml.YAMLError, ValueError) as error:  # a date such as 2026-99-99 is a ValueError
+    except (yaml.YAMLError, ValueError) as error:  # a whole number of 5000 digits is a ValueError
         raise UserError(f"{what} is not valid YAML: {' '.join(str(error).split())}") from None
     except RecursionError:
         pass
@@ -208,3 +207,24 @@ def is_small(value: Any) -> bool:
         if not level or len(level) > MAX_ENTRIES:
             return not level
     return False
+
+
+class Loader(yaml.SafeLoader):
+    """Reads words as YAML 1.2 does: 017 is seventeen and 1e-4 a number; 1:30, on, yes and dates are text."""
+
+    yaml_implicit_resolvers: ClassVar[dict] = {}
+
+
+class Dumper(yaml.SafeDumper):
+    """Writes what :class:`Loader` reads again: text that looks like one of its numbers is quoted."""
+
+
+for _tag, _pattern in {
+    "null": r"~|null|Null|NULL|",
+    "bool": r"true|True|TRUE|false|False|FALSE",
+    "int": r"[-+]?[0-9]+",
+    "float": r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+}.items():
+    for _class in (Loader, Dumper):
+        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})$"), None)
+Loader.add_constructor("tag:yaml.org,2002:int", lambda _, node: int(node.value))

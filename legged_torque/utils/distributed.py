@@ -13,22 +13,30 @@ from legged_torque.utils.errors import UserError
 
 def world_size() -> int:
     """Return how many processes train together: 1 unless torchrun has started more."""
-    return int(os.environ.get("WORLD_SIZE", "1"))
+    return _variable("WORLD_SIZE", 1)
 
 
 def rank() -> int:
     """Return the number of this process among all of them."""
-    return int(os.environ.get("RANK", "0")) if world_size() > 1 else 0
+    return _variable("RANK", 0) if world_size() > 1 else 0
 
 
 def local_world_size() -> int:
     """Return how many of the processes run on this machine."""
-    return int(os.environ.get("LOCAL_WORLD_SIZE", "1")) if world_size() > 1 else 1
+    return _variable("LOCAL_WORLD_SIZE", 1) if world_size() > 1 else 1
 
 
 def local_rank() -> int:
     """Return the number of this process among those on this machine, which is that of its GPU."""
-    return int(os.environ.get("LOCAL_RANK", "0")) if world_size() > 1 else 0
+    return _variable("LOCAL_RANK", 0) if world_size() > 1 else 0
+
+
+def _variable(name: str, lowest: int) -> int:
+    """Return the number that torchrun has put into an environment variable; ``lowest`` if it has not."""
+    text = os.environ.get(name, str(lowest))
+    if not text.isdecimal() or int(text) < lowest:
+        raise UserError(f"the environment variable {name}, which torchrun sets, must be a number, not '{text}'")
+    return int(text)
 
 
 def join(device: str) -> None:

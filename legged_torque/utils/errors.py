@@ -5,6 +5,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+OUT_OF_MEMORY = ("out of memory", "Failed to allocate", "can't allocate memory")
+"""Parts of the messages of CUDA, Warp and torch on the CPU when memory has run out."""
+
 
 class UserError(Exception):
     """A mistake in what the user gave: one line that says what, what is allowed and the nearest match.
@@ -27,3 +30,13 @@ def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
     match = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
     hint = f" did you mean '{match[0]}'?" if match else ""
     return UserError(f"unknown {kind} '{given}';{hint} allowed: {', '.join(allowed)}")
+
+
+def is_out_of_memory(error: BaseException | None) -> bool:
+    """Return whether an error, or one that led to it, says that memory has run out."""
+    while error is not None:
+        is_told = isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY)
+        if is_told or isinstance(error, MemoryError):
+            return True
+        error = error.__cause__ or error.__context__
+    return False

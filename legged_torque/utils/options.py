@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from legged_torque.utils.cli import check_at_least
 from legged_torque.utils.config import BaseConfig, section_keys, set_by_path, update_from_dict
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, unknown_name
@@ -61,8 +62,10 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
         env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
     if run_config:
         update_from_dict(env_cfg, env_cfg.of_older_runs())
-        update_from_dict(env_cfg, run_config["env"])
-        update_from_dict(train_cfg, run_config["train"])
+        for part, cfg in {"env": env_cfg, "train": train_cfg}.items():
+            if not isinstance(run_config[part], dict):
+                raise UserError(f"config key '{part}' is a section with entries, not the value {run_config[part]!r}")
+            update_from_dict(cfg, run_config[part])
     if options.perturbation:
         apply_perturbation(env_cfg, options.perturbation)
     if options.ranges:
@@ -76,8 +79,8 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
         if not separator:
             raise UserError(f"--set takes KEY=VALUE, not '{item}'")
         set_entry_of_either(env_cfg, train_cfg, path, text)
-    if options.max_iterations is not None and options.max_iterations < 1:
-        raise UserError(f"--max_iterations must be at least 1, not {options.max_iterations}")
+    if options.max_iterations is not None:
+        check_at_least(options, 1, "max_iterations")
 
 
 def apply_preset(env_cfg: Any, train_cfg: Any, name: str) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from legged_torque.utils.config import parse_yaml
+from legged_torque.utils.config import Dumper, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.files import is_whole_archive, part_of, remove_stale_parts, told_by_name, write_whole
 
@@ -102,7 +102,7 @@ def checkpoint_numbers(run_dir: Path) -> list[int]:
 def save_config(run_dir: str | Path, config: dict[str, Any]) -> None:
     """Write the settings of a run and the versions of the packages that it uses, between YAML's marks of a document."""
     content = {**config, "versions": package_versions()}
-    text = yaml.safe_dump(content, sort_keys=False, explicit_start=True, explicit_end=True)
+    text = yaml.dump(content, Dumper=Dumper, sort_keys=False, explicit_start=True, explicit_end=True)
     write_whole(Path(run_dir) / CONFIG_FILE, text.encode())
 
 

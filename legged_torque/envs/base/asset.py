@@ -10,8 +10,9 @@ import numpy as np
 
 from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.sim.model import build_model, collision_geoms, indices_matching, read_spec
+from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching, read_spec
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.mjcf import loading
 
 
 @dataclass
@@ -42,15 +43,28 @@ def load_asset(cfg: LeggedRobotCfg) -> Asset:
     """
     settings = cfg.asset
     spec = read_spec(resource_path(settings.file))
+    _check_parts(spec, settings.file)
     geoms = collision_geoms(spec)
     feet = indices_matching(geoms, [settings.foot_name])
     penalized = indices_matching(geoms, settings.penalize_contacts_on)
     terminating = indices_matching(geoms, settings.terminate_after_contacts_on)
-    model = build_model(spec, geoms)
+    with loading(resource_path(settings.file)):
+        model = build_model(spec, geoms)
+    if not np.isfinite([*model.body_mass, *model.body_inertia.flat]).all():
+        raise UserError(f"'{settings.file}' has a mass or an inertia that is not finite")
     model.opt.timestep = cfg.sim.dt
     dof_names = [model.joint(i).name for i in range(1, model.njnt)]
     _check_motors(model, dof_names, settings.file)
     return Asset(model, dof_names, geoms, feet, penalized, terminating)
+
+
+def _check_parts(spec: mujoco.MjSpec, file: str) -> None:
+    """Refuse a robot that does not float, or does not stand on a floor of that name, beside which nothing collides."""
+    trunks = [body for body in spec.worldbody.bodies if any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in body.joints)]
+    if len(trunks) != 1:
+        raise UserError(f"'{file}' must have one body with a free joint, the trunk, not {len(trunks)}")
+    if FLOOR not in [geom.name for geom in spec.worldbody.geoms]:
+        raise UserError(f"'{file}' must have a geom '{FLOOR}' in its worldbody")
 
 
 def _check_motors(model: mujoco.MjModel, dof_names: list[str], file: str) -> None:
