@@ -21,7 +21,7 @@ from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
 from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types
 
-LINE_SEARCH_TOLERANCE = wp.constant(0.01)
+LINE_SEARCH_TOLERANCE = wp.constant(0.1)
 """The line search stops when the slope has come down to this share of that at its start."""
 
 
@@ -155,14 +155,21 @@ def in_solver(layout: Layout) -> SimpleNamespace:
 
     @wp.func
     def assemble_all(
-        world: int, lane: int, branch: Branch, kept: Kept, rot: wp.mat33, acc: TrunkMotion, contacts: Contacts
+        world: int,
+        lane: int,
+        branch: Branch,
+        kept: Kept,
+        rot: wp.mat33,
+        acc: TrunkMotion,
+        contacts: Contacts,
+        first: bool,
     ):
         """Assemble and eliminate the branches' Newton equations; return also what is left for the trunk."""
         system = TrunkSystem()
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
             if lane + i * wp.static(lanes) < wp.static(branches):
-                branch, add = solver.assemble(branch, rot, acc, contacts)
+                branch, add = solver.assemble(branch, rot, acc, contacts, first)
                 system = solver.eliminate(branch, system, add)
             place.keep(kept, world, i, branch)
         return branch, system

@@ -10,7 +10,7 @@ Here is what concerns one branch, in the order of an iteration; ``branches`` loo
 import warp as wp
 
 from legged_torque.sim.fused.constraint import friction_force, friction_state, row_force
-from legged_torque.sim.fused.contact import Contact, Contacts, contact_force, contact_stiffness, row_values
+from legged_torque.sim.fused.contact import Contact, Contacts, contact_force, contact_stiffness, pushing_rows, row_values
 from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, with_column
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
 from legged_torque.sim.fused.types import AnyBranch, AnyColumns, AnyMatrix, AnyVector, vec4
@@ -53,8 +53,13 @@ def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: Co
 
 
 @wp.func
-def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: Contacts):
-    """Return a branch with gradient and Hessian of the cost, and what its contacts add for the trunk."""
+def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: Contacts, first: bool):
+    """Return a branch with gradient and Hessian of the cost, and what its contacts add for the trunk.
+
+    The first time, contacts push with the rows that are expected to, whatever the accelerations are: the step leads to
+    where the cost would be least if they did. It is a better start than the last step's accelerations, in which small
+    changes of velocities turn the signs of stiff rows.
+    """
     add = TrunkSystem()
     hessian = 1.0 * branch.smooth.mass
     coupling_lin = 1.0 * branch.smooth.mass_lin
@@ -80,11 +85,14 @@ def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts:
             if j < contact.depth:
                 motion = column(branch.smooth.lever, j) + wp.cross(column(branch.smooth.axis, j), contact.pos)
                 jacobian = with_column(jacobian, j, motion)
-        force = contact_force(contact, contacts.normal, contacts.residual[k])
+        pushing = pushing_rows(contacts.residual[k])
+        if first:
+            pushing = contact.expected
+        force = contact_force(contact, contacts.normal, contacts.residual[k], pushing)
         gradient -= wp.transpose(jacobian) * force
         gradient_lin -= force
         gradient_ang -= wp.transpose(lever) * force
-        stiffness = contact_stiffness(contact, contacts.normal, contacts.residual[k])
+        stiffness = contact_stiffness(contact, contacts.normal, pushing)
         pushed = stiffness * jacobian
         hessian += wp.transpose(jacobian) * pushed
         coupling_lin += pushed

@@ -10,6 +10,9 @@ import warp as wp
 from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.types import vec5
 
+MIN_TOLERANCE = 1e-9
+"""Of ``opt.tolerance``: float32 resolves no smaller decrease of the cost."""
+
 
 @wp.struct
 class Tables:
@@ -67,7 +70,8 @@ class Tables:
     # Options:
     timestep: wp.float32
     impratio: wp.float32
-    cost_scale: wp.float32
+    cost_scale: wp.float32  # from the cost to MuJoCo's units for its decrease
+    tolerance: wp.float32  # the solver stops when a step promises less decrease, in these units
 
 
 @wp.struct
@@ -117,6 +121,7 @@ def make_tables(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Tab
     tables.timestep = model.opt.timestep
     tables.impratio = model.opt.impratio
     tables.cost_scale = 1.0 / (model.stat.meaninertia * model.nv)
+    tables.tolerance = max(model.opt.tolerance, MIN_TOLERANCE)
     sensors = np.full(model.ngeom, -1, np.int32)
     sensors[model.sensor_refid] = model.sensor_adr
     tables.geom_sensor = wp.array(sensors, dtype=wp.int32)
