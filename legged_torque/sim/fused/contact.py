@@ -13,8 +13,9 @@ MIN_FRICTION = wp.constant(1.0e-5)
 MAX_CONTACT_MASS = wp.constant(4.0e4)
 """Most mass of a contact's rows, times the inverse weight of its body. Contacts get stiffer with less friction and with
 impratio, without limit, while float32 loses the solution; a contact as stiff as this one creeps by micrometres."""
-STICKING_SPEED = wp.constant(0.1)
-"""Contacts that slide faster [m/s] are expected to go on sliding. This changes how long the solver takes, no result."""
+STICKING_ACCELERATION = wp.constant(10.0)
+"""Contacts whose references ask for more [m/s^2] along a tangent are expected to slide. It changes how long the solver
+takes, no result."""
 CAPSULE = wp.constant(3)
 BOX = wp.constant(6)
 """MuJoCo's mjGEOM_CAPSULE and mjGEOM_BOX."""
@@ -32,7 +33,6 @@ class Contact:
     sensor: wp.int32  # address of its geom's contact sensor, -1 without
     friction: wp.float32
     mass: wp.float32  # D of its four rows
-    expected: vec4  # 1 for the rows that the solver expects to push when it starts, else 0
     reference: vec4  # a_ref of its four rows
 
 
@@ -42,6 +42,7 @@ class Contacts:
 
     found: wp.array(dtype=Contact)
     residual: wp.array(dtype=vec4)  # J a - a_ref of the four rows
+    pushing: wp.array(dtype=vec4)  # 1 for the rows that push, else 0
     change: wp.array(dtype=vec4)  # of the residual per unit of the solver's step
     normal: wp.vec3  # the floor's
 
@@ -101,31 +102,35 @@ def set_contact_rows(
     contact.mass = wp.min(constraint_mass(regularized, params[2]), MAX_CONTACT_MASS / wp.max(invweight, MIN_VALUE))
     along = row_values(contact, normal, velocity)
     contact.reference = vec4(-params[0] * params[2] * dist) - params[1] * along
-    contact.expected = expected_rows(along, wp.dot(normal, velocity), friction)
     return contact
 
 
 @wp.func
-def expected_rows(along: vec4, up: float, friction: float) -> vec4:
-    """Return 1 for the rows that are expected to push, from their velocities and the one along the normal, else 0.
+def expected_rows(contact: Contact) -> vec4:
+    """Return 1 for the rows that are expected to push, else 0: all where a contact sticks, else those against sliding.
 
-    Where a contact slides, friction opposes it; where it is slow, it is expected to stick, which takes all rows.
+    A row's reference is that of the normal and of the sideways velocity, which it shall stop.
     """
-    rows = vec4(1.0)
-    for r in range(4):
-        if along[r] - up > STICKING_SPEED * friction:
-            rows[r] = 0.0
-    return rows
+    reference = contact.reference
+    along_normal = 0.25 * (reference[0] + reference[1] + reference[2] + reference[3])
+    lowest = along_normal - STICKING_ACCELERATION * contact.friction
+    return vec4(
+        wp.where(reference[0] < lowest, 0.0, 1.0),
+        wp.where(reference[1] < lowest, 0.0, 1.0),
+        wp.where(reference[2] < lowest, 0.0, 1.0),
+        wp.where(reference[3] < lowest, 0.0, 1.0),
+    )
 
 
 @wp.func
 def pushing_rows(x: vec4) -> vec4:
     """Return 1 for the rows that push, from the residuals J qacc - a_ref, else 0."""
-    rows = vec4(0.0)
-    for r in range(4):
-        if x[r] < 0.0:
-            rows[r] = 1.0
-    return rows
+    return vec4(
+        wp.where(x[0] < 0.0, 1.0, 0.0),
+        wp.where(x[1] < 0.0, 1.0, 0.0),
+        wp.where(x[2] < 0.0, 1.0, 0.0),
+        wp.where(x[3] < 0.0, 1.0, 0.0),
+    )
 
 
 @wp.func

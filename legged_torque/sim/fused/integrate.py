@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from legged_torque.sim.fused.contact import Contacts, contact_force, pushing_rows
+from legged_torque.sim.fused.contact import Contacts, contact_force
 from legged_torque.sim.fused.math import quat_multiply, quat_rotation
 from legged_torque.sim.fused.solver import branch_step
 from legged_torque.sim.fused.tables import Tables, Worlds, dof, qadr
@@ -55,8 +55,7 @@ def sense_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch: Any
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
         address = contacts.found[k].sensor
         if address >= 0:
-            pushing = pushing_rows(contacts.residual[k])
-            force = contact_force(contacts.found[k], contacts.normal, contacts.residual[k], pushing)
+            force = contact_force(contacts.found[k], contacts.normal, contacts.residual[k], contacts.pushing[k])
             worlds.sensordata[world, address] = worlds.sensordata[world, address] + 1.0
             for r in range(3):
                 worlds.sensordata[world, address + 1 + r] = worlds.sensordata[world, address + 1 + r] + force[r]

@@ -83,6 +83,8 @@ class Worlds:
     qvel: wp.array2d(dtype=wp.float32)
     qacc_warmstart: wp.array2d(dtype=wp.float32)
     sensordata: wp.array2d(dtype=wp.float32)
+    xfrc_applied: wp.array2d(dtype=wp.spatial_vector)  # read only by kernels that are made for it, like the next one
+    qfrc_applied: wp.array2d(dtype=wp.float32)
 
 
 @wp.func
