@@ -10,7 +10,15 @@ Here is what concerns one branch, in the order of an iteration; ``branches`` loo
 import warp as wp
 
 from legged_torque.sim.fused.constraint import friction_force, friction_state, row_force
-from legged_torque.sim.fused.contact import Contact, Contacts, contact_force, contact_stiffness, expected_rows, pushing_rows, row_values
+from legged_torque.sim.fused.contact import (
+    Contact,
+    Contacts,
+    contact_force,
+    contact_stiffness,
+    expected_rows,
+    pushing_rows,
+    row_values,
+)
 from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, with_column
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
 from legged_torque.sim.fused.types import AnyBranch, AnyColumns, AnyMatrix, AnyVector, vec4

@@ -27,7 +27,13 @@ EXACT_STEP = wp.constant(1.0)
 
 
 class FusedStep:
-    """Steps all worlds of a MuJoCo Warp ``Data``, on its own arrays."""
+    """Steps all worlds of a MuJoCo Warp ``Data``, on its own arrays.
+
+    Attributes:
+        carried: What worlds carry from one step to the next beside their states: nothing.
+    """
+
+    carried: tuple[()] = ()
 
     def __init__(
         self, mj_model: mujoco.MjModel, model: mjw.Model, data: mjw.Data, applied_forces: bool = False

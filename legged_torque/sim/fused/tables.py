@@ -74,6 +74,18 @@ class Tables:
     tolerance: wp.float32  # the solver stops when a step promises less decrease, in these units
 
 
+FUSED_FIELDS = [
+    "gravity",
+    *(name for name in Tables.vars if name in mjw.Model.__annotations__ and Tables.vars[name].type.ndim == 2),
+]
+"""Fields of MuJoCo Warp's model that may differ from world to world."""
+
+
+def unread_columns(name: str) -> int:
+    """Return how many of the first entries of a world's part of a field are the free joint's, which nobody reads."""
+    return {"dof_": 6, "jnt_": 1, "qpos": 7}.get(name[:4], 0)
+
+
 @wp.struct
 class Worlds:
     """The state of the worlds: fields of MuJoCo Warp's data, one row per world."""
