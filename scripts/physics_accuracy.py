@@ -1,4 +1,7 @@
-"""Compare solver settings with converged mj_step on a walking robot: ``python scripts/physics_accuracy.py``."""
+"""Compare a physics step with converged mj_step in ten kinds of states: ``python scripts/physics_accuracy.py``.
+
+The states are made from those of a robot that walks under a trained policy.
+"""
 
 from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
@@ -8,42 +11,62 @@ without_renderer()  # before anything imports mujoco
 
 import torch
 
-from legged_torque.checks.accuracy import copy_state, reference_velocities, velocity_errors
+from legged_torque.checks.accuracy import (
+    KINDS,
+    TOLERANCE,
+    PhysicsState,
+    copy_state,
+    make_states,
+    measure_accuracy,
+    open_motors,
+    reference_step,
+)
 from legged_torque.envs import task_registry
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.simulator import ENGINES, Simulator
 from legged_torque.utils.args import Parser, add_task_args, options_of
 from legged_torque.utils.cli import check_at_least, run_script
+from legged_torque.utils.devices import device_name
 from legged_torque.utils.task_registry import set_seed
 
-SETTINGS = [(engine, *numbers) for engine in ("fused", "mujoco_warp") for numbers in ((10, 20), (5, 8), (3, 6))]
-"""Engine, solver iterations and line search iterations."""
+WALKERS = 32  # worlds that walk
 
 
 def main() -> None:
-    """Let a trained policy walk, keep its states, and step each with every setting."""
+    """Let a trained policy walk, keep its states, make the others of them, and step each with both engines."""
     parser = Parser(__doc__)
     add_task_args(parser)
-    parser.set_defaults(num_envs=32, seed=1)
-    help_text = "control steps to walk; one physics step of each is compared"
-    parser.add_argument("--steps", type=int, default=100, help=help_text)
+    parser.set_defaults(num_envs=WALKERS, seed=1)
+    parser.add_argument("--steps", type=int, default=100, help="control steps to walk; the states after each are kept")
+    parser.add_argument("--worlds", type=int, default=1500, help="states of each kind; default: %(default)s")
     args = parser.parse_args()
-    check_at_least(args, 1, "steps")
+    check_at_least(args, 1, "steps", "worlds")
     options = options_of(args)
     run = task_registry.load_run(options)
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options)
     policy = runner.get_inference_policy(env.device)
-    states, obs = [], env.get_observations()
+    kept: list[PhysicsState] = []
+    obs = env.get_observations()
     with torch.inference_mode():
         for _ in range(args.steps):
             obs = env.step(policy(obs))[0]
-            states.append(copy_state(env.sim))
-    reference = reference_velocities(env.sim.mj_model, states)
-    print("engine      | iterations | line search | rms error | 99.9% | max | rms change in a step   [m/s, rad/s]")
-    for engine, iterations, ls_iterations in SETTINGS:
-        sim = Simulator(env.sim.mj_model, env.num_envs, env.device, engine, iterations, ls_iterations)
-        errors = " | ".join(f"{value:.2e}" for value in velocity_errors(sim, states, reference).values())
-        print(f"{engine:<11} | {iterations:>10} | {ls_iterations:>11} | {errors}")
+            kept.append(copy_state(env.sim))
+    walking = {name: torch.cat([state[name] for state in kept]) for name in kept[0]}
+    model, settings = open_motors(env.sim.mj_model), env.cfg.sim
+    limits = (settings.solver_iterations, settings.ls_iterations)
+    sims = {engine: Simulator(model, args.worlds, env.device, engine, *limits) for engine in ENGINES}
+    print(f"{args.task} on {device_name(env.device)}: errors of the velocities after one step [m/s, rad/s]")
+    print(f"of {args.worlds} worlds each; {limits[0]} iterations of the solver, {limits[1]} of its line search")
+    titles = ("kind", "engine", "median", "99.9%", "max", f"> {TOLERANCE:g}", "left out", "iterations")
+    print("{:<21} | {:<11} | {:>7} | {:>7} | {:>7} | {:>7} | {:>8} | {:>10}".format(*titles))
+    for kind in KINDS:
+        states = make_states(kind, model, walking, args.worlds, args.seed)
+        expected = reference_step(model, states)
+        for engine, sim in sims.items():
+            row = measure_accuracy(sim, states, *expected)
+            errors = " | ".join(f"{value:7.1e}" for value in (row.median, row.p999, row.max))
+            shares = f"{row.wrong:7.2%} | {row.left_out:8.2%} | {row.iterations:10.1f}"
+            print(f"{kind:<21} | {engine:<11} | {errors} | {shares}", flush=True)
 
 
 if __name__ == "__main__":

@@ -15,11 +15,12 @@ from torch import Tensor
 from legged_torque.sim import kernels
 from legged_torque.sim.fused.set_const import DerivedConstants
 from legged_torque.sim.fused.step import FusedStep
+from legged_torque.sim.fused.tables import FUSED_FIELDS, unread_columns
 from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
-from legged_torque.sim.per_world import expand, owner
+from legged_torque.sim.per_world import check_fields, expand, owner
 from legged_torque.sim.warp_step import WarpStep
-from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.errors import UserError, unknown_name
 
 ENGINES = ("fused", "mujoco_warp")
 """What may step the worlds: one kernel per step for legged robots on a plane, or MuJoCo Warp for any robot."""
@@ -45,6 +46,9 @@ class Simulator:
             Shape: (num_envs, geoms, 3).
         diverged: Worlds whose state was seen to be not finite or absurdly large since the last :meth:`clear_diverged`.
             Shape: (num_envs,), bool.
+        xfrc_applied: Force [N] at the centre of mass of each body and torque [N m] on it, in the world frame; zeros
+            unless written. None without ``applied_forces``. Shape: (num_envs, nbody, 6).
+        qfrc_applied: Generalized forces, likewise. Shape: (num_envs, nv).
     """
 
     def __init__(
@@ -53,15 +57,17 @@ class Simulator:
         num_envs: int,
         device: str,
         engine: str = "fused",
-        solver_iterations: int = 10,
+        solver_iterations: int = 20,
         ls_iterations: int = 20,
         per_world: Sequence[str] = (),
+        applied_forces: bool = False,
     ) -> None:
         """Build the worlds on "cpu" or "cuda:N", all in the reference pose of a model with contact sensors.
 
         Each has its own rows of the fields ``per_world``, "gravity" among them. Iterations of the constraint solver,
-        and of its line search, are the most per physics step. A UserError if the engine, one of :data:`ENGINES`, is
-        unknown or cannot simulate this robot.
+        and of its line search, are the most per physics step. With ``applied_forces``, ``xfrc_applied`` and
+        ``qfrc_applied`` act. A UserError if the engine, one of :data:`ENGINES`, is unknown or cannot simulate this
+        robot, or does not read one of the fields.
         """
         if engine not in ENGINES:
             raise unknown_name("sim.engine", engine, ENGINES)
@@ -76,13 +82,18 @@ class Simulator:
             self.model.opt.warn_overflow = 0  # it prints from inside kernels; check_buffers tells instead
             rows = max_constraints(model, contacts, any_friction="dof_frictionloss" in per_world)
             self.data = mjw.make_data(model, nworld=num_envs, nconmax=contacts, njmax=rows)
+            check_fields(self.model, per_world, FUSED_FIELDS if engine == "fused" else None)
             for name in per_world:
                 expand(self.model, name, num_envs)
             self._diverged = wp.zeros(num_envs, dtype=wp.bool)
             self._overflow = wp.zeros(num_envs, dtype=wp.int32)
             self._reference_pose: wp.array = wp.array(model.qpos0, dtype=wp.float32)
         self._constants = DerivedConstants(model, self.model, num_envs) if per_world else None
-        self._step = FusedStep(model, self.model, self.data) if engine == "fused" else WarpStep(self.model, self.data)
+        self._is_fused = engine == "fused"
+        if self._is_fused:
+            self._step: FusedStep | WarpStep = FusedStep(model, self.model, self.data, applied_forces)
+        else:
+            self._step = WarpStep(self.model, self.data)
         state = (self.data.qpos, self.data.qvel, self.data.qacc_warmstart, self.data.ctrl)
         self.qpos, self.qvel, self.qacc_warmstart, self.ctrl = map(wp.to_torch, state)
         self.diverged = wp.to_torch(self._diverged)
@@ -90,10 +101,22 @@ class Simulator:
         self.contact_found, self.contact_force = sensors[:, :, 0], sensors[:, :, 1:]
         derived = ("body_invweight0", "dof_invweight0") if per_world else ()
         self.derived = [self.field(name) for name in derived]  # what update_constants has written, to be saved
+        forces = tuple(map(wp.to_torch, (self.data.xfrc_applied, self.data.qfrc_applied))) if applied_forces else ()
+        self.xfrc_applied, self.qfrc_applied = forces or (None, None)
+        self._carried = [tensor.view(num_envs, -1) for tensor in (*forces, *self._step.carried)]
 
     def field(self, name: str) -> Tensor:
         """Return a writable field of the model, one that was asked for ``per_world``. Shape: (num_envs, ...)."""
         return wp.to_torch(getattr(owner(self.model, name), name))
+
+    def check_columns(self, name: str, columns: Sequence[int]) -> None:
+        """Refuse numbers of a world's part of a field, all entries behind each other, that the engine never reads.
+
+        A UserError for those of the trunk's free joint with "fused".
+        """
+        unread = unread_columns(name) * self.field(name)[0, 0].numel() if self._is_fused else 0
+        if any(column < unread for column in columns):
+            raise UserError(f"sim.engine 'fused' does not read '{name}' of the trunk's free joint")
 
     def vary_legs(self) -> None:
         """Also recompute per-leg constants, see :func:`~legged_torque.sim.randomization.changes_legs`.
@@ -125,11 +148,13 @@ class Simulator:
     def reset(self, mask: Tensor) -> None:
         """Put the worlds of ``mask`` (num_envs,), bool, back to the reference pose, at rest.
 
-        All their buffers are cleared, warm starts included.
+        All that they carry from step to step is cleared, warm starts and applied forces included.
         """
         data = self.data
         state = (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, data.sensordata)
         self._launch(kernels.reset_worlds, wp.from_torch(mask), self._reference_pose, *state)
+        for rows in self._carried:
+            rows.masked_fill_(mask.unsqueeze(1), 0.0)
 
     def set_orientation(self, mask: Tensor, angles: Tensor) -> None:
         """Turn the trunks of the worlds in ``mask`` (num_envs,), bool, by roll, pitch and yaw [rad] (num_envs, 3).

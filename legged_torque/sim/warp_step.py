@@ -10,11 +10,17 @@ _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
 
 class WarpStep:
-    """Steps all worlds of a MuJoCo Warp ``Data``."""
+    """Steps all worlds of a MuJoCo Warp ``Data``.
+
+    Attributes:
+        carried: What worlds carry from one step to the next beside their states: constraint rows that are not used
+            now, whose NaN would spoil a world, since the solver multiplies them by zero.
+    """
 
     def __init__(self, model: mjw.Model, data: mjw.Data) -> None:
         """Keep model and data on the device."""
         self._model, self._data = model, data
+        self.carried = (wp.to_torch(data.efc.J), wp.to_torch(data.efc.force))
         self._device = data.qpos.device
         self._flags = model.opt.disableflags
         if self._device.is_cuda:

@@ -156,6 +156,7 @@ def of_model(task: LeggedRobot, name: str, field: str, columns: Sequence[int], *
     ``columns`` are numbers of a world's part of the field, all of its entries behind each other; ``settings`` is all
     else that a :class:`~legged_torque.sim.randomization.Parameter` takes.
     """
+    task.sim.check_columns(field, columns)
     return Parameter(name, task.sim.field(field).flatten(1), list(columns), model_field=field, **settings)
 
 

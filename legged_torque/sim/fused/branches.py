@@ -11,6 +11,7 @@ from typing import NamedTuple
 import warp as wp
 
 from legged_torque.sim.fused import solver
+from legged_torque.sim.fused.applied import apply_to_branch
 from legged_torque.sim.fused.constraint import make_joint_rows
 from legged_torque.sim.fused.contact import Contacts, find_contacts
 from legged_torque.sim.fused.integrate import integrate_branch, sense_branch
@@ -21,7 +22,7 @@ from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
 from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types
 
-LINE_SEARCH_TOLERANCE = wp.constant(0.01)
+LINE_SEARCH_TOLERANCE = wp.constant(0.1)
 """The line search stops when the slope has come down to this share of that at its start."""
 
 
@@ -67,8 +68,11 @@ def places(per_lane: int) -> SimpleNamespace:
 
 
 @functools.cache
-def around_solver(layout: Layout) -> SimpleNamespace:
-    """Return what comes before and after the solver: ``make_all``, ``damp_all`` and ``integrate_all``."""
+def around_solver(layout: Layout, applied_forces: bool) -> SimpleNamespace:
+    """Return what comes before and after the solver: ``make_all``, ``damp_all`` and ``integrate_all``.
+
+    ``applied_forces`` says whether there are forces that a user applies.
+    """
     branches, depth, points, lanes = layout
     per_lane, place = layout.per_lane, places(layout.per_lane)
     Branch, make_links = branch_types(depth).Branch, links_maker(depth)
@@ -79,6 +83,8 @@ def around_solver(layout: Layout) -> SimpleNamespace:
         """Return a branch with its equations of motion, constraints and the accelerations to start from."""
         poses = wp.zeros(shape=wp.static(depth + 1), dtype=Pose)
         branch, links = make_links(tables, worlds, world, b, trunk, poses)
+        if wp.static(applied_forces):
+            branch, links = apply_to_branch(branch, links, tables, worlds, world, b, poses)
         branch = make_equations(branch, links, tables, world, b, trunk.rot)
         branch.rows = make_joint_rows(branch.rows, tables, worlds, world, b)
         branch.first_contact = (world * wp.static(branches) + b) * wp.static(points)

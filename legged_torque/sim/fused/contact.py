@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from legged_torque.sim.fused.constraint import MIN_VALUE, constraint_mass, reference_dynamics, row_force
+from legged_torque.sim.fused.constraint import MIN_VALUE, constraint_mass, reference_dynamics
 from legged_torque.sim.fused.math import quat_to_matrix
 from legged_torque.sim.fused.smooth import Poses
 from legged_torque.sim.fused.tables import Tables, of_world
@@ -10,9 +10,12 @@ from legged_torque.sim.fused.types import vec4
 
 MIN_FRICTION = wp.constant(1.0e-5)
 """MuJoCo's mjMINMU."""
-MAX_CONTACT_MASS = wp.constant(1.0e5)
-"""Contacts get stiffer with less friction, without limit; above this, which one of 0.2 has with impratio 100, float32
-loses the solution, while the softness that it stands for no longer matters."""
+MAX_CONTACT_MASS = wp.constant(4.0e4)
+"""Most mass of a contact's rows, times the inverse weight of its body. Contacts get stiffer with less friction and with
+impratio, without limit, while float32 loses the solution; a contact as stiff as this one creeps by micrometres."""
+STICKING_ACCELERATION = wp.constant(10.0)
+"""Contacts whose references ask for more [m/s^2] along a tangent are expected to slide. It changes how long the solver
+takes, no result."""
 CAPSULE = wp.constant(3)
 BOX = wp.constant(6)
 """MuJoCo's mjGEOM_CAPSULE and mjGEOM_BOX."""
@@ -39,6 +42,7 @@ class Contacts:
 
     found: wp.array(dtype=Contact)
     residual: wp.array(dtype=vec4)  # J a - a_ref of the four rows
+    pushing: wp.array(dtype=vec4)  # 1 for the rows that push, else 0
     change: wp.array(dtype=vec4)  # of the residual per unit of the solver's step
     normal: wp.vec3  # the floor's
 
@@ -93,12 +97,40 @@ def set_contact_rows(
     params = reference_dynamics(solref, solimp, dist, tables.timestep)
     friction = wp.max(friction, MIN_FRICTION)
     invweight = of_world(tables.body_invweight0, world, tables.geom_bodyid[geom])[0]
-    invweight *= (1.0 + friction * friction) * 2.0 * friction * friction / tables.impratio
+    regularized = invweight * (1.0 + friction * friction) * 2.0 * friction * friction / tables.impratio
     contact.friction = friction
-    contact.mass = wp.min(constraint_mass(invweight, params[2]), MAX_CONTACT_MASS)
+    contact.mass = wp.min(constraint_mass(regularized, params[2]), MAX_CONTACT_MASS / wp.max(invweight, MIN_VALUE))
     along = row_values(contact, normal, velocity)
     contact.reference = vec4(-params[0] * params[2] * dist) - params[1] * along
     return contact
+
+
+@wp.func
+def expected_rows(contact: Contact) -> vec4:
+    """Return 1 for the rows that are expected to push, else 0: all where a contact sticks, else those against sliding.
+
+    A row's reference is that of the normal and of the sideways velocity, which it shall stop.
+    """
+    reference = contact.reference
+    along_normal = 0.25 * (reference[0] + reference[1] + reference[2] + reference[3])
+    lowest = along_normal - STICKING_ACCELERATION * contact.friction
+    return vec4(
+        wp.where(reference[0] < lowest, 0.0, 1.0),
+        wp.where(reference[1] < lowest, 0.0, 1.0),
+        wp.where(reference[2] < lowest, 0.0, 1.0),
+        wp.where(reference[3] < lowest, 0.0, 1.0),
+    )
+
+
+@wp.func
+def pushing_rows(x: vec4) -> vec4:
+    """Return 1 for the rows that push, from the residuals J qacc - a_ref, else 0."""
+    return vec4(
+        wp.where(x[0] < 0.0, 1.0, 0.0),
+        wp.where(x[1] < 0.0, 1.0, 0.0),
+        wp.where(x[2] < 0.0, 1.0, 0.0),
+        wp.where(x[3] < 0.0, 1.0, 0.0),
+    )
 
 
 @wp.func
@@ -111,17 +143,16 @@ def row_values(contact: Contact, normal: wp.vec3, motion: wp.vec3) -> vec4:
 
 
 @wp.func
-def contact_force(contact: Contact, normal: wp.vec3, x: vec4) -> wp.vec3:
+def contact_force(contact: Contact, normal: wp.vec3, x: vec4, pushing: vec4) -> wp.vec3:
     """Return the force on the robot in world axes [N] from the residuals J qacc - a_ref of its rows."""
-    f0, f1 = row_force(contact.mass, x[0]), row_force(contact.mass, x[1])
-    f2, f3 = row_force(contact.mass, x[2]), row_force(contact.mass, x[3])
+    f = -contact.mass * wp.cw_mul(pushing, x)
     second = wp.cross(normal, contact.tangent)
-    sideways = contact.friction * ((f0 - f1) * contact.tangent + (f2 - f3) * second)
-    return (f0 + f1 + f2 + f3) * normal + sideways
+    sideways = contact.friction * ((f[0] - f[1]) * contact.tangent + (f[2] - f[3]) * second)
+    return (f[0] + f[1] + f[2] + f[3]) * normal + sideways
 
 
 @wp.func
-def contact_stiffness(contact: Contact, normal: wp.vec3, x: vec4) -> wp.mat33:
+def contact_stiffness(contact: Contact, normal: wp.vec3, pushing: vec4) -> wp.mat33:
     """Return D times the sum over the pushing rows of direction x direction^T."""
     result = wp.mat33()
     first = contact.friction * contact.tangent
@@ -136,8 +167,7 @@ def contact_stiffness(contact: Contact, normal: wp.vec3, x: vec4) -> wp.mat33:
             direction = normal + second
         if k == 3:
             direction = normal - second
-        if x[k] < 0.0:
-            result += contact.mass * wp.outer(direction, direction)
+        result += contact.mass * pushing[k] * wp.outer(direction, direction)
     return result
 
 

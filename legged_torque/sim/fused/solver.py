@@ -10,7 +10,15 @@ Here is what concerns one branch, in the order of an iteration; ``branches`` loo
 import warp as wp
 
 from legged_torque.sim.fused.constraint import friction_force, friction_state, row_force
-from legged_torque.sim.fused.contact import Contact, Contacts, contact_force, contact_stiffness, row_values
+from legged_torque.sim.fused.contact import (
+    Contact,
+    Contacts,
+    contact_force,
+    contact_stiffness,
+    expected_rows,
+    pushing_rows,
+    row_values,
+)
 from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, with_column
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
 from legged_torque.sim.fused.types import AnyBranch, AnyColumns, AnyMatrix, AnyVector, vec4
@@ -41,7 +49,11 @@ def contact_rows_times(
 
 @wp.func
 def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: Contacts):
-    """Return a branch with the residuals of the accelerations that it starts from."""
+    """Return a branch with the residuals of the accelerations that it starts from.
+
+    Contacts push with the rows that are expected to, whatever these accelerations are. It is a better start than those
+    that push there, since small changes of velocities turn the signs of stiff rows.
+    """
     branch.residuals = joint_rows_times(branch, branch.acc)
     branch.residuals.friction = branch.residuals.friction - branch.rows.friction_reference
     branch.residuals.limit = branch.residuals.limit - branch.rows.limit_reference
@@ -49,6 +61,7 @@ def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: Co
         contact = contacts.found[k]
         motion = contact_rows_times(branch, rot, trunk_acc, branch.acc, contacts.normal, contact)
         contacts.residual[k] = motion - contact.reference
+        contacts.pushing[k] = expected_rows(contact)
     return branch
 
 
@@ -80,11 +93,12 @@ def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts:
             if j < contact.depth:
                 motion = column(branch.smooth.lever, j) + wp.cross(column(branch.smooth.axis, j), contact.pos)
                 jacobian = with_column(jacobian, j, motion)
-        force = contact_force(contact, contacts.normal, contacts.residual[k])
+        pushing = contacts.pushing[k]
+        force = contact_force(contact, contacts.normal, contacts.residual[k], pushing)
         gradient -= wp.transpose(jacobian) * force
         gradient_lin -= force
         gradient_ang -= wp.transpose(lever) * force
-        stiffness = contact_stiffness(contact, contacts.normal, contacts.residual[k])
+        stiffness = contact_stiffness(contact, contacts.normal, pushing)
         pushed = stiffness * jacobian
         hessian += wp.transpose(jacobian) * pushed
         coupling_lin += pushed
@@ -210,9 +224,9 @@ def move(branch: AnyBranch, contacts: Contacts, alpha: float):
     branch.residuals.friction = branch.residuals.friction + alpha * branch.change.friction
     branch.residuals.limit = branch.residuals.limit + alpha * branch.change.limit
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
-        before = contacts.residual[k]
-        after = before + alpha * contacts.change[k]
-        for r in range(4):
-            flips += wp.where((before[r] < 0.0) != (after[r] < 0.0), 1.0, 0.0)
-        contacts.residual[k] = after
+        before = contacts.pushing[k]
+        contacts.residual[k] = contacts.residual[k] + alpha * contacts.change[k]
+        after = pushing_rows(contacts.residual[k])
+        contacts.pushing[k] = after
+        flips += wp.length_sq(after - before)
     return branch, flips

@@ -11,28 +11,38 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from legged_torque.sim.fused.applied import apply_to_trunk
 from legged_torque.sim.fused.branches import Layout, around_solver, in_solver
 from legged_torque.sim.fused.contact import Contact, Contacts, floor_normal
 from legged_torque.sim.fused.integrate import integrate_trunk
-from legged_torque.sim.fused.smooth import make_trunk
+from legged_torque.sim.fused.smooth import make_trunk, trunk_pose
 from legged_torque.sim.fused.tables import Tables, Worlds, make_tables
 from legged_torque.sim.fused.tree import read_tree
 from legged_torque.sim.fused.trunk import TrunkMotion, solve_trunk, trunk_residual, trunk_slopes, whole_body
 from legged_torque.sim.fused.types import branch_types, vec4
 
 BLOCK_DIM = 128  # threads per block: the fastest of 32, 64 and 128 from 4096 worlds on
-TOLERANCE = wp.constant(1.0e-9)
-"""The solver stops when a step promises less than this decrease of the cost, in MuJoCo's units."""
+EXACT_STEP = wp.constant(1.0)
+"""A step that promises less than this decrease of the cost, in MuJoCo's units, is exact in float32 for our purposes."""
 
 
 class FusedStep:
-    """Steps all worlds of a MuJoCo Warp ``Data``, on its own arrays."""
+    """Steps all worlds of a MuJoCo Warp ``Data``, on its own arrays.
 
-    def __init__(self, mj_model: mujoco.MjModel, model: mjw.Model, data: mjw.Data) -> None:
+    Attributes:
+        carried: What worlds carry from one step to the next beside their states: nothing.
+    """
+
+    carried: tuple[()] = ()
+
+    def __init__(
+        self, mj_model: mujoco.MjModel, model: mjw.Model, data: mjw.Data, applied_forces: bool = False
+    ) -> None:
         """Read the robot's structure and prepare the kernel; it compiles at the first step.
 
-        Parameters that change in ``model``, the one on the device, act at once. A UserError if the robot has something
-        that this step does not simulate.
+        Parameters that change in ``model``, the one on the device, act at once; ``xfrc_applied`` and ``qfrc_applied``
+        of ``data`` act with ``applied_forces``. A UserError if the robot has something that this step does not
+        simulate.
         """
         tree = read_tree(mj_model)
         self._device = data.qpos.device
@@ -40,12 +50,13 @@ class FusedStep:
         room = data.nworld * layout.branches
         with wp.ScopedDevice(self._device):
             tables = make_tables(mj_model, model, tree)
-            self._scratch = [wp.empty(room * layout.points, dtype=dtype) for dtype in (Contact, vec4, vec4)]
+            self._scratch = [wp.empty(room * layout.points, dtype=dtype) for dtype in (Contact, vec4, vec4, vec4)]
             waiting = room if layout.per_lane > 1 else 1  # a GPU's threads have one branch each
             self._scratch.append(wp.empty(waiting, dtype=branch_types(layout.depth).Branch))
         self._model = [tables, mj_model.opt.iterations, mj_model.opt.ls_iterations]
         self._data = [data.ctrl, data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, data.solver_niter]
-        self._kernel, self._dim = make_kernel(layout), (data.nworld, layout.lanes)
+        self._data += [data.xfrc_applied, data.qfrc_applied]
+        self._kernel, self._dim = make_kernel(layout, applied_forces), (data.nworld, layout.lanes)
 
     def __call__(self, sense: bool) -> None:
         """Advance every world by one physics step; ``sense`` says whether to write the contact sensors."""
@@ -54,9 +65,9 @@ class FusedStep:
 
 
 @functools.cache
-def make_kernel(layout: Layout) -> wp.Kernel:
-    """Return the kernel for a robot's structure."""
-    around, solver, lanes = around_solver(layout), in_solver(layout), layout.lanes
+def make_kernel(layout: Layout, applied_forces: bool) -> wp.Kernel:
+    """Return the kernel for a robot's structure, with or without forces that a user applies."""
+    around, solver, lanes = around_solver(layout, applied_forces), in_solver(layout), layout.lanes
     Branch = branch_types(layout.depth).Branch
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
@@ -76,22 +87,29 @@ def make_kernel(layout: Layout) -> wp.Kernel:
         # Data out:
         sensordata: wp.array2d(dtype=float),
         solver_niter: wp.array(dtype=int),
+        # Data in, unless there are none:
+        xfrc_applied: wp.array2d(dtype=wp.spatial_vector),
+        qfrc_applied: wp.array2d(dtype=float),
         # Scratch:
         found: wp.array(dtype=Contact),
         residuals: wp.array(dtype=vec4),
+        pushing: wp.array(dtype=vec4),
         changes: wp.array(dtype=vec4),
         kept: wp.array(dtype=Branch),
     ):
         world, lane = wp.tid()
-        worlds = Worlds(ctrl, qpos, qvel, qacc_warmstart, sensordata)
-        contacts = Contacts(found, residuals, changes, floor_normal(tables, world))
+        worlds = Worlds(ctrl, qpos, qvel, qacc_warmstart, sensordata, xfrc_applied, qfrc_applied)
+        contacts = Contacts(found, residuals, pushing, changes, floor_normal(tables, world))
         trunk = make_trunk(tables, worlds, world)
+        if wp.static(applied_forces):
+            trunk = apply_to_trunk(tables, worlds, world, trunk, trunk_pose(trunk))
         acc = TrunkMotion()
         acc.lin = wp.vec3(qacc_warmstart[world, 0], qacc_warmstart[world, 1], qacc_warmstart[world, 2])
         acc.ang = wp.vec3(qacc_warmstart[world, 3], qacc_warmstart[world, 4], qacc_warmstart[world, 5])
         branch, total = around.make_all(tables, worlds, world, lane, trunk, acc, contacts, kept)
         whole = whole_body(trunk, total, wp.static(lanes))
         used = int(0)
+        searches = int(0)  # none in the first iteration, which goes to where the cost is least with the expected rows
         for _iteration in range(iterations):
             used += 1
             branch, system = solver.assemble_all(world, lane, branch, kept, trunk.rot, acc, contacts)
@@ -99,13 +117,15 @@ def make_kernel(layout: Layout) -> wp.Kernel:
             step = solve_trunk(whole, residual, system, wp.static(lanes))
             branch, slopes = solver.turn_all(world, lane, branch, kept, trunk.rot, step, contacts)
             start = slopes + trunk_slopes(whole, residual, step)
-            if not (-start[0] * tables.cost_scale > TOLERANCE):
+            decrease = -start[0] * tables.cost_scale
+            if searches > 0 and not (decrease > tables.tolerance):
                 break
-            alpha = solver.line_search(ls_iterations, world, branch, kept, start, contacts)
+            alpha = solver.line_search(searches, world, branch, kept, start, contacts)
+            searches = ls_iterations
             acc.lin = acc.lin + alpha * step.lin
             acc.ang = acc.ang + alpha * step.ang
             branch, flips = solver.move_all(world, branch, kept, contacts, alpha)
-            if alpha == 1.0 and flips == 0.0:
+            if alpha == 1.0 and flips == 0.0 and decrease < EXACT_STEP:
                 break  # the whole step stayed in one piece of the piecewise quadratic cost: this is its minimum
         branch, system = around.damp_all(tables.timestep, world, lane, branch, kept)
         damped = solve_trunk(whole, TrunkMotion(), system, wp.static(lanes))

@@ -10,6 +10,9 @@ import warp as wp
 from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.types import vec5
 
+MIN_TOLERANCE = 1e-9
+"""Of ``opt.tolerance``: float32 resolves no smaller decrease of the cost."""
+
 
 @wp.struct
 class Tables:
@@ -67,7 +70,20 @@ class Tables:
     # Options:
     timestep: wp.float32
     impratio: wp.float32
-    cost_scale: wp.float32
+    cost_scale: wp.float32  # from the cost to MuJoCo's units for its decrease
+    tolerance: wp.float32  # the solver stops when a step promises less decrease, in these units
+
+
+FUSED_FIELDS = [
+    "gravity",
+    *(name for name in Tables.vars if name in mjw.Model.__annotations__ and Tables.vars[name].type.ndim == 2),
+]
+"""Fields of MuJoCo Warp's model that may differ from world to world."""
+
+
+def unread_columns(name: str) -> int:
+    """Return how many of the first entries of a world's part of a field are the free joint's, which nobody reads."""
+    return {"dof_": 6, "jnt_": 1, "qpos": 7}.get(name[:4], 0)
 
 
 @wp.struct
@@ -79,6 +95,8 @@ class Worlds:
     qvel: wp.array2d(dtype=wp.float32)
     qacc_warmstart: wp.array2d(dtype=wp.float32)
     sensordata: wp.array2d(dtype=wp.float32)
+    xfrc_applied: wp.array2d(dtype=wp.spatial_vector)  # read only by kernels that are made for it, like the next one
+    qfrc_applied: wp.array2d(dtype=wp.float32)
 
 
 @wp.func
@@ -117,6 +135,7 @@ def make_tables(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Tab
     tables.timestep = model.opt.timestep
     tables.impratio = model.opt.impratio
     tables.cost_scale = 1.0 / (model.stat.meaninertia * model.nv)
+    tables.tolerance = max(model.opt.tolerance, MIN_TOLERANCE)
     sensors = np.full(model.ngeom, -1, np.int32)
     sensors[model.sensor_refid] = model.sensor_adr
     tables.geom_sensor = wp.array(sensors, dtype=wp.int32)

@@ -79,11 +79,13 @@ def _check(model: mujoco.MjModel) -> None:
     option = model.opt
     _require(option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL, "the friction cone must be pyramidal")
     _require(option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST, "the integrator must be implicitfast")
-    flags = option.disableflags or option.enableflags or option.noslip_iterations or option.disableactuator
+    enabled = option.enableflags & ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)  # which changes no motion
+    flags = option.disableflags or enabled or option.noslip_iterations or option.disableactuator
     _require(not flags, "it sets flags in its options")
-    _require(not (option.density or option.viscosity or option.wind.any()), "it moves through a fluid")
-    _require(not (model.neq or model.ntendon or model.npair or model.nmocap), "equalities, tendons, pairs or mocap")
-    _require(not model.nexclude, "some contacts are excluded")
+    _require(not (option.density or option.viscosity), "it moves through a fluid")
+    others = model.eq_active0.any() or model.ntendon or model.npair or model.nmocap
+    _require(not others, "equalities, tendons, pairs or mocap")
+    _require(not (_excluded(model) == 0).any(), "some contacts are excluded")
 
 
 def _check_bodies(model: mujoco.MjModel) -> None:
@@ -109,10 +111,11 @@ def _check_contacts(model: mujoco.MjModel) -> None:
     floor = np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & collides)
     robot = collides & (model.geom_bodyid > 0)
     _require(bool(len(floor) == 1 and (collides & ~robot).sum() == 1), "it needs one plane and no other obstacle")
-    types, affinities = model.geom_contype[robot], model.geom_conaffinity[robot]
+    types, affinities, bodies = model.geom_contype[robot], model.geom_conaffinity[robot], model.geom_bodyid[robot]
     kinds = {mujoco.mjtGeom(kind) for kind in model.geom_type[robot]}
     _require(kinds <= set(_GEOM_POINTS), "only spheres, capsules and boxes may collide")
-    _require(not (types[:, None] & affinities).any(), "parts of the robot collide with each other")
+    apart = _may_collide(model)[np.ix_(bodies, bodies)]
+    _require(not (types[:, None] & affinities)[apart].any(), "parts of the robot collide with each other")
     touch = (types & model.geom_conaffinity[floor]) | (affinities & model.geom_contype[floor])
     _require(bool((touch != 0).all()), "the floor lets some of its geoms through")
     _require(bool((model.geom_condim[collides] == 3).all()), "condim must be 3")
@@ -120,6 +123,20 @@ def _check_contacts(model: mujoco.MjModel) -> None:
     _require(not _any_of(model, "geom_surfacevel", "geom_adhesion"), "surfaces move or stick")
     solrefs = np.concatenate([model.geom_solref[collides], model.jnt_solref, model.dof_solref])
     _require(bool(((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1)).all()), "a solref mixes its two formats")
+
+
+def _excluded(model: mujoco.MjModel) -> np.ndarray:
+    """Return pairs of bodies whose contacts are excluded. Shape: (pairs, 2)."""
+    return np.stack([model.exclude_signature >> 16, model.exclude_signature & 0xFFFF], axis=1)
+
+
+def _may_collide(model: mujoco.MjModel) -> np.ndarray:
+    """Return which bodies can touch each other: not parent and child, not those excluded. Shape: (nbody, nbody)."""
+    apart = ~np.eye(model.nbody, dtype=bool)
+    children = np.arange(2, model.nbody)
+    pairs = np.concatenate([np.stack([model.body_parentid[children], children], axis=1), _excluded(model)])
+    apart[pairs[:, 0], pairs[:, 1]] = apart[pairs[:, 1], pairs[:, 0]] = False
+    return apart
 
 
 def _check_motors(model: mujoco.MjModel) -> None:
