@@ -187,6 +187,16 @@ def test_packing(dtype, shape):
     assert not room[..., 0].any()
 
 
+@pytest.mark.parametrize("num_worlds", [1, 3])
+def test_packing_of_odd_strides(num_worlds):
+    """Columns of a matrix whose other axis has one entry, and a single world, come back too."""
+    tensors = {"x": torch.rand(num_worlds, 5)[:, 2:3], "y": torch.rand(4, num_worlds).T[:, :1], "z": torch.rand(4, 1).T}
+    tensors = {name: tensor for name, tensor in tensors.items() if num_worlds in tensor.shape}
+    copies = {name: torch.zeros(tensor.shape) for name, tensor in tensors.items()}
+    unpack(pack(tensors, num_worlds), copies, num_worlds)
+    assert not differences(tensors, copies)
+
+
 def spoil(key, value):
     """A function that replaces an entry."""
     return lambda packed: packed.__setitem__(key, value)

@@ -90,7 +90,8 @@ def root(tmp_path_factory):
     checkpoint = (run / "model_2.pt").read_bytes()
     for name, content in {"text": b"this is no checkpoint\n", "half": checkpoint[: len(checkpoint) // 2]}.items():
         copy = shutil.copytree(run, root / "logs" / f"{name}_checkpoint" / run.name)
-        (copy / "model_2.pt").write_bytes(content)
+        for number in (1, 2):
+            (copy / f"model_{number}.pt").write_bytes(content)
     return root
 
 
@@ -234,6 +235,7 @@ def test_run_folder(root):
     assert {path.name.split(".tfevents")[0] for path in run.iterdir() if path.is_file()} == {
         "model_1.pt",
         "model_2.pt",
+        "worlds_2.pt",
         "events.out",
         "config.yaml",
     }
