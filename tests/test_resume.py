@@ -334,6 +334,18 @@ def test_a_damaged_checkpoint_is_passed_over(copied, capsys, how):
         assert "model_2.pt' is not a readable checkpoint" in error_of(start, None, *words)
 
 
+def test_a_damaged_run_is_passed_over(half, tmp_path, capsys):
+    """If the newest run has nothing but damaged checkpoints, the one before is taken, and a line says so."""
+    folder = tmp_path / "a1_torque_multihead"
+    for name in ("2026-01-01", "2026-01-02"):
+        shutil.copytree(half.log_dir, folder / name)
+    for file in folder.glob("2026-01-02/*.pt"):
+        file.write_bytes(b"")
+    runner = start(None, "--resume", f"--log_root={tmp_path}")
+    assert f"Newer checkpoints than '{folder / '2026-01-01' / 'model_2.pt'}' are damaged" in capsys.readouterr().out
+    assert runner.current_learning_iteration == 2
+
+
 def test_flipped_bits_are_found(half, tmp_path):
     """Wherever a bit flips, the checkpoint is refused, unless the bit means nothing."""
     whole, file = Path(half.log_dir, "model_2.pt").read_bytes(), tmp_path / "model_2.pt"
