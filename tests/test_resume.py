@@ -422,6 +422,28 @@ def test_curves_that_cannot_be_written(tmp_path, capsys, fault):
     runner.logger.init_logging_writer = lambda: setattr(runner.logger, "writer", Writer())
     runner.learn(3)
     output, error = capsys.readouterr()
-    assert error.count("\n") == 1 and error.startswith("Warning: no more curves are written: ")
+    assert error.count("\n") == 1 and error.startswith("Warning: logs end here: ")
     assert output.count("Learning iteration") == 2 and (Path(runner.log_dir) / "model_3.pt").is_file()
     assert runner.logger.tot_timesteps == 3 * 4 * WORLDS
+
+
+def test_worlds_that_cannot_be_written(tmp_path, capsys):
+    """The checkpoint is kept without them, and the last worlds stay beside their own."""
+    runner = train(tmp_path, 1)
+    (Path(runner.log_dir) / "worlds_2.pt").mkdir()
+    runner.learn(1)
+    assert capsys.readouterr().err.startswith("Warning: worlds would start anew in a resumed run: cannot write '")
+    files = {path.name for path in Path(runner.log_dir).glob("*.pt*") if path.is_file()}
+    assert files == {"model_1.pt", "worlds_1.pt", "model_2.pt"}
+    start(None, "--resume", f"--load_run={runner.log_dir}")
+    assert "The worlds start anew" in capsys.readouterr().out
+
+
+def test_an_evaluation_that_cannot_be_written(tmp_path, capsys):
+    """Training goes on and leaves its checkpoint."""
+    runner = start(tmp_path)
+    runner.claim_log_dir({})
+    (Path(runner.log_dir) / "evaluations.csv").mkdir()
+    runner.learn(1)
+    assert "Warning: an evaluation is not kept: cannot write '" in capsys.readouterr().err
+    assert (Path(runner.log_dir) / "model_1.pt").is_file()
