@@ -101,6 +101,17 @@ def test_order_and_commands(stage, tmp_path):
     assert "8 of 8 cells done, " in output and "time left unknown yet" in output and " left\n" in output
 
 
+def test_a_damaged_checkpoint_does_not_block_its_cell(stage, tmp_path):
+    """Training goes on from the one before, here from the start, and the cell is done afterwards."""
+    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
+    assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
+    (damaged,) = (out / "a1_torque-low-s1").glob("*/model_*")
+    damaged.write_bytes(b"PK")
+    (out / "a1_torque-low-s1" / "result_high.json").unlink()
+    assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
+    assert order(stage).count("a1_torque-low-s1") == 2 and (out / "a1_torque-low-s1" / "result_high.json").is_file()
+
+
 def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
     """The exit status is 1, the last lines of its log are shown, and the next call tries it again, and only it."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"

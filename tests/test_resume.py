@@ -187,6 +187,16 @@ def test_packing(dtype, shape):
     assert not room[..., 0].any()
 
 
+@pytest.mark.parametrize("num_worlds", [1, 3])
+def test_packing_of_odd_strides(num_worlds):
+    """Columns of a matrix whose other axis has one entry, and a single world, come back too."""
+    tensors = {"x": torch.rand(num_worlds, 5)[:, 2:3], "y": torch.rand(4, num_worlds).T[:, :1], "z": torch.rand(4, 1).T}
+    tensors = {name: tensor for name, tensor in tensors.items() if num_worlds in tensor.shape}
+    copies = {name: torch.zeros(tensor.shape) for name, tensor in tensors.items()}
+    unpack(pack(tensors, num_worlds), copies, num_worlds)
+    assert not differences(tensors, copies)
+
+
 def spoil(key, value):
     """A function that replaces an entry."""
     return lambda packed: packed.__setitem__(key, value)
@@ -324,6 +334,18 @@ def test_a_damaged_checkpoint_is_passed_over(copied, capsys, how):
         assert "model_2.pt' is not a readable checkpoint" in error_of(start, None, *words)
 
 
+def test_a_damaged_run_is_passed_over(half, tmp_path, capsys):
+    """If the newest run has nothing but damaged checkpoints, the one before is taken, and a line says so."""
+    folder = tmp_path / "a1_torque_multihead"
+    for name in ("2026-01-01", "2026-01-02"):
+        shutil.copytree(half.log_dir, folder / name)
+    for file in folder.glob("2026-01-02/*.pt"):
+        file.write_bytes(b"")
+    runner = start(None, "--resume", f"--log_root={tmp_path}")
+    assert f"Newer checkpoints than '{folder / '2026-01-01' / 'model_2.pt'}' are damaged" in capsys.readouterr().out
+    assert runner.current_learning_iteration == 2
+
+
 def test_flipped_bits_are_found(half, tmp_path):
     """Wherever a bit flips, the checkpoint is refused, unless the bit means nothing."""
     whole, file = Path(half.log_dir, "model_2.pt").read_bytes(), tmp_path / "model_2.pt"
@@ -400,6 +422,28 @@ def test_curves_that_cannot_be_written(tmp_path, capsys, fault):
     runner.logger.init_logging_writer = lambda: setattr(runner.logger, "writer", Writer())
     runner.learn(3)
     output, error = capsys.readouterr()
-    assert error.count("\n") == 1 and error.startswith("Warning: no more curves are written: ")
+    assert error.count("\n") == 1 and error.startswith("Warning: logs end here: ")
     assert output.count("Learning iteration") == 2 and (Path(runner.log_dir) / "model_3.pt").is_file()
     assert runner.logger.tot_timesteps == 3 * 4 * WORLDS
+
+
+def test_worlds_that_cannot_be_written(tmp_path, capsys):
+    """The checkpoint is kept without them, and the last worlds stay beside their own."""
+    runner = train(tmp_path, 1)
+    (Path(runner.log_dir) / "worlds_2.pt").mkdir()
+    runner.learn(1)
+    assert capsys.readouterr().err.startswith("Warning: worlds would start anew in a resumed run: cannot write '")
+    files = {path.name for path in Path(runner.log_dir).glob("*.pt*") if path.is_file()}
+    assert files == {"model_1.pt", "worlds_1.pt", "model_2.pt"}
+    start(None, "--resume", f"--load_run={runner.log_dir}")
+    assert "The worlds start anew" in capsys.readouterr().out
+
+
+def test_an_evaluation_that_cannot_be_written(tmp_path, capsys):
+    """Training goes on and leaves its checkpoint."""
+    runner = start(tmp_path)
+    runner.claim_log_dir({})
+    (Path(runner.log_dir) / "evaluations.csv").mkdir()
+    runner.learn(1)
+    assert "Warning: an evaluation is not kept: cannot write '" in capsys.readouterr().err
+    assert (Path(runner.log_dir) / "model_1.pt").is_file()

@@ -90,8 +90,8 @@ def root(tmp_path_factory):
     checkpoint = (run / "model_2.pt").read_bytes()
     for name, content in {"text": b"this is no checkpoint\n", "half": checkpoint[: len(checkpoint) // 2]}.items():
         copy = shutil.copytree(run, root / "logs" / f"{name}_checkpoint" / run.name)
-        (copy / "model_2.pt").write_bytes(content)
-        (copy / "model_1.pt").unlink()
+        for number in (1, 2):
+            (copy / f"model_{number}.pt").write_bytes(content)
     return root
 
 

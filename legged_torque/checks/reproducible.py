@@ -5,6 +5,7 @@ Trainings run as processes of their own, as a user starts them.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import os
 import random
@@ -82,7 +83,7 @@ class Training:
                         break
             time.sleep(chance.uniform(0.0, SAVING if done else STARTING))
         finally:
-            os.killpg(process.pid, signal.SIGKILL)
+            kill_family(process.pid)
             process.communicate()
         return done
 
@@ -125,8 +126,15 @@ class Training:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             env=os.environ | {"PYTHONUNBUFFERED": "1"},
-            start_new_session=True,  # so that all of its processes can be killed
         )
+
+
+def kill_family(process: int) -> None:
+    """Kill a process and its children, which torchrun starts in sessions of their own."""
+    children = [file.read_text().split() for file in Path(f"/proc/{process}/task").glob("*/children")]
+    for each in [process, *(int(child) for part in children for child in part)]:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(each, signal.SIGKILL)
 
 
 def compare(name: str, first: Training, second: Training) -> Comparison:

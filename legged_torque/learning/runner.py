@@ -74,6 +74,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self._saved_iteration = -1  # that of the last checkpoint
         self._worlds_go_on = False  # whether they are those of a checkpoint
         self._unwritten_log: dict | None = None
+        self._log_is_broken = False
         self._nobody_reads: BrokenPipeError | None = None  # why nothing can be printed any more
         env.num_processes = self.gpu_world_size
         env.step_graph.enabled = self.alg.update_graph.enabled = self.cfg["capture"]
@@ -291,8 +292,9 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         except BrokenPipeError as error:  # | head: as good as Ctrl-C
             self._nobody_reads = error
         except Exception as error:  # what writes curves raises about anything
-            print(f"Warning: no more curves are written: {checkpoint.last_line(error)}.", file=sys.stderr)
-            self.logger.writer = NoLogWriter("")
+            if not self._log_is_broken:
+                print(f"Warning: logs end here: {checkpoint.last_line(error)}. Training goes on.", file=sys.stderr)
+            self._log_is_broken, self.logger.writer = True, NoLogWriter("")
             self.logger.ep_extras.clear()
 
     def _save_checkpoint(self) -> None:
@@ -300,16 +302,20 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self._write_log()
         if self.log_dir is not None and self._saved_iteration != self.current_learning_iteration:
             file = checkpoint_file(Path(self.log_dir), self.current_learning_iteration)
-            self.save(str(file), {"worlds": self._save_worlds(file)})
+            digest = self._save_worlds(file)
+            self.save(str(file), {"worlds": digest})
             self._saved_iteration = self.current_learning_iteration
-            if self.gpu_global_rank == 0:
+            if digest:
                 remove_other_worlds(file)
         warning = self.env.sim.check_buffers()
         if warning:
             print(f"Warning: {warning}.")
 
     def _save_worlds(self, file: Path) -> str:
-        """Write the worlds of all processes, which belong to a checkpoint, and return their digest."""
+        """Write the worlds of all processes, which belong to a checkpoint, and return their digest.
+
+        Empty in all processes but the first, and if they cannot be written: the checkpoint is worth more.
+        """
         mine = {
             "worlds": pack(world_tensors(self.env), self.env.num_envs),
             "evaluation": self._evaluator and self._evaluator.state(),
@@ -319,7 +325,11 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         processes = distributed.gather(mine)
         if self.gpu_global_rank > 0:
             return ""
-        return write_worlds(file, {**identity(self.env, self.cfg["evaluation"]), "processes": processes})
+        try:
+            return write_worlds(file, {**identity(self.env, self.cfg["evaluation"]), "processes": processes})
+        except UserError as error:
+            print(f"Warning: worlds would start anew in a resumed run: {error}.", file=sys.stderr)
+            return ""
 
     def _restore_worlds(self, file: Path, digest: str | None) -> None:
         """Go on with the worlds that belong to a checkpoint; a UserError, and no world changed, if they do not fit."""

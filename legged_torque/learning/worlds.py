@@ -163,7 +163,7 @@ def unpack(packed: dict[str, Any], tensors: dict[str, Tensor], num_worlds: int) 
                 start += count
     for tensor, part in zip(tensors.values(), parts, strict=True):
         axis = tensor.shape.index(num_worlds)
-        rows = torch.stack(part, dim=2).permute(1, 0, 2).contiguous().view(tensor.dtype)
+        rows = torch.stack(part, dim=2).permute(1, 0, 2).reshape(-1).view(tensor.dtype)
         rest = [*tensor.shape[:axis], *tensor.shape[axis + 1 :]]
         tensor.copy_(rows.view(num_worlds, *rest).movedim(0, axis))
 
@@ -175,8 +175,8 @@ def _layout(name: str, tensor: Tensor) -> list[Any]:
 
 def _planes(tensor: Tensor, num_worlds: int) -> Tensor:
     """Return the planes of a tensor. Shape: (bytes of a number, numbers of a world, num_worlds)."""
-    rows = tensor.detach().movedim(tensor.shape.index(num_worlds), 0).reshape(num_worlds, -1).contiguous()
-    return rows.view(torch.uint8).view(num_worlds, -1, tensor.element_size()).permute(2, 1, 0)
+    rows = tensor.detach().movedim(tensor.shape.index(num_worlds), 0).clone(memory_format=torch.contiguous_format)
+    return rows.view(-1).view(torch.uint8).view(num_worlds, -1, tensor.element_size()).permute(2, 1, 0)
 
 
 def _compressed(chunk: bytes) -> bytes:

@@ -135,13 +135,15 @@ class TaskRegistry:
         """Return the run that the options name; a UserError if there is none, it is unreadable or of another task."""
         _, train_cfg = self.get_cfgs(options.task)
         train_cfg.runner.experiment_name = options.experiment_name or train_cfg.runner.experiment_name
-        folder = find_run(experiment_dir(train_cfg, options.log_root), options.load_run)
+        root = experiment_dir(train_cfg, options.log_root)
+        folder = find_run(root, options.load_run)
         config = load_config(folder)
         if config["task"] != options.task:
             raise UserError(f"the run '{folder}' is of task '{config['task']}', not '{options.task}'")
         cfgs = self.get_cfgs(options.task, options, config)
         file = find_checkpoint(folder, options.checkpoint)
-        if options.checkpoint is None and checkpoint_number(file) != checkpoint_numbers(folder)[-1]:
+        newer_runs = not options.load_run and any(checkpoint_numbers(run) for run in root.glob("*") if run > folder)
+        if newer_runs or (options.checkpoint is None and checkpoint_number(file) != checkpoint_numbers(folder)[-1]):
             print(f"Newer checkpoints than '{file}' are damaged; taking this one.")
         return LoadedRun(folder, config, *cfgs, file)
 
