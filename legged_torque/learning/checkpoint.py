@@ -37,7 +37,10 @@ def read(file: Path, what: str, device: str) -> Any:
         raise UserError(f"'{file}' is not a readable {what}: {last_line(error)}") from None
     if not is_whole_archive(file):
         raise UserError(f"'{file}' is not a readable {what}: it is damaged")
-    bad = not_finite(content)
+    try:
+        bad = not_finite(content)
+    except RecursionError:
+        raise UserError(f"'{file}' is not a readable {what}: it is nested too deeply") from None
     if bad:
         raise UserError(f"'{file}' is not a usable {what}: {bad} holds numbers that are not finite")
     return content

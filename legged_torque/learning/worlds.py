@@ -146,12 +146,13 @@ def unpack(packed: dict[str, Any], tensors: dict[str, Tensor], num_worlds: int) 
         names = {entry[0] for entry in packed["layout"] if entry not in layout}
         names |= {entry[0] for entry in layout if entry not in packed["layout"]}
         raise UserError(f"the task keeps other tensors than it did: {', '.join(sorted(names)) or 'in another order'}")
-    places = packed["places"].long()
-    room = (int(places.max()) + 1) * num_worlds
-    data = b"".join(_decompressed(chunk, room) for chunk in packed["planes"])
     counts = [tensor.numel() // num_worlds for tensor in tensors.values()]
     sizes = [tensor.element_size() for tensor in tensors.values()]
-    if len(data) != room or int(places.min()) < 0 or len(places) != sum(np.multiply(counts, sizes)):
+    places, num_planes = packed["places"].long(), sum(np.multiply(counts, sizes))
+    fits = len(places) == num_planes and 0 <= int(places.min()) and int(places.max()) < num_planes
+    room = (int(places.max()) + 1) * num_worlds if fits else 0
+    data = b"".join(_decompressed(chunk, room) for chunk in packed["planes"]) if fits else b""
+    if not fits or len(data) != room:
         raise UserError("they are not as large as they should be")
     planes = torch.frombuffer(bytearray(data), dtype=torch.uint8).view(-1, num_worlds)[places]
     parts: list[list[Tensor]] = [[] for _ in tensors]
