@@ -243,7 +243,7 @@ def test_number_of_processes_that_is_none(tmp_path, monkeypatch):
 
 def test_values_of_several_lines(tmp_path):
     """The line of a mistake is one even if a name in it has two."""
-    assert_told_in_one_line(run_here("train.py", "--task=a\nb", root=tmp_path), "unknown task 'a b'")
+    assert_told_in_one_line(run_here("train.py", "--task=a\nb", root=tmp_path), "unknown task 'a")
 
 
 @pytest.mark.parametrize("script", ["train.py", "play.py", "learning_curve.py", "benchmark.py"])
