@@ -20,7 +20,9 @@ METRICS = [metric.name for metric in CURVE_METRICS]
 def files(tmp_path):
     """The same curve as a run's evaluations, as JSON of learning_curve.py, and twice as evaluations of a report."""
     lines = [line(1, 0.1), line(2, 0.2, height="")]
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump({"task": "a1_torque", "env": {}, "train": {"seed": 3}}))
+    (tmp_path / "config.yaml").write_text(
+        yaml.safe_dump({"task": "a1_torque", "env": {}, "train": {"seed": 3}, "versions": {}})
+    )
     (tmp_path / "evaluations.csv").write_text("\n".join([HEADER, *lines]) + "\n")
     points = [{"steps": 1_000_000 * i, **dict.fromkeys(METRICS, float(i)), "track_percentage": 0.1 * i} for i in (1, 2)]
     (tmp_path / "curve.json").write_text(json.dumps({"task": "a1_torque", "seed": 3, "points": points}))

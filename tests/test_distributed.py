@@ -5,6 +5,7 @@ Started by torchrun (:func:`train_together`), this file is the process that trai
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -65,6 +66,12 @@ def train(folder):
     runner.learn(2, init_at_random_ep_len=True)
     notes = {"start": start, "trained": everything(runner), "observations": runner.env.obs_buf["policy"].clone()}
     notes["saved_stream"] = upcoming()
+    kept = folder / "kept"  # as it would be if training had stopped here
+    if distributed.rank() == 0:
+        shutil.copytree(runner.log_dir, kept)
+    distributed.any_process(False, "cpu")  # waits for the copy
+    runner.learn(1)
+    notes["third"] = everything(runner)
     update = runner.alg.update
 
     def update_with_signal():
@@ -77,9 +84,9 @@ def train(folder):
     notes["stopped"] = everything(runner)
     resumed = make_runner(None)
     notes["own_stream"] = upcoming()
-    infos = resumed.load(str(next((folder / "logs").glob("*/model_2.pt"))))
+    resumed.load(str(kept / "model_2.pt"))
     notes["loaded"], notes["loaded_stream"] = everything(resumed), upcoming()
-    resumed.continue_random_numbers(infos)
+    resumed.resume(str(kept / "model_2.pt"))
     notes["continued_stream"] = upcoming()
     resumed.learn(1)
     notes["resumed"] = everything(resumed)
@@ -182,12 +189,15 @@ def test_a_signal_to_one_process_stops_both(together):
     """Both finish the iteration in which the second one was asked to stop, and the first one saves."""
     folder, (first, second), _ = together
     assert int(first["stopped"]["iterations"]) == int(second["stopped"]["iterations"]) == 4
-    assert {path.name for path in folder.glob("logs/*/*") if path.is_file()} == {"model_2.pt", "model_4.pt"}
+    files = {path.name for path in folder.glob("logs/*/*") if path.is_file()}
+    assert files == {"config.yaml", "worlds_4.pt", *(f"model_{iterations}.pt" for iterations in (2, 3, 4))}
 
 
 def test_both_resume(together):
-    """Both continue from the checkpoint, and stay together."""
-    _, (first, second), _ = together
+    """Both continue from the checkpoint, each in its worlds: the next iteration is that of the run, bit by bit."""
+    _, (first, second), output = together
+    assert same(first["resumed"], first["third"]) and same(second["resumed"], second["third"])
+    assert not same(first["third"], first["trained"]) and "start anew" not in output
     assert same(first["loaded"], second["loaded"]) and same(first["loaded"], first["trained"])
     assert int(first["resumed"]["iterations"]) == 3 and int(first["resumed"]["total_steps"]) == 3 * ALL_STEPS
 
@@ -209,8 +219,8 @@ def test_both_give_up(together):
     _, (first, second), output = together
     assert first["given_up"] == second["given_up"]
     assert first["given_up"]["iterations"] == 1 + PATIENCE
-    assert "75%" in first["given_up"]["reason"] and "buffer 'commands' in 3 worlds" in first["given_up"]["reason"]
-    assert output.count("Warning: buffer 'commands' was not finite in 3 worlds") == 1
+    assert "75%" in first["given_up"]["reason"] and "buffer 'commands' 3" in first["given_up"]["reason"]
+    assert output.count("Warning: buffer 'commands' was not finite; resets of worlds for it: 3.") == 1
 
 
 def union_gradients():
@@ -280,7 +290,7 @@ def test_train_script_in_two_processes(tmp_path):
                 break
         output += process.communicate(timeout=120)[0]
     (run,) = (tmp_path / "a1_position").iterdir()
-    (checkpoint,) = run.glob("*.pt*")
+    (checkpoint,) = run.glob("model_*")
     count = int(checkpoint.stem.removeprefix("model_"))
     state = torch.load(checkpoint, weights_only=True)
     config = yaml.safe_load((run / "config.yaml").read_text())

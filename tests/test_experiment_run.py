@@ -22,7 +22,7 @@ from legged_torque.experiments.matrix import read_matrix
 from legged_torque.experiments.run import ExperimentRun, time_left
 
 STAND_IN_TRAIN = """
-import os, signal, sys, time
+import os, signal, sys, time, zipfile
 from pathlib import Path
 options = dict(word.lstrip("-").partition("=")[::2] for word in sys.argv[1:])
 cell = Path(options["log_root"]) / options["experiment_name"]
@@ -35,7 +35,7 @@ runs = sorted(cell.glob("run_*"))
 done = max((int(file.stem[6:]) for file in runs[-1].glob("model_*")), default=0) if runs else 0
 run = cell / f"run_{len(runs)}"
 run.mkdir()
-(run / "config.yaml").write_text("{task: t, env: {}, train: {}, max_iterations: 4}")
+(run / "config.yaml").write_text("{task: t, env: {}, train: {}, max_iterations: 4, versions: {}}")
 stopped = []
 signal.signal(signal.SIGTERM, lambda *_: stopped.append(1))
 while done < 4 and not stopped and not (behaviour == "early" and done == 2):
@@ -43,7 +43,7 @@ while done < 4 and not stopped and not (behaviour == "early" and done == 2):
     done += 1
     while behaviour == "slow" and done == 3 and not stopped:
         time.sleep(0.02)
-(run / f"model_{done}.pt").touch()
+zipfile.ZipFile(run / f"model_{done}.pt", "w").close()
 """
 
 STAND_IN_EVALUATE = """

@@ -100,12 +100,17 @@ def test_a_variants_own_settings():
         assert error_of(check_section, changed).startswith((f"{name} must be ", f"unknown {name} "))
 
 
+def test_words_of_null():
+    """A setting that may be null says so; a number in its place is told what numbers may be."""
+    assert describe(Count | None) == "at least 1 (integer) or null"
+    assert error_of(check_value, "x", 0, Count | None) == "x must be at least 1, not 0"
+
+
 @pytest.mark.parametrize(
     ("hint", "words"),
     [
         (Positive, "greater than 0"),
         (Annotated[int, Limits(1, 10_000_000)], "from 1 to 10000000 (integer)"),
-        (Count | None, "at least 1 (integer) or null"),
         (Interval, "[minimum, maximum]"),
         (Annotated[list[float], Limits(-1, length=3)], "3 numbers, at least -1"),
         (Literal["a", "b"], "a or b"),

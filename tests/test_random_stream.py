@@ -104,7 +104,7 @@ def test_the_last_checkpoint_is_the_default(trained):
 
 def test_saving_draws_nothing(trained):
     """A run goes on alike whether it saves or not."""
-    assert trained.saving_draws == [False] * 3  # two iterations, and the end
+    assert trained.saving_draws == [False] * 2
 
 
 def random_actions(runner):

@@ -1,13 +1,20 @@
 """Run folders: found, read, and refused when they are broken."""
 
+import os
+import resource
+import zipfile
+
 import numpy as np
 import pytest
 import torch
+import yaml
 from settings import TASKS, error_of, flatten, get_cfgs
 
 from legged_torque.envs import task_registry
 from legged_torque.utils import runs
 from legged_torque.utils.config import to_dict, update_from_dict
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import write_whole
 
 
 @pytest.fixture
@@ -20,7 +27,7 @@ def log_root(tmp_path):
     }.items():
         (tmp_path / run).mkdir()
         for file in files:
-            (tmp_path / run / file).touch()
+            zipfile.ZipFile(tmp_path / run / file, "w").close()
     return tmp_path
 
 
@@ -127,6 +134,66 @@ def test_config_that_does_not_fit(values, message):
 
 def test_runs_of_the_same_second_do_not_share_a_folder(tmp_path):
     """Every run gets a folder of its own, numbered where the name is taken."""
-    folders = [runs.claim_run_dir(tmp_path / "logs" / "2026-11-21_10-00-00") for _ in range(3)]
+    folders = [runs.claim_run_dir(tmp_path / "logs" / "2026-11-21_10-00-00", {"run": i}) for i in range(3)]
     assert [folder.name for folder in folders] == [f"2026-11-21_10-00-00{end}" for end in ("", "_2", "_3")]
-    assert all(folder.is_dir() for folder in folders)
+    assert sorted((tmp_path / "logs").iterdir()) == folders  # nothing else is left
+    assert [yaml.safe_load((folder / "config.yaml").read_text())["run"] for folder in folders] == [0, 1, 2]
+
+
+def test_no_run_is_without_its_settings(tmp_path, monkeypatch):
+    """If the process ends while they are written, there is no folder of a run; the next run removes what is left."""
+    monkeypatch.setattr(os, "fsync", lambda stream: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        runs.claim_run_dir(tmp_path / "run", {})
+    assert not (tmp_path / "run").exists()
+    (left,) = tmp_path.iterdir()
+    left.rename(tmp_path / "run.999999999.part")
+    monkeypatch.undo()
+    assert list(tmp_path.iterdir()) != [runs.claim_run_dir(tmp_path / "run", {})] == list(tmp_path.iterdir())
+
+
+def test_a_file_instead_of_a_folder(tmp_path):
+    """What cannot be written is named in one line."""
+    (tmp_path / "logs").touch()
+    line = error_of(runs.claim_run_dir, tmp_path / "logs" / "run", {})
+    assert line.startswith(f"cannot write '{tmp_path / 'logs' / 'run'}") and line.endswith(": Not a directory")
+    line = error_of(runs.claim_run_dir, tmp_path / ("x" * 300), {})
+    assert line.endswith(": File name too long")
+
+
+def limited_write(file, most):
+    """Write 100000 bytes where a file may have only so many, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+    try:
+        return error_of(write_whole, file, b"1" * 100_000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk(tmp_path):
+    """It is told by its name, and the file stays what it was."""
+    (tmp_path / "file").write_bytes(b"old")
+    line = limited_write(tmp_path / "file", 50_000)
+    assert line == f"cannot write '{tmp_path / 'file'}': File too large"
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
+
+
+@pytest.mark.parametrize("marks", [True, False])
+def test_a_config_file_that_was_cut_off(tmp_path, marks):
+    """None of its beginnings gives other settings than the whole file, that of an older version neither."""
+    env_cfg, train_cfg = get_cfgs()
+    runs.save_config(tmp_path, {"task": "a1_position", "env": to_dict(env_cfg), "train": to_dict(train_cfg)})
+    file = tmp_path / "config.yaml"
+    text = file.read_text()
+    text = text if marks else text.removeprefix("---\n").removesuffix("...\n")
+    file.write_text(text)
+    whole = runs.load_config(tmp_path)
+    for end in [*range(0, len(text), 97), *range(text.index("\nversions"), len(text))]:
+        file.write_text(text[:end])
+        try:
+            config = runs.load_config(tmp_path)
+        except UserError as error:
+            assert str(file) in str(error)
+        else:
+            assert not marks and {**config, "versions": 0} == {**whole, "versions": 0}

@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -322,6 +323,16 @@ def test_late_mistake_in_a_process_of_its_own(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("after", [0.4, 1.2])
+def test_interrupt_while_starting(tmp_path, after):
+    """Ctrl-C before anything runs ends a script by that signal, without a word."""
+    process = start("train.py", *SMALL, root=tmp_path)
+    time.sleep(after)
+    process.send_signal(signal.SIGINT)
+    status, output, error = finish(process)
+    assert (status, output, error) == (-signal.SIGINT, "", "") and not list(tmp_path.iterdir())
+
+
 def test_train_stop_resume_play(tmp_path):
     """Ctrl-C saves and ends with status 130, resuming goes on with all counters, and playing prints how it walks."""
     task, logs = ["--task=a1_torque_multihead", "--device=cpu"], tmp_path / "logs" / "a1_torque_multihead"
@@ -340,7 +351,7 @@ def test_train_stop_resume_play(tmp_path):
     status, output, error = finish(process)
     assert status == 130 and "Traceback" not in error and "Stopping" in output + error
     (first,) = logs.iterdir()
-    (checkpoint,) = first.glob("model_*.pt*")
+    (checkpoint,) = first.glob("model_*.pt")
     count = int(checkpoint.stem.removeprefix("model_"))
     state = torch.load(checkpoint, weights_only=True)
     assert 2 <= count == state["iter"] and state["infos"]["total_timesteps"] == count * 8

@@ -6,6 +6,7 @@ import os
 import pickle
 import shutil
 import sys
+import zipfile
 
 import pytest
 import torch
@@ -184,6 +185,19 @@ def test_checkpoint_that_runs_code(run, harm, script):
         assert_told_in_one_line(load_run(script, run), "model_1.pt' is not a readable checkpoint")
 
 
+@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
+def test_checkpoint_of_nothing_but_lists(run, script):
+    """Lists inside of lists that no function can follow are told as well, and what is no dictionary."""
+    with zipfile.ZipFile(run / "model_1.pt") as whole:
+        parts = {name: whole.read(name) for name in whole.namelist()}
+    depth = 100_000
+    for content in (b"\x80\x02" + b"]" * depth + b"a" * (depth - 1) + b".", b"\x80\x02K\x01."):
+        with zipfile.ZipFile(run / "model_1.pt", "w") as crafted:
+            for name, part in parts.items():
+                crafted.writestr(name, content if name.endswith("/data.pkl") else part)
+        assert_told_in_one_line(load_run(script, run), "model_1.pt'")
+
+
 def test_checkpoint_that_runs_code_on_the_page(run, harm):
     """The viewer's page refuses it as well, and is never opened."""
     pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
@@ -219,7 +233,7 @@ TEXTS = {
     "deep": ("[" * 1000 + "]" * 1000, "is nested too deeply"),
     "less_deep": ("[" * 60 + "]" * 60, "is nested too deeply"),
     "itself": ("&a [*a]", "is nested too deeply"),
-    "huge": (f"a: {'9' * 400}", "is nested too deeply or larger"),
+    "huge": (f"a: {'9' * 1000}", "is nested too deeply or larger"),
     "long": ("# " + "x" * 1_000_000, "is nested too deeply or larger than settings are"),
     "many": ("\n".join(["a: &a0 [x]", *(f"b{i}: &a{i + 1} [{f'*a{i}, ' * 9}]" for i in range(12))]), "is nested too"),
 }
@@ -363,6 +377,10 @@ EXPORTS = {
     "huge speed": (set_entry("initial_state.joint_velocity", [0.0, 1e30]), "initial_state.joint_velocity.1"),
     "huge whole number": (lambda d: d["commands"].update(lin_vel_x=[0, 10**300]), "commands.lin_vel_x.1"),
     "huger one": (lambda d: d["commands"].update(lin_vel_x=[0, 10**400]), "larger than settings are"),
+    "endless steps": (
+        lambda d: d["timing"].update(decimation=10**8, control_frequency=1e-6, physics_frequency=100.0),
+        "timing.decimation",
+    ),
     "no number": (set_entry("episode.length", float("nan")), "episode.length is not a finite number"),
     "another folder": (set_entry("network.file", "../out/policy.onnx"), "must be the name of a file beside it"),
     "a class": (lambda d: d.update(task={"class_name": "payload:run"}), "task"),

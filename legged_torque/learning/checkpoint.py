@@ -45,6 +45,8 @@ def read(file: Path, what: str, device: str) -> Any:
 
 def check_counters(state: dict[str, Any], file: str) -> None:
     """Refuse a checkpoint whose counters are no numbers, by UserError."""
+    if not isinstance(state, dict) or not isinstance(state.get("infos"), dict):
+        raise UserError(f"'{file}' is not a usable checkpoint: it lacks the entry infos")
     infos = state["infos"]
     counters = {"iter": state["iter"]} | {key: infos[key] for key in ("total_timesteps", "seconds")}
     for name, value in counters.items():

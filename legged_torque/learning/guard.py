@@ -31,9 +31,9 @@ class TrainingGuard:
     def add_iteration(self, skipped_updates: float) -> dict[str, float]:
         """Judge an iteration, tell what was not finite for the first time, and return its numbers to be logged."""
         share, found = self._task.health.read()
-        for tensor, worlds in found.items():
+        for tensor, count in found.items():
             if tensor not in self._told and distributed.rank() == 0:
-                print(f"Warning: {tensor} was not finite in {of_worlds(worlds)}, which had to be reset.", flush=True)
+                print(f"Warning: {tensor} was not finite; resets of worlds for it: {count}.", flush=True)
         self._told.update(found)
         self._without_update = self._without_update + 1 if skipped_updates >= self._num_updates else 0
         self._diverging = self._diverging + 1 if share > MAX_DIVERGED else 0
@@ -47,16 +47,11 @@ class TrainingGuard:
         if self._diverging >= PATIENCE:
             reasons.append(f"more than half of the worlds diverged in each of {PATIENCE} iterations, now {share:.0%}")
         if reasons:
-            names = ", ".join(f"{tensor} in {of_worlds(worlds)}" for tensor, worlds in found.items())
-            self.problem = "; ".join([*reasons, *([f"not finite: {names}"] if names else [])])
-        return {f"Health/not_finite/{tensor.tag}": float(worlds) for tensor, worlds in found.items()}
+            names = ", ".join(f"{tensor} {count}" for tensor, count in found.items())
+            self.problem = "; ".join([*reasons, *([f"not finite, with resets of worlds: {names}"] if names else [])])
+        return {f"Health/not_finite/{tensor.tag}": float(count) for tensor, count in found.items()}
 
     def check(self) -> None:
         """Raise a TrainingError if training cannot go on."""
         if self.problem:
             raise TrainingError(f"training cannot learn: {self.problem}")
-
-
-def of_worlds(count: int) -> str:
-    """Return how often worlds were concerned."""
-    return f"{count} world{'s' * (count != 1)}"

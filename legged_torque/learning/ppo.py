@@ -96,13 +96,14 @@ class OnDevicePPO(PPO):
                 self.update_graph()
         self._update_normalization()
         self.storage.clear()
+        is_finite = torch.isfinite(flattened(self._state())).all().float()
+        numbers = torch.cat([self._losses, is_finite.unsqueeze(0)])
         if self.is_multi_gpu:
-            distributed.average([self._losses])
-        is_finite = torch.isfinite(flattened(self._state())).all()
-        *values, learned = torch.cat([self._losses, is_finite.unsqueeze(0)]).tolist()  # the only time the host waits
+            distributed.average([numbers])
+        *values, share_finite = numbers.tolist()  # the only time that the host waits
         losses = dict(zip(LOSS_NAMES, values, strict=True))
         num_updates = self.num_learning_epochs * self.num_mini_batches
-        if not learned:
+        if share_finite < 1.0:  # in any process
             self._restore(before)
             losses = dict.fromkeys(LOSS_NAMES, 0.0) | {"skipped_updates": float(num_updates)}
         updates = num_updates - losses["skipped_updates"]

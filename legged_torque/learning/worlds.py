@@ -11,6 +11,7 @@ import inspect
 import json
 import zlib
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -102,14 +103,17 @@ def world_tensors(task: BaseTask) -> dict[str, Tensor]:
 
 
 def _parts(value: Any) -> dict[Any, Any]:
-    """Return what a container or an object holds, by key or attribute; nothing for what holds no state of a task."""
+    """Return what a container or an object holds, by key or attribute, unless it follows from the rest."""
     if isinstance(value, (dict, TensorDict)):
         return dict(value.items())
     if isinstance(value, (list, tuple)):
         return dict(enumerate(value))
     is_code = inspect.isroutine(value) or inspect.isclass(value) or inspect.ismodule(value)
     is_foreign = type(value).__module__.split(".")[0] in _FOREIGN
-    return {} if is_code or is_foreign or isinstance(value, Section) else getattr(value, "__dict__", {})
+    if is_code or is_foreign or isinstance(value, Section):
+        return {}
+    kept = getattr(value, "__dict__", {})
+    return {key: part for key, part in kept.items() if not isinstance(getattr(type(value), key, None), cached_property)}
 
 
 def pack(tensors: dict[str, Tensor], num_worlds: int) -> dict[str, Any]:

@@ -36,29 +36,37 @@ class Watched:
 class Health:
     """Checks all tensors of all worlds in two kernels, inside the step's CUDA graph, and counts on the device."""
 
-    def __init__(self, watched: Sequence[Watched], num_envs: int, device: str) -> None:
-        """Prepare; what the first world has now takes the place of numbers that are not finite later."""
+    def __init__(self, watched: Sequence[Watched], diverged: Tensor) -> None:
+        """Prepare; what the first world has now takes the place of numbers that are not finite later.
+
+        ``diverged`` is where worlds are marked. Shape: (num_envs,), bool.
+        """
+        self._marks = diverged
         self._watched = sorted(watched, key=lambda tensor: tensor.is_result)
         self._defaults = [tensor.numbers[0].clone() for tensor in self._watched]  # their memory must not be freed
         rows = [address(*pair) for pair in zip(self._watched, self._defaults, strict=True)]
+        self._diverged, self._excused, nobody = diverged.new_zeros(3, len(diverged)).unbind()
+        self._counts = torch.zeros(len(rows), dtype=torch.int32, device=diverged.device)
         num_causes = sum(not tensor.is_result for tensor in watched)
-        self._causes: wp.array = wp.array(rows[:num_causes], dtype=kernels.Numbers2d, device=device)
-        self._results: wp.array = wp.array(rows[num_causes:], dtype=kernels.Numbers2d, device=device)
-        self._diverged, self._excused, self._nobody = torch.zeros(3, num_envs, dtype=torch.bool, device=device).unbind()
-        self._counts = torch.zeros(len(rows), dtype=torch.int32, device=device)
+        self._causes = self._arguments(rows[:num_causes], nobody, self._counts[:num_causes])
+        self._results = self._arguments(rows[num_causes:], self._excused, self._counts[num_causes:])
 
-    def check(self, diverged: Tensor) -> None:
-        """Replace numbers that are not finite, and add their worlds to those that have diverged (num_envs,), bool."""
-        num_causes = len(self._causes)
-        self._mend(self._causes, self._nobody, diverged, self._counts[:num_causes])
-        self._excused.copy_(diverged)
-        self._mend(self._results, self._excused, diverged, self._counts[num_causes:])
-        self._diverged.logical_or_(diverged)
+    def _arguments(self, rows: list[Any], excused: Tensor, counts: Tensor) -> list[Any]:
+        """Return the kernel's arguments for some of the tensors."""
+        table: wp.array = wp.array(rows, dtype=kernels.Numbers2d, device=wp.device_from_torch(excused.device))
+        return [table, *map(wp.from_torch, (excused, self._marks, counts))]
 
-    def _mend(self, rows: wp.array, *tensors: Tensor) -> None:
-        """Run the kernel on some of the tensors."""
-        arrays = [wp.from_torch(tensor) for tensor in tensors]
-        wp.launch(kernels.mend, (len(rows), len(self._nobody)), [rows, *arrays], device=rows.device)
+    def check(self) -> None:
+        """Replace numbers that are not finite, and mark their worlds."""
+        self._mend(self._causes)
+        self._excused.copy_(self._marks)
+        self._mend(self._results)
+        self._diverged.logical_or_(self._marks)
+
+    def _mend(self, arguments: list[Any]) -> None:
+        """Run the kernel."""
+        rows = arguments[0]
+        wp.launch(kernels.mend, (len(rows), len(self._marks)), arguments, device=rows.device)
 
     def read(self) -> tuple[float, dict[Watched, int]]:
         """Return what happened since the last call, over all processes that train together, and wait for the device.
@@ -79,7 +87,7 @@ class Health:
 def address(tensor: Watched, defaults: Tensor) -> Any:
     """Return where a tensor's numbers are, and what takes their place."""
     row: Any = kernels.Numbers2d()
-    size = tensor.numbers.element_size()
     row.address, row.defaults, row.count = tensor.numbers.data_ptr(), defaults.data_ptr(), len(defaults)
-    row.world_stride, row.stride = (size * stride for stride in tensor.numbers.stride())
+    row.world_stride = tensor.numbers.stride(0) * tensor.numbers.element_size()
+    row.stride = tensor.numbers.stride(1)
     return row

@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 
 from legged_torque.utils.cli import Parser
+from legged_torque.utils.limits import describe, types_of
 from legged_torque.utils.options import Options
 
 _SETTINGS = ("task", "seed", "perturbation", "ranges", "device", "set")
@@ -36,11 +37,15 @@ def add_train_args(parser: Parser) -> None:
 
 
 def add_options(parser: Parser, *names: str) -> None:
-    """Add fields of :class:`Options`, which tell their help, type and default."""
+    """Add fields of :class:`Options`, which tell their help, type, limits and default."""
+    hints = types_of(Options)
     for field in dataclasses.fields(Options):
         if field.name in names:
             default = field.default if field.default is not dataclasses.MISSING else []
-            parser.add_argument(f"--{field.name}", **{"default": default, **field.metadata})
+            how = {"default": default, **field.metadata}
+            if "type" in how:
+                how["help"] += f"; {describe(hints[field.name]).removesuffix(' or null')}"
+            parser.add_argument(f"--{field.name}", **how)
 
 
 def options_of(args: argparse.Namespace) -> Options:

@@ -63,6 +63,7 @@ Share = Annotated[float, Limits(lowest=0, highest=1)]
 Fraction = Annotated[float, Limits(above=0, highest=1)]
 Count = Annotated[int, Limits(lowest=1)]
 Number = Annotated[int, Limits(lowest=0)]
+Worlds = Annotated[int, Limits(1, 10_000_000)]
 Sizes = Annotated[list[int], Limits(lowest=1, highest=1e6, nonempty=True)]
 Interval = Annotated[list[float], Limits(ordered=True)]
 PositiveInterval = Annotated[list[float], Limits(above=0, ordered=True)]
@@ -71,7 +72,7 @@ NotNegativeInterval = Annotated[list[float], Limits(lowest=0, ordered=True)]
 
 def check_section(section: Section, path: str = "") -> None:
     """Raise a UserError that names the first setting of a section, or below it, whose value is not allowed."""
-    hints = types_of(type(section))  # type: ignore[arg-type]  # mypy: a class is not seen as hashable
+    hints = types_of(type(section))
     for key in section_keys(section):
         value, dotted = getattr(section, key), f"{path}.{key}" if path else key
         if isinstance(value, Section):
@@ -90,6 +91,8 @@ def check_value(name: str, value: Any, hint: Any) -> None:
         return
     if get_origin(hint) is Literal and isinstance(value, str):
         raise unknown_name(name, value, get_args(hint))
+    if get_origin(hint) in (Union, types.UnionType):
+        hint = next(part for part in get_args(hint) if part is not types.NoneType)
     parts = get_args(hint) if get_origin(hint) is Annotated else ()
     is_type_right = parts and _fits(value, parts[0])
     raise UserError(f"{name} must be {parts[1] if is_type_right else describe(hint)}, not {value!r}")
@@ -114,16 +117,18 @@ def describe(hint: Any) -> str:
     return names.get(hint, "")
 
 
-@functools.cache
 def types_of(section: type) -> dict[str, Any]:
-    """Return the types that a section and its bases declare for their settings; a UserError if one is not known."""
-    hints: dict[str, Any] = {}
-    for owner in reversed(section.__mro__):
-        try:
-            hints |= inspect.get_annotations(owner, eval_str=True)
-        except NameError as error:
-            raise UserError(f"a type in {owner.__module__}.{owner.__qualname__} is not known: {error}") from None
-    return hints
+    """Return the types that a class and its bases declare for their settings; a UserError if one is not known."""
+    return {name: hint for owner in reversed(section.__mro__) for name, hint in _own_types(owner).items()}
+
+
+@functools.cache
+def _own_types(owner: type) -> dict[str, Any]:
+    """Return the types that a class itself declares."""
+    try:
+        return inspect.get_annotations(owner, eval_str=True)
+    except NameError as error:
+        raise UserError(f"a type in {owner.__module__}.{owner.__qualname__} is not known: {error}") from None
 
 
 def _plain(number: float) -> str:

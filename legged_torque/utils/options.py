@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from legged_torque.utils.cli import check_at_least
 from legged_torque.utils.config import BaseConfig, section_keys, set_by_path, update_from_dict
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.limits import Count, Number, Worlds, check_value, types_of
 
 DEFAULT_TASK = "a1_torque_multihead"
 DEFAULT_PRESET = "parallel"
@@ -22,16 +22,19 @@ def _option(help: str, default: Any = None, **how: Any) -> Any:  # noqa: A002 (a
 
 @dataclass
 class Options:
-    """The options that scripts share; None leaves a setting as it is. Fields tell what they mean by their help."""
+    """The options that scripts share; None leaves a setting as it is.
+
+    Fields tell what they mean by their help, and by their types what they may be, see ``utils.limits``.
+    """
 
     task: str = _option("name of the task, see train.py --list; default: %(default)s", DEFAULT_TASK)
     device: str = _option(
         "auto, cpu or cuda:N; auto takes the GPU if there is one, with torchrun one for each process", "auto"
     )
-    num_envs: int | None = _option(
+    num_envs: Worlds | None = _option(
         "number of worlds, with torchrun those of each process; default: that of the task", type=int
     )
-    seed: int | None = _option("random seed; default: that of the training settings", type=int)
+    seed: Number | None = _option("random seed; default: that of the training settings", type=int)
     preset: str | None = _option("training settings: parallel (the default) or paper (Table II)")
     perturbation: str | None = _option(
         "random parameters, pushes and noise: none, low, high, high_frequency or doubled; default: none, or what a "
@@ -46,9 +49,9 @@ class Options:
     run_name: str | None = _option("added to the name of the run's folder")
     logger: str | None = _option("where curves are written: tensorboard, wandb or none")
     load_run: str | None = _option("run to load: name of its folder or a path; default: the last one")
-    checkpoint: int | None = _option("checkpoint to load; default: the last one", type=int)
+    checkpoint: Number | None = _option("checkpoint to load; default: the last one", type=int)
     resume: bool = _option("continue a run, with its settings", False, action="store_true")
-    max_iterations: int | None = _option("iterations in all; default: 110e6 environment steps", type=int)
+    max_iterations: Count | None = _option("iterations in all; default: 110e6 environment steps", type=int)
 
 
 def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: dict[str, Any] | None = None) -> None:
@@ -57,6 +60,9 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
     In this order: the preset, the number of worlds that suits the device, the settings of a loaded run ("env" and
     "train" of ``run_config``), the perturbation, the ranges, single options, ``set``. One without sense is a UserError.
     """
+    for name, hint in types_of(Options).items():
+        if isinstance(getattr(options, name), int):
+            check_value(f"--{name}", getattr(options, name), hint)
     apply_preset(env_cfg, train_cfg, options.preset or DEFAULT_PRESET)
     if resolve_device(options.device) == "cpu":
         env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
@@ -79,8 +85,6 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
         if not separator:
             raise UserError(f"--set takes KEY=VALUE, not '{item}'")
         set_entry_of_either(env_cfg, train_cfg, path, text)
-    if options.max_iterations is not None:
-        check_at_least(options, 1, "max_iterations")
 
 
 def apply_preset(env_cfg: Any, train_cfg: Any, name: str) -> None:

@@ -76,7 +76,7 @@ class LeggedRobot(BaseTask):
         seen = (cfg.env.history_length, cfg.normalization.clip_observations, cfg.noise.add_noise)
         self.observations = Observations(self.observation_terms(), *seen, self.num_envs)
         self.obs_buf = self.observations.buffers
-        self.health = Health(watched(self), self.num_envs, self.device)
+        self.health = Health(watched(self), self.sim.diverged)
         self.reset()
 
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
@@ -181,8 +181,8 @@ class LeggedRobot(BaseTask):
 
     def end_broken_worlds(self) -> None:
         """Count worlds in which anything is not finite as diverged, and end their episodes without a reward."""
+        self.health.check()
         diverged = self.sim.diverged
-        self.health.check(diverged)
         self.num_diverged += diverged.sum()
         self.reset_buf.logical_or_(diverged)
         self.time_out_buf.logical_and_(~diverged)

@@ -20,9 +20,9 @@ from legged_torque.utils.limits import (
     PositiveInterval,
     Share,
     Sizes,
+    Worlds,
 )
 
-Worlds = Annotated[int, Limits(1, 10_000_000)]
 Place = Annotated[list[float], Limits(-1e3, 1e3, length=3)]
 Gains = Annotated[float | dict[str, float], Limits(lowest=0)]
 
