@@ -4,11 +4,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+import yaml
 from settings import TASKS, error_of, flatten, get, get_cfgs, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.cli import run_script
-from legged_torque.utils.config import section_keys, set_by_path, to_dict
+from legged_torque.utils.config import Dumper, parse_yaml, section_keys, set_by_path, to_dict
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import num_iterations
@@ -34,7 +35,9 @@ from legged_torque.utils.task_registry import num_iterations
         ("algorithm.schedule", "fixed", "fixed"),
         ("runner.run_name", "7", "7"),
         ("runner.run_name", "a=b", "a=b"),
+        ("runner.run_name", "1:30", "1:30"),
         ("seed", "7", 7),
+        ("seed", "017", 17),
         ("actor.distribution_cfg.init_std", "2", 2.0),
     ],
 )
@@ -230,3 +233,10 @@ def test_number_of_worlds_suits_the_device(monkeypatch):
     args = parse()
     args.device = "auto"
     assert task_registry.get_cfgs("a1_position", args)[0].env.num_envs == 4096
+
+
+def test_text_that_looks_like_a_number_is_written_as_text():
+    """What a run writes is read again as it was, by any version of YAML."""
+    values = ["017", "09", "1e-4", "1:30", "on", "null", "", ".nan", "2026-01-01", 1e-5, 1e30, True, None, 5, "a: b"]
+    text = yaml.dump(values, Dumper=Dumper)
+    assert parse_yaml(text, "the text") == values == yaml.safe_load(text)

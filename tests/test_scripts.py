@@ -138,7 +138,16 @@ MISTAKES = [
     ("--resume --experiment_name=text_checkpoint", "model_2.pt' is not a readable checkpoint"),
     ("--resume --experiment_name=half_checkpoint", "model_2.pt' is not a readable checkpoint"),
     ("--resume --experiment_name=a1_position --task=a1_torque", "is of task 'a1_position', not 'a1_torque'"),
-    # values that would only fail somewhere deep inside
+    # words of older YAML, and values that would only fail somewhere deep inside
+    ("--set=env.num_envs=1:30", "config key 'env.num_envs' takes a value like 2, not '1:30'"),
+    ("--set=domain_rand.push_robots=on", "config key 'domain_rand.push_robots' takes a value like False, not 'on'"),
+    ("--set=asset.mirrored_legs=[[FR]]", "asset.mirrored_legs must be pairs [right, left], not ['FR']"),
+    ("--num_envs=3000000000", "num_envs must be from 1 to 10000000"),
+    ("--preset=", "the value of --preset is empty"),
+    ("--perturbation=", "the value of --perturbation is empty"),
+    ("--log_root=/dev/null", "cannot write '/dev/null/a1_position/"),
+    (f"--run_name={'x' * 300}", "File name too long"),
+    ("--task=a1_torque_gravity --set=pretraining.file=/proc/x/y.pt", "cannot write '/proc/x/y.pt'"),
     ("--set=env.num_envs=", "env.num_envs"),
     ("--set=env.num_envs=null", "env.num_envs"),
     ("--set=env.num_envs=2026-99-99", "2026-99-99"),
@@ -210,6 +219,12 @@ def test_mistakes_when_training(root, words, message):
         ("learning_curve.py", "--load_run=2026", "unknown run '2026'"),
         ("learning_curve.py", "--num_envs=2 --json=/dev/null/a", "cannot write '/dev/null/a': Not a directory"),
         ("evaluate.py", "--json=/dev", "cannot write '/dev': it is a folder"),
+        ("evaluate.py", "--json=/proc/x", "cannot write '/proc/x'"),
+        ("evaluate.py", "--command nan 0 0", "argument --command: it must be finite, not nan"),
+        ("export.py", "--num_envs=0", "num_envs must be from 1"),
+        ("export.py", "--out=/dev/null", "cannot write '/dev/null/policy.yaml'"),
+        ("play.py", "--video=/dev/null/a.mp4", "cannot write '/dev/null/a.mp4'"),
+        ("physics_accuracy.py", "--steps=0", "--steps must be at least 1, not 0"),
     ],
 )
 def test_mistakes_after_training(root, script, words, message):
@@ -218,6 +233,18 @@ def test_mistakes_after_training(root, script, words, message):
     result = run_here(script, "--task=a1_position", "--device=cpu", *words.split(), root=root)
     assert_told_in_one_line(result, message)
     assert contents(root) == before
+
+
+def test_number_of_processes_that_is_none(tmp_path, monkeypatch):
+    """What torchrun says by the environment is a mistake of the user's if it makes no sense."""
+    monkeypatch.setenv("WORLD_SIZE", "x")
+    assert_told_in_one_line(run_here("train.py", *SMALL, root=tmp_path), "WORLD_SIZE, which torchrun sets, must be")
+    assert not list(tmp_path.iterdir())
+
+
+def test_values_of_several_lines(tmp_path):
+    """The line of a mistake is one even if a name in it has two."""
+    assert_told_in_one_line(run_here("train.py", "--task=a\nb", root=tmp_path), "unknown task 'a")
 
 
 @pytest.mark.parametrize("script", ["train.py", "play.py", "learning_curve.py", "benchmark.py"])

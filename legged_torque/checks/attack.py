@@ -26,6 +26,8 @@ _OUTPUT, _ERROR = ".output", ".error"  # added to the name of a case's folder
 
 Contents = dict[Path, tuple[int, int]]
 """Every file and folder below a folder, with the time of its last change [ns] and its size."""
+Running = dict[int, tuple["Case", Path, Contents]]
+"""By process: its case, the folder of the case and what that held before."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ def attack(cases: Iterable[Case], fixture: Path, *folders: Path) -> Iterator[Res
 
     Cases are forks of this process, which must have no threads: what it has imported and compiled is there for all.
     """
-    waiting, running = iter(cases), {}
+    waiting, running = iter(cases), Running()
     for folder in folders:
         _start_next(waiting, fixture, folder, running)
     while running:
@@ -69,7 +71,7 @@ def attack(cases: Iterable[Case], fixture: Path, *folders: Path) -> Iterator[Res
         _start_next(waiting, fixture, folder, running)
 
 
-def _start_next(waiting: Iterator[Case], fixture: Path, folder: Path, running: dict) -> None:
+def _start_next(waiting: Iterator[Case], fixture: Path, folder: Path, running: Running) -> None:
     """Start the next case in a fresh folder, and note it under its process."""
     case = next(waiting, None)
     if case is None:

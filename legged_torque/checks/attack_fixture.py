@@ -47,10 +47,10 @@ WORDS = {
     "plot_curves.py": (CURVE, "--out=out.png"),
     "plot_pretraining.py": (REPORT, "--out=out.png"),
     "plot_randomization.py": (*_SMALL, "--out=out.png"),
-    "benchmark.py": (*_SMALL, "--rounds=1"),
-    "check_capture.py": _SMALL,
+    "benchmark.py": ("--task=a1_position", *_SMALL, "--rounds=1"),
+    "check_capture.py": ("--task=a1_position", *_SMALL),
     "check_standing.py": _SMALL,
-    "check_reproducible.py": (*_SMALL, "--iterations=1", "--resumes=0"),
+    "check_reproducible.py": ("--task=a1_position", *_SMALL, "--iterations=1", "--resumes=0"),
 }
 """Command lines that are valid in the folder of :func:`make_fixture`, with as little work as possible."""
 _PLAN = {"tasks": ["a1_position"], "environments": {"none": ["none"]}, "seeds": [1]}

@@ -6,7 +6,7 @@ import copy
 import inspect
 import itertools
 import re
-from typing import Any, ClassVar
+from typing import Any
 
 import yaml
 
@@ -212,13 +212,12 @@ def is_small(value: Any) -> bool:
 class Loader(yaml.SafeLoader):
     """Reads words as YAML 1.2 does: 017 is seventeen and 1e-4 a number; 1:30, on, yes and dates are text."""
 
-    yaml_implicit_resolvers: ClassVar[dict] = {}
-
 
 class Dumper(yaml.SafeDumper):
     """Writes what :class:`Loader` reads again: text that looks like one of its numbers is quoted."""
 
 
+Loader.yaml_implicit_resolvers = {}  # none of YAML 1.1
 for _tag, _pattern in {
     "null": r"~|null|Null|NULL|",
     "bool": r"true|True|TRUE|false|False|FALSE",

@@ -12,6 +12,9 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     """Raise a UserError that names the first setting of a task that makes no sense, alone or with others."""
     check_section(cfg)
     _check_changes(cfg)
+    for pair in cfg.asset.mirrored_legs:
+        if len(pair) != 2:
+            raise UserError(f"asset.mirrored_legs must be pairs [right, left], not {pair}")
     if cfg.rewards.scales.symmetry and not cfg.asset.mirrored_legs:
         raise UserError("rewards.scales.symmetry needs asset.mirrored_legs: which legs are right and left of a pair")
     if cfg.rewards.scales.base_height and not cfg.rewards.base_height_target > 0.0:
