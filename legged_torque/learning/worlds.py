@@ -149,7 +149,7 @@ def unpack(packed: dict[str, Any], tensors: dict[str, Tensor], num_worlds: int) 
     counts = [tensor.numel() // num_worlds for tensor in tensors.values()]
     sizes = [tensor.element_size() for tensor in tensors.values()]
     places, num_planes = packed["places"].long(), sum(np.multiply(counts, sizes))
-    fits = len(places) == num_planes and 0 <= int(places.min()) and int(places.max()) < num_planes
+    fits = len(places) == num_planes and int(places.min()) >= 0 and int(places.max()) < num_planes
     room = (int(places.max()) + 1) * num_worlds if fits else 0
     data = b"".join(_decompressed(chunk, room) for chunk in packed["planes"]) if fits else b""
     if not fits or len(data) != room:

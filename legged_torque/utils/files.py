@@ -67,6 +67,7 @@ def is_whole_archive(file: Path) -> bool:
     """Return whether a file is a zip archive, as torch writes, whose parts all have their checksums."""
     try:
         with zipfile.ZipFile(file) as archive:
-            return archive.testzip() is None
+            has_folders = any(part.external_attr for part in archive.infolist())  # torch writes none, and reads no data
+            return archive.testzip() is None and not has_folders
     except Exception:  # zipfile raises about anything for a damaged file
         return False
