@@ -38,7 +38,7 @@ class LeggedRobotCfg(BaseConfig):
     class sim:  # physics
         dt = 0.005  # [s] physics step
         engine = "fused"  # one kernel per physics step, for legged robots on a plane; or "mujoco_warp" for any robot
-        solver_iterations = 20  # at most
+        solver_iterations = 30  # at most
         ls_iterations = 20  # line search, at most
 
     class terrain:  # the ground
