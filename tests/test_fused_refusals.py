@@ -1,12 +1,14 @@
 """What the fused step does not simulate, and refuses by name."""
 
 import mujoco
+import numpy as np
 import pytest
+from test_fused import assert_alike, compiled, draw_states, make_a1, put, step_fused, step_mujoco
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.sim.fused.tree import read_tree
 from legged_torque.sim.model import build_model, read_spec
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.simulator import ENGINES, Simulator
 from legged_torque.utils.errors import UserError
 
 GEOM, JOINT, TRN = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtTrn
@@ -36,13 +38,13 @@ REFUSED = [
     ("spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC", "the friction cone must be pyramidal"),
     ("spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER", "the integrator must be implicitfast"),
     ("spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_WARMSTART", "it sets flags in its options"),
-    ("spec.option.enableflags = mujoco.mjtEnableBit.mjENBL_ENERGY", "it sets flags in its options"),
+    ("spec.option.enableflags = mujoco.mjtEnableBit.mjENBL_INVDISCRETE", "it sets flags in its options"),
     ("spec.add_equality(type=2, name1='FR_hip_joint', name2='FL_hip_joint')", "equalities, tendons, pairs or mocap"),
     ("spec.add_tendon(name='t').wrap_joint('FR_hip_joint', 1.0)", "equalities, tendons, pairs or mocap"),
     ("spec.add_pair(geomname1='floor', geomname2='FR_foot')", "equalities, tendons, pairs or mocap"),
     ("spec.option.density = 1.2", "it moves through a fluid"),
     ("spec.option.viscosity = 1.2", "it moves through a fluid"),
-    ("spec.option.wind = (1, 0, 0)", "it moves through a fluid"),
+    ("spec.option.wind = (1, 0, 0); spec.option.density = 1.2", "it moves through a fluid"),
     ("spec.body('FR_calf').gravcomp = 0.5", "bodies are compensated for gravity"),
     (SITE, "actuators must be motors"),
     ("spec.actuator('FR_hip').set_to_position(kp=10.0)", "actuators must be motors"),
@@ -116,6 +118,76 @@ def test_refused(edit, reason):
     message = str(error.value)
     assert message.startswith("sim.engine 'fused' cannot simulate this robot: ") and reason in message
     assert message.endswith("; use sim.engine = 'mujoco_warp', without randomize_parameters")
+
+
+CALF_MEETS_THIGH = "spec.geom('FR_calf').contype = 2; spec.geom('FR_thigh').conaffinity |= 2"
+LEGS_MEET = "spec.geom('FR_calf').contype = 2; spec.geom('FL_calf').conaffinity |= 2; "
+ACCEPTED = [
+    CALF_MEETS_THIGH,
+    LEGS_MEET + "spec.add_exclude(bodyname1='FL_calf', bodyname2='FR_calf')",
+    "spec.add_exclude(bodyname1='FL_calf', bodyname2='FR_calf')",
+    "spec.add_equality(type=2, name1='FR_hip_joint', name2='FL_hip_joint', active=False)",
+    "spec.option.wind = (5, 0, 0)",
+    "spec.option.enableflags = mujoco.mjtEnableBit.mjENBL_ENERGY",
+]
+
+
+@pytest.mark.parametrize("edit", ACCEPTED, ids=[edit[-60:] for edit in ACCEPTED])
+def test_accepted(edit):
+    """Settings that change no motion are accepted, and indeed plain MuJoCo moves as without them."""
+    spec = make_a1()
+    exec(edit, globals(), {"spec": spec})
+    model = compiled(spec)
+    states = draw_states(compiled(make_a1()), 10, seed=7)
+    assert np.array_equal(step_mujoco(model, states)[0], step_mujoco(compiled(make_a1()), states)[0])
+    expected = step_mujoco(model, states)
+    assert_alike(model, states, step_fused(model, states), expected)
+
+
+def test_legs_that_meet_are_refused():
+    """Without the exclude, the same collision bits are refused."""
+    spec = make_a1()
+    exec(LEGS_MEET, globals(), {"spec": spec})
+    with pytest.raises(UserError, match="parts of the robot collide with each other"):
+        read_tree(compiled(spec))
+
+
+@pytest.mark.parametrize("name", ["geom_margin", "jnt_margin", "body_gravcomp", "actuator_gainprm", "geom_gap"])
+def test_fields_that_are_not_read(name):
+    """Fields that the fused step does not read cannot be had per world; MuJoCo Warp's step takes them."""
+    model = compiled(make_a1())
+    with pytest.raises(UserError, match=f"does not read '{name}' per world"):
+        Simulator(model, 2, "cpu", per_world=["body_mass", name])
+    Simulator(model, 2, "cpu", engine="mujoco_warp", per_world=[name])
+    with pytest.raises(UserError, match="body_mass"):
+        Simulator(model, 2, "cpu", per_world=["body_mas"])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("name", ["dof_damping", "dof_armature", "dof_frictionloss", "jnt_stiffness"])
+def test_the_free_joint_is_not_read(engine, name):
+    """Random parameters of the trunk's free joint are refused where they would not act; those of hinges are not."""
+    sim = Simulator(compiled(make_a1()), 2, "cpu", engine, per_world=[name])
+    last_of_trunk = 0 if name == "jnt_stiffness" else 5
+    sim.check_columns(name, [last_of_trunk + 1])
+    if engine == "fused":
+        with pytest.raises(UserError, match=f"does not read '{name}' of the trunk's free joint"):
+            sim.check_columns(name, [last_of_trunk + 1, last_of_trunk])
+    else:
+        sim.check_columns(name, [last_of_trunk])
+
+
+def test_tolerance():
+    """``opt.tolerance`` acts: where everything is good enough, the solver stops after its second iteration."""
+    model = compiled(make_a1())
+    states, counts = draw_states(model, 30, seed=8), []
+    for tolerance in (1e-8, 1e9):
+        model.opt.tolerance = tolerance
+        sim = Simulator(model, 30, "cpu")
+        put(sim, states)
+        sim.step()
+        counts.append(sim.data.solver_niter.numpy().copy())
+    assert counts[0].max() > 4 and counts[1].max() <= 2
 
 
 def test_engines_by_name():

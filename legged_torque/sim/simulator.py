@@ -57,7 +57,7 @@ class Simulator:
         num_envs: int,
         device: str,
         engine: str = "fused",
-        solver_iterations: int = 20,
+        solver_iterations: int = 30,
         ls_iterations: int = 20,
         per_world: Sequence[str] = (),
         applied_forces: bool = False,

@@ -23,7 +23,9 @@ from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
 from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types
 
 LINE_SEARCH_TOLERANCE = wp.constant(0.1)
-"""The line search stops when the slope has come down to this share of that at its start."""
+FIRST_TOLERANCE = wp.constant(5.0)
+"""The line search stops when the slope has come down to this share of that at its start; likewise in the first
+iteration, whose step leads to where the cost is least with the expected rows: it is only cut short if it is absurd."""
 
 
 class Layout(NamedTuple):
@@ -182,14 +184,20 @@ def in_solver(layout: Layout) -> SimpleNamespace:
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
             if lane + i * wp.static(lanes) < wp.static(branches):
-                branch = solver.turn_to(branch, rot, step, contacts)
-                slopes += solver.slopes_at_start(branch, step, contacts)
+                branch, of_rows = solver.turn_to(branch, rot, step, contacts)
+                slopes += solver.slopes_at_start(branch, step, of_rows)
             place.keep(kept, world, i, branch)
         return branch, group_sum3(slopes, wp.static(lanes))
 
     @wp.func
     def line_search(
-        iterations: int, world: int, branch: Branch, kept: Kept, at_start: wp.vec3, contacts: Contacts
+        tolerance: float,
+        iterations: int,
+        world: int,
+        branch: Branch,
+        kept: Kept,
+        at_start: wp.vec3,
+        contacts: Contacts,
     ) -> float:
         """Return the share of the step at which the cost is least: Newton's method, kept between bounds."""
         alpha = float(1.0)
@@ -202,7 +210,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
                 slopes += solver.row_slopes(branch, contacts, alpha)
             slope = at_start[1] + alpha * at_start[2] + group_sum(slopes[0], wp.static(lanes))
             curvature = at_start[2] + group_sum(slopes[1], wp.static(lanes))
-            if wp.abs(slope) <= -LINE_SEARCH_TOLERANCE * at_start[0]:
+            if wp.abs(slope) <= tolerance * wp.abs(at_start[0]):
                 break
             if slope < 0.0:
                 low = alpha

@@ -14,8 +14,10 @@ MAX_CONTACT_MASS = wp.constant(4.0e4)
 """Most mass of a contact's rows, times the inverse weight of its body. Contacts get stiffer with less friction and with
 impratio, without limit, while float32 loses the solution; a contact as stiff as this one creeps by micrometres."""
 STICKING_ACCELERATION = wp.constant(10.0)
-"""Contacts whose references ask for more [m/s^2] along a tangent are expected to slide. It changes how long the solver
-takes, no result."""
+PARTING_ACCELERATION = wp.constant(40.0)
+"""Contacts whose references ask for more [m/s^2] along a tangent are expected to slide, into the floor to part. This
+changes how long the solver takes, no result."""
+INFINITY = wp.constant(1.0e30)
 CAPSULE = wp.constant(3)
 BOX = wp.constant(6)
 """MuJoCo's mjGEOM_CAPSULE and mjGEOM_BOX."""
@@ -109,11 +111,14 @@ def set_contact_rows(
 def expected_rows(contact: Contact) -> vec4:
     """Return 1 for the rows that are expected to push, else 0: all where a contact sticks, else those against sliding.
 
-    A row's reference is that of the normal and of the sideways velocity, which it shall stop.
+    A row's reference is that of the normal and of the sideways velocity, which it shall stop. A contact that parts
+    faster than its bodies can follow does not push.
     """
     reference = contact.reference
     along_normal = 0.25 * (reference[0] + reference[1] + reference[2] + reference[3])
     lowest = along_normal - STICKING_ACCELERATION * contact.friction
+    if along_normal < -PARTING_ACCELERATION:
+        lowest = INFINITY
     return vec4(
         wp.where(reference[0] < lowest, 0.0, 1.0),
         wp.where(reference[1] < lowest, 0.0, 1.0),

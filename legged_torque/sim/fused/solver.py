@@ -163,13 +163,25 @@ def branch_step(branch: AnyBranch, trunk_step: TrunkMotion):
 
 @wp.func
 def turn_to(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts: Contacts):
-    """Return a branch with its part of the Newton step and the changes of its residuals along it."""
+    """Return a branch with its part of the Newton step and the changes of its residuals along it.
+
+    Return also the slope of its rows' cost along the step.
+    """
     branch.step = branch_step(branch, trunk_step)
     branch.change = joint_rows_times(branch, branch.step)
+    slope = float(0.0)
+    for j in range(len(branch.acc)):
+        friction = friction_force(
+            branch.rows.friction_mass[j], branch.rows.friction_loss[j], branch.residuals.friction[j]
+        )
+        slope -= friction * branch.change.friction[j]
+        slope -= row_force(branch.rows.limit_mass[j], branch.residuals.limit[j]) * branch.change.limit[j]
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
         contact = contacts.found[k]
-        contacts.change[k] = contact_rows_times(branch, rot, trunk_step, branch.step, contacts.normal, contact)
-    return branch
+        change = contact_rows_times(branch, rot, trunk_step, branch.step, contacts.normal, contact)
+        slope += contact.mass * wp.dot(wp.cw_mul(contacts.pushing[k], contacts.residual[k]), change)
+        contacts.change[k] = change
+    return branch, slope
 
 
 @wp.func
@@ -200,14 +212,14 @@ def row_slopes(branch: AnyBranch, contacts: Contacts, alpha: float) -> wp.vec2:
 
 
 @wp.func
-def slopes_at_start(branch: AnyBranch, trunk_step: TrunkMotion, contacts: Contacts) -> wp.vec3:
+def slopes_at_start(branch: AnyBranch, trunk_step: TrunkMotion, of_rows: float) -> wp.vec3:
     """Return a branch's slope of the whole cost along the step, and slope and curvature of its smooth part."""
     slope = wp.dot(branch.step, branch.gradient)
     slope += wp.dot(trunk_step.lin, branch.trunk_gradient_lin) + wp.dot(trunk_step.ang, branch.trunk_gradient_ang)
     curvature = wp.dot(branch.step, branch.smooth.mass * branch.step)
     curvature += 2.0 * wp.dot(branch.smooth.mass_lin * branch.step, trunk_step.lin)
     curvature += 2.0 * wp.dot(branch.smooth.mass_ang * branch.step, trunk_step.ang)
-    return wp.vec3(slope, slope - row_slopes(branch, contacts, 0.0)[0], curvature)
+    return wp.vec3(slope, slope - of_rows, curvature)
 
 
 @wp.func

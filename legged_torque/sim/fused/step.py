@@ -12,7 +12,7 @@ import mujoco_warp as mjw
 import warp as wp
 
 from legged_torque.sim.fused.applied import apply_to_trunk
-from legged_torque.sim.fused.branches import Layout, around_solver, in_solver
+from legged_torque.sim.fused.branches import FIRST_TOLERANCE, LINE_SEARCH_TOLERANCE, Layout, around_solver, in_solver
 from legged_torque.sim.fused.contact import Contact, Contacts, floor_normal
 from legged_torque.sim.fused.integrate import integrate_trunk
 from legged_torque.sim.fused.smooth import make_trunk, trunk_pose
@@ -109,7 +109,6 @@ def make_kernel(layout: Layout, applied_forces: bool) -> wp.Kernel:
         branch, total = around.make_all(tables, worlds, world, lane, trunk, acc, contacts, kept)
         whole = whole_body(trunk, total, wp.static(lanes))
         used = int(0)
-        searches = int(0)  # none in the first iteration, which goes to where the cost is least with the expected rows
         for _iteration in range(iterations):
             used += 1
             branch, system = solver.assemble_all(world, lane, branch, kept, trunk.rot, acc, contacts)
@@ -118,10 +117,10 @@ def make_kernel(layout: Layout, applied_forces: bool) -> wp.Kernel:
             branch, slopes = solver.turn_all(world, lane, branch, kept, trunk.rot, step, contacts)
             start = slopes + trunk_slopes(whole, residual, step)
             decrease = -start[0] * tables.cost_scale
-            if searches > 0 and not (decrease > tables.tolerance):
+            if used > 1 and not (decrease > tables.tolerance):
                 break
-            alpha = solver.line_search(searches, world, branch, kept, start, contacts)
-            searches = ls_iterations
+            share = wp.where(used > 1, LINE_SEARCH_TOLERANCE, FIRST_TOLERANCE)
+            alpha = solver.line_search(share, ls_iterations, world, branch, kept, start, contacts)
             acc.lin = acc.lin + alpha * step.lin
             acc.ang = acc.ang + alpha * step.ang
             branch, flips = solver.move_all(world, branch, kept, contacts, alpha)

@@ -1,0 +1,38 @@
+"""Put NaN, inf and 1e30 into single worlds of both engines: ``python scripts/check_injections.py --count 400``.
+
+No other world may differ by a bit, and a reset must make the world as good as new. Exits with 1 otherwise.
+"""
+
+import sys
+
+from legged_torque.utils.rendering import without_renderer
+
+without_renderer()  # before anything imports mujoco
+
+from legged_torque import RESOURCES_DIR
+from legged_torque.checks import injections
+from legged_torque.sim.model import build_model, collision_geoms, read_spec
+from legged_torque.sim.simulator import ENGINES
+from legged_torque.utils.args import Parser
+from legged_torque.utils.cli import check_at_least, run_script
+
+
+def main() -> None:
+    """Print the counts of both engines."""
+    parser = Parser(__doc__)
+    parser.add_argument("--count", type=int, default=400, help="bad numbers per engine; default: %(default)s")
+    parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:N"; default: %(default)s')
+    args = parser.parse_args()
+    check_at_least(args, 1, "count")
+    spec = read_spec(RESOURCES_DIR / "robots/a1/a1.xml")
+    model = build_model(spec, collision_geoms(spec))
+    is_good = True
+    for engine in ENGINES:
+        counts = injections.run(model, engine, args.count, args.device)
+        print(f"{engine}: " + ", ".join(f"{count} {name}" for name, count in counts.items()), flush=True)
+        is_good &= counts["leaked"] == counts["not recovered"] == 0
+    sys.exit(0 if is_good else 1)
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,34 @@
+"""Bad numbers in single worlds, as ``scripts/check_injections.py`` puts there more of."""
+
+import pytest
+import torch
+from test_fused import compiled, make_a1
+
+from legged_torque.checks import injections
+from legged_torque.sim.simulator import ENGINES, Simulator
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_bad_numbers_stay_in_their_world(engine):
+    """No other world differs by a bit, and the world is as good as new after a reset."""
+    counts = injections.run(compiled(make_a1()), engine, 12, "cpu")
+    assert counts == {"injections": 12, "leaked": 0, "not recovered": 0}
+
+
+def test_what_is_counted(monkeypatch):
+    """Without resets nothing recovers: the counts are no constants."""
+    monkeypatch.setattr(Simulator, "reset", lambda self, mask: None)
+    counts = injections.run(compiled(make_a1()), "fused", 6, "cpu")
+    assert counts["not recovered"] > 0
+
+
+def test_stale_constraint_rows_are_cleared():
+    """A bad joint angle spoils rows of MuJoCo Warp's Jacobian, of which none is left after a reset."""
+    sim = Simulator(compiled(make_a1()), 2, "cpu", "mujoco_warp")
+    sim.qpos[:, 2] = 0.1
+    sim.qpos[1, -1] = float("nan")
+    sim.step()
+    jacobian = sim.data.efc.J.numpy
+    assert torch.isnan(torch.tensor(jacobian()[1])).any()
+    sim.reset(torch.tensor([False, True]))
+    assert (jacobian()[1] == 0.0).all() and (jacobian()[0] != 0.0).any()
