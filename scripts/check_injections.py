@@ -3,32 +3,36 @@
 No other world may differ by a bit, and a reset must make the world as good as new. Exits with 1 otherwise.
 """
 
-import sys
-
+from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
+end_on_interrupt()
 without_renderer()  # before anything imports mujoco
+
+import sys
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.checks import injections
 from legged_torque.sim.model import build_model, collision_geoms, read_spec
 from legged_torque.sim.simulator import ENGINES
-from legged_torque.utils.args import Parser
+from legged_torque.utils.args import Parser, add_options
 from legged_torque.utils.cli import check_at_least, run_script
+from legged_torque.utils.devices import resolve_device
 
 
 def main() -> None:
     """Print the counts of both engines."""
     parser = Parser(__doc__)
     parser.add_argument("--count", type=int, default=400, help="bad numbers per engine; default: %(default)s")
-    parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:N"; default: %(default)s')
+    add_options(parser, "device")
     args = parser.parse_args()
     check_at_least(args, 1, "count")
+    device = resolve_device(args.device)
     spec = read_spec(RESOURCES_DIR / "robots/a1/a1.xml")
     model = build_model(spec, collision_geoms(spec))
     is_good = True
     for engine in ENGINES:
-        counts = injections.run(model, engine, args.count, args.device)
+        counts = injections.run(model, engine, args.count, device)
         print(f"{engine}: " + ", ".join(f"{count} {name}" for name, count in counts.items()), flush=True)
         is_good &= counts["leaked"] == counts["not recovered"] == 0
     sys.exit(0 if is_good else 1)

@@ -50,6 +50,7 @@ WORDS = {
     "benchmark.py": ("--task=a1_position", *_SMALL, "--rounds=1"),
     "check_capture.py": ("--task=a1_position", *_SMALL),
     "check_standing.py": _SMALL,
+    "check_injections.py": ("--count=1",),
     "check_reproducible.py": ("--task=a1_position", *_SMALL, "--iterations=1", "--resumes=0"),
 }
 """Command lines that are valid in the folder of :func:`make_fixture`, with as little work as possible."""
