@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from test_fused import compiled, make_a1
+from test_scripts import SMALL, run_here
 
 from legged_torque.checks.accuracy import (
     KINDS,
@@ -18,7 +19,7 @@ from legged_torque.checks.accuracy import (
     reference_step,
 )
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.simulator import ENGINES, Simulator
 
 WORLDS = 120
 SETTINGS = (LeggedRobotCfg.sim.solver_iterations, LeggedRobotCfg.sim.ls_iterations)
@@ -92,3 +93,15 @@ def test_slopes_do_not_creep(friction, impratio, impedance):
         sim.step()
     creep = np.linalg.norm(np.subtract(*places), axis=2).mean(axis=1)
     assert abs(creep[1] - creep[0]) < 1e-4 and creep[0] < 5e-3
+
+
+def test_physics_accuracy(tmp_path):
+    """The script names the machine and has a row per kind of state and engine; mistakes are told in a line."""
+    assert run_here("train.py", *SMALL, root=tmp_path)[0] == 0
+    words = ("--task=a1_position", "--device=cpu", "--num_envs=2", "--steps=3", "--worlds=4")
+    status, output, _ = run_here("physics_accuracy.py", *words, root=tmp_path)
+    lines = output.splitlines()
+    rows = [line.split("|")[:2] for line in lines if " | " in line][1:]
+    assert status == 0 and any(line.startswith("a1_position on CPU") for line in lines)
+    assert [[cell.strip() for cell in row] for row in rows] == [[kind, engine] for kind in KINDS for engine in ENGINES]
+    assert run_here("physics_accuracy.py", *words, "--steps=0", root=tmp_path)[0] == 2

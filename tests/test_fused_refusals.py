@@ -6,6 +6,7 @@ import pytest
 from test_fused import assert_alike, compiled, draw_states, make_a1, put, step_fused, step_mujoco
 
 from legged_torque import RESOURCES_DIR
+from legged_torque.envs.base.domain_rand import of_model
 from legged_torque.sim.fused.tree import read_tree
 from legged_torque.sim.model import build_model, read_spec
 from legged_torque.sim.simulator import ENGINES, Simulator
@@ -175,6 +176,14 @@ def test_the_free_joint_is_not_read(engine, name):
             sim.check_columns(name, [last_of_trunk + 1, last_of_trunk])
     else:
         sim.check_columns(name, [last_of_trunk])
+
+
+def test_random_parameters_of_the_free_joint(make_task):
+    """A task cannot draw what would not act."""
+    task = make_task("a1_torque", 2, **{"domain_rand.randomize_parameters": True})
+    assert of_model(task, "damping of hinges", "dof_damping", [6]).model_field == "dof_damping"
+    with pytest.raises(UserError, match="does not read 'dof_damping' of the trunk's free joint"):
+        of_model(task, "damping of the trunk", "dof_damping", [0])
 
 
 def test_tolerance():

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from test_fused import compiled, make_a1
+from test_scripts import run_here
 
 from legged_torque.checks import injections
 from legged_torque.sim.simulator import ENGINES, Simulator
@@ -32,3 +33,15 @@ def test_stale_constraint_rows_are_cleared():
     assert torch.isnan(torch.tensor(jacobian()[1])).any()
     sim.reset(torch.tensor([False, True]))
     assert (jacobian()[1] == 0.0).all() and (jacobian()[0] != 0.0).any()
+
+
+@pytest.mark.parametrize(("leaked", "status"), [(0, 0), (1, 1)])
+def test_check_injections(tmp_path, monkeypatch, leaked, status):
+    """The script prints the counts of both engines and exits with 1 if something leaked."""
+    told = {"injections": 3, "leaked": leaked, "not recovered": 0}
+    monkeypatch.setattr(injections, "run", lambda model, engine, count, device: told)
+    found, output, _ = run_here("check_injections.py", "--count=3", root=tmp_path)
+    assert found == status and output == "".join(
+        f"{engine}: 3 injections, {leaked} leaked, 0 not recovered\n" for engine in ENGINES
+    )
+    assert run_here("check_injections.py", "--count=0", root=tmp_path)[0] == 2

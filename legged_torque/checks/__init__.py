@@ -1,1 +1,1 @@
-"""Checks of speed, accuracy and CUDA graphs, run by benchmark.py, physics_accuracy.py and check_capture.py."""
+"""Checks of speed, accuracy, CUDA graphs and bad numbers, of which each has a script of its own."""

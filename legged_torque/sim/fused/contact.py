@@ -12,7 +12,8 @@ MIN_FRICTION = wp.constant(1.0e-5)
 """MuJoCo's mjMINMU."""
 MAX_CONTACT_MASS = wp.constant(4.0e4)
 """Most mass of a contact's rows, times the inverse weight of its body. Contacts get stiffer with less friction and with
-impratio, without limit, while float32 loses the solution; a contact as stiff as this one creeps by micrometres."""
+impratio, without limit, while float32 loses the solution: at this stiffness, rounding
+errors reach about 1e-3 m/s."""
 STICKING_ACCELERATION = wp.constant(10.0)
 PARTING_ACCELERATION = wp.constant(40.0)
 """Contacts whose references ask for more [m/s^2] along a tangent are expected to slide, into the floor to part. This
