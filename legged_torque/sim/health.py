@@ -43,21 +43,22 @@ class Health:
         """
         self._marks = diverged
         self._watched = sorted(watched, key=lambda tensor: tensor.is_result)
-        self._defaults = [tensor.numbers[0].clone() for tensor in self._watched]  # their memory must not be freed
-        rows = [address(*pair) for pair in zip(self._watched, self._defaults, strict=True)]
         self._diverged, self._excused, nobody = diverged.new_zeros(3, len(diverged)).unbind()
-        self._counts = torch.zeros(len(rows), dtype=torch.int32, device=diverged.device)
-        num_causes = sum(not tensor.is_result for tensor in watched)
-        self._causes = self._arguments(rows[:num_causes], nobody, self._counts[:num_causes])
-        self._results = self._arguments(rows[num_causes:], self._excused, self._counts[num_causes:])
+        self._found = diverged.new_zeros(len(self._watched), len(diverged), dtype=torch.int32)
+        self._counts = diverged.new_zeros(len(self._watched), dtype=torch.int32)
+        self._causes = self._arguments(False, nobody)
+        self._results = self._arguments(True, self._excused)
 
-    def _arguments(self, rows: list[Any], excused: Tensor, counts: Tensor) -> list[Any]:
-        """Return the kernel's arguments for some of the tensors."""
-        table: wp.array = wp.array(rows, dtype=kernels.Numbers2d, device=wp.device_from_torch(excused.device))
-        return [table, *map(wp.from_torch, (excused, self._marks, counts))]
+    def _arguments(self, is_result: bool, excused: Tensor) -> list[Any]:
+        """Return the kernel's arguments for the causes or the results."""
+        chosen = [(i, tensor) for i, tensor in enumerate(self._watched) if tensor.is_result == is_result]
+        rows = [row for i, tensor in chosen for row in columns(i, tensor.numbers)]
+        table: wp.array = wp.array(rows, dtype=kernels.Column, device=wp.device_from_torch(excused.device))
+        return [table, *map(wp.from_torch, (excused, self._marks, self._found, self._counts))]
 
     def check(self) -> None:
         """Replace numbers that are not finite, and mark their worlds."""
+        self._found.zero_()
         self._mend(self._causes)
         self._excused.copy_(self._marks)
         self._mend(self._results)
@@ -66,7 +67,7 @@ class Health:
     def _mend(self, arguments: list[Any]) -> None:
         """Run the kernel."""
         rows = arguments[0]
-        wp.launch(kernels.mend, (len(rows), len(self._marks)), arguments, device=rows.device)
+        wp.launch(kernels.mend, (len(self._marks), len(rows)), arguments, device=rows.device)
 
     def read(self) -> tuple[float, dict[Watched, int]]:
         """Return what happened since the last call, over all processes that train together, and wait for the device.
@@ -84,10 +85,12 @@ class Health:
         return share, {tensor: count for tensor, count in zip(self._watched, counts, strict=True) if count}
 
 
-def address(tensor: Watched, defaults: Tensor) -> Any:
-    """Return where a tensor's numbers are, and what takes their place."""
-    row: Any = kernels.Numbers2d()
-    row.address, row.defaults, row.count = tensor.numbers.data_ptr(), defaults.data_ptr(), len(defaults)
-    row.world_stride = tensor.numbers.stride(0) * tensor.numbers.element_size()
-    row.stride = tensor.numbers.stride(1)
-    return row
+def columns(i: int, numbers: Tensor) -> list[Any]:
+    """Return where the numbers of the tensor number ``i`` are, and what takes their place."""
+    rows = []
+    for column, healthy in enumerate(numbers[0].tolist()):
+        row: Any = kernels.Column()
+        row.address, row.stride = numbers[:, column].data_ptr(), numbers.stride(0) * numbers.element_size()
+        row.tensor, row.healthy = i, healthy
+        rows.append(row)
+    return rows

@@ -114,30 +114,25 @@ def draw(mask: Mask, seeds: Integers, rows: wp.array(dtype=Row), values: Rows):
 
 
 @wp.struct
-class Numbers2d:
-    """Numbers of every world, wherever they are in memory."""
+class Column:
+    """One number of every world, wherever it is in memory."""
 
-    address: wp.uint64  # of the first world's first number
-    world_stride: wp.uint64  # from world to world [bytes]
-    stride: wp.int32  # from number to number [numbers]
-    count: wp.int32  # of the numbers of a world
-    defaults: wp.uint64  # address of what takes the place of each
+    address: wp.uint64  # of the first world's
+    stride: wp.uint64  # from world to world [bytes]
+    tensor: wp.int32  # which tensor it belongs to
+    healthy: wp.float32  # what takes its place
 
 
 @wp.kernel(enable_backward=False)
-def mend(tensors: wp.array(dtype=Numbers2d), excused: Mask, diverged: Mask, counts: Integers):
-    """Replace what is not finite in one tensor of one world; mark the world, and count it unless it is excused."""
-    tensor, world = wp.tid()
-    place = tensors[tensor]
-    row = place.address + wp.uint64(world) * place.world_stride
-    numbers = wp.array(ptr=row, shape=(place.count * place.stride,), dtype=wp.float32)
-    defaults = wp.array(ptr=place.defaults, shape=(place.count,), dtype=wp.float32)
-    found = bool(False)  # a variable; Warp would take False for a constant
-    for i in range(place.count):
-        if not wp.abs(numbers[i * place.stride]) <= wp.static(MAX_FLOAT):  # faster than isfinite
-            numbers[i * place.stride] = defaults[i]
-            found = True
-    if found:
+def mend(
+    columns: wp.array(dtype=Column), excused: Mask, diverged: Mask, found: wp.array2d(dtype=wp.int32), counts: Integers
+):
+    """Replace one number of one world if it is not finite; mark the world, and count its tensor unless excused."""
+    world, column = wp.tid()  # neighbours in memory are read together
+    place = columns[column]
+    number = wp.array(ptr=place.address + wp.uint64(world) * place.stride, shape=(1,), dtype=wp.float32)
+    if not wp.abs(number[0]) <= wp.static(MAX_FLOAT):  # faster than isfinite
+        number[0] = place.healthy
         diverged[world] = True
-        if not excused[world]:
-            wp.atomic_add(counts, tensor, 1)
+        if not excused[world] and wp.atomic_max(found, place.tensor, world, 1) == 0:
+            wp.atomic_add(counts, place.tensor, 1)
