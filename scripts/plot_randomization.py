@@ -52,13 +52,14 @@ UNIT_OF = {name: f" [{unit}]" for unit, names in UNITS.items() for name in names
 
 @dataclass
 class Panel:
-    """Numbers that were drawn, and how they should be distributed: U(offset) x U(scale)."""
+    """Numbers that were drawn, and how they should be distributed: U(offset) x U(scale) x U(column_scale)."""
 
     group: str  # one of GROUPS
     title: str  # with its unit
     values: torch.Tensor  # a row per world
     offset: Sequence[float]  # range, including what the offset is added to
     scale: Sequence[float] = (1.0, 1.0)  # range
+    column_scale: Sequence[float] = (1.0, 1.0)  # range
     own: Sequence[float] = (0.0,)  # values without draws, one per column
     may_keep: bool = False  # whether some worlds keep their own values
     bins: int = BINS
@@ -70,17 +71,19 @@ class Panel:
 
     def limits(self) -> tuple[float, float]:
         """Return the lowest and the highest number that can be drawn."""
-        return np.outer(self.offset, self.scale).min(), np.outer(self.offset, self.scale).max()
+        ends = np.multiply.outer(np.outer(self.offset, self.scale), self.column_scale)
+        return ends.min(), ends.max()
 
     def density(self, at: np.ndarray) -> np.ndarray:
         """Return the expected density."""
         if self.geometric:
             return self.geometric * (1.0 - self.geometric) ** (at - 1.0)
-        if self.offset[0] == self.offset[1]:
-            return np.full(len(at), 1.0 / np.ptp(self.limits()))
-        scale = np.linspace(*self.scale, 4001)[:, None]  # the density of a product is a mean over one factor
-        inside = (at / scale >= self.offset[0]) & (at / scale <= self.offset[1])
-        return (inside / scale).mean(axis=0) / np.ptp(self.offset)
+        ranges = [self.offset, self.scale, self.column_scale]
+        first = next(i for i, ends in enumerate(ranges) if ends[0] < ends[1])
+        low, high = ranges.pop(first)  # the density of a product is a mean over the other factors
+        factor = np.outer(*(np.linspace(*ends, 81 if ends[0] < ends[1] else 1) for ends in ranges)).reshape(-1, 1)
+        inside = (at / factor >= low) & (at / factor <= high)
+        return (inside / factor).mean(axis=0) / (high - low)
 
 
 def main() -> None:
@@ -131,7 +134,7 @@ def panel_of(drawn: Parameter, group: str, own: list[float]) -> Panel:
     Numbers that replace the own values are shown over their weight. If columns have different own values, the
     differences to these are shown, or the ratios if a factor is drawn.
     """
-    columns = list(drawn.columns)[: 1 if drawn.shared else None]
+    columns = list(drawn.columns)[: drawn.num_listed]
     own = np.array(own[: len(columns)])
     base = own if drawn.base is None else np.array(per_column(drawn.base, len(drawn.columns)))[: len(columns)]
     weight = per_column(drawn.weight, len(drawn.columns))[0]
@@ -148,7 +151,8 @@ def panel_of(drawn: Parameter, group: str, own: list[float]) -> Panel:
 
     values = torch.as_tensor(shown(drawn.field[:, columns].cpu().numpy()))
     offset = [shown(base + weight * end)[0] for end in drawn.offset]
-    return Panel(group, title + unit, values, offset, drawn.scale, shown(own), drawn.may_keep)
+    factors = (drawn.scale, drawn.column_scale or (1.0, 1.0))
+    return Panel(group, title + unit, values, offset, *factors, shown(own), drawn.may_keep)
 
 
 def sensors(task: LeggedRobot) -> list[Panel]:
@@ -171,6 +175,7 @@ def events(task: LeggedRobot) -> list[Panel]:
     rand, velocity, numbers = task.cfg.domain_rand, task.sim.qvel[:, :3], task.randomization.values
     start, first, pushes = numbers.clone(), torch.full((task.num_envs,), torch.inf, device=task.device), []
     nowhere = torch.zeros_like(task.reset_buf)
+    rand.push_set_factor = 1.0  # what is drawn, before it
     for step in range(1, STEPS + 1):
         velocity.zero_()
         task.events.happen(nowhere)
@@ -179,7 +184,7 @@ def events(task: LeggedRobot) -> list[Panel]:
     chance = rand.resampling_probability * rand.randomize_parameters
     until, push = np.multiply([1.0, STEPS], chance > 0.0), np.multiply(rand.push_velocity, rand.push_robots)
     return [
-        Panel("events", "push, per axis [m/s]", torch.cat(pushes), push),
+        Panel("events", "push as drawn, per axis [m/s]", torch.cat(pushes), push),
         Panel("events", "steps to the next redraw", first, until, own=(), geometric=chance),
     ]
 
