@@ -2,7 +2,7 @@
 
 import io
 import os
-import time
+from types import SimpleNamespace
 
 import pytest
 import warp as wp
@@ -21,83 +21,107 @@ class Terminal(io.StringIO):
         return True
 
 
+class Play:
+    """Time that passes only while the watching thread waits, and what happens to a cache meanwhile."""
+
+    def __init__(self, cache):
+        self.cache, self.now, self.end, self.events = cache, 100.0, 100.0, []
+
+    def after(self, seconds, action=lambda: None):
+        """Plan what happens some seconds after all that is planned."""
+        self.end += seconds
+        self.events.append((self.end, action))
+
+    def build(self, names, mark=OURS, seconds=1.5, folder="."):
+        """Plan what Warp does when it compiles modules, one after the other."""
+        for name in names:
+            part = self.cache / folder / f"{name}{mark}"
+            self.after(0.0, lambda part=part: part.mkdir(parents=True))
+            self.after(seconds, lambda part=part, name=name: part.rename(part.with_name(name)))
+
+    def wait(self, seconds):
+        """Let time pass; stands in for the wait of an event, and returns whether the play is over."""
+        self.now += seconds
+        while self.events and self.events[0][0] <= self.now:
+            self.events.pop(0)[1]()
+        return self.now > self.end
+
+    def set(self):
+        """Nobody ends the play."""
+
+
 @pytest.fixture
-def cache(tmp_path, monkeypatch):
-    """A kernel cache with one old module; all times are a tenth of the real ones."""
+def play(tmp_path, monkeypatch):
+    """A kernel cache with one old module, and the time in which things happen to it."""
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    for name in ("SHOW_AFTER", "QUIET_AFTER", "END_AFTER", "_POLL"):
-        monkeypatch.setattr(progress, name, getattr(progress, name) / 10)
     (tmp_path / "wp_old").mkdir()
-    return tmp_path
+    play = Play(tmp_path)
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: play.now))
+    return play
 
 
-def build(cache, names, mark=OURS, seconds=0.15):
-    """Do with the cache what Warp does when it compiles modules."""
-    for name in names:
-        folder = cache / f"{name}{mark}"
-        folder.mkdir(parents=True)
-        time.sleep(seconds)
-        folder.rename(cache / name)
+def watch(play, stream):
+    """Watch the whole play."""
+    compilation = CompileProgress(stream)
+    compilation._stop = play
+    with compilation:
+        compilation._thread.join()
+    return compilation
 
 
-def test_line_in_a_file(cache):
+def test_line_in_a_file(play):
     """Elsewhere than in a terminal a line is written now and then, and a last one with all modules."""
+    play.build(["wp_a", "wp_b", "wp_c", "wp_d"])
     stream = io.StringIO()
-    with CompileProgress(stream) as compilation:
-        build(cache, ["wp_a", "wp_b", "wp_c", "wp_d"])
-    lines = stream.getvalue().splitlines()
-    assert len(lines) == 2 and "\r" not in stream.getvalue()
-    assert lines[0].startswith("compiling physics kernels, once per machine: ") and " modules, " in lines[0]
-    assert lines[1].startswith("compiled physics kernels: 4 modules, ")
+    compilation = watch(play, stream)
+    assert stream.getvalue().splitlines() == [
+        "compiling physics kernels, once per machine: 1 modules, 2 s",
+        "compiled physics kernels: 4 modules, 6 s",
+    ]
     assert compilation.modules == 4
 
 
-def test_line_in_a_terminal(cache):
-    """In a terminal the line is rewritten, and what is printed next covers it."""
+def test_line_in_a_terminal(play):
+    """In a terminal the line is rewritten every second, and what is printed next covers it."""
     stream = Terminal()
-    progress_line = CompileProgress(stream)
-    progress_line._interval = 0.1
-    with progress_line:
-        build(cache, ["wp_a", "wp_b", "wp_c", "wp_d"])
+    play.build(["wp_a", "wp_b", "wp_c", "wp_d"])
+    watch(play, stream)
     *rewritten, last = stream.getvalue().split("\r")
-    assert len(rewritten) >= 2 and all(line.startswith("compiling") and "\n" not in line for line in rewritten)
-    assert last.startswith("compiled physics kernels: 4 modules") and last.endswith(" \n")
+    assert len(rewritten) == 4 and all(line.startswith("compiling") and "\n" not in line for line in rewritten)
+    assert last.startswith("compiled physics kernels: 4 modules, 6 s") and last.endswith(" \n")
 
 
-def test_nothing_to_tell(cache):
+def test_nothing_to_tell(play):
     """Nothing is shown if all is in the cache, if little is compiled, or if another process compiles."""
     stream = io.StringIO()
-    with CompileProgress(stream) as compilation:
-        build(cache, ["wp_other"], mark=OTHERS, seconds=0.4)
-    with CompileProgress(stream):
-        time.sleep(0.4)
-    with CompileProgress(stream) as short:
-        build(cache, ["wp_short"], seconds=0.1)
+    play.build(["wp_other"], mark=OTHERS, seconds=4.0)
+    assert watch(play, stream).modules == 1
+    play.after(4.0)
+    assert watch(play, stream).modules == 0
+    play.build(["wp_short"], seconds=1.5)
+    assert watch(play, stream).modules == 1
     assert stream.getvalue() == ""
-    assert (compilation.modules, short.modules) == (1, 1)
 
 
-def test_work_that_counts(cache):
+def test_work_that_counts(play):
     """The first GPU kernels of an old module, and code that is linked into modules, count as compilation too."""
     stream = io.StringIO()
-    with CompileProgress(stream) as compilation:
-        build(cache / "lto", ["part"], seconds=0.4)
-        (cache / "wp_old" / "module.sm90.cubin").touch()
-    assert compilation.modules == 1
+    play.build(["part"], seconds=4.0, folder="lto")
+    play.after(0.0, (play.cache / "wp_old" / "module.sm90.cubin").touch)
+    assert watch(play, stream).modules == 1
     assert stream.getvalue().splitlines()[-1].startswith("compiled physics kernels: 1 modules")
 
 
-def test_the_end_of_watching(cache, monkeypatch):
-    """When compilation is over the line is finished, and soon after nobody looks any more."""
-    monkeypatch.setattr(progress, "END_AFTER", 1.0)
-    stream = io.StringIO()
-    with CompileProgress(stream) as compilation:
-        build(cache, ["wp_a"], seconds=0.4)
-        time.sleep(0.7)
-        assert stream.getvalue().splitlines()[-1].startswith("compiled physics kernels: 1 modules")
-        compilation._thread.join(timeout=2.0)
-        assert not compilation._thread.is_alive()
-    assert stream.getvalue().count("compiled") == 1
+def test_the_end_of_watching(play):
+    """When compilation is over the line is finished, and later nobody looks any more."""
+    stream, finished = io.StringIO(), []
+    play.build(["wp_a"], seconds=4.0)
+    play.after(4.0, lambda: finished.append("compiled" in stream.getvalue()))
+    play.after(2.0, lambda: finished.append("compiled" in stream.getvalue()))
+    play.after(200.0)
+    watch(play, stream)
+    assert finished == [False, True] and stream.getvalue().count("compiled") == 1
+    assert play.now == pytest.approx(104.0 + progress.END_AFTER, abs=1.0)
 
 
 def test_without_warp(monkeypatch, tmp_path):
@@ -108,7 +132,7 @@ def test_without_warp(monkeypatch, tmp_path):
     assert compilation.modules == 0
 
 
-def test_error_inside(cache):
+def test_error_inside(play):
     """An error goes through, and the thread ends."""
     with pytest.raises(ValueError, match="mine"), CompileProgress(io.StringIO()) as compilation:
         raise ValueError("mine")

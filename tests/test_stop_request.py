@@ -99,7 +99,10 @@ def test_a_terminal_that_closes(tmp_path, before):
     streams = {"stdin": slave, "stdout": slave, "stderr": slave}
     process = subprocess.Popen(command, **streams, env=environment, preexec_fn=take_terminal)
     os.close(slave)
-    assert os.read(master, 5) == b"ready"
+    line = b""
+    while not line.endswith(b"\n"):  # or the terminal would close while the line is being written
+        line += os.read(master, 100)
+    assert line.strip() == b"ready"
     os.close(master)
     if before:
         with pytest.raises(subprocess.TimeoutExpired):
