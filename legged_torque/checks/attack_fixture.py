@@ -67,6 +67,7 @@ def parsers() -> Iterator[tuple[str, Parser]]:
         found: list[Parser] = []
 
         def keep(parser: Parser, *_: object, found: list[Parser] = found) -> None:
+            """Note the parser instead of parsing."""
             found.append(parser)
             raise _StopError
 

@@ -34,12 +34,14 @@ def run(model: mujoco.MjModel, engine: str, count: int, device: str, seed: int =
     counts = {"injections": 0, "leaked": 0, "not recovered": 0}
 
     def step(times: int) -> None:
+        """Step both simulators under the same random torques."""
         for torques in torch.tensor(rng.normal(0.0, TORQUE, (times, WORLDS, model.nu))):
             for sim in sims:
                 sim.ctrl.copy_(torques)
                 sim.step()
 
     def restart(worlds: torch.Tensor, height: float) -> None:
+        """Reset worlds of both simulators and pose them alike, at a height [m]."""
         angles = torch.tensor(rng.normal(0.0, 0.1, (WORLDS, model.nu)), dtype=torch.float32, device=device)
         for sim in sims:
             sim.reset(worlds)

@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 
 from legged_torque.utils.cli import Parser
-from legged_torque.utils.limits import describe, types_of
+from legged_torque.utils.limits import describe, types_of, without_null
 from legged_torque.utils.options import Options
 
 _SETTINGS = ("task", "seed", "perturbation", "ranges", "device", "set")
@@ -44,7 +44,7 @@ def add_options(parser: Parser, *names: str) -> None:
             default = field.default if field.default is not dataclasses.MISSING else []
             how = {"default": default, **field.metadata}
             if "type" in how:
-                how["help"] += f"; {describe(hints[field.name]).removesuffix(' or null')}"
+                how["help"] += f"; {describe(without_null(hints[field.name]))}"
             parser.add_argument(f"--{field.name}", **how)
 
 

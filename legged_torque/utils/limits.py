@@ -91,11 +91,16 @@ def check_value(name: str, value: Any, hint: Any) -> None:
         return
     if get_origin(hint) is Literal and isinstance(value, str):
         raise unknown_name(name, value, get_args(hint))
-    if get_origin(hint) in (Union, types.UnionType):
-        hint = next(part for part in get_args(hint) if part is not types.NoneType)
+    hint = without_null(hint)
     parts = get_args(hint) if get_origin(hint) is Annotated else ()
     is_type_right = parts and _fits(value, parts[0])
     raise UserError(f"{name} must be {parts[1] if is_type_right else describe(hint)}, not {value!r}")
+
+
+def without_null(hint: Any) -> Any:
+    """Return a type that may be null as what it is otherwise."""
+    is_union = get_origin(hint) in (Union, types.UnionType)
+    return next(part for part in get_args(hint) if part is not types.NoneType) if is_union else hint
 
 
 def describe(hint: Any) -> str:

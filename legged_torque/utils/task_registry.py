@@ -82,7 +82,6 @@ class TaskRegistry:
             check_names(train_cfg, [registered for _, _, registered in self._tasks.values()])
             check_section(env_cfg)
             check_train_cfg(train_cfg)
-            to_rsl_rl(train_cfg)  # refuses an unknown logger
         return env_cfg, train_cfg
 
     def make_env(self, name: str, args: Options | None = None, env_cfg: Any | None = None) -> tuple[VecEnv, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,6 @@ from legged_torque.utils.limits import check_section
 
 def check_train_cfg(train_cfg: Any) -> None:
     """Raise a UserError that names the first setting of a training that makes no sense."""
-
-    def value_of(path: str) -> Any:
-        return operator.attrgetter(path)(train_cfg)
-
     check_section(train_cfg)
     rate = train_cfg.algorithm
     if rate.schedule == "adaptive" and rate.learning_rate > rate.max_learning_rate:
@@ -31,8 +26,8 @@ def check_train_cfg(train_cfg: Any) -> None:
         value = getattr(train_cfg.runner, key)
         if value and (Path(value).name != value or value == ".." or not value.isprintable()):
             raise UserError(f"runner.{key} must be a name, not the path '{value}'")
-    for path in ("actor.activation", "critic.activation"):
+    for network in ("actor", "critic"):
         try:
-            resolve_nn_activation(value_of(path))
+            resolve_nn_activation(getattr(train_cfg, network).activation)
         except ValueError as error:
-            raise UserError(f"{path}: {error}") from None
+            raise UserError(f"{network}.activation: {error}") from None

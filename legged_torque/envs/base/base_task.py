@@ -58,7 +58,7 @@ class BaseTask(VecEnv):
 
         Numbers that are not finite are 0 in it; their worlds are reset in the next step.
         """
-        groups = {name: self.obs_buf[name].nan_to_num() for name in ("policy", "critic")}
+        groups = {name: self.obs_buf[name].nan_to_num() for name in map(str, self.obs_buf.keys())}
         return TensorDict(groups, [self.num_envs], device=self.device)
 
     def reset(self) -> TensorDict:

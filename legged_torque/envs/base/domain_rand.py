@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -61,7 +60,6 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
     dofs, joints = range(6, model.nv), range(1, model.njnt)
     feet = [model.geom(name).id for name in task.foot_names]
     trunk = offset(cfg, "trunk_mass_offset") | scale(cfg, "trunk_mass_scale")
-    at_least = LEAST_MASS if cfg.randomize_parameters else -math.inf
     inertia_per_mass = list(model.body_inertia[TRUNK] / model.body_mass[TRUNK])
     joint_values = symmetry.joints and symmetry.joints.unsigned()
     foot_vectors = symmetry.feet and symmetry.feet.of_vectors(VECTOR)
@@ -74,7 +72,7 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
     foot_radius = absolute(cfg, "foot_radius")
     inertia = {**trunk, "weight": inertia_per_mass, "shared": True, "same_draw_as": "trunk_mass"}
     return [
-        of_model(task, "trunk_mass", "body_mass", [TRUNK], at_least=at_least, **trunk),
+        of_model(task, "trunk_mass", "body_mass", [TRUNK], **trunk, **at_least(cfg, LEAST_MASS)),
         of_model(task, "trunk_inertia", "body_inertia", entries(3, [TRUNK]), **inertia),
         of_model(task, "trunk_com", "body_ipos", entries(3, [TRUNK]), **trunk_com),
         of_model(task, "foot_radius", "geom_size", [3 * foot for foot in feet], shared=True, **foot_radius),
@@ -105,12 +103,11 @@ def control_parameters(task: LeggedRobot) -> list[Parameter]:
     """Return what is drawn of the controller: numbers for all joints, offsets and further factors of each joint."""
     cfg, control = task.cfg.domain_rand, task.cfg.control
     joints, mirror = range(task.num_dof), task.symmetry.joints
-    least = 0.0 if cfg.randomize_parameters else -math.inf
     action_scale = offset(cfg, "action_scale_offset")
     torque_scale = action_scale | {"weight": control.torque_scale / control.action_scale}
     strength = scale(cfg, "motor_strength")
-    stiffness = offset(cfg, "stiffness_offset") | scale(cfg, "stiffness_scale") | {"at_least": least}
-    damping = offset(cfg, "damping_offset") | scale(cfg, "damping_scale") | {"at_least": least}
+    stiffness = offset(cfg, "stiffness_offset") | scale(cfg, "stiffness_scale") | at_least(cfg, 0.0)
+    damping = offset(cfg, "damping_offset") | scale(cfg, "damping_scale") | at_least(cfg, 0.0)
 
     def of_joints(name: str, factor: str, field: Tensor, drawn: dict[str, Any]) -> Parameter:
         own = getattr(cfg, f"{factor}_per_joint")
@@ -122,7 +119,7 @@ def control_parameters(task: LeggedRobot) -> list[Parameter]:
     return [
         of_joints("motor_strength", "motor_strength", task.motors.strength, strength),
         Parameter("joint_offset", task.joint_offset, joints, mirror=mirror, **offset(cfg, "joint_offset")),
-        Parameter("action_scale", task.action_scale, [0], at_least=least, **action_scale),
+        Parameter("action_scale", task.action_scale, [0], **action_scale, **at_least(cfg, 0.0)),
         Parameter("torque_scale", task.torque_scale, [0], same_draw_as="action_scale", **torque_scale),
         of_joints("p_gains", "stiffness_scale", task.p_gains, stiffness),
         of_joints("d_gains", "damping_scale", task.d_gains, damping),
@@ -184,6 +181,11 @@ def offset(cfg: Any, name: str) -> dict[str, Any]:
 def scale(cfg: Any, name: str) -> dict[str, Any]:
     """Return settings for a value that is multiplied, unless it is kept fixed."""
     return {"scale": pair(getattr(cfg, name))} if is_drawn(cfg, name) else {}
+
+
+def at_least(cfg: Any, value: float) -> dict[str, Any]:
+    """Return settings for a value that no draw may bring below another, where anything is drawn."""
+    return {"at_least": value} if cfg.randomize_parameters else {}
 
 
 def absolute(cfg: Any, name: str, weight: list[float] | float = 1.0) -> dict[str, Any]:
