@@ -10,7 +10,8 @@ VERSION = re.search(r'__version__ = "(.+?)"', (ROOT / "legged_torque" / "__init_
 EXPORT = ["onnx>=1.16,<2", "onnxruntime>=1.18,<2", "jsonschema>=4.18,<5"]
 PLOTS = ["matplotlib", "scipy>=1.10,<2"]
 VIDEO = ["imageio", "imageio-ffmpeg", "pillow>=10.1"]
-TEST = ["pytest", "pytest-xdist>=3.6,<4", "setuptools>=77", *PLOTS, *VIDEO, *EXPORT]
+TRITON = "triton>=3.2; sys_platform == 'linux'"  # torch for a GPU brings its own
+TEST = ["pytest", TRITON, "pytest-xdist>=3.6,<4", "setuptools>=77", *PLOTS, *VIDEO, *EXPORT]
 
 setup(
     name="legged_torque",

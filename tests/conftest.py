@@ -7,6 +7,9 @@ os.environ["MUJOCO_GL"] = "disable"  # before anything imports mujoco: no test r
 import pytest
 import torch
 
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # before anything imports triton: kernels of the update run on the CPU
+
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.options import Options

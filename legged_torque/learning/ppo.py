@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.utils._pytree import tree_map
 
+from legged_torque.envs.base.symmetry import with_mirror_images
+from legged_torque.learning.distribution import GaussianDistribution
+from legged_torque.learning.fused.networks import read_network
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
+
+if TYPE_CHECKING:
+    from legged_torque.learning.fused.learner import FusedLearner
 
 MIN_LEARNING_RATE = 1e-5  # lower bound of the adaptive learning rate, that of rsl_rl
 
@@ -44,60 +54,70 @@ class OnDevicePPO(PPO):
         """Create the algorithm; arguments are rsl_rl's, and an upper bound of the adaptive learning rate."""
         if optimizer not in ("adam", "adamw"):  # of these torch can skip a step on the device
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
-        for name in ("rnd_cfg", "use_mixed_precision"):
-            if kwargs.get(name):
-                raise UserError(f"{type(self).__name__} does not support algorithm.{name}")
+        if kwargs.get("rnd_cfg"):
+            raise UserError(f"{type(self).__name__} does not support algorithm.rnd_cfg")
         if actor.is_recurrent or critic.is_recurrent:
             raise UserError(f"{type(self).__name__} does not support recurrent models")
         symmetry = kwargs.pop("symmetry_cfg", None)
         if symmetry and (symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]):
             kwargs["symmetry_cfg"] = symmetry
         super().__init__(actor, critic, storage, learning_rate=learning_rate, optimizer=optimizer, **kwargs)
-        self._batch_size = storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches
-        if self._batch_size < 1:
+        self.batch_size = storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches
+        if self.batch_size < 1:
             raise UserError(
                 f"algorithm.num_mini_batches is {self.num_mini_batches}, more than the samples of a rollout "
                 f"({storage.num_envs} worlds x {storage.num_transitions_per_env} steps)"
             )
-        self._max_learning_rate = max_learning_rate
+        self.learning_rates = (MIN_LEARNING_RATE, max_learning_rate)
         self.learning_rate = torch.tensor(learning_rate, device=self.device)
         self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
         make_optimizer = type(self.optimizer)
         self.optimizer = make_optimizer(self._parameters, lr=self.learning_rate, fused=True, capturable=True)
-        self._actor_learns = torch.ones((), device=self.device)
+        self.actor_learns = torch.ones((), device=self.device)
         self._skip = torch.zeros((), device=self.device)
         self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # where torch's own gradient scaler tells a fused optimizer to skip
-        self._losses = torch.zeros(len(LOSS_NAMES), device=self.device)
-        self._indices = torch.zeros(self._batch_size, dtype=torch.long, device=self.device)
+        self.losses = torch.zeros(len(LOSS_NAMES), device=self.device)
+        self.indices = torch.zeros(self.batch_size, dtype=torch.long, device=self.device)
+        self.fused = self._fuse()
         self.update_graph = CudaGraph(self._update_minibatch, self.device)  # the update from one minibatch
 
     def learn_actor(self, enabled: bool) -> None:
         """Say whether the next updates train the policy too, or the value function alone."""
-        self._actor_learns.fill_(float(enabled))
+        self.actor_learns.fill_(float(enabled))
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions and keep the transition, with a copy of observations that a task may overwrite in its step."""
-        return super().act(obs.clone())
+        return self.fused.act(obs) if self.fused else super().act(obs.clone())
+
+    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
+        """Keep what followed the actions, as rsl_rl does."""
+        if self.fused:
+            self.fused.add_step(rewards, dones, extras.get("time_outs"))
+        else:
+            super().process_env_step(obs, rewards, dones, extras)
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute returns and advantages (GAE) in place, with rsl_rl's formulas."""
-        advantages = self.storage.advantages
-        super().compute_returns(obs)
-        self.storage.advantages = advantages.copy_(self.storage.advantages)
+        if self.fused:
+            self.fused.compute_returns(obs)
+        else:
+            advantages = self.storage.advantages
+            super().compute_returns(obs)
+            self.storage.advantages = advantages.copy_(self.storage.advantages)
 
     def update(self) -> dict[str, float]:
         """Learn from the rollout in random order, epoch by epoch; return :data:`LOSS_NAMES` over all processes."""
-        self._losses.zero_()
+        self.losses.zero_()
         before = flattened(self._state())
         for _ in range(self.num_learning_epochs):
-            order = torch.randperm(self._batch_size * self.num_mini_batches, device=self.device)
-            for indices in order.split(self._batch_size):
-                self._indices.copy_(indices)
+            order = torch.randperm(self.batch_size * self.num_mini_batches, device=self.device)
+            for indices in order.split(self.batch_size):
+                self.indices.copy_(indices)
                 self.update_graph()
         self._update_normalization()
         self.storage.clear()
         is_finite = torch.isfinite(flattened(self._state())).all().float()
-        numbers = torch.cat([self._losses, is_finite.unsqueeze(0)])
+        numbers = torch.cat([self.losses, is_finite.unsqueeze(0)])
         if self.is_multi_gpu:
             distributed.average([numbers])
         *values, share_finite = numbers.tolist()  # the only time that the host waits
@@ -109,6 +129,10 @@ class OnDevicePPO(PPO):
         updates = num_updates - losses["skipped_updates"]
         return {name: loss if name == "skipped_updates" else loss / max(updates, 1) for name, loss in losses.items()}
 
+    def save(self) -> dict:
+        """Return what rsl_rl saves, each tensor in memory of its own."""
+        return tree_map(lambda value: value.clone() if isinstance(value, Tensor) else value, super().save())
+
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Load as rsl_rl does, and keep the learning rate the tensor that it was."""
         learning_rate = self.learning_rate
@@ -116,11 +140,27 @@ class OnDevicePPO(PPO):
         self.learning_rate = learning_rate.copy_(torch.as_tensor(self.learning_rate))
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
+        if self.fused:
+            self.fused.share_state(self.optimizer)
         self.update_graph.reset()  # the optimizer's tensors are new
         return load_iteration
 
+    def action_std(self) -> Tensor:
+        """Return the standard deviations of the actions that were sampled last. Shape: (..., num_actions)."""
+        return self.fused.action_std() if self.fused else self.actor.output_std
+
+    def _fuse(self) -> FusedLearner | None:
+        """Return what acts and learns in few kernels; None where that needs something that is not there."""
+        if torch.device(self.device).type != "cuda" or not find_spec("triton") or not can_be_fused(self):
+            return None
+        from legged_torque.learning.fused.learner import FusedLearner  # imports Triton
+
+        return FusedLearner(self)
+
     def _state(self) -> list[Tensor]:
         """Return the weights, and the optimizer's moments and counters, which do not exist before the first step."""
+        if self.fused:
+            return self.fused.state()
         kept = [value for entry in self.optimizer.state.values() for value in entry.values()]
         return [*(parameter.data for parameter in self._parameters), *kept]
 
@@ -141,10 +181,17 @@ class OnDevicePPO(PPO):
                 model.obs_normalizer._std = std.copy_(model.obs_normalizer._std)
 
     def _update_minibatch(self) -> None:
-        """Take one gradient step on the samples of ``_indices``."""
+        """Take one gradient step on the samples of ``indices``."""
+        if self.fused:
+            self.fused.update_minibatch()
+        else:
+            self._update_by_autograd()
+
+    def _update_by_autograd(self) -> None:
+        """Take the step with torch's operations."""
         batch = self._gather()
         if self.symmetry:
-            self.symmetry.augment_batch(batch, self._batch_size)
+            self.symmetry.augment_batch(batch, self.batch_size)
         self.actor(batch.observations, stochastic_output=True)
         log_prob = self.actor.get_output_log_prob(batch.actions)
         values = self.critic(batch.observations)
@@ -154,9 +201,9 @@ class OnDevicePPO(PPO):
         value_loss = self._value_loss(batch, values)
         actor_loss = surrogate_loss - self.entropy_coef * entropy
         if self.symmetry and self.symmetry.use_mirror_loss:
-            mirror_loss = self.symmetry.compute_loss(self.actor, batch, self._batch_size)
+            mirror_loss = self.symmetry.compute_loss(self.actor, batch, self.batch_size)
             actor_loss = actor_loss + self.symmetry.mirror_loss_coeff * mirror_loss
-        loss = self._actor_learns * actor_loss + self.value_loss_coef * value_loss
+        loss = self.actor_learns * actor_loss + self.value_loss_coef * value_loss
         self.optimizer.zero_grad()
         loss.backward()
         if self.is_multi_gpu:
@@ -169,11 +216,11 @@ class OnDevicePPO(PPO):
         self.optimizer.step()
         numbers = torch.stack([value_loss, surrogate_loss, entropy, kl, gradient_norm, norms[1]]).detach()
         kept = torch.where(self._skip.bool(), 0.0, numbers)
-        self._losses += torch.cat([kept, self._skip.unsqueeze(0)])
+        self.losses += torch.cat([kept, self._skip.unsqueeze(0)])
 
     def _gather(self) -> RolloutStorage.Batch:
-        """Return the samples of ``_indices`` from the stored rollout."""
-        storage, indices = self.storage, self._indices
+        """Return the samples of ``indices`` from the stored rollout."""
+        storage, indices = self.storage, self.indices
 
         def pick(tensor: Tensor) -> Tensor:
             return tensor.flatten(0, 1)[indices]
@@ -194,7 +241,7 @@ class OnDevicePPO(PPO):
     @torch.no_grad()
     def _mean_kl(self, batch: RolloutStorage.Batch) -> Tensor:
         """Return the mean KL divergence of the policy from the one that acted, without mirror images. Scalar."""
-        params = tuple(params[: self._batch_size] for params in self.actor.output_distribution_params)
+        params = tuple(params[: self.batch_size] for params in self.actor.output_distribution_params)
         return self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
 
     def _adapt_learning_rate(self, kl: Tensor) -> None:
@@ -203,8 +250,8 @@ class OnDevicePPO(PPO):
             lower = kl > 2.0 * self.desired_kl
             higher = (kl < 0.5 * self.desired_kl) & (kl > 0.0)
             factor = torch.where(lower, 1.0 / 1.5, torch.where(higher, 1.5, 1.0))
-            factor = torch.where(self._actor_learns.bool(), factor, 1.0)  # a policy that stays says nothing
-            self.learning_rate.mul_(factor).clamp_(MIN_LEARNING_RATE, self._max_learning_rate)
+            factor = torch.where(self.actor_learns.bool(), factor, 1.0)  # a policy that stays says nothing
+            self.learning_rate.mul_(factor).clamp_(*self.learning_rates)
 
     def _surrogate_loss(self, batch: RolloutStorage.Batch, log_prob: Tensor) -> Tensor:
         """Return PPO's clipped policy loss."""
@@ -225,3 +272,16 @@ class OnDevicePPO(PPO):
 def flattened(tensors: list[Tensor]) -> Tensor:
     """Return the numbers of several tensors behind each other."""
     return torch.cat([tensor.flatten() for tensor in tensors])
+
+
+def can_be_fused(alg: OnDevicePPO) -> bool:
+    """Return whether there are kernels for all that an algorithm asks for."""
+    models, symmetry = (alg.actor, alg.critic), alg.symmetry
+    return (
+        isinstance(alg.actor.distribution, GaussianDistribution)
+        and all(read_network(model.mlp) and not model.obs_normalization for model in models)
+        and all(parameter.requires_grad for model in models for parameter in model.parameters())
+        and not alg.normalize_advantage_per_mini_batch
+        and not (symmetry and symmetry.use_mirror_loss)
+        and not (symmetry and symmetry.data_augmentation_func is not with_mirror_images)
+    )

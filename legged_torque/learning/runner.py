@@ -279,7 +279,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         numbers |= {f"Curriculum/{name}": value for name, value in zip(curricula, values, strict=True)}
         self.logger.ep_extras.append(numbers)
         progress = {"it": self.current_learning_iteration, "start_it": start_it, "total_it": total_it, **times}
-        policy = {"learning_rate": float(self.alg.learning_rate), "action_std": self.alg.get_policy().output_std.cpu()}
+        policy = {"learning_rate": float(self.alg.learning_rate), "action_std": self.alg.action_std().cpu()}
         self._unwritten_log = {**progress, **policy, "loss_dict": losses, "rnd_weight": None}
 
     def _write_log(self) -> None:

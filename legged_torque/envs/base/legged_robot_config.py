@@ -304,6 +304,7 @@ class LeggedRobotCfgPPO(BaseConfig):
         desired_kl: Positive = 0.01  # of the policy before and after an update
         max_learning_rate: Fraction = 1e-2  # upper bound of an adaptive learning rate
         use_clipped_value_loss: bool = True  # whether value changes are clipped too
+        use_mixed_precision: bool = False  # on a GPU with Triton, matrix products of bfloat16 numbers instead of TF32
 
         class symmetry_cfg:  # learning from mirror images as well, with rsl_rl's names
             use_data_augmentation: bool = False  # whether minibatches hold mirror images as well

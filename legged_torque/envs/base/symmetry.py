@@ -72,7 +72,11 @@ def counterparts(names: Names, mirrored_legs: Sequence[Names]) -> tuple[int, ...
 
 
 class Mirror:
-    """Reflects vectors at the robot's sagittal plane."""
+    """Reflects vectors at the robot's sagittal plane.
+
+    Attributes:
+        maps: Order and signs of the mirror image of each kind of vector: entry i becomes sign i times entry order i.
+    """
 
     def __init__(self, parts: Mapping[str, Sequence[tuple[str, Mirroring | None]]], problem: str, device: str) -> None:
         """Prepare the permutations.
@@ -80,18 +84,18 @@ class Mirror:
         ``parts`` are, for each kind of vector, its terms by name, one behind the other. A UserError says which mirror
         image is not known, or the ``problem``, why the robot is not symmetric.
         """
-        self._maps = {}
+        self.maps: dict[str, tuple[Tensor, Tensor]] = {}
         for kind, terms in parts.items():
             for name, mirroring in terms:
                 if mirroring is None:
                     reason = problem or f"the mirror image of '{name}' in '{kind}' is not known"
                     raise UserError(f"algorithm.symmetry_cfg: {reason}")
             whole = Mirroring.joined([mirroring for _, mirroring in terms if mirroring])
-            self._maps[kind] = torch.tensor(whole.order, device=device), torch.tensor(whole.signs, device=device)
+            self.maps[kind] = torch.tensor(whole.order, device=device), torch.tensor(whole.signs, device=device)
 
     def __call__(self, name: str, values: Tensor) -> Tensor:
         """Return the mirror image of "policy", "critic" or "actions". Shape: (samples, size)."""
-        order, signs = self._maps[name]
+        order, signs = self.maps[name]
         return values[:, order] * signs
 
 

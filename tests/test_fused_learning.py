@@ -1,0 +1,270 @@
+"""Acting and learning in few kernels against torch's autograd, torch's Adam and rsl_rl, in Triton's interpreter.
+
+The interpreter runs kernels on the CPU with the numbers' own precision: matrix products of float32 are exact there.
+"""
+
+import copy
+import math
+import os
+
+import numpy as np
+import pytest
+import torch
+from rollouts import SETTINGS, SIZES, copy_rollout, make_ppo, parameters, random_obs, record_rollout
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+
+from legged_torque.learning.distribution import GaussianDistribution
+from legged_torque.learning.multi_head import MultiHeadModel
+from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, can_be_fused
+
+pytest.importorskip("triton", reason="Triton is there for Linux only")
+if os.environ.get("TRITON_INTERPRET") != "1":
+    pytest.skip("on a GPU kernels run for real: scripts/check_capture.py compares them", allow_module_level=True)
+from legged_torque.learning.fused.learner import FusedLearner
+
+STEPS, WORLDS, NUM_ACTIONS = 3, 40, 6
+MIRROR = {  # an order that is its own inverse, and signs
+    "policy": ([1, 0, 2, 4, 3], [1.0, 1.0, -1.0, 1.0, 1.0]),
+    "critic": ([1, 0, 2, 4, 3, 5, 6], [1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0]),
+    "actions": ([3, 4, 5, 0, 1, 2], [-1.0, 1.0, 1.0, -1.0, 1.0, 1.0]),
+}
+
+
+class Mirrored:
+    """As much of a task as learning from mirror images needs."""
+
+    def __init__(self):
+        self.mirror = lambda name, values: values[:, self.maps[name][0]] * self.maps[name][1]
+        self.maps = {name: (torch.tensor(order), torch.tensor(signs)) for name, (order, signs) in MIRROR.items()}
+        self.mirror.maps = self.maps
+
+
+def make(kind=OnDevicePPO, multi_head=False, symmetric=False, fuse=False, seed=0, std_type="log", **settings):
+    """An algorithm whose layers are wider than a tile, no multiple of one, and no power of two."""
+    torch.manual_seed(seed)
+    distribution = {"class_name": GaussianDistribution, "init_std": 0.7, "std_type": std_type}
+    obs, groups = random_obs(WORLDS), {"actor": ["policy"], "critic": ["critic"]}
+    arguments = (obs, groups, "actor", NUM_ACTIONS, [72, 136], "elu", False, distribution)
+    actor = MultiHeadModel(*arguments, head_hidden_dims=[40]) if multi_head else MLPModel(*arguments)
+    critic = MLPModel(obs, groups, "critic", 1, [200, 24, 16], "elu")
+    storage = RolloutStorage("rl", WORLDS, STEPS, obs, [NUM_ACTIONS])
+    if symmetric:
+        function = "legged_torque.envs.base.symmetry:with_mirror_images"
+        settings["symmetry_cfg"] = {"data_augmentation_func": function, "use_data_augmentation": True}
+        settings["symmetry_cfg"] |= {"use_mirror_loss": False, "env": Mirrored()}
+    alg = kind(actor, critic, storage, **{**SETTINGS, **settings})
+    if fuse:
+        assert can_be_fused(alg)
+        alg.fused = FusedLearner(alg)
+    return alg
+
+
+def pair(seed=3, **settings):
+    """The same algorithm with torch's operations and fused, after the same rollout, and samples of a minibatch."""
+    plain, fused = make(**settings), make(**settings, fuse=True)
+    record_rollout(plain, seed)
+    record_rollout(fused, seed)
+    return plain, fused
+
+
+def choose(algorithms, seed):
+    """Let all algorithms learn from the same samples next."""
+    order = torch.randperm(STEPS * WORLDS, generator=torch.Generator().manual_seed(seed))
+    for alg in algorithms:
+        alg.indices.copy_(order[: alg.batch_size])
+
+
+KINDS = [{}, {"multi_head": True, "symmetric": True}]
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+def test_rollout_is_that_of_rsl_rl(kind):
+    """Actions, their probabilities, values, returns and advantages (GAE)."""
+    plain, fused = pair(**kind)
+    for name in ("actions", "actions_log_prob", "values", "rewards", "dones", "returns", "advantages"):
+        actual, expected = getattr(fused.storage, name), getattr(plain.storage, name)
+        torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-4, msg=lambda m, n=name: f"{n}: {m}")
+    for name in SIZES:
+        assert torch.equal(fused.storage.observations[name], plain.storage.observations[name])
+    torch.testing.assert_close(fused.action_std(), plain.action_std()[0])
+
+
+@pytest.mark.parametrize("kind", [*KINDS, {"std_type": "scalar"}, {"use_clipped_value_loss": False}], ids=str)
+def test_gradients_are_those_of_autograd(kind):
+    """Of all parameters, for a policy that has moved since it acted, so that ratios and values are clipped too."""
+    settings = {"max_grad_norm": 1e9, "clip_param": 0.02, "learning_rate": 1e-2, "entropy_coef": 0.1, **kind}
+    algorithms = plain, fused = pair(**settings)
+    for round_number in range(2):
+        choose(algorithms, round_number)
+        plain.losses.zero_()
+        fused.losses.zero_()
+        plain._update_minibatch()
+        fused._update_minibatch()
+        gradients = dict(zip(parameters(fused), fused.fused.gradients(), strict=True))
+        expected = {f"actor.{name}": p.grad for name, p in plain.actor.named_parameters()}
+        expected |= {f"critic.{name}": p.grad for name, p in plain.critic.named_parameters()}
+        for name, gradient in gradients.items():
+            scale = float(expected[name].abs().max())
+            torch.testing.assert_close(
+                gradient, expected[name], rtol=2e-3, atol=2e-4 * scale, msg=lambda m, n=name: f"{n}: {m}"
+            )
+        torch.testing.assert_close(fused.losses, plain.losses, rtol=2e-4, atol=1e-5)
+        with torch.no_grad():  # errors do not add up
+            for own, other in zip(parameters(fused).values(), parameters(plain).values(), strict=True):
+                own.copy_(other)
+        fused.fused.round_weights()
+
+
+def test_share_of_clipped_samples_is_neither_none_nor_all():
+    """In the test above, rollouts do clip: the ratio leaves its range for some samples."""
+    plain, _ = pair(clip_param=0.02, learning_rate=1e-3)
+    choose([plain], 0)
+    plain._update_minibatch()
+    batch = plain._gather()
+    plain.actor(batch.observations, stochastic_output=True)
+    ratio = torch.exp(plain.actor.get_output_log_prob(batch.actions) - batch.old_actions_log_prob.squeeze(1))
+    share = ((ratio - 1.0).abs() > 0.02).float().mean()
+    assert 0.1 < share < 0.9
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "adamw"])
+def test_steps_are_those_of_torch(optimizer):
+    """Adam and AdamW of torch, in float64 and given the same gradients, which are clipped as torch clips them."""
+    alg = make(fuse=True, optimizer=optimizer, max_grad_norm=0.05)
+    models = (copy.deepcopy(alg.actor).double(), copy.deepcopy(alg.critic).double())
+    theirs = [*models[0].parameters(), *models[1].parameters()]
+    reference = type(alg.optimizer)(theirs, lr=1e-3)
+    record_rollout(alg)
+    for round_number in range(3):
+        choose([alg], round_number)
+        alg._update_minibatch()
+        for parameter, gradient in zip(theirs, alg.fused.gradients(), strict=True):
+            parameter.grad = gradient.double()
+        for model in models:
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 0.05)
+        reference.step()
+    for own, other in zip(parameters(alg).values(), theirs, strict=True):
+        torch.testing.assert_close(own.double(), other, rtol=1e-5, atol=1e-7)
+
+
+def test_whole_updates_are_those_of_rsl_rl():
+    """One epoch of stock rsl_rl on the same rollout, with minibatches that hold the same samples."""
+    plain, fused = pair(num_mini_batches=1)
+    stock = make(PPO, num_mini_batches=1)
+    copy_rollout(plain.storage, stock.storage)
+    expected, actual = stock.update(), fused.update()
+    for name in ("value", "surrogate", "entropy"):
+        assert actual[name] == pytest.approx(expected[name], rel=1e-3, abs=1e-5)
+    for own, other in zip(parameters(fused).values(), parameters(stock).values(), strict=True):
+        far = (own - other).abs() > 2e-4  # where a gradient is all but 0, rounding decides the first step's direction
+        assert far.float().mean() < 0.01
+
+
+def test_learning_rate_follows_the_divergence():
+    """As without fused kernels: after the policy has moved far, it falls by 1.5, and its bounds hold."""
+    algorithms = pair(schedule="adaptive", learning_rate=1e-2, desired_kl=0.01)
+    for round_number in range(3):
+        choose(algorithms, round_number)
+        algorithms[0]._update_minibatch()
+        algorithms[1]._update_minibatch()
+        assert float(algorithms[1].learning_rate) == pytest.approx(float(algorithms[0].learning_rate), rel=1e-6)
+    assert float(algorithms[1].learning_rate) < 1e-2
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing():
+    """It is counted; parameters, moments and the count of steps stay as they were to the bit."""
+    alg = make(fuse=True)
+    record_rollout(alg, poison=(2, 3))
+    before = [tensor.clone() for tensor in alg.fused.state()]
+    choose([alg], 0)
+    alg.indices[0] = 2 * WORLDS + 3  # the poisoned sample
+    alg._update_minibatch()
+    assert all(torch.equal(old, new) for old, new in zip(before, alg.fused.state(), strict=True))
+    losses = dict(zip(LOSS_NAMES, alg.losses.tolist(), strict=True))
+    assert losses.pop("skipped_updates") == 1.0
+    assert set(losses.values()) == {0.0}
+
+
+def test_the_critic_learns_alone():
+    """While a pre-trained policy stays, only the critic's parameters move."""
+    alg = make(fuse=True)
+    record_rollout(alg)
+    alg.learn_actor(False)
+    before = {name: value.clone() for name, value in parameters(alg).items()}
+    choose([alg], 0)
+    alg._update_minibatch()
+    for name, value in parameters(alg).items():
+        assert torch.equal(value, before[name]) == name.startswith("actor")
+
+
+def test_checkpoints_go_both_ways():
+    """What the fused update has learned, torch's update goes on with, and the other way round; both then agree."""
+    first = make(fuse=True)
+    record_rollout(first)
+    choose([first], 0)
+    first._update_minibatch()
+    plain, fused = make(seed=8), make(seed=9, fuse=True)
+    for alg in (plain, fused):
+        alg.load(copy.deepcopy(first.save()), None, True)
+        record_rollout(alg, 4)
+    assert math.isclose(float(fused.fused.adam_steps), 1.0)
+    choose([plain, fused], 1)
+    plain._update_minibatch()
+    fused._update_minibatch()
+    for own, other in zip(parameters(fused).values(), parameters(plain).values(), strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-3, atol=2e-5)
+    back = make(fuse=True)
+    back.load(copy.deepcopy(plain.save()), None, True)
+    for own, other in zip(parameters(back).values(), parameters(plain).values(), strict=True):
+        assert torch.equal(own, other)
+
+
+def test_the_same_bits_twice():
+    """Rollouts and updates repeat to the bit."""
+    states = []
+    for _ in range(2):
+        alg = make(fuse=True, multi_head=True)
+        record_rollout(alg)
+        choose([alg], 0)
+        alg._update_minibatch()
+        states.append([tensor.numpy().tobytes() for tensor in alg.fused.state()])
+    assert states[0] == states[1]
+
+
+def test_padding_does_not_matter():
+    """A minibatch that fills no tile gives the mean over its samples alone, here by hand."""
+    alg = make(fuse=True, num_mini_batches=3)
+    assert alg.batch_size == 40
+    record_rollout(alg)
+    choose([alg], 0)
+    alg._update_minibatch()
+    observations = alg.storage.observations["critic"].flatten(0, 1)[alg.indices]
+    with torch.no_grad():
+        fresh = make(num_mini_batches=3)
+        values = fresh.critic.mlp(observations).squeeze(1).double().numpy()
+    returns = alg.storage.returns.flatten()[alg.indices].double().numpy()
+    old = alg.storage.values.flatten()[alg.indices].double().numpy()
+    clipped = old + np.clip(values - old, -0.2, 0.2)
+    expected = np.maximum((values - returns) ** 2, (clipped - returns) ** 2).mean()
+    assert float(alg.losses[0]) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("what", ["normalization", "activation", "advantages", "mirror loss", "fixed deviation"])
+def test_what_has_no_kernels_is_left_to_torch(what):
+    """Algorithms with other parts are known beforehand."""
+    alg = make_ppo()
+    assert can_be_fused(alg)
+    if what == "normalization":
+        alg = make_ppo(obs_normalization=True)
+    elif what == "activation":
+        alg.actor.mlp[1] = torch.nn.Tanh()
+    elif what == "advantages":
+        alg = make_ppo(normalize_advantage_per_mini_batch=True)
+    elif what == "mirror loss":
+        alg = make(symmetric=True)
+        alg.symmetry.use_mirror_loss = True
+    else:
+        alg.actor.distribution.log_std_param.requires_grad_(False)
+    assert not can_be_fused(alg)
