@@ -51,7 +51,7 @@ class FusedLearner:
         self._norms = torch.zeros(2, steps.PARTS, device=device)
         self._scalars = torch.zeros(5, device=device)  # see :func:`~legged_torque.learning.fused.steps.settle`
         self._means, self._stds = torch.zeros_like(storage.actions), torch.zeros(size, device=device)
-        self._log_probs = storage.actions_log_prob
+        storage.distribution_params = (self._means, self._stds)  # the deviations are the same for all samples
         self._maps = [[self._mirror_map(group) for group in model.obs_groups] for model in (alg.actor, alg.critic)]
         self._action_map = self._mirror_map("actions")
         self.share_state(alg.optimizer)
@@ -67,7 +67,7 @@ class FusedLearner:
         self._run_networks(obs)
         actions = storage.actions[step]
         noise = torch.randn_like(actions)
-        written = (actions, self._means[step], self._stds, self._log_probs[step], storage.values[step])
+        written = (actions, self._means[step], self._stds, storage.actions_log_prob[step], storage.values[step])
         shape, columns = actions.shape, _power_of_two(actions.shape[1])
         samples.act[(-(-shape[0] // samples.ROWS),)](
             self._acting.outputs, noise, *self._std[:3], *written, *shape,
@@ -181,7 +181,7 @@ class FusedLearner:
         """Compute losses and their gradients by the outputs."""
         alg, work, storage = self._alg, self._learning, self._alg.storage
         size = storage.actions.shape[-1]
-        batch = (storage.actions, self._means, self._log_probs, storage.values, storage.advantages, storage.returns)
+        batch = (storage.actions, self._means, storage.actions_log_prob, storage.values, storage.advantages, storage.returns)
         numbers = (self._num_chosen, self._num_samples, size, alg.clip_param, alg.value_loss_coef, alg.entropy_coef)
         places, strides, columns = self._places
         samples.losses[(len(work.sums),)](
