@@ -89,8 +89,8 @@ class Simulator:
             self._overflow = wp.zeros(num_envs, dtype=wp.int32)
             self._reference_pose: wp.array = wp.array(model.qpos0, dtype=wp.float32)
         self._constants = DerivedConstants(model, self.model, num_envs) if per_world else None
-        self._is_fused = engine == "fused"
-        if self._is_fused:
+        self.is_fused = engine == "fused"
+        if self.is_fused:
             self._step: FusedStep | WarpStep = FusedStep(model, self.model, self.data, applied_forces)
         else:
             self._step = WarpStep(self.model, self.data)
@@ -114,7 +114,7 @@ class Simulator:
 
         A UserError for those of the trunk's free joint with "fused".
         """
-        unread = unread_columns(name) * self.field(name)[0, 0].numel() if self._is_fused else 0
+        unread = unread_columns(name) * self.field(name)[0, 0].numel() if self.is_fused else 0
         if any(column < unread for column in columns):
             raise UserError(f"sim.engine 'fused' does not read '{name}' of the trunk's free joint")
 
@@ -144,6 +144,15 @@ class Simulator:
         Of several steps, only the last one needs to ``sense``.
         """
         self._step(sense)
+
+    def drive(self, steps: int, law: wp.Function, reads: Any) -> None:
+        """Advance every world by some physics steps in one launch, each under torques of its own; the last one senses.
+
+        Before each of them, ``law(reads, world, motor, step, position, velocity)`` gives the torque of a motor [N m],
+        which is written to ``ctrl``; ``step`` counts from 0, position [rad] and velocity [rad/s] are its joint's.
+        ``reads`` is an instance of the Warp struct that the law's first argument is. Only the fused engine does this.
+        """
+        self._step.drive(steps, law, reads)
 
     def reset(self, mask: Tensor) -> None:
         """Put the worlds of ``mask`` (num_envs,), bool, back to the reference pose, at rest.

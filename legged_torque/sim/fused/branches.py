@@ -6,7 +6,7 @@ On a GPU the branch stays in registers: it is handed from function to function a
 
 import functools
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -17,7 +17,7 @@ from legged_torque.sim.fused.contact import Contacts, find_contacts
 from legged_torque.sim.fused.integrate import integrate_branch, sense_branch
 from legged_torque.sim.fused.math import group_sum, group_sum3
 from legged_torque.sim.fused.smooth import Pose, add_bodies, links_maker, make_equations
-from legged_torque.sim.fused.tables import Tables, Worlds, dof
+from legged_torque.sim.fused.tables import Tables, Worlds, dof, qadr
 from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
 from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types
@@ -70,15 +70,30 @@ def places(per_lane: int) -> SimpleNamespace:
 
 
 @functools.cache
-def around_solver(layout: Layout, applied_forces: bool) -> SimpleNamespace:
-    """Return what comes before and after the solver: ``make_all``, ``damp_all`` and ``integrate_all``.
+def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None) -> SimpleNamespace:
+    """Return what comes before and after the solver: ``drive_all``, ``make_all``, ``damp_all`` and ``integrate_all``.
 
-    ``applied_forces`` says whether there are forces that a user applies.
+    ``applied_forces`` says whether there are forces that a user applies, ``law`` what computes the torques, if anything.
     """
     branches, depth, points, lanes = layout
     per_lane, place = layout.per_lane, places(layout.per_lane)
     Branch, make_links = branch_types(depth).Branch, links_maker(depth)
     Kept = wp.array(dtype=Branch)
+
+    @wp.func
+    def drive_all(tables: Tables, worlds: Worlds, world: int, lane: int, step: int, reads: Any):
+        """Write the torques of the branches' motors in a step of this launch; without a law they are there already."""
+        if wp.static(law is not None):
+            for i in range(wp.static(per_lane)):
+                b = lane + i * wp.static(lanes)
+                if b < wp.static(branches):
+                    for j in range(wp.static(depth)):
+                        joint = tables.branch_joint[b, j]
+                        motor = tables.branch_actuator[b, j]
+                        if motor >= 0:
+                            pos = worlds.qpos[world, qadr(joint)]
+                            vel = worlds.qvel[world, dof(joint)]
+                            worlds.ctrl[world, motor] = law(reads, world, motor, step, pos, vel)
 
     @wp.func
     def make_branch(tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, contacts: Contacts) -> Branch:
@@ -151,7 +166,7 @@ def around_solver(layout: Layout, applied_forces: bool) -> SimpleNamespace:
                 if sense:
                     sense_branch(tables, worlds, world, b, branch, contacts)
 
-    return SimpleNamespace(make_all=make_all, damp_all=damp_all, integrate_all=integrate_all)
+    return SimpleNamespace(drive_all=drive_all, make_all=make_all, damp_all=damp_all, integrate_all=integrate_all)
 
 
 @functools.cache
