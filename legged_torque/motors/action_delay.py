@@ -20,6 +20,14 @@ class Delay:
     drawn: wp.array2d[float]
     physics_steps: int
     decimation: int
+    depth: int
+
+
+@wp.func
+def age_of_actions(delay: Delay, world: int, physics_step: int) -> int:
+    """Return how many control steps ago a world was sent the actions that have reached its motors."""
+    missing = int(wp.clamp(delay.drawn[world, 0], 0.0, 1.0e4)) * delay.physics_steps - physics_step
+    return wp.clamp((missing + delay.decimation - 1) // delay.decimation, 0, delay.depth)
 
 
 class ActionDelay:
@@ -30,14 +38,14 @@ class ActionDelay:
         self.decimation = decimation  # physics steps of a control step
         self.physics_steps = decimation if unit == "control_steps" else 1  # of the unit
         self.newest = newest  # buffer of the newest actions, written elsewhere. Shape: (num_envs, num_actions)
-        depth = math.ceil(longest * self.physics_steps / decimation)
+        self.depth = math.ceil(longest * self.physics_steps / decimation)  # older actions that are kept
         # Older ones, the newest first. Shape: (num_envs, control steps, num_actions).
-        self.before = newest.new_zeros(len(newest), depth, newest.shape[1])
+        self.before = newest.new_zeros(len(newest), self.depth, newest.shape[1])
         self.drawn = newest.new_zeros(len(newest), 1)  # in the unit; its whole part counts. Shape: (num_envs, 1)
 
     def keep(self) -> None:
         """Keep the newest actions, before they are overwritten."""
-        if self.before.numel():
+        if self.depth:
             self.before.copy_(torch.cat([self.newest.unsqueeze(1), self.before[:, :-1]], dim=1))
 
     def reset(self, mask: Tensor) -> None:
@@ -46,9 +54,9 @@ class ActionDelay:
 
     def actions(self, physics_step: int) -> Tensor:
         """Return the actions that have reached the motors by this physics step. Shape: (num_envs, num_actions)."""
-        if not self.before.numel():
+        if not self.depth:
             return self.newest
         missing = self.drawn.floor() * self.physics_steps - physics_step
-        age = (missing / self.decimation).ceil().long().clamp(0, self.before.shape[1])  # NaN becomes any number
+        age = (missing / self.decimation).ceil().long().clamp(0, self.depth)  # NaN becomes any number
         history = torch.cat([self.newest.unsqueeze(1), self.before], dim=1)
         return history.gather(1, age.unsqueeze(2).expand(-1, 1, self.newest.shape[1])).squeeze(1)

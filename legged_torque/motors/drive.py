@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import warp as wp
 from torch import Tensor
 
-from legged_torque.motors.action_delay import ActionDelay, Delay
+from legged_torque.motors.action_delay import ActionDelay, Delay, age_of_actions
 from legged_torque.motors.motors import Motors
 
 Method = TypeVar("Method", bound=Callable)
@@ -15,7 +15,7 @@ Method = TypeVar("Method", bound=Callable)
 _IN_KERNEL: dict[Callable, wp.Function] = {}
 
 
-def in_kernel(function: wp.Function) -> Callable[[Method], Method]:
+def in_kernel(function: Any) -> Callable[[Method], Method]:
     """Name the Warp function that does inside the physics kernel what the decorated method does in torch.
 
     It belongs to this method alone: one that overrides it runs in torch, unless it names a function of its own. The
@@ -40,26 +40,24 @@ def find_in_kernel(method: Callable) -> wp.Function | None:
 
 
 class Drive:
-    """A task's torques as one Warp function, if its ``_compute_torques`` and its motors name Warp functions."""
+    """A task's torques as one Warp function, where ``_compute_torques`` and the motors' ``apply`` name one each."""
 
     def __init__(self, task: Any, delay: ActionDelay, motors: Motors) -> None:
-        """Keep who has the methods and what they read."""
+        """Keep who computes torques, and what delays actions."""
         self._task, self._delay, self._motors = task, delay, motors
-        self._joined: tuple[wp.Function, Any] | None = None
         self._parts: tuple[wp.Function | None, wp.Function | None] = (None, None)
+        self._made: tuple[wp.Function, Any] | None = None
 
     def get(self) -> tuple[wp.Function, Any] | None:
-        """Return the function and the struct that it reads, as ``Simulator.drive`` takes them; None without one."""
-        parts = (find_in_kernel(self._task._compute_torques), find_in_kernel(self._motors.apply))
+        """Return the function and the struct that it reads, as ``Simulator.drive`` takes them; None if one lacks."""
+        parts = find_in_kernel(self._task._compute_torques), find_in_kernel(self._motors.apply)
         if parts != self._parts:
-            self._parts, self._joined = parts, self._join(*parts)
-        return self._joined
+            self._parts, self._made = parts, None if None in parts else self._make(*parts)
+        return self._made
 
-    def _join(self, law: wp.Function | None, motor: wp.Function | None) -> tuple[wp.Function, Any] | None:
-        """Return the function of these parts and what it reads."""
-        if law is None or motor is None:
-            return None
-        Reads, torque = _join(law, motor)
+    def _make(self, law: wp.Function, motor: wp.Function) -> tuple[wp.Function, Any]:
+        """Return the function of these parts, and what it reads."""
+        Reads, torque = _compose(law, motor)
         reads = Reads()
         reads.law, reads.motors = _read(_struct(law), self._task), _read(_struct(motor), self._motors)
         reads.delay = _read(Delay, self._delay)
@@ -81,7 +79,7 @@ def _read(struct: Any, owner: Any) -> Any:
 
 
 @functools.cache
-def _join(law: wp.Function, motor: wp.Function) -> tuple[Any, wp.Function]:
+def _compose(law: wp.Function, motor: wp.Function) -> tuple[Any, wp.Function]:
     """Return the struct and the function of a control law and motors, behind an action delay."""
     Law, Motor = _struct(law), _struct(motor)
 
@@ -96,10 +94,8 @@ def _join(law: wp.Function, motor: wp.Function) -> tuple[Any, wp.Function]:
     @wp.func
     def torque(reads: Reads, world: int, joint: int, step: int, pos: float, vel: float) -> float:
         """Return the torque of a joint at a physics step of a control step [N m]."""
-        delay = reads.delay
-        missing = int(wp.clamp(delay.drawn[world, 0], 0.0, 1.0e4)) * delay.physics_steps - step
-        age = wp.clamp((missing + delay.decimation - 1) // delay.decimation, 0, delay.before.shape[1])
-        actions = wp.where(age > 0, delay.before[world, wp.max(age, 1) - 1], delay.newest[world])
+        age = age_of_actions(reads.delay, world, step)
+        actions = wp.where(age > 0, reads.delay.before[world, wp.max(age, 1) - 1], reads.delay.newest[world])
         wanted = law(reads.law, actions, world, joint, pos, vel)
         return motor(reads.motors, world, joint, wanted, vel)
 

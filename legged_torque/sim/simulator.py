@@ -46,6 +46,7 @@ class Simulator:
             Shape: (num_envs, geoms, 3).
         diverged: Worlds whose state was seen to be not finite or absurdly large since the last :meth:`clear_diverged`.
             Shape: (num_envs,), bool.
+        is_fused: Whether the engine is "fused", which has :meth:`drive`.
         xfrc_applied: Force [N] at the centre of mass of each body and torque [N m] on it, in the world frame; zeros
             unless written. None without ``applied_forces``. Shape: (num_envs, nbody, 6).
         qfrc_applied: Generalized forces, likewise. Shape: (num_envs, nv).
@@ -152,6 +153,8 @@ class Simulator:
         which is written to ``ctrl``; ``step`` counts from 0, position [rad] and velocity [rad/s] are its joint's.
         ``reads`` is an instance of the Warp struct that the law's first argument is. Only the fused engine does this.
         """
+        if not isinstance(self._step, FusedStep):
+            raise ValueError("only the fused engine computes torques itself")
         self._step.drive(steps, law, reads)
 
     def reset(self, mask: Tensor) -> None:

@@ -29,9 +29,7 @@ class PdControl:
 
 
 @wp.func
-def pd_torque(
-    task: PdControl, actions: wp.array[float], world: int, joint: int, pos: float, vel: float
-) -> float:
+def pd_torque(task: PdControl, actions: wp.array[float], world: int, joint: int, pos: float, vel: float) -> float:
     """Return what :func:`pd_torques` does, of one joint."""
     target = task.default_dof_pos[joint] + task.joint_offset[world, joint]
     target += task.action_scale[world, 0] * actions[joint]

@@ -73,7 +73,7 @@ def places(per_lane: int) -> SimpleNamespace:
 def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None) -> SimpleNamespace:
     """Return what comes before and after the solver: ``drive_all``, ``make_all``, ``damp_all`` and ``integrate_all``.
 
-    ``applied_forces`` says whether there are forces that a user applies, ``law`` what computes the torques, if anything.
+    ``applied_forces`` says whether there are forces that a user applies, ``law`` what computes torques, if anything.
     """
     branches, depth, points, lanes = layout
     per_lane, place = layout.per_lane, places(layout.per_lane)
