@@ -49,11 +49,19 @@ class Layout(NamedTuple):
 
 
 @functools.cache
-def places(per_lane: int) -> SimpleNamespace:
-    """Return how threads keep their branches: ``take`` and ``keep`` the one number ``i`` of a thread.
+def places(layout: Layout) -> SimpleNamespace:
+    """Return how threads keep their branches: ``take`` and ``keep`` the one number ``i`` of a thread, if it ``has`` it.
 
     A thread that has only one keeps it in registers: both do nothing.
     """
+    per_lane = layout.per_lane
+
+    @wp.func
+    def has(lane: int, i: int) -> bool:
+        # Where this is known beforehand, nothing is moved between registers for the other case.
+        return wp.static(layout.branches == layout.lanes * per_lane) or lane + i * wp.static(
+            layout.lanes
+        ) < wp.static(layout.branches)
 
     @wp.func
     def take(kept: wp.array(dtype=AnyBranch), world: int, i: int, branch: AnyBranch):
@@ -66,7 +74,7 @@ def places(per_lane: int) -> SimpleNamespace:
         if wp.static(per_lane > 1):
             kept[world * wp.static(per_lane) + i] = branch
 
-    return SimpleNamespace(take=take, keep=keep)
+    return SimpleNamespace(has=has, take=take, keep=keep)
 
 
 @functools.cache
@@ -76,7 +84,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
     ``applied_forces`` says whether there are forces that a user applies, ``law`` what computes torques, if anything.
     """
     branches, depth, points, lanes = layout
-    per_lane, place = layout.per_lane, places(layout.per_lane)
+    per_lane, place = layout.per_lane, places(layout)
     Branch, make_links = branch_types(depth).Branch, links_maker(depth)
     Kept = wp.array(dtype=Branch)
 
@@ -86,7 +94,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
         if wp.static(law is not None):
             for i in range(wp.static(per_lane)):
                 b = lane + i * wp.static(lanes)
-                if b < wp.static(branches):
+                if place.has(lane, i):
                     for j in range(wp.static(depth)):
                         joint = tables.branch_joint[b, j]
                         motor = tables.branch_actuator[b, j]
@@ -126,7 +134,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
         total = Body()
         for i in range(wp.static(per_lane)):
             b = lane + i * wp.static(lanes)
-            if b < wp.static(branches):
+            if place.has(lane, i):
                 branch = make_branch(tables, worlds, world, b, trunk, contacts)
                 branch = solver.start(branch, trunk.rot, acc, contacts)
                 total = add_bodies(total, branch.smooth.total)
@@ -139,7 +147,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
         system = TrunkSystem()
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
-            if lane + i * wp.static(lanes) < wp.static(branches):
+            if place.has(lane, i):
                 branch = solver.assemble_damping(branch, timestep)
                 system = solver.eliminate(branch, system, TrunkSystem())
             place.keep(kept, world, i, branch)
@@ -161,7 +169,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
         for i in range(wp.static(per_lane)):
             b = lane + i * wp.static(lanes)
             branch = place.take(kept, world, i, branch)
-            if b < wp.static(branches):
+            if place.has(lane, i):
                 integrate_branch(tables, worlds, world, b, branch, damped)
                 if sense:
                     sense_branch(tables, worlds, world, b, branch, contacts)
@@ -173,7 +181,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
 def in_solver(layout: Layout) -> SimpleNamespace:
     """Return the parts of a solver iteration: ``assemble_all``, ``turn_all``, ``line_search`` and ``move_all``."""
     branches, _, _, lanes = layout
-    per_lane, place, Branch = layout.per_lane, places(layout.per_lane), branch_types(layout.depth).Branch
+    per_lane, place, Branch = layout.per_lane, places(layout), branch_types(layout.depth).Branch
     Kept = wp.array(dtype=Branch)
 
     @wp.func
@@ -184,7 +192,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
         system = TrunkSystem()
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
-            if lane + i * wp.static(lanes) < wp.static(branches):
+            if place.has(lane, i):
                 branch, add = solver.assemble(branch, rot, acc, contacts)
                 system = solver.eliminate(branch, system, add)
             place.keep(kept, world, i, branch)
@@ -198,7 +206,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
         slopes = wp.vec3(0.0)
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
-            if lane + i * wp.static(lanes) < wp.static(branches):
+            if place.has(lane, i):
                 branch, of_rows = solver.turn_to(branch, rot, step, contacts)
                 slopes += solver.slopes_at_start(branch, step, of_rows)
             place.keep(kept, world, i, branch)
