@@ -37,16 +37,21 @@ class ActionDelay:
         """Prepare; no delay until one is drawn, up to ``longest`` in a unit of :data:`UNITS`."""
         self.decimation = decimation  # physics steps of a control step
         self.physics_steps = decimation if unit == "control_steps" else 1  # of the unit
-        self.newest = newest  # buffer of the newest actions, written elsewhere. Shape: (num_envs, num_actions)
+        self._newest = newest  # buffer of the newest actions, written elsewhere. Shape: (num_envs, num_actions)
         self.depth = math.ceil(longest * self.physics_steps / decimation)  # older actions that are kept
         # Older ones, the newest first. Shape: (num_envs, control steps, num_actions).
         self.before = newest.new_zeros(len(newest), self.depth, newest.shape[1])
         self.drawn = newest.new_zeros(len(newest), 1)  # in the unit; its whole part counts. Shape: (num_envs, 1)
 
+    @property
+    def newest(self) -> Tensor:
+        """The newest actions. Shape: (num_envs, num_actions)."""
+        return self._newest
+
     def keep(self) -> None:
         """Keep the newest actions, before they are overwritten."""
         if self.depth:
-            self.before.copy_(torch.cat([self.newest.unsqueeze(1), self.before[:, :-1]], dim=1))
+            self.before.copy_(torch.cat([self._newest.unsqueeze(1), self.before[:, :-1]], dim=1))
 
     def reset(self, mask: Tensor) -> None:
         """Forget the actions of the worlds in ``mask``. Shape: (num_envs,), bool."""
@@ -55,8 +60,8 @@ class ActionDelay:
     def actions(self, physics_step: int) -> Tensor:
         """Return the actions that have reached the motors by this physics step. Shape: (num_envs, num_actions)."""
         if not self.depth:
-            return self.newest
+            return self._newest
         missing = self.drawn.floor() * self.physics_steps - physics_step
         age = (missing / self.decimation).ceil().long().clamp(0, self.depth)  # NaN becomes any number
-        history = torch.cat([self.newest.unsqueeze(1), self.before], dim=1)
-        return history.gather(1, age.unsqueeze(2).expand(-1, 1, self.newest.shape[1])).squeeze(1)
+        history = torch.cat([self._newest.unsqueeze(1), self.before], dim=1)
+        return history.gather(1, age.unsqueeze(2).expand(-1, 1, self._newest.shape[1])).squeeze(1)
