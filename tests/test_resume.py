@@ -124,8 +124,17 @@ def reachable(value, name="env", seen=None):
         parts = dict(enumerate(value))
     if hasattr(value, "batch_size"):  # a TensorDict
         parts = dict(value.items())
-    if type(value).__name__ in ("FusedStep", "WarpStep", "DerivedConstants", "Data", "CudaGraph", "Device", "Asset"):
-        return {}  # scratch, and what a step writes before it reads it
+    if type(value).__name__ in (
+        "FusedStep",
+        "WarpStep",
+        "DerivedConstants",
+        "Data",
+        "CudaGraph",
+        "Device",
+        "Asset",
+        "Drive",
+    ):
+        return {}  # scratch, what a step writes before it reads it, and what is found elsewhere
     found = {}
     for key, part in parts.items():
         found |= reachable(part, f"{name}.{key}", seen)
