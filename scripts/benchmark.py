@@ -14,11 +14,10 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from legged_torque.checks.benchmark import TRACED, MemoryMeter, measure
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.args import Parser, add_settings_args, options_of
-from legged_torque.utils.cli import check_at_least, check_output, run_script, write_json
+from legged_torque.utils.cli import check_at_least, check_output, importing, run_script, write_json
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError, is_out_of_memory
 from legged_torque.utils.paths import without_machine
@@ -51,15 +50,17 @@ ENDURANCE = """\
 def main() -> None:
     """Measure every size, print a table, write JSON."""
     args = parse_args()
-    device = resolve_device(args.device)
     changes = ["evaluation.interval=0", *args.set]  # without evaluations iterations are alike
     sizes = []
-    for num_envs in args.num_envs or [None]:
-        options = dataclasses.replace(options_of(args), num_envs=num_envs, set=changes)
-        sizes.append(task_registry.get_cfgs(args.task, options))
-        check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
+    with importing():
+        for num_envs in args.num_envs or [None]:
+            options = dataclasses.replace(options_of(args), num_envs=num_envs, set=changes)
+            sizes.append(task_registry.get_cfgs(args.task, options))
+            check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
+        from legged_torque.checks.benchmark import TRACED, MemoryMeter, measure
     for file in filter(None, (args.json, args.profile)):
         check_output(file)
+    device = resolve_device(args.device)
     memory = MemoryMeter(device)
     of_gpu = "GPU memory of torch and Warp together, without the CUDA context"
     print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")
@@ -102,7 +103,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
     parser.add_argument("--json", type=Path, help="file to write")
-    help_text = f"write a trace of {TRACED} iterations for ui.perfetto.dev, as .json or .json.gz"
+    help_text = "write a trace of a few iterations for ui.perfetto.dev, as .json or .json.gz"
     parser.add_argument("--profile", type=Path, help=help_text)
     help_text = "also run N iterations and compare the first tenth with the last"
     parser.add_argument("--endurance", type=int, default=0, metavar="N", help=help_text)
