@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from settings import error_of, get_cfgs
+from settings import error_of, get_cfgs, torques_in_torch
 from test_control import pd_by_hand
 
 from legged_torque.envs.base.validation import check_env_cfg
@@ -23,6 +23,7 @@ def delayed(low, high, unit="physics_steps", decimation=4, **more):
 
 def watch(task, still=False):
     """A list that gets torques and joint states at the start of each physics step; ``still`` leaves out the physics."""
+    torques_in_torch(task)
     notes, step = [], task.sim.step
 
     def noted_step(sense=True):

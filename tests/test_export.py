@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from settings import TASKS, error_of
+from settings import TASKS, error_of, torques_in_torch
 from test_scripts import SMALL, assert_told_in_one_line, run_here
 
 from legged_torque.deploy import description as description_module
@@ -91,6 +91,7 @@ def test_parity(make_task, tmp_path, name, settings):
         physics_steps.append([part.clone().numpy() for part in (task.dof_pos, task.dof_vel, task.sim.ctrl)])
         scramble(task, generator)
 
+    torques_in_torch(task)
     task.sim.step = random_physics
     close = {"rtol": 1e-5, "atol": 1e-5}
     largest = 0.0

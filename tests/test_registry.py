@@ -105,7 +105,7 @@ def test_variant_is_built(make_task):
     reference = make_task("a1_position", 2)
     assert set(reference.reward_names) == {*task.reward_names, "action_rate"}
     torch.testing.assert_close(
-        task._pd_torques(torch.zeros(2, 12)), 40.0 * (task.default_dof_pos - task.dof_pos) - 0.5 * task.dof_vel
+        task._compute_torques(torch.zeros(2, 12)), 40.0 * (task.default_dof_pos - task.dof_pos) - 0.5 * task.dof_vel
     )
 
 

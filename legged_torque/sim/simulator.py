@@ -46,6 +46,7 @@ class Simulator:
             Shape: (num_envs, geoms, 3).
         diverged: Worlds whose state was seen to be not finite or absurdly large since the last :meth:`clear_diverged`.
             Shape: (num_envs,), bool.
+        is_fused: Whether the engine is "fused", which has :meth:`drive`.
         xfrc_applied: Force [N] at the centre of mass of each body and torque [N m] on it, in the world frame; zeros
             unless written. None without ``applied_forces``. Shape: (num_envs, nbody, 6).
         qfrc_applied: Generalized forces, likewise. Shape: (num_envs, nv).
@@ -89,8 +90,8 @@ class Simulator:
             self._overflow = wp.zeros(num_envs, dtype=wp.int32)
             self._reference_pose: wp.array = wp.array(model.qpos0, dtype=wp.float32)
         self._constants = DerivedConstants(model, self.model, num_envs) if per_world else None
-        self._is_fused = engine == "fused"
-        if self._is_fused:
+        self.is_fused = engine == "fused"
+        if self.is_fused:
             self._step: FusedStep | WarpStep = FusedStep(model, self.model, self.data, applied_forces)
         else:
             self._step = WarpStep(self.model, self.data)
@@ -114,7 +115,7 @@ class Simulator:
 
         A UserError for those of the trunk's free joint with "fused".
         """
-        unread = unread_columns(name) * self.field(name)[0, 0].numel() if self._is_fused else 0
+        unread = unread_columns(name) * self.field(name)[0, 0].numel() if self.is_fused else 0
         if any(column < unread for column in columns):
             raise UserError(f"sim.engine 'fused' does not read '{name}' of the trunk's free joint")
 
@@ -144,6 +145,17 @@ class Simulator:
         Of several steps, only the last one needs to ``sense``.
         """
         self._step(sense)
+
+    def drive(self, steps: int, law: wp.Function, reads: Any) -> None:
+        """Advance every world by some physics steps in one launch, each under torques of its own; the last one senses.
+
+        Before each of them, ``law(reads, world, motor, step, position, velocity)`` gives the torque of a motor [N m],
+        which is written to ``ctrl``; ``step`` counts from 0, position [rad] and velocity [rad/s] are its joint's.
+        ``reads`` is an instance of the Warp struct that the law's first argument is. Only the fused engine does this.
+        """
+        if not isinstance(self._step, FusedStep):
+            raise ValueError("only the fused engine computes torques itself")
+        self._step.drive(steps, law, reads)
 
     def reset(self, mask: Tensor) -> None:
         """Put the worlds of ``mask`` (num_envs,), bool, back to the reference pose, at rest.

@@ -2,14 +2,35 @@
 
 from __future__ import annotations
 
+import warp as wp
 from torch import Tensor
 
 from legged_torque.envs.approaches.multi_head_config import MultiHeadCfg as MultiHeadCfg
 from legged_torque.envs.approaches.multi_head_config import MultiHeadCfgPPO as MultiHeadCfgPPO
 from legged_torque.envs.approaches.multi_head_config import TorqueMultiHeadCfg as TorqueMultiHeadCfg
 from legged_torque.envs.base.actions import ActionTerm, position_residual, torque
+from legged_torque.envs.base.control_laws import PdControl, pd_torque, pd_torques
 from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.motors.drive import in_kernel
+
+
+@wp.struct
+class MultiHeadControl:
+    """What :func:`mixed_torque` reads of a task."""
+
+    pd: PdControl
+    torque_scale: wp.array2d[float]
+    mixing: wp.array[float]
+
+
+@wp.func
+def mixed_torque(
+    task: MultiHeadControl, actions: wp.array[float], world: int, joint: int, pos: float, vel: float
+) -> float:
+    """Return the torque of one joint."""
+    torque = task.torque_scale[world, 0] * actions[task.pd.default_dof_pos.shape[0] + joint]
+    return task.mixing[0] * pd_torque(task.pd, actions, world, joint, pos, vel) + task.mixing[1] * torque
 
 
 class MultiHeadRobot(LeggedRobot):
@@ -39,11 +60,12 @@ class MultiHeadRobot(LeggedRobot):
         interval = self.cfg.control.mixing.update_interval
         self.mixing.copy_(self._mixing_curriculum(self.total_steps // interval * interval))
 
+    @in_kernel(mixed_torque)
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """tau = theta_pd tau_pd(a[:n]) + theta_torque torque_scale a[n:] (eq. 7) [N m]. Shape: (num_envs, n)."""
         theta_pd, theta_torque = self.mixing
         positions, torques = actions.split(self.num_dof, dim=1)
-        return theta_pd * self._pd_torques(positions) + theta_torque * (self.torque_scale * torques)
+        return theta_pd * pd_torques(self, positions) + theta_torque * (self.torque_scale * torques)
 
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the mixing weights too."""

@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+import warp as wp
 from torch import Tensor
 
 from legged_torque.envs.approaches.torque_config import TorqueCfg as TorqueCfg
 from legged_torque.envs.approaches.torque_config import TorqueCfgPPO as TorqueCfgPPO
 from legged_torque.envs.base.actions import ActionTerm, torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.motors.drive import in_kernel
+
+
+@wp.struct
+class TorqueControl:
+    """What :func:`scaled_torque` reads of a task."""
+
+    torque_scale: wp.array2d[float]
+
+
+@wp.func
+def scaled_torque(
+    task: TorqueControl, actions: wp.array[float], world: int, joint: int, pos: float, vel: float
+) -> float:
+    """Return the torque of one joint."""
+    return task.torque_scale[world, 0] * actions[joint]
 
 
 class TorqueRobot(LeggedRobot):
@@ -17,6 +34,7 @@ class TorqueRobot(LeggedRobot):
         """Return one torque per joint."""
         return [torque(self.torque_scale)]
 
+    @in_kernel(scaled_torque)
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """tau = torque_scale a [N m]. Shapes: (num_envs, num_dof)."""
         return self.torque_scale * actions

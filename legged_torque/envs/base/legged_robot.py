@@ -12,6 +12,7 @@ from legged_torque.envs.base.actions import ActionTerm, position_residual
 from legged_torque.envs.base.asset import by_joint, load_asset, nominal_pose
 from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.commands import UniformCommands
+from legged_torque.envs.base.control_laws import pd_torque, pd_torques
 from legged_torque.envs.base.domain_rand import MODEL_FIELDS, check_fields, initial_state, mirrors, parameters
 from legged_torque.envs.base.health import watched
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
@@ -23,6 +24,7 @@ from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.motors import make_motors
 from legged_torque.motors.action_delay import ActionDelay
+from legged_torque.motors.drive import Drive, in_kernel
 from legged_torque.sim.health import Health
 from legged_torque.sim.randomization import Parameter, changes_legs
 from legged_torque.sim.simulator import Simulator
@@ -81,17 +83,14 @@ class LeggedRobot(BaseTask):
 
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
 
+    @in_kernel(pd_torque)
     def _compute_torques(self, actions: Tensor) -> Tensor:
-        """Return the torques that motors are asked for [N m]; called at every physics step.
+        """Return the torques that motors are asked for [N m], at every physics step.
 
-        This is position control (eq. 8). Shapes: (num_envs, num_actions) to (num_envs, num_dof).
+        This is position control (eq. 8). Shapes: (num_envs, num_actions) to (num_envs, num_dof). The physics kernel
+        computes them itself where a Warp function is named for it, see :func:`~legged_torque.motors.drive.in_kernel`.
         """
-        return self._pd_torques(actions)
-
-    def _pd_torques(self, actions: Tensor) -> Tensor:
-        """tau = Kp (q_nominal + scale a - q) - Kd qd (eq. 8). Shapes: (num_envs, num_dof)."""
-        target = self.default_dof_pos + self.joint_offset + self.action_scale * actions
-        return self.p_gains * (target - self.dof_pos) - self.d_gains * self.dof_vel
+        return pd_torques(self, actions)
 
     def action_terms(self) -> list[ActionTerm]:
         """Return what the actions of :meth:`_compute_torques` are, one term per action of a joint."""
@@ -120,14 +119,22 @@ class LeggedRobot(BaseTask):
         clip = self.cfg.normalization.clip_actions
         self.action_delay.keep()
         self.actions.copy_(self._given_actions.nan_to_num().clamp(-clip, clip))
-        decimation = self.cfg.control.decimation
+        self.run_physics()
+        self.sim.flag_diverged()
+        self.post_physics_step()
+
+    def run_physics(self) -> None:
+        """Do the physics steps of a control step: one launch if control law and motors have Warp functions."""
+        decimation, refresh = self.cfg.control.decimation, self.cfg.control.refresh_torques
+        drive = self._drive.get() if refresh and self.sim.is_fused else None
+        if drive:
+            self.sim.drive(decimation, *drive)
+            return
         for i in range(decimation):
-            if i == 0 or self.cfg.control.refresh_torques:
+            if i == 0 or refresh:
                 wanted = self._compute_torques(self.action_delay.actions(i))
                 self.motors.apply(wanted, self.dof_vel, out=self.torques)
             self.sim.step(sense=i == decimation - 1)
-        self.sim.flag_diverged()
-        self.post_physics_step()
 
     def post_physics_step(self) -> None:
         """Do what follows the physics: termination, rewards, resets, commands, observations."""
@@ -277,6 +284,7 @@ class LeggedRobot(BaseTask):
         actions = torch.zeros(3, self.num_envs, self.num_actions, device=self.device)
         self._given_actions, self.actions, self.last_actions = actions.unbind()
         self.action_delay = ActionDelay(self.actions, rand.action_delay[1], rand.action_delay_unit, control.decimation)
+        self._drive = Drive(self, self.action_delay, self.motors)
 
     def _prepare_reward_functions(self) -> None:
         """Collect the functions of all terms with a scale that is not zero, and their weights."""

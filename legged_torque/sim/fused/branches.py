@@ -6,7 +6,7 @@ On a GPU the branch stays in registers: it is handed from function to function a
 
 import functools
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -17,7 +17,7 @@ from legged_torque.sim.fused.contact import Contacts, find_contacts
 from legged_torque.sim.fused.integrate import integrate_branch, sense_branch
 from legged_torque.sim.fused.math import group_sum, group_sum3
 from legged_torque.sim.fused.smooth import Pose, add_bodies, links_maker, make_equations
-from legged_torque.sim.fused.tables import Tables, Worlds, dof
+from legged_torque.sim.fused.tables import Tables, Worlds, dof, qadr
 from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
 from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types
@@ -49,11 +49,19 @@ class Layout(NamedTuple):
 
 
 @functools.cache
-def places(per_lane: int) -> SimpleNamespace:
-    """Return how threads keep their branches: ``take`` and ``keep`` the one number ``i`` of a thread.
+def places(layout: Layout) -> SimpleNamespace:
+    """Return how threads keep their branches: ``take`` and ``keep`` the one number ``i`` of a thread, if it ``has`` it.
 
     A thread that has only one keeps it in registers: both do nothing.
     """
+    per_lane = layout.per_lane
+
+    @wp.func
+    def has(lane: int, i: int) -> bool:
+        # Where this is known beforehand, nothing is moved between registers for the other case.
+        return wp.static(layout.branches == layout.lanes * per_lane) or lane + i * wp.static(
+            layout.lanes
+        ) < wp.static(layout.branches)
 
     @wp.func
     def take(kept: wp.array(dtype=AnyBranch), world: int, i: int, branch: AnyBranch):
@@ -66,19 +74,34 @@ def places(per_lane: int) -> SimpleNamespace:
         if wp.static(per_lane > 1):
             kept[world * wp.static(per_lane) + i] = branch
 
-    return SimpleNamespace(take=take, keep=keep)
+    return SimpleNamespace(has=has, take=take, keep=keep)
 
 
 @functools.cache
-def around_solver(layout: Layout, applied_forces: bool) -> SimpleNamespace:
-    """Return what comes before and after the solver: ``make_all``, ``damp_all`` and ``integrate_all``.
+def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None) -> SimpleNamespace:
+    """Return what comes before and after the solver: ``drive_all``, ``make_all``, ``damp_all`` and ``integrate_all``.
 
-    ``applied_forces`` says whether there are forces that a user applies.
+    ``applied_forces`` says whether there are forces that a user applies, ``law`` what computes torques, if anything.
     """
     branches, depth, points, lanes = layout
-    per_lane, place = layout.per_lane, places(layout.per_lane)
+    per_lane, place = layout.per_lane, places(layout)
     Branch, make_links = branch_types(depth).Branch, links_maker(depth)
     Kept = wp.array(dtype=Branch)
+
+    @wp.func
+    def drive_all(tables: Tables, worlds: Worlds, world: int, lane: int, step: int, reads: Any):
+        """Write the torques of the branches' motors in a step of this launch; without a law they are there already."""
+        if wp.static(law is not None):
+            for i in range(wp.static(per_lane)):
+                b = lane + i * wp.static(lanes)
+                if place.has(lane, i):
+                    for j in range(wp.static(depth)):
+                        joint = tables.branch_joint[b, j]
+                        motor = tables.branch_actuator[b, j]
+                        if motor >= 0:
+                            pos = worlds.qpos[world, qadr(joint)]
+                            vel = worlds.qvel[world, dof(joint)]
+                            worlds.ctrl[world, motor] = law(reads, world, motor, step, pos, vel)
 
     @wp.func
     def make_branch(tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, contacts: Contacts) -> Branch:
@@ -111,7 +134,7 @@ def around_solver(layout: Layout, applied_forces: bool) -> SimpleNamespace:
         total = Body()
         for i in range(wp.static(per_lane)):
             b = lane + i * wp.static(lanes)
-            if b < wp.static(branches):
+            if place.has(lane, i):
                 branch = make_branch(tables, worlds, world, b, trunk, contacts)
                 branch = solver.start(branch, trunk.rot, acc, contacts)
                 total = add_bodies(total, branch.smooth.total)
@@ -124,7 +147,7 @@ def around_solver(layout: Layout, applied_forces: bool) -> SimpleNamespace:
         system = TrunkSystem()
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
-            if lane + i * wp.static(lanes) < wp.static(branches):
+            if place.has(lane, i):
                 branch = solver.assemble_damping(branch, timestep)
                 system = solver.eliminate(branch, system, TrunkSystem())
             place.keep(kept, world, i, branch)
@@ -146,19 +169,19 @@ def around_solver(layout: Layout, applied_forces: bool) -> SimpleNamespace:
         for i in range(wp.static(per_lane)):
             b = lane + i * wp.static(lanes)
             branch = place.take(kept, world, i, branch)
-            if b < wp.static(branches):
+            if place.has(lane, i):
                 integrate_branch(tables, worlds, world, b, branch, damped)
                 if sense:
                     sense_branch(tables, worlds, world, b, branch, contacts)
 
-    return SimpleNamespace(make_all=make_all, damp_all=damp_all, integrate_all=integrate_all)
+    return SimpleNamespace(drive_all=drive_all, make_all=make_all, damp_all=damp_all, integrate_all=integrate_all)
 
 
 @functools.cache
 def in_solver(layout: Layout) -> SimpleNamespace:
     """Return the parts of a solver iteration: ``assemble_all``, ``turn_all``, ``line_search`` and ``move_all``."""
     branches, _, _, lanes = layout
-    per_lane, place, Branch = layout.per_lane, places(layout.per_lane), branch_types(layout.depth).Branch
+    per_lane, place, Branch = layout.per_lane, places(layout), branch_types(layout.depth).Branch
     Kept = wp.array(dtype=Branch)
 
     @wp.func
@@ -169,7 +192,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
         system = TrunkSystem()
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
-            if lane + i * wp.static(lanes) < wp.static(branches):
+            if place.has(lane, i):
                 branch, add = solver.assemble(branch, rot, acc, contacts)
                 system = solver.eliminate(branch, system, add)
             place.keep(kept, world, i, branch)
@@ -183,7 +206,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
         slopes = wp.vec3(0.0)
         for i in range(wp.static(per_lane)):
             branch = place.take(kept, world, i, branch)
-            if lane + i * wp.static(lanes) < wp.static(branches):
+            if place.has(lane, i):
                 branch, of_rows = solver.turn_to(branch, rot, step, contacts)
                 slopes += solver.slopes_at_start(branch, step, of_rows)
             place.keep(kept, world, i, branch)

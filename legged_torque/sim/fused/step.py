@@ -1,11 +1,14 @@
-"""One physics step as one kernel: a group of threads per world, one thread per branch.
+"""Physics steps as one kernel: a group of threads per world, one thread per branch.
 
 MuJoCo Warp runs a step as some hundred small kernels, which wait for each other and for memory. A legged robot on a
 plane is small: a trunk and a few branches of hinge joints that meet only there. Here a thread holds a branch in
 registers from kinematics to integration, and the threads of a world add up what concerns the trunk.
+
+A launch may do several steps, each under torques that a Warp function computes from the state of the joints.
 """
 
 import functools
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -15,6 +18,7 @@ from legged_torque.sim.fused.applied import apply_to_trunk
 from legged_torque.sim.fused.branches import FIRST_TOLERANCE, LINE_SEARCH_TOLERANCE, Layout, around_solver, in_solver
 from legged_torque.sim.fused.contact import Contact, Contacts, floor_normal
 from legged_torque.sim.fused.integrate import integrate_trunk
+from legged_torque.sim.fused.math import group_sync
 from legged_torque.sim.fused.smooth import make_trunk, trunk_pose
 from legged_torque.sim.fused.tables import Tables, Worlds, make_tables
 from legged_torque.sim.fused.tree import read_tree
@@ -38,7 +42,7 @@ class FusedStep:
     def __init__(
         self, mj_model: mujoco.MjModel, model: mjw.Model, data: mjw.Data, applied_forces: bool = False
     ) -> None:
-        """Read the robot's structure and prepare the kernel; it compiles at the first step.
+        """Read the robot's structure; the kernels compile at the first step that needs them.
 
         Parameters that change in ``model``, the one on the device, act at once; ``xfrc_applied`` and ``qfrc_applied``
         of ``data`` act with ``applied_forces``. A UserError if the robot has something that this step does not
@@ -56,18 +60,28 @@ class FusedStep:
         self._model = [tables, mj_model.opt.iterations, mj_model.opt.ls_iterations]
         self._data = [data.ctrl, data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, data.solver_niter]
         self._data += [data.xfrc_applied, data.qfrc_applied]
-        self._kernel, self._dim = make_kernel(layout, applied_forces), (data.nworld, layout.lanes)
+        self._kernel_for, self._dim = (layout, applied_forces), (data.nworld, layout.lanes)
 
     def __call__(self, sense: bool) -> None:
         """Advance every world by one physics step; ``sense`` says whether to write the contact sensors."""
-        inputs = [*self._model, sense, *self._data, *self._scratch]
-        wp.launch(self._kernel, self._dim, inputs, block_dim=BLOCK_DIM, device=self._device)
+        self._launch(1, sense, None, 0)
+
+    def drive(self, steps: int, law: wp.Function, reads: Any) -> None:
+        """Advance every world by some physics steps, each under torques of its own; see :meth:`Simulator.drive`."""
+        self._launch(steps, True, law, reads)
+
+    def _launch(self, steps: int, sense: bool, law: wp.Function | None, reads: Any) -> None:
+        """Run the kernel for some steps, the last of which may sense."""
+        inputs = [*self._model, steps, sense, reads, *self._data, *self._scratch]
+        kernel = make_kernel(*self._kernel_for, law)
+        wp.launch(kernel, self._dim, inputs, block_dim=BLOCK_DIM, device=self._device)
 
 
 @functools.cache
-def make_kernel(layout: Layout, applied_forces: bool) -> wp.Kernel:
-    """Return the kernel for a robot's structure, with or without forces that a user applies."""
-    around, solver, lanes = around_solver(layout, applied_forces), in_solver(layout), layout.lanes
+def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = None) -> wp.Kernel:
+    """Return the kernel for a robot's structure, with or without forces that a user applies, and a law for torques."""
+    around, solver, lanes = around_solver(layout, applied_forces, law), in_solver(layout), layout.lanes
+    Reads = next(iter(law.input_types.values())) if law else wp.int32  # what the law reads: its first argument
     Branch = branch_types(layout.depth).Branch
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
@@ -77,8 +91,10 @@ def make_kernel(layout: Layout, applied_forces: bool) -> wp.Kernel:
         iterations: int,
         ls_iterations: int,
         # In:
+        steps: int,
         sense: bool,
-        # Data in:
+        reads: Reads,
+        # Data in, or out with a law:
         ctrl: wp.array2d(dtype=float),
         # Data in and out:
         qpos: wp.array2d(dtype=float),
@@ -100,37 +116,40 @@ def make_kernel(layout: Layout, applied_forces: bool) -> wp.Kernel:
         world, lane = wp.tid()
         worlds = Worlds(ctrl, qpos, qvel, qacc_warmstart, sensordata, xfrc_applied, qfrc_applied)
         contacts = Contacts(found, residuals, pushing, changes, floor_normal(tables, world))
-        trunk = make_trunk(tables, worlds, world)
-        if wp.static(applied_forces):
-            trunk = apply_to_trunk(tables, worlds, world, trunk, trunk_pose(trunk))
-        acc = TrunkMotion()
-        acc.lin = wp.vec3(qacc_warmstart[world, 0], qacc_warmstart[world, 1], qacc_warmstart[world, 2])
-        acc.ang = wp.vec3(qacc_warmstart[world, 3], qacc_warmstart[world, 4], qacc_warmstart[world, 5])
-        branch, total = around.make_all(tables, worlds, world, lane, trunk, acc, contacts, kept)
-        whole = whole_body(trunk, total, wp.static(lanes))
-        used = int(0)
-        for _iteration in range(iterations):
-            used += 1
-            branch, system = solver.assemble_all(world, lane, branch, kept, trunk.rot, acc, contacts)
-            residual = trunk_residual(whole, acc)
-            step = solve_trunk(whole, residual, system, wp.static(lanes))
-            branch, slopes = solver.turn_all(world, lane, branch, kept, trunk.rot, step, contacts)
-            start = slopes + trunk_slopes(whole, residual, step)
-            decrease = -start[0] * tables.cost_scale
-            if used > 1 and not (decrease > tables.tolerance):
-                break
-            share = wp.where(used > 1, LINE_SEARCH_TOLERANCE, FIRST_TOLERANCE)
-            alpha = solver.line_search(share, ls_iterations, world, branch, kept, start, contacts)
-            acc.lin = acc.lin + alpha * step.lin
-            acc.ang = acc.ang + alpha * step.ang
-            branch, flips = solver.move_all(world, branch, kept, contacts, alpha)
-            if alpha == 1.0 and flips == 0.0 and decrease < EXACT_STEP:
-                break  # the whole step stayed in one piece of the piecewise quadratic cost: this is its minimum
-        branch, system = around.damp_all(tables.timestep, world, lane, branch, kept)
-        damped = solve_trunk(whole, TrunkMotion(), system, wp.static(lanes))
-        around.integrate_all(tables, worlds, world, lane, branch, kept, damped, contacts, sense)
-        if lane == 0:
-            integrate_trunk(tables.timestep, worlds, world, trunk, acc, damped)
-            solver_niter[world] = used
+        for i in range(steps):
+            trunk = make_trunk(tables, worlds, world)
+            if wp.static(applied_forces):
+                trunk = apply_to_trunk(tables, worlds, world, trunk, trunk_pose(trunk))
+            acc = TrunkMotion()
+            acc.lin = wp.vec3(qacc_warmstart[world, 0], qacc_warmstart[world, 1], qacc_warmstart[world, 2])
+            acc.ang = wp.vec3(qacc_warmstart[world, 3], qacc_warmstart[world, 4], qacc_warmstart[world, 5])
+            around.drive_all(tables, worlds, world, lane, i, reads)
+            branch, total = around.make_all(tables, worlds, world, lane, trunk, acc, contacts, kept)
+            whole = whole_body(trunk, total, wp.static(lanes))
+            used = int(0)
+            for _iteration in range(iterations):
+                used += 1
+                branch, system = solver.assemble_all(world, lane, branch, kept, trunk.rot, acc, contacts)
+                residual = trunk_residual(whole, acc)
+                step = solve_trunk(whole, residual, system, wp.static(lanes))
+                branch, slopes = solver.turn_all(world, lane, branch, kept, trunk.rot, step, contacts)
+                start = slopes + trunk_slopes(whole, residual, step)
+                decrease = -start[0] * tables.cost_scale
+                if used > 1 and not (decrease > tables.tolerance):
+                    break
+                share = wp.where(used > 1, LINE_SEARCH_TOLERANCE, FIRST_TOLERANCE)
+                alpha = solver.line_search(share, ls_iterations, world, branch, kept, start, contacts)
+                acc.lin = acc.lin + alpha * step.lin
+                acc.ang = acc.ang + alpha * step.ang
+                branch, flips = solver.move_all(world, branch, kept, contacts, alpha)
+                if alpha == 1.0 and flips == 0.0 and decrease < EXACT_STEP:
+                    break  # the whole step stayed in one piece of the piecewise quadratic cost: this is its minimum
+            branch, system = around.damp_all(tables.timestep, world, lane, branch, kept)
+            damped = solve_trunk(whole, TrunkMotion(), system, wp.static(lanes))
+            around.integrate_all(tables, worlds, world, lane, branch, kept, damped, contacts, sense and i == steps - 1)
+            if lane == 0:
+                integrate_trunk(tables.timestep, worlds, world, trunk, acc, damped)
+                solver_niter[world] = used
+            group_sync(wp.static(lanes))  # the next step reads the trunk that lane 0 has written
 
     return fused_step
