@@ -59,9 +59,9 @@ def places(layout: Layout) -> SimpleNamespace:
     @wp.func
     def has(lane: int, i: int) -> bool:
         # Where this is known beforehand, nothing is moved between registers for the other case.
-        return wp.static(layout.branches == layout.lanes * per_lane) or lane + i * wp.static(
-            layout.lanes
-        ) < wp.static(layout.branches)
+        return wp.static(layout.branches == layout.lanes * per_lane) or lane + i * wp.static(layout.lanes) < wp.static(
+            layout.branches
+        )
 
     @wp.func
     def take(kept: wp.array(dtype=AnyBranch), world: int, i: int, branch: AnyBranch):
