@@ -1,6 +1,7 @@
 """The code in the how-to pages and in the README, run as it stands there."""
 
 import re
+import runpy
 from pathlib import Path
 
 import mujoco
@@ -22,14 +23,14 @@ def blocks(page, language):
 
 @pytest.fixture
 def run_page(monkeypatch, tmp_path):
-    """Run a page's Python as one program; its tasks are forgotten afterwards."""
+    """Run a page's Python as one file, which Warp reads; its tasks are forgotten afterwards."""
     monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
     monkeypatch.chdir(tmp_path)
 
     def run(page):
-        names = {}
-        exec("\n".join(blocks(page, "python")), names)
-        return names
+        file = tmp_path / "page.py"
+        file.write_text("\n".join(blocks(page, "python")))
+        return runpy.run_path(str(file))
 
     return run
 
@@ -131,6 +132,19 @@ def test_approach(run_page):
     assert task.cfg.env.num_actions == 12
     torch.testing.assert_close(task._compute_torques(actions), 2.0 * (10.0 * actions - task.dof_vel))
     train(task, "a1_velocity")
+
+
+def test_approach_in_kernel(run_page):
+    """With a Warp function, the same actions give the same torques, and no other launch is needed."""
+    run_page("docs/howto/approach.md")
+    tasks = [make(name, "init_state.pos=[0, 0, 50]") for name in ("a1_velocity", "a1_fast_velocity")]
+    tasks[1].sim.step = None
+    for seed in range(4):
+        actions = torch.randn(4, 12, generator=torch.Generator().manual_seed(seed))
+        for task in tasks:
+            task.step(actions)
+    assert tasks[0].torques.abs().max() > 5.0
+    torch.testing.assert_close(tasks[1].torques, tasks[0].torques, rtol=1e-3, atol=1e-3)
 
 
 def test_robot(run_page):

@@ -11,7 +11,8 @@ from torch import Tensor
 class Motors(ABC):
     """One motor per joint in each world.
 
-    A model is a subclass with :meth:`apply`, and its name in ``MOTORS``; tasks choose it by ``motors.model``.
+    A model is a subclass with :meth:`apply`, and its name in ``MOTORS``; tasks choose it by ``motors.model``. If it
+    also names a Warp function (see :func:`~legged_torque.motors.drive.in_kernel`), it runs inside the physics kernel.
     """
 
     def __init__(self, num_envs: int, limits: Tensor) -> None:

@@ -187,7 +187,8 @@ def find_contacts(
     last_geom = int(-1)
     in_geom = int(0)
     height = origin - of_world(tables.geom_pos, world, tables.floor)
-    for point in range(tables.point_count[b]):
+    point = int(0)
+    while point < tables.point_count[b]:
         geom = tables.point_geom[b, point]
         depth = tables.point_depth[b, point]
         size = of_world(tables.geom_size, world, geom)
@@ -195,10 +196,14 @@ def find_contacts(
         half = size
         if is_capsule:
             half = wp.vec3(0.0, 0.0, size[1])
+        radius = tables.point_radius[b, point] * size[0]
+        middle = poses[depth].pos + poses[depth].rot * of_world(tables.geom_pos, world, geom)
+        if wp.dot(height + middle, normal) > wp.length(half) + radius:  # nothing of the geom reaches the floor
+            point = tables.point_next[b, point]
+            continue
         turn = poses[depth].rot * quat_to_matrix(of_world(tables.geom_quat, world, geom))
         arm = turn * wp.cw_mul(tables.point_offset[b, point], half)
-        centre = poses[depth].pos + poses[depth].rot * of_world(tables.geom_pos, world, geom) + arm
-        radius = tables.point_radius[b, point] * size[0]
+        centre = middle + arm
         dist = wp.dot(height + centre, normal) - radius
         if geom != last_geom:
             last_geom = geom
@@ -215,4 +220,5 @@ def find_contacts(
             velocity = poses[depth].lin_vel + wp.cross(poses[depth].ang_vel, contact.pos)
             contacts.found[first + count] = set_contact_rows(tables, world, geom, dist, velocity, normal, contact)
             count += 1
+        point += 1
     return count

@@ -111,6 +111,18 @@ def with_column(m: AnyColumns, j: int, v: wp.vec3):
     return m
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return rsqrtf(value);
+#else
+    return 1.0f / sqrt(value);
+#endif
+""")
+def inverse_sqrt(value: float) -> float:
+    """Return one over the square root: on a GPU one instruction instead of two that wait for each other."""
+    ...
+
+
 @wp.func
 def cholesky(a: AnyMatrix):
     """Return the lower factor of a symmetric matrix, with the inverse of its diagonal in the diagonal's place."""
@@ -120,7 +132,7 @@ def cholesky(a: AnyMatrix):
         for k in range(len(a)):
             if k < j:
                 pivot -= lower[j, k] * lower[j, k]
-        inverse = 1.0 / wp.sqrt(wp.max(pivot, 1.0e-12))
+        inverse = inverse_sqrt(wp.max(pivot, 1.0e-12))
         lower[j, j] = inverse
         for i in range(len(a)):
             if i > j:

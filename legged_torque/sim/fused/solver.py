@@ -19,7 +19,7 @@ from legged_torque.sim.fused.contact import (
     pushing_rows,
     row_values,
 )
-from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, with_column
+from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, forward_solve, with_column
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
 from legged_torque.sim.fused.types import AnyBranch, AnyColumns, AnyMatrix, AnyVector, vec4
 
@@ -132,24 +132,23 @@ def assemble_damping(branch: AnyBranch, timestep: float):
 
 @wp.func
 def solve_rows(factor: AnyMatrix, c: AnyColumns):
-    """Return C H^-1 from the factor of H."""
+    """Return C L^-T from the factor L of H = L L^T; the product with its transpose is C H^-1 C^T."""
     out = type(c)()
     for r in range(3):
-        out[r] = cholesky_solve(factor, c[r])
+        out[r] = forward_solve(factor, c[r])
     return out
 
 
 @wp.func
 def eliminate(branch: AnyBranch, system: TrunkSystem, add: TrunkSystem) -> TrunkSystem:
     """Add to the trunk's equations what is left there of a branch's (Schur complement) and of its contacts."""
-    free = cholesky_solve(branch.factor, branch.gradient)  # the branch's own step, less the sign
-    system.rhs_lin = system.rhs_lin + branch.coupling_lin * free - branch.trunk_gradient_lin
-    system.rhs_ang = system.rhs_ang + branch.coupling_ang * free - branch.trunk_gradient_ang
-    solved_lin = solve_rows(branch.factor, branch.coupling_lin)
-    system.lin = system.lin + add.lin - solved_lin * wp.transpose(branch.coupling_lin)
-    system.coupling = system.coupling + add.coupling - solved_lin * wp.transpose(branch.coupling_ang)
-    solved_ang = solve_rows(branch.factor, branch.coupling_ang)
-    system.ang = system.ang + add.ang - solved_ang * wp.transpose(branch.coupling_ang)
+    gradient = forward_solve(branch.factor, branch.gradient)
+    lin, ang = solve_rows(branch.factor, branch.coupling_lin), solve_rows(branch.factor, branch.coupling_ang)
+    system.rhs_lin = system.rhs_lin + lin * gradient - branch.trunk_gradient_lin
+    system.rhs_ang = system.rhs_ang + ang * gradient - branch.trunk_gradient_ang
+    system.lin = system.lin + add.lin - lin * wp.transpose(lin)
+    system.coupling = system.coupling + add.coupling - lin * wp.transpose(ang)
+    system.ang = system.ang + add.ang - ang * wp.transpose(ang)
     return system
 
 

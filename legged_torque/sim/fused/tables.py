@@ -65,6 +65,7 @@ class Tables:
     point_depth: wp.array2d(dtype=wp.int32)  # (branch, point), 0 is the trunk
     point_offset: wp.array2d(dtype=wp.vec3)  # (branch, point), in half sizes of the geom
     point_radius: wp.array2d(dtype=wp.float32)  # (branch, point), in first sizes of the geom
+    point_next: wp.array2d(dtype=wp.int32)  # (branch, point), the first one of the next geom
     point_count: wp.array(dtype=wp.int32)  # (branch)
     floor: wp.int32  # its geom
     # Options:
@@ -147,5 +148,8 @@ def make_tables(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Tab
     for place, (name, dtype) in enumerate(columns):
         values = [[point[place] for point in points] for points in padded]
         setattr(tables, f"point_{name}", wp.array(values, dtype=dtype))
+    geoms = [[point[0] for point in points] for points in tree.points]
+    after = [[i + 1 + row[i + 1 :].count(geom) for i, geom in enumerate(row)] for row in geoms]
+    tables.point_next = wp.array([row + [0] * (tree.most_points - len(row)) for row in after], dtype=wp.int32)
     tables.point_count = wp.array([len(points) for points in tree.points], dtype=wp.int32)
     return tables
