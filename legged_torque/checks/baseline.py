@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from legged_torque.utils.plotting import read_data
 SETTINGS = ("task", "preset", "perturbation", "ranges", "set")
 """What must be the same in both."""
 
+LARGEST = 1e30  # number in a row; a stranger's file may hold integers that are no floats
 Row = dict[str, Any]
 Size = tuple[int, int]
 """Worlds, and control steps of a rollout."""
@@ -48,7 +48,7 @@ class Baseline:
         was = {"device": data["device"], **versions}
         now = {"device": result["device"], **result["versions"]}
         changed = [name for name in {**was, **now} if was.get(name) != now.get(name)]
-        self.notes += [f"its {name} was {was.get(name)}, is {now.get(name)}" for name in changed]
+        self.notes += [f"its {name} was {was.get(name)!r}, is {now.get(name)!r}" for name in changed]
 
     def compare(self, row: Row, names: Iterable[str]) -> list[tuple[str, float, float, float]]:
         """Return name, old number, new number and new / old of what both rows have; empty if the size is missing."""
@@ -59,7 +59,7 @@ class Baseline:
 
 def _is_positive(value: Any) -> bool:
     """Return whether a value is a number of which there is a ratio."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < math.inf
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < LARGEST
 
 
 def _texts(sizes: Iterable[Size]) -> str:
