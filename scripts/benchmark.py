@@ -110,7 +110,7 @@ def main() -> None:
             write_json(args.json, result | {"rows": rows})
     measured = [row for row in rows if "error" not in row]
     if measured:
-        peaks = roofline.measure_peaks(device)  # at the end: they take memory, too
+        peaks = roofline.measure_peaks(device, measured[0]["update_dtype"])  # at the end: they take memory, too
         for row in measured:
             row |= roofline.shares(row, peaks)
         print_shares(measured)

@@ -55,12 +55,14 @@ def test_update_by_hand(tmp_path):
     actor = 2 * (2 * actor_inputs * 8 + 3 * (8 * 6 + 6 * 12))
     critic = 2 * (2 * critic_inputs * 7 + 3 * (7 * 5 + 5))
     assert roofline.update_flop(alg) == 2 * 12 * (actor + critic)
-    # of a sample: observations, actions, value, return, advantage, log probability, mean and deviation of 12 actions
-    stored = actor_inputs + critic_inputs + 12 + 4 + 2 * 12
+    # of a sample: observations, 12 actions and their means, value, return, advantage, logarithm of the probability
+    stored = actor_inputs + critic_inputs + 2 * 12 + 4
     activations = (8 + 6 + 12) + (7 + 5 + 1)
     weights = (actor_inputs + 1) * 8 + 9 * 6 + 7 * 12 + 12 + (critic_inputs + 1) * 7 + 8 * 5 + 6
     expected = 12 * (stored + 2 * 2 * activations) + 4 * 2 * 3 * weights
     assert roofline.update_bytes(alg) == 4 * expected
+    alg.use_mixed_precision = True  # halves the activations, nothing else
+    assert roofline.update_bytes(alg) == 4 * expected - 12 * 2 * 2 * activations * 2
 
 
 def test_samples_that_no_minibatch_has(tmp_path):
@@ -116,4 +118,4 @@ def test_peaks(monkeypatch):
         return float(len(calls))  # 1 to 5 for the product, whose median is 3, then 6 to 10
 
     monkeypatch.setattr(roofline, "seconds_per_call", seconds)
-    assert roofline.measure_peaks("cpu") == Peaks(flop_per_s=2e6 / 3, bytes_per_s=2000 / 8)
+    assert roofline.measure_peaks("cpu", "bfloat16") == Peaks(flop_per_s=2e6 / 3, bytes_per_s=2000 / 8)

@@ -28,7 +28,6 @@ from legged_torque.learning.ppo import OnDevicePPO
 from legged_torque.sim.fused.tables import FUSED_FIELDS, unread_columns
 from legged_torque.sim.simulator import Simulator
 
-UPDATE_DTYPE = torch.float32  # of activations and matrix products in an update; a GPU takes these in TF32
 GPU_CALLS = 20  # calls per timing on a GPU, where a single one is short; on the CPU one call is timed
 _ROUNDS = 5  # timings of each peak
 _MATRIX = {"cuda": 8192, "cpu": 1024}  # rows and columns of the product
@@ -39,15 +38,18 @@ _COPY = {"cuda": 2**29, "cpu": 2**26}  # bytes that are copied: several times th
 class Peaks:
     """What a device reaches in large pieces of work."""
 
-    flop_per_s: float  # of matrix products of :data:`UPDATE_DTYPE`
+    flop_per_s: float  # of matrix products
     bytes_per_s: float  # of a copy, read and written
 
 
-def measure_peaks(device: str) -> Peaks:
-    """Measure the peaks on "cpu" or "cuda:N", in the precision that products of float32 have at present."""
+def measure_peaks(device: str, dtype: str) -> Peaks:
+    """Measure the peaks on "cpu" or "cuda:N"; products are of numbers of a ``dtype``, "float32" (TF32) or "bfloat16".
+
+    Those of float32 have the precision that torch is set to, so after a training that of its update.
+    """
     kind = torch.device(device).type
     size, count = _MATRIX[kind], _COPY[kind]
-    a, b, c = torch.randn(3, size, size, device=device).to(UPDATE_DTYPE)
+    a, b, c = torch.randn(3, size, size, device=device).to(getattr(torch, dtype))
     product = _median_seconds(lambda: torch.mm(a, b, out=c), device)
     source, target = torch.zeros(2, count, dtype=torch.uint8, device=device)
     copy = _median_seconds(lambda: target.copy_(source), device)
@@ -65,9 +67,13 @@ def seconds_per_call(function: Callable[[], object], device: str) -> float:
     return (time.perf_counter() - start) / calls
 
 
-def work(alg: OnDevicePPO, sim: Simulator, decimation: int) -> dict[str, float]:
-    """Return what an update and the physics of a control step need: "update_flop", "update_bytes", "physics_bytes"."""
+def work(alg: OnDevicePPO, sim: Simulator, decimation: int) -> dict[str, Any]:
+    """Return what an update and the physics of a control step need: "update_flop", "update_bytes", "physics_bytes".
+
+    "update_dtype" is the kind of numbers that an update multiplies.
+    """
     return {
+        "update_dtype": str(update_dtype(alg)).removeprefix("torch."),
         "update_flop": update_flop(alg),
         "update_bytes": update_bytes(alg),
         "physics_bytes": physics_bytes(sim, decimation),
@@ -95,13 +101,18 @@ def flop_per_sample(model: nn.Module) -> int:
     return 2 * (2 * first + 3 * sum(others))
 
 
+def update_dtype(alg: OnDevicePPO) -> torch.dtype:
+    """Return the kind of numbers that are multiplied, which activations are kept as."""
+    return torch.bfloat16 if alg.use_mixed_precision else torch.float32
+
+
 def update_bytes(alg: OnDevicePPO) -> int:
     """Return the bytes that an update reads and writes if it does so once, see above."""
-    storage, width = alg.storage, UPDATE_DTYPE.itemsize
+    storage, width = alg.storage, update_dtype(alg).itemsize
     groups = {*alg.actor.obs_groups, *alg.critic.obs_groups}
     stored: list[Tensor] = [storage.observations[name] for name in groups]
-    stored += [storage.actions, storage.values, storage.returns, storage.advantages, storage.actions_log_prob]
-    stored += storage.distribution_params or ()
+    stored += [storage.actions, storage.actions]  # and their means
+    stored += [storage.values, storage.returns, storage.advantages, storage.actions_log_prob]
     outputs = {alg.actor: actor_passes(alg), alg.critic: images(alg)}
     activations = sum(count * layer.out_features for model, count in outputs.items() for layer in _linear(model))
     parameters = [*alg.actor.parameters(), *alg.critic.parameters()]
