@@ -1,5 +1,7 @@
 """Measure speed and memory of training: ``python scripts/benchmark.py --num_envs 1024 4096``."""
 
+from __future__ import annotations
+
 import os
 
 from legged_torque.utils.interrupt import end_on_interrupt
@@ -11,18 +13,23 @@ os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or torch's profiler writes to
 
 import argparse
 import dataclasses
+import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from legged_torque.checks.benchmark import TRACED, MemoryMeter, measure
+from legged_torque import SCRIPTS_DIR
+from legged_torque.checks.baseline import Baseline
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.args import Parser, add_settings_args, options_of
-from legged_torque.utils.cli import check_at_least, check_output, run_script, write_json
+from legged_torque.utils.cli import check_at_least, check_output, importing, run_script, write_json
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError, is_out_of_memory
 from legged_torque.utils.paths import without_machine
 from legged_torque.utils.runs import package_versions
+
+if TYPE_CHECKING:
+    from legged_torque.checks.benchmark import MemoryMeter
 
 COLUMNS = {
     "num_envs": (" worlds", 0),
@@ -38,6 +45,17 @@ COLUMNS = {
     "startup_s": ("start-up s", 1),
 }
 """Heading of each column, as wide as the column, and its number of decimals."""
+NOT_COMPARED = ("num_envs", "iteration_over_physics", "startup_s")
+SHARES = {
+    "num_envs": (" worlds", ",.0f"),
+    "update_gflop_per_s": ("update GFLOP/s", ",.0f"),
+    "update_flop_share": ("of peak", ".1%"),
+    "update_gbytes_per_s": ("update GB/s", ",.1f"),
+    "update_bytes_share": ("of peak", ".1%"),
+    "physics_gbytes_per_s": ("physics GB/s", ",.1f"),
+    "physics_bytes_share": ("of peak", ".1%"),
+}
+"""Heading of each column and its format."""
 LEGEND = """\
   physics: only the physics steps of one control step; step: env.step; iteration: a whole iteration, with logging
   x floor: iteration / (physics x control steps of a rollout); steps/s: over whole iterations
@@ -46,25 +64,32 @@ LEGEND = """\
 ENDURANCE = """\
   {iterations} iterations in a row: {first_ms:.1f} ms in the first tenth, {last_ms:.1f} ms in the last \
 ({slowdown:+.1%}); memory {first_memory_mib:.0f} MiB, then {growth_mib:+.1f} MiB"""
+LEARNING = """\
+  train.py, {steps:,} steps: {total_s:.1f} s from the command to its end, training starts after {start_s:.1f} s"""
+REACHED = """\
+    tracking {share:.0%} after {steps:,} steps: {training_s:.1f} s from there, {command_s:.1f} s from the command"""
+NOT_REACHED = "    tracking {share:.0%} was not reached"
+PEAKS = """
+Counted FLOP and bytes per second (checks/roofline.py says which), and shares of what the device reaches here:
+  matrix products {peak_gflop_per_s:,.0f} GFLOP/s, copies {peak_gbytes_per_s:,.1f} GB/s"""
 
 
 def main() -> None:
-    """Measure every size, print a table, write JSON."""
+    """Measure every size, print tables, write JSON."""
     args = parse_args()
-    device = resolve_device(args.device)
     changes = ["evaluation.interval=0", *args.set]  # without evaluations iterations are alike
     sizes = []
-    for num_envs in args.num_envs or [None]:
-        options = dataclasses.replace(options_of(args), num_envs=num_envs, set=changes)
-        sizes.append(task_registry.get_cfgs(args.task, options))
-        check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
+    with importing():
+        for num_envs in args.num_envs or [None]:
+            options = dataclasses.replace(options_of(args), num_envs=num_envs, set=changes)
+            sizes.append(task_registry.get_cfgs(args.task, options))
+            check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
+        device = resolve_device(args.device)
+        from legged_torque.checks import roofline
+        from legged_torque.checks.benchmark import MemoryMeter
+        from legged_torque.checks.learning_time import time_training
     for file in filter(None, (args.json, args.profile)):
         check_output(file)
-    memory = MemoryMeter(device)
-    of_gpu = "GPU memory of torch and Warp together, without the CUDA context"
-    print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")
-    print(LEGEND.format(memory=of_gpu if memory.is_gpu else "peak resident memory of this process"))
-    print(" | ".join(title for title, _ in COLUMNS.values()), flush=True)
     result = {
         "task": args.task,
         "device": device_name(device),
@@ -74,24 +99,31 @@ def main() -> None:
         "ranges": args.ranges or "default",
         "set": without_machine(args.set),
         "rounds": args.rounds,
-        "rows": [],
     }
+    numbers = [(env_cfg.env.num_envs, train_cfg.runner.num_steps_per_env) for env_cfg, train_cfg in sizes]
+    baseline = Baseline(args.baseline, result, numbers) if args.baseline else None
+    memory = MemoryMeter(device)
+    print_head(args, device, memory)
+    rows: list[dict[str, Any]] = []
     for cfgs in sizes:
-        try:
-            row = measure(args.task, cfgs, memory, args.rounds, args.endurance, args.profile)
-        except Exception as error:
-            if not is_out_of_memory(error):
-                raise
-            row = {"num_envs": cfgs[0].env.num_envs, "error": "does not fit in memory"}
-        memory.clear()
-        result["rows"].append(row | {"left_memory_mib": memory.used()})
-        print_row(row)
-        if "kernels" in row:
-            kind = "kernels" if memory.is_gpu else "torch operators (Warp's kernels show on a GPU only)"
-            print(f"  most expensive {kind} of {TRACED} iterations, see {args.profile}:")
-            print_kernels(row["kernels"])
+        row = measure_size(args, cfgs, memory)
+        rows.append(row)
+        print_row(row, args.profile, memory)
+        if args.learn and "error" not in row:
+            row["learn"] = time_training(training_command(args, row["num_envs"]))
+            print_learning(row["learn"])
         if args.json:
-            write_json(args.json, result)
+            write_json(args.json, result | {"rows": rows})
+    measured = [row for row in rows if "error" not in row]
+    if measured:
+        peaks = roofline.measure_peaks(device, measured[0]["update_dtype"])  # at the end: they take memory, too
+        for row in measured:
+            row |= roofline.shares(row, peaks)
+        print_shares(measured)
+    if args.json:
+        write_json(args.json, result | {"rows": rows})
+    if baseline:
+        print_comparison(args.baseline, baseline, measured)
 
 
 def parse_args() -> argparse.Namespace:
@@ -102,7 +134,11 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
     parser.add_argument("--json", type=Path, help="file to write")
-    help_text = f"write a trace of {TRACED} iterations for ui.perfetto.dev, as .json or .json.gz"
+    help_text = "file that --json of an earlier benchmark wrote: print what is different"
+    parser.add_argument("--baseline", type=Path, help=help_text)
+    help_text = "also run train.py for each number of worlds, and print when tracking reaches 70%% and 75%%"
+    parser.add_argument("--learn", action="store_true", help=help_text)
+    help_text = "write a trace of a few iterations for ui.perfetto.dev, as .json or .json.gz"
     parser.add_argument("--profile", type=Path, help=help_text)
     help_text = "also run N iterations and compare the first tenth with the last"
     parser.add_argument("--endurance", type=int, default=0, metavar="N", help=help_text)
@@ -111,17 +147,86 @@ def parse_args() -> argparse.Namespace:
     check_at_least(args, 0, "endurance")
     if args.profile and len(args.num_envs or [None]) > 1:
         raise UserError("--profile writes one trace: give one number of worlds")
+    if args.learn:
+        with importing():
+            _, cfg = task_registry.get_cfgs(args.task, dataclasses.replace(options_of(args), num_envs=None))
+        if not 0 < cfg.evaluation.interval <= cfg.runner.total_steps:
+            steps = f"evaluation.interval is {cfg.evaluation.interval}, of {cfg.runner.total_steps} steps"
+            raise UserError(f"--learn needs evaluations during training: {steps}")
     return args
 
 
-def print_row(row: dict[str, Any]) -> None:
-    """Print the numbers of one size."""
+def measure_size(args: argparse.Namespace, cfgs: tuple, memory: MemoryMeter) -> dict[str, Any]:
+    """Measure one size, which may not fit in memory, and give the memory back."""
+    from legged_torque.checks.benchmark import measure
+
+    try:
+        row = measure(args.task, cfgs, memory, args.rounds, args.endurance, args.profile)
+    except Exception as error:
+        if not is_out_of_memory(error):
+            raise
+        row = {"num_envs": cfgs[0].env.num_envs, "error": "does not fit in memory"}
+    memory.clear()
+    return row | {"left_memory_mib": memory.used()}
+
+
+def training_command(args: argparse.Namespace, num_envs: int) -> list[str]:
+    """Return the command that trains with the same options."""
+    given = {name: getattr(args, name) for name in ("task", "seed", "perturbation", "ranges", "device", "preset")}
+    words = [f"--{name}={value}" for name, value in given.items() if value is not None]
+    words += [f"--num_envs={num_envs}", *(f"--set={change}" for change in args.set)]
+    return [sys.executable, str(SCRIPTS_DIR / "train.py"), *words]
+
+
+def print_head(args: argparse.Namespace, device: str, memory: MemoryMeter) -> None:
+    """Print what is measured, and the heading of the table."""
+    of_gpu = "GPU memory of torch and Warp together, without the CUDA context"
+    print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")
+    print(LEGEND.format(memory=of_gpu if memory.is_gpu else "peak resident memory of this process"))
+    print(" | ".join(title for title, _ in COLUMNS.values()), flush=True)
+
+
+def print_row(row: dict[str, Any], trace: Path, memory: MemoryMeter) -> None:
+    """Print the numbers of one size; ``trace`` is the file of its trace, if there is one."""
     cells = [f"{row[key]:>{len(title)},.{digits}f}" for key, (title, digits) in COLUMNS.items() if key in row]
     if "error" in row:
         cells.append(row["error"])
     print(" | ".join(cells), flush=True)
     if "endurance" in row:
         print(ENDURANCE.format(**row["endurance"]))
+    if "kernels" in row:
+        from legged_torque.checks.benchmark import TRACED
+
+        kind = "kernels" if memory.is_gpu else "torch operators (Warp's kernels show on a GPU only)"
+        print(f"  most expensive {kind} of {TRACED} iterations, see {trace}:")
+        print_kernels(row["kernels"])
+
+
+def print_learning(times: dict[str, Any]) -> None:
+    """Print the wall clock of a training."""
+    print(LEARNING.format(**times))
+    for point in times["reached"]:
+        print((REACHED if point["steps"] else NOT_REACHED).format(**point), flush=True)
+
+
+def print_shares(rows: list[dict[str, Any]]) -> None:
+    """Print the shares of the device's peaks."""
+    print(PEAKS.format(**rows[0]))
+    print(" | ".join(title for title, _ in SHARES.values()))
+    for row in rows:
+        print(" | ".join(f"{row[name]:>{len(title)}{style}}" for name, (title, style) in SHARES.items()))
+
+
+def print_comparison(file: Path, baseline: Baseline, rows: list[dict[str, Any]]) -> None:
+    """Print the numbers of all sizes against those of the baseline."""
+    print(f"\nAgainst {file}", *baseline.notes, sep="\n  ")
+    print(f" worlds | {'what':<12} | {'old':>11} | {'new':>11} | new / old")
+    names = [name for name in COLUMNS if name not in NOT_COMPARED]
+    for row in rows:
+        for name, old, new, ratio in baseline.compare(row, names):
+            title, digits = COLUMNS[name]
+            cells = [f"{row['num_envs']:>7,}", f"{title.strip():<12}"]
+            print(" | ".join([*cells, *(f"{value:>11,.{digits}f}" for value in (old, new)), f"{ratio:>9.3f}"]))
 
 
 def print_kernels(kernels: list[dict[str, Any]]) -> None:

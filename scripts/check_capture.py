@@ -1,5 +1,7 @@
 """Check that training does the same with and without CUDA graphs: ``python scripts/check_capture.py``."""
 
+from __future__ import annotations
+
 from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
@@ -8,15 +10,17 @@ without_renderer()  # before anything imports mujoco
 
 import sys
 from dataclasses import astuple
+from typing import TYPE_CHECKING
 
-from legged_torque.checks.capture import compare_capture, warm_up
 from legged_torque.envs import task_registry
-from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import check_at_least, run_script
+from legged_torque.utils.cli import check_at_least, importing, run_script
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import set_seed
+
+if TYPE_CHECKING:
+    from legged_torque.learning.runner import OnPolicyRunner
 
 
 def main() -> None:
@@ -30,11 +34,15 @@ def main() -> None:
     args = parser.parse_args()
     check_at_least(args, 1, "iterations")
     check_at_least(args, 0, "tolerance")
-    device = resolve_device(args.device)
+    options = options_of(args)
+    with importing():
+        task_registry.get_cfgs(options.task, options)  # mistakes are told before anything is built
+        device = resolve_device(args.device)
+        from legged_torque.checks.capture import compare_capture
     print(f"{args.task} on {device_name(device)}: with CUDA graphs against without")
     if device == "cpu":
         print("a CPU has no graphs: this compares two runs that are the same")
-    plain, captured = (build_runner(options_of(args), capture) for capture in (False, True))
+    plain, captured = (build_runner(options, capture) for capture in (False, True))
     too_far = []
     for iteration in range(args.iterations):
         print(f"{f'iteration {iteration}':<24} largest |  relative |       rms | rms of two without")
@@ -50,6 +58,8 @@ def main() -> None:
 
 def build_runner(options: Options, capture: bool) -> OnPolicyRunner:
     """Build the task and its runner from the seed of the settings, and let everything that can be captured be so."""
+    from legged_torque.checks.capture import warm_up
+
     env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     train_cfg.runner.capture = capture
     set_seed(train_cfg.seed)

@@ -12,11 +12,8 @@ without_renderer()  # before anything imports mujoco
 import sys
 
 from legged_torque import RESOURCES_DIR
-from legged_torque.checks import injections
-from legged_torque.sim.model import build_model, collision_geoms, read_spec
-from legged_torque.sim.simulator import ENGINES
 from legged_torque.utils.args import Parser, add_options
-from legged_torque.utils.cli import check_at_least, run_script
+from legged_torque.utils.cli import check_at_least, importing, run_script
 from legged_torque.utils.devices import resolve_device
 
 
@@ -27,7 +24,11 @@ def main() -> None:
     add_options(parser, "device")
     args = parser.parse_args()
     check_at_least(args, 1, "count")
-    device = resolve_device(args.device)
+    with importing():
+        device = resolve_device(args.device)
+        from legged_torque.checks import injections
+        from legged_torque.sim.model import build_model, collision_geoms, read_spec
+        from legged_torque.sim.simulator import ENGINES
     spec = read_spec(RESOURCES_DIR / "robots/a1/a1.xml")
     model = build_model(spec, collision_geoms(spec))
     is_good = True

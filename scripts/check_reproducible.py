@@ -12,10 +12,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from legged_torque.checks.reproducible import Training, compare, kill_often
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import check_at_least, run_script
+from legged_torque.utils.cli import check_at_least, importing, run_script
 from legged_torque.utils.errors import UserError
 
 SAVE_INTERVAL = 2  # iterations; of trainings that are killed
@@ -37,13 +36,16 @@ def main() -> None:
     check_at_least(args, 0, "resumes", "kills")
     if args.resumes >= args.iterations:
         raise UserError(f"--resumes must be less than --iterations, which is {args.iterations}, not {args.resumes}")
-    task_registry.get_cfgs(args.task, options_of(args))  # mistakes are told before anything is trained
+    with importing():
+        task_registry.get_cfgs(args.task, options_of(args))  # mistakes are told before anything is trained
     with tempfile.TemporaryDirectory() as folder:
         sys.exit(0 if check(args, Path(folder)) else 1)
 
 
 def check(args: argparse.Namespace, folder: Path) -> bool:
     """Print a line per comparison; return whether nothing differs and nothing is broken."""
+    from legged_torque.checks.reproducible import Training, compare, kill_often
+
     words = train_words(args)
     first, again, resumed, killed, straight = (
         Training(words, folder / name, args.processes) for name in ("first", "again", "resumed", "killed", "straight")

@@ -11,15 +11,10 @@ from legged_torque.utils.rendering import without_renderer
 end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
-from legged_torque.control.dynamics import RobotDynamics
-from legged_torque.control.gravity_pretraining import act_by_controller, act_by_policy, make_controller
-from legged_torque.control.standing import measure_standing, place_on_ground, use_standing_trials
 from legged_torque.envs import task_registry
-from legged_torque.learning.pretrained import check_spaces, pretrained_file, start_from
 from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import run_script
+from legged_torque.utils.cli import importing, run_script
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.progress import CompileProgress
 from legged_torque.utils.task_registry import set_seed
 
 
@@ -31,7 +26,13 @@ def main() -> None:
     parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in the current directory")
     args = parser.parse_args()
     options = options_of(args)
-    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+    with importing():
+        env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+        from legged_torque.control.dynamics import RobotDynamics
+        from legged_torque.control.gravity_pretraining import act_by_controller, act_by_policy, make_controller
+        from legged_torque.control.standing import measure_standing, place_on_ground, use_standing_trials
+        from legged_torque.learning.pretrained import check_spaces, pretrained_file, start_from
+        from legged_torque.utils.progress import CompileProgress
     file = pretrained_file(options.task, train_cfg, options.log_root)
     if not file.exists():
         raise UserError(f"there is no pre-trained policy '{file}'; run scripts/pretrain_gravity.py first")

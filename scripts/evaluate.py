@@ -1,5 +1,7 @@
 """Measure a checkpoint: ``python scripts/evaluate.py --task=a1_position --perturbation=high``."""
 
+from __future__ import annotations
+
 from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
@@ -8,19 +10,19 @@ without_renderer()  # before anything imports mujoco
 
 from dataclasses import asdict
 from pathlib import Path
-
-import torch
+from typing import TYPE_CHECKING
 
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.metrics import COMMANDS, CommandBreakdown, measure
-from legged_torque.learning.evaluator import evaluation_cfg
 from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import add_command_arg, check_at_least, check_output, run_script, write_json
+from legged_torque.utils.cli import add_command_arg, check_at_least, check_output, importing, run_script, write_json
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.paths import portable_path
 from legged_torque.utils.runs import package_versions
 from legged_torque.utils.task_registry import set_seed
+
+if TYPE_CHECKING:
+    from legged_torque.envs.base.metrics import CommandBreakdown
 
 
 def main() -> None:
@@ -36,7 +38,12 @@ def main() -> None:
     if args.json:
         check_output(args.json)
     options = options_of(args)
-    run = task_registry.load_run(options)
+    with importing():
+        run = task_registry.load_run(options)
+        import torch
+
+        from legged_torque.envs.base.metrics import COMMANDS, CommandBreakdown, measure
+        from legged_torque.learning.evaluator import evaluation_cfg
     env_cfg = evaluation_cfg(run.env_cfg, run.env_cfg.env.num_envs)
     for name, value in zip(COMMANDS, args.command or (), strict=False):
         setattr(env_cfg.commands.ranges, name, [value, value])

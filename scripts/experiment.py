@@ -16,7 +16,7 @@ from legged_torque.experiments.job import find_workers
 from legged_torque.experiments.matrix import SETTINGS_FILE, cell_state, check_same, read_matrix
 from legged_torque.experiments.run import ExperimentRun, claim_folder
 from legged_torque.utils.args import Parser
-from legged_torque.utils.cli import check_output, run_script
+from legged_torque.utils.cli import check_output, importing, run_script
 
 
 def main() -> None:
@@ -29,7 +29,8 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, help="runs at a time on the CPU; default: 1")
     parser.add_argument("--dry-run", action="store_true", help="only list what is left to do")
     args = parser.parse_args()
-    matrix = read_matrix(args.file)
+    with importing():
+        matrix = read_matrix(args.file)
     out = (args.out or Path("logs", "experiments", args.file.stem)).resolve()
     check_output(out / SETTINGS_FILE)
     workers = find_workers(args.device, args.jobs)

@@ -9,10 +9,9 @@ without_renderer()  # before anything imports mujoco
 from pathlib import Path
 
 from legged_torque.deploy.description import DESCRIPTION_FILE
-from legged_torque.deploy.export import export_policy, nominal_cfg
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, check_output, run_script
+from legged_torque.utils.cli import Parser, check_output, importing, run_script
 
 
 def main() -> None:
@@ -24,7 +23,9 @@ def main() -> None:
     if args.out:
         check_output(args.out / DESCRIPTION_FILE)
     options = options_of(args)
-    run = task_registry.load_run(options)
+    with importing():
+        run = task_registry.load_run(options)
+        from legged_torque.deploy.export import export_policy, nominal_cfg
     env, runner = task_registry.make_loaded(run, options, nominal_cfg(run.env_cfg))
     iterations = runner.current_learning_iteration
     out = args.out or run.folder / f"exported_{iterations}"

@@ -9,9 +9,8 @@ without_renderer()  # before anything imports mujoco
 from pathlib import Path
 
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.metrics import measure
 from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import check_at_least, check_output, run_script, write_json
+from legged_torque.utils.cli import check_at_least, check_output, importing, run_script, write_json
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.paths import without_machine
@@ -32,7 +31,9 @@ def main() -> None:
     args = parser.parse_args()
     check_at_least(args, 1, "steps")
     options = options_of(args)
-    run = task_registry.load_run(options)
+    with importing():
+        run = task_registry.load_run(options)
+        from legged_torque.envs.base.metrics import measure
     file = args.json or run.folder / "curve.json"
     check_output(file)
     env, _ = task_registry.make_env(args.task, options, run.env_cfg)

@@ -9,22 +9,9 @@ from legged_torque.utils.rendering import without_renderer
 end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
-import torch
-
-from legged_torque.checks.accuracy import (
-    KINDS,
-    TOLERANCE,
-    PhysicsState,
-    copy_state,
-    make_states,
-    measure_accuracy,
-    open_motors,
-    reference_step,
-)
 from legged_torque.envs import task_registry
-from legged_torque.sim.simulator import ENGINES, Simulator
 from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import check_at_least, run_script
+from legged_torque.utils.cli import check_at_least, importing, run_script
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.task_registry import set_seed
 
@@ -41,7 +28,21 @@ def main() -> None:
     args = parser.parse_args()
     check_at_least(args, 1, "steps", "worlds")
     options = options_of(args)
-    run = task_registry.load_run(options)
+    with importing():
+        run = task_registry.load_run(options)
+        import torch
+
+        from legged_torque.checks.accuracy import (
+            KINDS,
+            TOLERANCE,
+            PhysicsState,
+            copy_state,
+            make_states,
+            measure_accuracy,
+            open_motors,
+            reference_step,
+        )
+        from legged_torque.sim.simulator import ENGINES, Simulator
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options)
     policy = runner.get_inference_policy(env.device)

@@ -1,5 +1,7 @@
 """Watch a trained policy walk: ``python scripts/play.py --task=a1_torque_multihead``, live with ``--viewer web``."""
 
+from __future__ import annotations
+
 from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import choose_offscreen_renderer
 
@@ -11,21 +13,21 @@ import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from legged_torque import resource_path
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.envs.base.metrics import measure
-from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, check_at_least, check_output, run_script
+from legged_torque.utils.cli import Parser, check_at_least, check_output, importing, run_script
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.task_registry import set_seed
-from legged_torque.viewer import native
-from legged_torque.viewer.session import Session
-from legged_torque.viewer.video import TaskRecorder
+
+if TYPE_CHECKING:
+    from legged_torque.envs.base.legged_robot import LeggedRobot
+    from legged_torque.learning.runner import OnPolicyRunner
+    from legged_torque.viewer.session import Session
 
 NUM_ENVS = {"none": 16, "web": 4, "native": 1}  # default number of worlds, by viewer
 MAX_GRID = 25  # maximum number of tiles; more would be unreadable
@@ -54,7 +56,9 @@ def main() -> None:
     if args.video:
         check_output(args.video)
     options = options_of(args)
-    run = task_registry.load_run(options)
+    with importing():
+        run = task_registry.load_run(options)
+        from legged_torque.viewer.session import Session
     set_seed(args.seed)
     if args.viewer == "none":
         roll_out(args, *task_registry.make_loaded(run, options), run.checkpoint)
@@ -80,6 +84,8 @@ def choose_worlds(args: argparse.Namespace) -> None:
 def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
     """Return the function that shows a session of a robot's MJCF; a UserError if a package or a screen is missing."""
     if args.viewer == "native":
+        from legged_torque.viewer import native
+
         native.check_display("--viewer web")
         return native.watch
     try:
@@ -91,6 +97,9 @@ def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
 
 def roll_out(args: argparse.Namespace, env: LeggedRobot, runner: OnPolicyRunner, checkpoint: Path) -> None:
     """Roll out mean actions, print the metrics, save a video."""
+    from legged_torque.envs.base.metrics import measure
+    from legged_torque.viewer.video import TaskRecorder
+
     recorder = TaskRecorder(env, args.grid)
     metrics = measure(env, runner.get_inference_policy(env.device), args.steps, lambda commands: recorder.add_step())
     print(f"{checkpoint}, after {int(runner.logger.tot_timesteps):,} steps of training:")

@@ -12,12 +12,10 @@ end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 from legged_torque.envs import task_registry
-from legged_torque.learning.pretrained import make_pretrained, pretrained_file
 from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import check_output, run_script, write_json
+from legged_torque.utils.cli import check_output, importing, run_script, write_json
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.paths import without_machine
-from legged_torque.utils.progress import CompileProgress
 
 
 def main() -> None:
@@ -34,7 +32,10 @@ def main() -> None:
         if getattr(args, name) is not None:
             args.set.append(f"pretraining.{name}={getattr(args, name)}")
     options = options_of(args)
-    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+    with importing():
+        env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+        from legged_torque.learning.pretrained import make_pretrained, pretrained_file
+        from legged_torque.utils.progress import CompileProgress
     file, device = pretrained_file(options.task, train_cfg, options.log_root), resolve_device(options.device)
     if args.json:
         check_output(args.json)

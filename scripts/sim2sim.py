@@ -3,6 +3,8 @@
 Needs neither torch nor Warp.
 """
 
+from __future__ import annotations
+
 import sys
 
 from legged_torque.utils.interrupt import end_on_interrupt
@@ -13,28 +15,27 @@ NO_RENDERER = None if "--viewer" in sys.argv else choose_offscreen_renderer()  #
 
 import argparse
 import contextlib
+import importlib.metadata
 from pathlib import Path
-
-import mujoco
-import numpy as np
+from typing import TYPE_CHECKING
 
 from legged_torque import resource_path
-from legged_torque.deploy.policy import Policy
-from legged_torque.deploy.robot import MujocoRobot
-from legged_torque.deploy.simulation import Events, Simulation
 from legged_torque.utils.cli import (
     Parser,
     add_command_arg,
     check_at_least,
     check_output,
     finite,
+    importing,
     run_script,
     write_json,
 )
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.metrics import UNITS, Estimate, estimates, ratios
-from legged_torque.viewer.native import simulation_window
-from legged_torque.viewer.video import SimulationRecorder
+
+if TYPE_CHECKING:
+    from legged_torque.deploy.policy import Policy
+    from legged_torque.deploy.robot import MujocoRobot
+    from legged_torque.utils.metrics import Estimate
 
 
 def parse_args() -> argparse.Namespace:
@@ -71,6 +72,15 @@ def parse_args() -> argparse.Namespace:
 def main() -> None:
     """Load a policy and a robot, simulate, print the metrics, and write JSON and video if asked to."""
     args = parse_args()
+    with importing():
+        import numpy as np
+
+        from legged_torque.deploy.policy import Policy
+        from legged_torque.deploy.robot import MujocoRobot
+        from legged_torque.deploy.simulation import Events, Simulation
+        from legged_torque.utils.metrics import UNITS, estimates, ratios
+        from legged_torque.viewer.native import simulation_window
+        from legged_torque.viewer.video import SimulationRecorder
     policy = Policy(args.policy)
     xml = args.xml or resource_path(policy.description["robot"]["file"])
     robot = MujocoRobot(xml, policy.description)
@@ -101,7 +111,10 @@ def write_results(args: argparse.Namespace, policy: Policy, robot: MujocoRobot, 
     """Write arguments and results; null stands for what was not measured."""
     result = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
     result["task"], result["training"] = policy.description["task"], policy.description["training"]
-    result["notes"], result["versions"] = robot.notes, {"mujoco": mujoco.__version__, "numpy": np.__version__}
+    result["notes"], result["versions"] = (
+        robot.notes,
+        {name: importlib.metadata.version(name) for name in ("mujoco", "numpy")},
+    )
     result["metrics"] = {name: vars(estimate) for name, estimate in metrics.items()}
     write_json(args.json, result)
 

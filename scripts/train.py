@@ -3,6 +3,8 @@
 On several GPUs of a machine: ``torchrun --standalone --nproc_per_node=2 scripts/train.py --task=a1_torque_multihead``.
 """
 
+from __future__ import annotations
+
 from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
 
@@ -10,21 +12,21 @@ end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from legged_torque.envs import task_registry
-from legged_torque.learning.pretrained import find_pretrained, pretrained_file, start_from
-from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils import distributed
 from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of
-from legged_torque.utils.cli import check_output, run_script
+from legged_torque.utils.cli import check_output, importing, run_script
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.options import DEFAULT_PRESET, Options
-from legged_torque.utils.progress import CompileProgress
 from legged_torque.utils.runs import CONFIG_FILE, new_run_dir
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, set_seed
+
+if TYPE_CHECKING:
+    from legged_torque.learning.runner import OnPolicyRunner
 
 
 def main() -> None:
@@ -41,16 +43,20 @@ def main() -> None:
     if options.resume:
         if options.preset:
             raise UserError("--preset cannot be given with --resume, which keeps the settings of the run")
-        run = task_registry.load_run(options)
+        with importing():
+            run = task_registry.load_run(options)
         env_cfg, train_cfg = run.env_cfg, run.train_cfg
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
         options.max_iterations = options.max_iterations or run.config.get("max_iterations")
     elif options.load_run or options.checkpoint is not None:
         raise UserError("--load_run and --checkpoint need --resume")
     else:
-        env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+        with importing():
+            env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     folder = experiment_dir(train_cfg, options.log_root)
     check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)
+    with importing():
+        from legged_torque.utils.progress import CompileProgress
     set_seed(train_cfg.seed)
     with CompileProgress():
         train(options, env_cfg, train_cfg)
@@ -58,6 +64,8 @@ def main() -> None:
 
 def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
     """Build the task and train it, from a pre-trained policy if the task has one."""
+    from legged_torque.learning.pretrained import find_pretrained, pretrained_file, start_from
+
     is_first = distributed.rank() == 0
     pretrained = pretrained_file(options.task, train_cfg, options.log_root)
     starts_pretrained = bool(train_cfg.pretraining.function) and not options.resume and is_first

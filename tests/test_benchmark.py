@@ -72,9 +72,9 @@ def test_table(measured):
     output, result = measured
     lines = output.splitlines()
     assert max(map(len, lines)) <= 140
-    (head,) = (i for i, line in enumerate(lines) if line.lstrip().startswith("worlds"))
+    (head,) = (i for i, line in enumerate(lines) if line.startswith(" worlds | physics ms"))
     titles = [cell.strip() for cell in lines[head].split("|")]
-    rows = [line for line in lines[head:] if "|" in line][1:]
+    rows = [line for line in lines[head : lines.index("", head)] if "|" in line][1:]
     assert len(rows) == 2
     for line, row in zip(rows, result["rows"], strict=True):
         cells = dict(zip(titles, (cell.strip().replace(",", "") for cell in line.split("|")), strict=True))
@@ -82,6 +82,40 @@ def test_table(measured):
         assert cells["steps/s"] == f"{row['iteration_steps_per_s']:.0f}"
         assert cells["peak MiB"] == f"{row['peak_memory_mib']:.0f}"
         assert cells["start-up s"] == f"{row['startup_s']:.1f}"
+
+
+def test_shares_of_peaks(measured):
+    """The second table has a line for each size, with what follows from counts, times and peaks."""
+    output, result = measured
+    lines = output.splitlines()
+    (head,) = (i for i, line in enumerate(lines) if "update GFLOP/s" in line)
+    assert len(lines) == head + 3
+    for line, row in zip(lines[head + 1 :], result["rows"], strict=True):
+        share = row["update_flop"] / (row["update_ms"] / 1000) / (1e9 * row["peak_gflop_per_s"])
+        assert row["update_flop_share"] == pytest.approx(share)
+        cells = [cell.strip() for cell in line.split("|")]
+        assert cells[0] == str(row["num_envs"]) and cells[2] == f"{share:.1%}"
+
+
+def test_against_an_earlier_run(measured, tmp_path):
+    """Its numbers and the new ones stand beside each other with their ratios; a whole training is timed on demand."""
+    old = measured[1]
+    more = ["runner.total_steps=12", "evaluation.interval=6", "evaluation.num_samples=4"]
+    (tmp_path / "old.json").write_text(json.dumps(old | {"set": CHANGES + more, "device": "a mill"}))
+    words = [*SMALL, *(f"--set={change}" for change in more), "--num_envs=2", "--learn"]
+    files = ["--baseline=old.json", f"--json={tmp_path / 'new.json'}"]
+    status, output, error = run_here("benchmark.py", *words, *files, root=tmp_path)
+    assert (status, error) == (0, "")
+    assert "train.py, 12 steps: " in output
+    assert "tracking 70% was not reached" in output and "tracking 75% was not reached" in output
+    (new,) = json.loads((tmp_path / "new.json").read_text())["rows"]
+    assert 0 < new["learn"]["start_s"] < new["learn"]["total_s"]
+    notes, table = output.split("Against old.json\n")[1].split(" worlds | ")
+    assert "its device was 'a mill', is 'CPU" in notes
+    lines = [[cell.strip() for cell in line.split("|")] for line in table.splitlines()[1:]]
+    assert [cells[1] for cells in lines][:3] == ["physics ms", "step ms", "rollout ms"] and len(lines) == 8
+    ratios = {cells[1]: float(cells[4]) for cells in lines}
+    assert ratios["update ms"] == pytest.approx(new["update_ms"] / old["rows"][0]["update_ms"], abs=1e-3)
 
 
 def test_endurance(measured):
@@ -116,7 +150,8 @@ def test_profile_option(tmp_path):
     assert len(gzip.decompress(file.read_bytes())) > 1000 and str(file) in output
     lines = output.splitlines()
     (head,) = (i for i, line in enumerate(lines) if line.split() == ["calls", "total", "ms", "name"])
-    assert len(lines) - head - 1 == benchmark.TOP_KERNELS and any(" aten::" in line for line in lines[head:])
+    kernels = lines[head + 1 : lines.index("", head)]
+    assert len(kernels) == benchmark.TOP_KERNELS and any(" aten::" in line for line in kernels)
 
 
 def test_most_expensive_on_a_gpu():
@@ -243,6 +278,7 @@ def test_memory_of_a_gpu(monkeypatch):
         ("--preset=papr", "unknown preset 'papr'; did you mean 'paper'?"),
         ("--set=sim.solver_iteration=3", "did you mean 'sim.solver_iterations'?"),
         ("--set=runner.num_step_per_env=12", "did you mean 'runner.num_steps_per_env'?"),
+        ("--learn --set=evaluation.interval=0", "needs evaluations during training: evaluation.interval is 0, of 110"),
         ("--num_envs 2 4 --profile=trace.json", "--profile writes one trace: give one number of worlds"),
     ],
 )

@@ -255,6 +255,46 @@ def test_help(script, tmp_path):
     assert "--task" in output and "--num_envs" in output and "--device" in output
 
 
+@pytest.mark.parametrize("script", sorted(path.name for path in (ROOT / "scripts").glob("[!_]*.py")))
+def test_help_needs_nothing_heavy(script, tmp_path):
+    """``--help`` of every script comes before anything is imported that takes seconds."""
+    assert_light(script, "--help", root=tmp_path)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--list",
+        "--task=a1_positon",
+        "--num_env=3",
+        "--num_envs=few",
+        "--num_envs=0",
+        "--set=control.stifness=1",
+        "--set=sim.dt=0",
+        "--set=algorithm.learning_rate=1",
+        "--set=runner.class_name=Other",
+        "--resume --load_run=2026",
+    ],
+)
+def test_answers_need_nothing_heavy(words, tmp_path):
+    """Nor do lists and mistakes that the settings show."""
+    assert_light("train.py", *words.split(), root=tmp_path)
+
+
+def assert_light(script, *words, root):
+    """A script answers without any of the packages that take long to import."""
+    code = "import runpy, sys; path, *sys.argv = sys.argv[1:]\ntry: runpy.run_path(path, run_name='__main__')\n"
+    code += "finally: print('modules:', *sys.modules)"
+    command = [sys.executable, "-c", code, str(ROOT / "scripts" / script), script, *words]
+    done = subprocess.run(
+        command, cwd=root, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    assert done.returncode == (0 if words[0] in ("--help", "--list") else 2), done.stderr
+    imported = done.stdout.rpartition("modules: ")[2].split()
+    assert "legged_torque.utils.cli" in imported
+    assert not {"torch", "warp", "mujoco", "mujoco_warp", "rsl_rl", "tensordict", "matplotlib"} & set(imported)
+
+
 def test_run_folder(root):
     """A run leaves its checkpoints, events and settings, in a folder named by its time and name."""
     (run,) = (root / "logs" / "a1_position").glob("*_good")

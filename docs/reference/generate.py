@@ -17,7 +17,7 @@ from types import ModuleType
 os.environ["MUJOCO_GL"] = "disable"
 
 from legged_torque import SCRIPTS_DIR
-from legged_torque.envs.approaches import multi_head, torque, torque_curriculum, torque_gravity
+from legged_torque.envs.approaches import multi_head_config, torque_config, torque_curriculum_config, torque_gravity
 from legged_torque.envs.base import legged_robot_config
 from legged_torque.envs.robots import a1
 from legged_torque.utils.limits import describe, types_of
@@ -29,12 +29,12 @@ CONFIGS = (
     (legged_robot_config, "LeggedRobotCfgPPO"),
     (a1, "A1Cfg"),
     (a1, "A1CfgPPO"),
-    (torque, "TorqueCfgPPO"),
-    (torque_curriculum, "TorqueCurriculumCfg"),
+    (torque_config, "TorqueCfgPPO"),
+    (torque_curriculum_config, "TorqueCurriculumCfg"),
     (torque_gravity, "TorqueGravityCfgPPO"),
-    (multi_head, "TorqueMultiHeadCfg"),
-    (multi_head, "MultiHeadCfg"),
-    (multi_head, "MultiHeadCfgPPO"),
+    (multi_head_config, "TorqueMultiHeadCfg"),
+    (multi_head_config, "MultiHeadCfg"),
+    (multi_head_config, "MultiHeadCfgPPO"),
 )
 """Config classes in the order of the page."""
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import os
+import pkgutil
 import runpy
 import shutil
 import sys
@@ -10,9 +13,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from unittest.mock import patch
 
-import torch
 import yaml
 
+import legged_torque
 from legged_torque import RESOURCES_DIR, SCRIPTS_DIR
 from legged_torque.checks.attack import ACCEPTED, Case, attack
 from legged_torque.envs import task_registry
@@ -62,7 +65,7 @@ class _StopError(Exception):
 
 
 def parsers() -> Iterator[tuple[str, Parser]]:
-    """Import every script with all that it needs, and yield its name and its parser with all options."""
+    """Yield the name of every script and its parser with all options."""
     for script in WORDS:
         found: list[Parser] = []
 
@@ -79,7 +82,12 @@ def parsers() -> Iterator[tuple[str, Parser]]:
 
 
 def warm_up() -> None:
-    """Build a task and step it, so that its kernels are loaded before this process is forked."""
+    """Import what scripts import, build a task and step it, so that all is loaded before this process is forked."""
+    for module in pkgutil.walk_packages(legged_torque.__path__, "legged_torque."):
+        with contextlib.suppress(ImportError):  # of an extra that is not installed
+            importlib.import_module(module.name)
+    import torch
+
     task, _ = task_registry.make_env("a1_position", Options(task="a1_position", num_envs=2, device="cpu"))
     with torch.no_grad():
         task.step(torch.zeros(2, task.num_actions))

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from legged_torque.checks import roofline
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning.runner import OnPolicyRunner
@@ -30,7 +31,6 @@ WARM_UP = 2  # iterations before timing begins: the first one compiles, the seco
 TRACED = 2  # iterations in a trace
 PHYSICS_STEPS = 5
 """Control steps of physics timed in a row: enough to hide the cost of the reset before them, and no robot falls yet."""
-GPU_CALLS = 20  # calls per timing on a GPU, where a single one is short; on the CPU one call is timed
 ACTION_SCALE = 0.5  # standard deviation of the random actions while env.step is timed
 TOP_KERNELS = 10  # kernels listed from a trace
 _MIB = 2**20
@@ -120,6 +120,7 @@ def measure(
         row = summarize(times, physics, step, task.num_envs, train_cfg.runner.num_steps_per_env) | peak
         row |= zip(("build_s", "log_s", "first_iteration_s", "capture_s"), np.diff(marks).tolist(), strict=True)
         row |= {"startup_s": marks[-1] - marks[0], "compiled_modules": compilation.modules}
+        row |= roofline.work(runner.alg, task.sim, env_cfg.control.decimation)
         if endurance:
             row["endurance"] = measure_endurance(runner, endurance, memory)
         if trace:
@@ -175,7 +176,6 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
     actions = ACTION_SCALE * torch.randn(task.num_envs, task.num_actions, device=task.device)
     state = (task.sim.qpos, task.sim.qvel, task.sim.qacc_warmstart)
     kept = [tensor.clone() for tensor in state]
-    calls = GPU_CALLS if torch.device(task.device).type == "cuda" else 1
 
     def physics() -> None:
         for tensor, values in zip(state, kept, strict=True):
@@ -185,12 +185,7 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
             task.sim.step(sense=(i + 1) % decimation == 0)
 
     def milliseconds(function: Callable[[], object]) -> float:
-        wp.synchronize_device(task.device)
-        start = time.perf_counter()
-        for _ in range(calls):
-            function()
-        wp.synchronize_device(task.device)
-        return _MS * (time.perf_counter() - start) / calls
+        return _MS * roofline.seconds_per_call(function, task.device)
 
     graph = CudaGraph(physics, task.device)
     for _ in range(WARM_UP):

@@ -1,13 +1,11 @@
-"""All tasks, and what a variant builds on."""
+"""All tasks, and what a variant builds on; what needs torch is imported when it is first asked for."""
 
-from legged_torque.envs.approaches.multi_head import MultiHeadRobot as MultiHeadRobot
-from legged_torque.envs.approaches.torque import TorqueRobot as TorqueRobot
-from legged_torque.envs.approaches.torque_curriculum import TorqueCurriculumRobot as TorqueCurriculumRobot
-from legged_torque.envs.base.legged_robot import LeggedRobot as LeggedRobot
+import pkgutil
+from typing import TYPE_CHECKING, Any
+
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg as LeggedRobotCfg
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfgPPO as LeggedRobotCfgPPO
 from legged_torque.envs.base.legged_robot_config import LinearChange as LinearChange
-from legged_torque.envs.base.observations import ObservationTerm as ObservationTerm
 from legged_torque.envs.robots.a1 import A1Cfg as A1Cfg
 from legged_torque.envs.robots.a1 import A1CfgPPO as A1CfgPPO
 from legged_torque.envs.tasks import A1MultiHeadCfg as A1MultiHeadCfg
@@ -20,3 +18,26 @@ from legged_torque.envs.tasks import A1TorqueGravityCfgPPO as A1TorqueGravityCfg
 from legged_torque.envs.tasks import A1TorqueMultiHeadCfg as A1TorqueMultiHeadCfg
 from legged_torque.utils.config import Section as Section
 from legged_torque.utils.task_registry import task_registry as task_registry
+
+if TYPE_CHECKING:
+    from legged_torque.envs.approaches.multi_head import MultiHeadRobot as MultiHeadRobot
+    from legged_torque.envs.approaches.torque import TorqueRobot as TorqueRobot
+    from legged_torque.envs.approaches.torque_curriculum import TorqueCurriculumRobot as TorqueCurriculumRobot
+    from legged_torque.envs.base.legged_robot import LeggedRobot as LeggedRobot
+    from legged_torque.envs.base.observations import ObservationTerm as ObservationTerm
+
+_LATER = {
+    "MultiHeadRobot": "legged_torque.envs.approaches.multi_head:MultiHeadRobot",
+    "TorqueRobot": "legged_torque.envs.approaches.torque:TorqueRobot",
+    "TorqueCurriculumRobot": "legged_torque.envs.approaches.torque_curriculum:TorqueCurriculumRobot",
+    "LeggedRobot": "legged_torque.envs.base.legged_robot:LeggedRobot",
+    "ObservationTerm": "legged_torque.envs.base.observations:ObservationTerm",
+}
+"""Where classes are that need torch, by name."""
+
+
+def __getattr__(name: str) -> Any:
+    """Return a class of :data:`_LATER`: Python calls this for names that the module does not have (PEP 562)."""
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return pkgutil.resolve_name(_LATER[name])

@@ -1,9 +1,14 @@
-"""Every task by name: robot x approach x ground, by listing their settings as bases, the approach first."""
+"""Every task by name: robot x approach x ground, by listing their settings as bases, the approach first.
+
+Task classes are named, not imported, so that a command line is answered before torch is there.
+"""
 
 from __future__ import annotations
 
-from legged_torque.envs.approaches import multi_head, torque, torque_curriculum, torque_gravity
-from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.approaches import multi_head_config as multi_head
+from legged_torque.envs.approaches import torque_config as torque
+from legged_torque.envs.approaches import torque_curriculum_config as torque_curriculum
+from legged_torque.envs.approaches import torque_gravity
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.utils.task_registry import task_registry
 
@@ -40,12 +45,17 @@ class A1MultiHeadCfgPPO(multi_head.MultiHeadCfgPPO, A1CfgPPO):
     """Training of both."""
 
 
+_ROBOT = "legged_torque.envs.base.legged_robot:LeggedRobot"
+_TORQUE = "legged_torque.envs.approaches.torque:TorqueRobot"
+_CURRICULUM = "legged_torque.envs.approaches.torque_curriculum:TorqueCurriculumRobot"
+_MULTI_HEAD = "legged_torque.envs.approaches.multi_head:MultiHeadRobot"
+
 for name, robot, env_cfg, train_cfg in (
-    ("a1_position", LeggedRobot, A1Cfg, A1CfgPPO),
-    ("a1_torque", torque.TorqueRobot, A1TorqueCfg, A1TorqueCfgPPO),
-    ("a1_torque_gravity", torque.TorqueRobot, A1TorqueCfg, A1TorqueGravityCfgPPO),
-    ("a1_torque_curriculum", torque_curriculum.TorqueCurriculumRobot, A1TorqueCurriculumCfg, A1TorqueCurriculumCfgPPO),
-    ("a1_torque_multihead", multi_head.MultiHeadRobot, A1TorqueMultiHeadCfg, A1MultiHeadCfgPPO),
-    ("a1_multihead", multi_head.MultiHeadRobot, A1MultiHeadCfg, A1MultiHeadCfgPPO),
+    ("a1_position", _ROBOT, A1Cfg, A1CfgPPO),
+    ("a1_torque", _TORQUE, A1TorqueCfg, A1TorqueCfgPPO),
+    ("a1_torque_gravity", _TORQUE, A1TorqueCfg, A1TorqueGravityCfgPPO),
+    ("a1_torque_curriculum", _CURRICULUM, A1TorqueCurriculumCfg, A1TorqueCurriculumCfgPPO),
+    ("a1_torque_multihead", _MULTI_HEAD, A1TorqueMultiHeadCfg, A1MultiHeadCfgPPO),
+    ("a1_multihead", _MULTI_HEAD, A1MultiHeadCfg, A1MultiHeadCfgPPO),
 ):
     task_registry.register(name, robot, env_cfg(), train_cfg())

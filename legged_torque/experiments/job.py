@@ -17,8 +17,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO
 
-import torch
-
 from legged_torque.experiments.matrix import Cell, CellState
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
@@ -119,6 +117,8 @@ def try_lock(file: Path) -> BinaryIO | None:
 
 def find_workers(device: str, jobs: int | None) -> list[Worker]:
     """Return the workers: one per GPU ("auto": all GPUs if any), or ``jobs`` on the CPU; UserError if not possible."""
+    import torch
+
     first = resolve_device(device)  # does not create a CUDA context
     if jobs is not None and jobs < 1:
         raise UserError(f"--jobs must be at least 1, not {jobs}")

@@ -11,7 +11,6 @@ from typing import Any
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
@@ -113,6 +112,8 @@ class CellState:
 
 def read_matrix(file: Path) -> Matrix:
     """Read a matrix, and check what train.py and evaluate.py would check only hours later; UserError if it is wrong."""
+    from legged_torque.envs.base.asset import load_asset
+
     matrix = read_plan(file)
     for key, source in CELL_SETTINGS.items():
         if key in matrix.train:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import gc
 import json
 import math
 import os
-import signal
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
 from legged_torque.utils.errors import TrainingError, UserError, is_out_of_memory, unknown_name
+from legged_torque.utils.interrupt import end_on_interrupt, raise_on_interrupt
 
 MAX_NAME = 255  # bytes of the name of a file, on the usual systems
 
@@ -45,18 +46,33 @@ class Parser(argparse.ArgumentParser):
         return namespace
 
 
+@contextlib.contextmanager
+def importing() -> Iterator[None]:
+    """Import inside what takes seconds, torch and Warp, after all that can be told without it.
+
+    Ctrl-C ends the process without a traceback. The garbage collector rests, and what has been imported stays out of
+    its sight: searching that took a third of the time, and would take a second or two at the end.
+    """
+    end_on_interrupt()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
+        raise_on_interrupt()
+    if "mujoco" in sys.modules:  # which would write its warnings to a file in the current folder
+        sys.modules["mujoco"].set_mju_user_warning(lambda text: print(f"MuJoCo: {text}", file=sys.stderr))
+
+
 def run_script(main: Callable[[], None]) -> None:
     """Run a script's main function; expected errors exit without a traceback.
 
     Exit status 2 for a user's mistake, a file that cannot be used or too little memory, 130 for Ctrl-C, 1 for a
     training that cannot learn or an output that nobody reads any more (``| head``).
     """
-    gc.freeze()  # what has been imported stays: searching it for garbage at the end would take a second or two
-    if "mujoco" in sys.modules:  # which would write its warnings to a file in the current folder
-        sys.modules["mujoco"].set_mju_user_warning(lambda text: print(f"MuJoCo: {text}", file=sys.stderr))
     try:
-        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # see end_on_interrupt
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        raise_on_interrupt()
         main()
     except UserError as error:
         print("error:", " ".join(str(error).splitlines()), file=sys.stderr)

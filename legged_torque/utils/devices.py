@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 
-import torch
-
 from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
 
@@ -15,6 +13,8 @@ def resolve_device(device: str | None) -> str:
 
     Processes that train together take a GPU each; a UserError if there is no such device, or not one for each.
     """
+    import torch  # not above: scripts read their command lines without it
+
     num_gpus = torch.cuda.device_count()
     available = ["cpu", *(f"cuda:{i}" for i in range(num_gpus))]
     if device in (None, "auto"):
@@ -35,6 +35,8 @@ def resolve_device(device: str | None) -> str:
 
 def device_name(device: str) -> str:
     """Return what the machine calls the device."""
+    import torch
+
     if torch.device(device).type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"CPU, {torch.get_num_threads()} threads"

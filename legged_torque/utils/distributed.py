@@ -1,14 +1,17 @@
-"""Several processes that train one policy, each on a GPU of its own, started by torchrun."""
+"""Several processes that train one policy, each on a GPU of its own, started by torchrun.
+
+How many there are is known without torch: scripts read their command lines before they import it.
+"""
 
 from __future__ import annotations
 
 import os
-from typing import Any
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from legged_torque.utils.errors import UserError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def world_size() -> int:
@@ -41,6 +44,8 @@ def _variable(name: str, lowest: int) -> int:
 
 def join(device: str) -> None:
     """Meet the other processes, unless that has happened already, to exchange tensors on a device ("cpu", "cuda:N")."""
+    import torch
+
     if torch.distributed.is_initialized():
         return
     try:
@@ -51,6 +56,8 @@ def join(device: str) -> None:
 
 def average(tensors: list[Tensor]) -> None:
     """Replace tensors by their means over all processes, in one exchange; can be captured in a CUDA graph."""
+    import torch
+
     flat = torch.cat([tensor.flatten() for tensor in tensors])
     torch.distributed.all_reduce(flat)
     flat /= torch.distributed.get_world_size()
@@ -60,6 +67,8 @@ def average(tensors: list[Tensor]) -> None:
 
 def any_process(condition: bool, device: str) -> bool:
     """Return whether a condition holds in any process, and wait for all of them; a single process asks nobody."""
+    import torch
+
     if not torch.distributed.is_initialized():
         return condition
     flag = torch.tensor(float(condition), device=device)
@@ -69,6 +78,8 @@ def any_process(condition: bool, device: str) -> bool:
 
 def gather(value: Any) -> list[Any]:
     """Return the values of all processes, in their order; a single process asks nobody."""
+    import torch
+
     if not torch.distributed.is_initialized():
         return [value]
     values: list[Any] = [None] * torch.distributed.get_world_size()

@@ -60,6 +60,12 @@ def leave_terminal() -> None:
 
 
 def end_on_interrupt() -> None:
-    """Let Ctrl-C end the process without a traceback, while a script imports; ``run_script`` takes over from there."""
+    """Let Ctrl-C end the process without a traceback, while a script imports: see :func:`raise_on_interrupt`."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def raise_on_interrupt() -> None:
+    """Let Ctrl-C raise KeyboardInterrupt again, from where there is something to leave in order."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

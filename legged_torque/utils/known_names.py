@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from rsl_rl.utils import resolve_callable
-
 from legged_torque.utils.config import BaseConfig, flat, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 
@@ -29,6 +27,13 @@ def check_names(train_cfg: BaseConfig, registered: Iterable[Any]) -> None:
         if name not in known.get(path, []):
             error = unknown_name(path, str(name), {str(other) for other in known.get(path, []) if other})
             raise UserError(f"{error}; these are the names that registered tasks have, register a task to add one")
+
+
+def import_names(train_cfg: BaseConfig) -> None:
+    """Import what training settings name; a UserError says what cannot be."""
+    from rsl_rl.utils import resolve_callable  # takes seconds: first :func:`check_names` tells mistakes without it
+
+    for path, name in named(to_dict(train_cfg)):
         try:
             if name:
                 resolve_callable(name)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from legged_torque.utils.config import BaseConfig, section_keys, set_by_path, update_from_dict
-from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import Count, Number, Worlds, check_value, types_of
 
@@ -54,17 +53,20 @@ class Options:
     max_iterations: Count | None = _option("iterations in all; default: 110e6 environment steps", type=int)
 
 
-def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: dict[str, Any] | None = None) -> None:
+def apply_options(
+    env_cfg: Any, train_cfg: Any, options: Options, run_config: dict[str, Any] | None = None, on_cpu: bool = False
+) -> None:
     """Change settings as the options ask; what is more explicit wins.
 
-    In this order: the preset, the number of worlds that suits the device, the settings of a loaded run ("env" and
-    "train" of ``run_config``), the perturbation, the ranges, single options, ``set``. One without sense is a UserError.
+    In this order: the preset, the number of worlds that suits the device, ``on_cpu`` or a GPU, the settings of a loaded
+    run ("env" and "train" of ``run_config``), the perturbation, the ranges, single options, ``set``. One without sense
+    is a UserError. Which device there is, :func:`~legged_torque.utils.devices.resolve_device` tells.
     """
     for name, hint in types_of(Options).items():
         if isinstance(getattr(options, name), int):
             check_value(f"--{name}", getattr(options, name), hint)
     apply_preset(env_cfg, train_cfg, options.preset or DEFAULT_PRESET)
-    if resolve_device(options.device) == "cpu":
+    if on_cpu:
         env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
     if run_config:
         update_from_dict(env_cfg, env_cfg.of_older_runs())

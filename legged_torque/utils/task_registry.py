@@ -8,21 +8,17 @@ import importlib.util
 import io
 import math
 import os
+import pkgutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import torch
-from rsl_rl.env import VecEnv
-from rsl_rl.runners import OnPolicyRunner
-from rsl_rl.utils import resolve_callable
+from typing import TYPE_CHECKING, Any
 
 from legged_torque.utils import distributed
 from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.files import remove_stale_parts
-from legged_torque.utils.known_names import check_names
+from legged_torque.utils.known_names import check_names, import_names
 from legged_torque.utils.limits import check_section
 from legged_torque.utils.options import Options, apply_options
 from legged_torque.utils.runs import (
@@ -34,6 +30,10 @@ from legged_torque.utils.runs import (
     new_run_dir,
 )
 from legged_torque.utils.train_validation import check_train_cfg
+
+if TYPE_CHECKING:
+    from rsl_rl.env import VecEnv
+    from rsl_rl.runners import OnPolicyRunner
 
 
 @dataclass
@@ -57,10 +57,13 @@ class TaskRegistry:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._tasks: dict[str, tuple[type[VecEnv], Any, Any]] = {}
+        self._tasks: dict[str, tuple[type[VecEnv] | str, Any, Any]] = {}
 
-    def register(self, name: str, task_class: type[VecEnv], env_cfg: BaseConfig, train_cfg: BaseConfig) -> None:
-        """Make a task known that is created as ``task_class(env_cfg, device)``."""
+    def register(self, name: str, task_class: type[VecEnv] | str, env_cfg: BaseConfig, train_cfg: BaseConfig) -> None:
+        """Make a task known that is created as ``task_class(env_cfg, device)``.
+
+        The class may be named instead, ``"module:Class"``: it is imported when the task is built.
+        """
         self._tasks[name] = (task_class, env_cfg, train_cfg)
 
     def names(self) -> list[str]:
@@ -69,19 +72,24 @@ class TaskRegistry:
 
     def get_task_class(self, name: str) -> type[VecEnv]:
         """Return the class of a task; an unknown name is a UserError."""
-        return self._get(name)[0]
+        task_class = self._get(name)[0]
+        return pkgutil.resolve_name(task_class) if isinstance(task_class, str) else task_class
 
     def get_cfgs(
         self, name: str, args: Options | None = None, run_config: dict[str, Any] | None = None
     ) -> tuple[Any, Any]:
         """Return copies of the settings of a task and its training, or of a loaded run's, as ``args`` change them."""
-        env_cfg, train_cfg = (copy.deepcopy(cfg) for cfg in self._get(name)[1:])
-        train_cfg.runner.experiment_name = train_cfg.runner.experiment_name or name
-        if args is not None:
-            apply_options(env_cfg, train_cfg, args, run_config)
-            check_names(train_cfg, [registered for _, _, registered in self._tasks.values()])
+        if args is None:
+            return self._copies(name)
+        of_device = {}
+        for on_cpu in (True, False):  # mistakes are told before torch is imported, which knows the devices
+            env_cfg, train_cfg = of_device[on_cpu] = self._copies(name)
+            apply_options(env_cfg, train_cfg, args, run_config, on_cpu)
             check_section(env_cfg)
+            check_names(train_cfg, [registered for _, _, registered in self._tasks.values()])
             check_train_cfg(train_cfg)
+        env_cfg, train_cfg = of_device[resolve_device(args.device) == "cpu"]
+        import_names(train_cfg)
         return env_cfg, train_cfg
 
     def make_env(self, name: str, args: Options | None = None, env_cfg: Any | None = None) -> tuple[VecEnv, Any]:
@@ -120,6 +128,8 @@ class TaskRegistry:
         if root and train_cfg.runner.logger == "wandb" and importlib.util.find_spec("wandb") is None:
             raise UserError("--logger wandb needs the extra: pip install -e .[wandb]")
         log_dir = str(new_run_dir(root, train_cfg.runner.run_name)) if root else None
+        from rsl_rl.utils import resolve_callable
+
         runner_class = resolve_callable(train_cfg.runner.class_name)
         os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"  # checkpoints run no code, whoever's runner loads them
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints its networks at length
@@ -157,7 +167,13 @@ class TaskRegistry:
         runner.load(str(run.checkpoint))
         return env, runner
 
-    def _get(self, name: str) -> tuple[type[VecEnv], Any, Any]:
+    def _copies(self, name: str) -> tuple[Any, Any]:
+        """Return copies of the settings of a task and of its training."""
+        env_cfg, train_cfg = (copy.deepcopy(cfg) for cfg in self._get(name)[1:])
+        train_cfg.runner.experiment_name = train_cfg.runner.experiment_name or name
+        return env_cfg, train_cfg
+
+    def _get(self, name: str) -> tuple[type[VecEnv] | str, Any, Any]:
         """Return what was registered under a name."""
         if name not in self._tasks:
             raise unknown_name("task", name, self._tasks)
@@ -197,6 +213,8 @@ def to_rsl_rl(train_cfg: Any) -> dict[str, Any]:
 
 def set_seed(seed: int) -> None:
     """Seed every random number that a training draws; each process has random numbers of its own."""
+    import torch
+
     torch.manual_seed(seed + distributed.rank())
 
 

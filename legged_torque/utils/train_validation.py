@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rsl_rl.utils import resolve_nn_activation
-
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import check_section
 
@@ -26,6 +24,8 @@ def check_train_cfg(train_cfg: Any) -> None:
         value = getattr(train_cfg.runner, key)
         if value and (Path(value).name != value or value == ".." or not value.isprintable()):
             raise UserError(f"runner.{key} must be a name, not the path '{value}'")
+    from rsl_rl.utils import resolve_nn_activation  # takes seconds: all else is told before
+
     for network in ("actor", "critic"):
         try:
             resolve_nn_activation(getattr(train_cfg, network).activation)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import warp as wp
 from torch import Tensor
 
+from legged_torque.envs.approaches.multi_head_config import MultiHeadCfg as MultiHeadCfg
+from legged_torque.envs.approaches.multi_head_config import MultiHeadCfgPPO as MultiHeadCfgPPO
+from legged_torque.envs.approaches.multi_head_config import TorqueMultiHeadCfg as TorqueMultiHeadCfg
 from legged_torque.envs.base.actions import ActionTerm, position_residual, torque
 from legged_torque.envs.base.control_laws import PdControl, pd_torque, pd_torques
 from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO, LinearChange
 from legged_torque.motors.drive import in_kernel
-from legged_torque.utils.config import Section
-from legged_torque.utils.limits import Count, Sizes
 
 
 @wp.struct
@@ -70,37 +70,3 @@ class MultiHeadRobot(LeggedRobot):
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the mixing weights too."""
         return super().curriculum_values() | {"mixing_pd": self.mixing[0], "mixing_torque": self.mixing[1]}
-
-
-class TorqueMultiHeadCfg(LeggedRobotCfg):
-    """Settings of multi-head control whose PD part fades to 0."""
-
-    class control:
-        class mixing(Section):
-            update_interval: Count = 64_000  # [total steps]; weights change between rollouts only
-
-            class pd(LinearChange):
-                start, end = 1.0, 0.0
-                t_start, t_end = 0, 50_000_000
-
-            class torque(LinearChange):
-                start, end = 1.0, 1.0
-                t_start, t_end = 0, 50_000_000
-
-
-class MultiHeadCfg(TorqueMultiHeadCfg):
-    """Settings of multi-head control whose PD part fades to 0.1."""
-
-    class control:
-        class mixing:
-            class pd:
-                end = 0.1
-
-
-class MultiHeadCfgPPO(LeggedRobotCfgPPO):
-    """Training of multi-head control."""
-
-    class actor:
-        class_name = "legged_torque.learning.multi_head:MultiHeadModel"  # Figure 2
-        hidden_dims = [512, 256]  # shared by both heads
-        head_hidden_dims: Sizes = [128]  # of either head

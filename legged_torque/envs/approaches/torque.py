@@ -5,9 +5,10 @@ from __future__ import annotations
 import warp as wp
 from torch import Tensor
 
+from legged_torque.envs.approaches.torque_config import TorqueCfg as TorqueCfg
+from legged_torque.envs.approaches.torque_config import TorqueCfgPPO as TorqueCfgPPO
 from legged_torque.envs.base.actions import ActionTerm, torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 from legged_torque.motors.drive import in_kernel
 
 
@@ -37,14 +38,3 @@ class TorqueRobot(LeggedRobot):
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """tau = torque_scale a [N m]. Shapes: (num_envs, num_dof)."""
         return self.torque_scale * actions
-
-
-class TorqueCfg(LeggedRobotCfg):
-    """Settings of torque control: those of the robot."""
-
-
-class TorqueCfgPPO(LeggedRobotCfgPPO):
-    """Training of torque control."""
-
-    class algorithm:
-        max_learning_rate = 2e-3  # with near-zero rewards the adaptive rate climbs until the critic diverges

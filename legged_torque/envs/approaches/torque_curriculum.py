@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from legged_torque.envs.approaches.torque import TorqueCfg, TorqueCfgPPO, TorqueRobot
-from legged_torque.envs.base.legged_robot_config import LinearChange
-from legged_torque.utils.limits import Positive
+from legged_torque.envs.approaches.torque import TorqueRobot
+from legged_torque.envs.approaches.torque_curriculum_config import TorqueCurriculumCfg as TorqueCurriculumCfg
+from legged_torque.envs.approaches.torque_curriculum_config import TorqueCurriculumCfgPPO as TorqueCurriculumCfgPPO
 
 
 class TorqueCurriculumRobot(TorqueRobot):
@@ -19,28 +19,3 @@ class TorqueCurriculumRobot(TorqueRobot):
         """exp(-gamma |q - q_nominal|^2), joint angles [rad]. Shape: (num_envs,)."""
         error = (self.dof_pos - self.default_dof_pos).square().sum(dim=1)
         return torch.exp(-self.cfg.rewards.nominal_position_temperature * error)
-
-
-class TorqueCurriculumCfg(TorqueCfg):
-    """Settings of the torque curriculum: the reward for the pose fades, then tracking takes over."""
-
-    class rewards:
-        nominal_position_temperature: Positive = 0.5  # gamma of the term
-
-        class scales:
-            nominal_position: float = 1.0  # standing in the nominal pose
-
-        class curriculum:
-            class nominal_position(LinearChange):
-                start, end = 20.0, 1.0
-                t_start, t_end = 0, 5_000_000
-
-            class tracking_lin_vel:
-                t_start, t_end = 3_000_000, 13_000_000
-
-            class tracking_ang_vel:
-                t_start, t_end = 3_000_000, 13_000_000
-
-
-class TorqueCurriculumCfgPPO(TorqueCfgPPO):
-    """Training of the torque curriculum: that of torque control."""

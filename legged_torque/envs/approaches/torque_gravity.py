@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from legged_torque.envs.approaches.torque import TorqueCfgPPO
+from legged_torque.envs.approaches.torque_config import TorqueCfgPPO
 from legged_torque.utils.config import Section
 from legged_torque.utils.limits import Count, Fraction, NotNegative, Number, Positive, Share
 

@@ -24,6 +24,7 @@ from legged_torque.sim.fused.tables import Tables, Worlds, make_tables
 from legged_torque.sim.fused.tree import read_tree
 from legged_torque.sim.fused.trunk import TrunkMotion, solve_trunk, trunk_residual, trunk_slopes, whole_body
 from legged_torque.sim.fused.types import branch_types, vec4
+from legged_torque.sim.parallel import launch_worlds
 
 BLOCK_DIM = 128  # threads per block: of 32, 64 and 128 the fastest in many worlds, in 4096 within 3% of it
 WARP = 32  # threads that run together
@@ -87,7 +88,7 @@ class FusedStep:
         """Run the kernel for some steps, the last of which may sense."""
         inputs = [*self._model, steps, sense, reads, *self._data, *self._scratch]
         kernel = make_kernel(*self._kernel_for, law)
-        wp.launch(kernel, self._dim, inputs, block_dim=BLOCK_DIM, device=self._device)
+        launch_worlds(kernel, self._dim, inputs, self._device, BLOCK_DIM)
 
 
 @functools.cache
@@ -99,6 +100,7 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def fused_step(
+        first_world: int,
         # Model:
         tables: Tables,
         iterations: int,
@@ -126,7 +128,8 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
         changes: wp.array(dtype=vec4),
         kept: wp.array(dtype=Branch),
     ):
-        world, lane = wp.tid()
+        place, lane = wp.tid()
+        world = first_world + place
         if lane >= wp.static(lanes):
             return
         worlds = Worlds(ctrl, qpos, qvel, qacc_warmstart, sensordata, xfrc_applied, qfrc_applied)

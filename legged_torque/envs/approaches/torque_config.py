@@ -1,0 +1,16 @@
+"""Settings of torque control, see :mod:`~legged_torque.envs.approaches.torque`."""
+
+from __future__ import annotations
+
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+
+
+class TorqueCfg(LeggedRobotCfg):
+    """Settings of torque control: those of the robot."""
+
+
+class TorqueCfgPPO(LeggedRobotCfgPPO):
+    """Training of torque control."""
+
+    class algorithm:
+        max_learning_rate = 2e-3  # with near-zero rewards the adaptive rate climbs until the critic diverges

@@ -1,0 +1,121 @@
+"""FLOP and bytes of update and physics: as PyTorch counts them, and as counted by hand."""
+
+import pytest
+from torch.utils.flop_counter import FlopCounterMode
+
+from legged_torque.checks import roofline
+from legged_torque.checks.roofline import Peaks
+from legged_torque.envs import task_registry
+from legged_torque.utils.config import set_by_path
+from legged_torque.utils.options import Options
+
+SMALL = {
+    "runner.num_steps_per_env": 3,
+    "runner.capture": False,
+    "algorithm.num_learning_epochs": 2,
+    "algorithm.num_mini_batches": 2,
+    "actor.hidden_dims": [8, 6],
+    "critic.hidden_dims": [7, 5],
+}
+
+
+def make_runner(tmp_path, task="a1_position", perturbation="none", **changes):
+    """A runner with small networks and two worlds that has collected a rollout."""
+    env_cfg, train_cfg = task_registry.get_cfgs(task, Options(device="cpu", num_envs=2, perturbation=perturbation))
+    for path, value in {**SMALL, **changes}.items():
+        set_by_path(train_cfg, path, value)
+    env = task_registry.get_task_class(task)(env_cfg, "cpu")
+    runner, _ = task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=tmp_path)
+    runner.alg.train_mode()
+    runner.collect_rollout()
+    return runner
+
+
+@pytest.mark.parametrize(
+    ("task", "changes"),
+    [
+        ("a1_position", {}),
+        ("a1_torque_multihead", {"actor.head_hidden_dims": [4]}),
+        ("a1_position", {"algorithm.symmetry_cfg.use_data_augmentation": False}),
+        ("a1_position", {"algorithm.symmetry_cfg.use_mirror_loss": True}),
+    ],
+)
+def test_flop_as_pytorch_counts_them(tmp_path, task, changes):
+    """The matrix products of a real update, forward and backward, with mirror images and a multi-head actor."""
+    alg = make_runner(tmp_path, task, **changes).alg
+    with FlopCounterMode(display=False) as counter:
+        alg.update()
+    assert roofline.update_flop(alg) == counter.get_total_flops() > 0
+
+
+def test_update_by_hand(tmp_path):
+    """Layers of 4 and 3 inputs; 2 worlds x 3 steps x 2 epochs, each sample with its mirror image."""
+    alg = make_runner(tmp_path).alg
+    actor_inputs, critic_inputs = (model.obs_dim for model in (alg.actor, alg.critic))
+    actor = 2 * (2 * actor_inputs * 8 + 3 * (8 * 6 + 6 * 12))
+    critic = 2 * (2 * critic_inputs * 7 + 3 * (7 * 5 + 5))
+    assert roofline.update_flop(alg) == 2 * 12 * (actor + critic)
+    # of a sample: observations, 12 actions and their means, value, return, advantage, logarithm of the probability
+    stored = actor_inputs + critic_inputs + 2 * 12 + 4
+    activations = (8 + 6 + 12) + (7 + 5 + 1)
+    weights = (actor_inputs + 1) * 8 + 9 * 6 + 7 * 12 + 12 + (critic_inputs + 1) * 7 + 8 * 5 + 6
+    expected = 12 * (stored + 2 * 2 * activations) + 4 * 2 * 3 * weights
+    assert roofline.update_bytes(alg) == 4 * expected
+    alg.use_mixed_precision = True  # halves the activations, nothing else
+    assert roofline.update_bytes(alg) == 4 * expected - 12 * 2 * 2 * activations * 2
+
+
+def test_samples_that_no_minibatch_has(tmp_path):
+    """Six samples in four minibatches of one: two of each epoch are left out."""
+    alg = make_runner(tmp_path, **{"algorithm.num_mini_batches": 4}).alg
+    assert roofline.samples(alg) == 2 * 4
+
+
+def test_physics_by_hand(tmp_path):
+    """An A1 without parameters of its own: 67 floats read, 55 written, and 17 sensors of 4 once in a control step."""
+    runner = make_runner(tmp_path)
+    assert roofline.physics_bytes(runner.env.sim, 4) == 4 * 2 * (4 * (67 + 55) + 17 * 4)
+
+
+def test_own_parameters(tmp_path):
+    """Random parameters add the rows that the kernel reads; the free joint's are not read."""
+    sim = make_runner(tmp_path, perturbation="low").env.sim
+    shared = 4 * (4 * (67 + 55) + 17 * 4)
+    of_bodies = 14 * (3 + 1 + 3 + 2)  # centre of mass, mass, inertia, inverse weights
+    of_joints = 12 * (1 + 1 + 1 + 1 + 1)  # stiffness, damping, armature, friction, inverse weight
+    of_geoms = 18 * (3 + 3 + 3 + 2)  # place, size, friction, stiffness and damping of contacts
+    own = 4 * 4 * (3 + of_bodies + of_joints + of_geoms)
+    assert roofline.physics_bytes(sim, 4) == 2 * (shared + own)
+
+
+def test_shares_by_hand():
+    """Rates and shares of made-up peaks."""
+    row = {"update_ms": 50.0, "physics_ms": 0.5, "update_flop": 1e12, "update_bytes": 1e10, "physics_bytes": 2e8}
+    got = roofline.shares(row, Peaks(flop_per_s=400e12, bytes_per_s=4e12))
+    assert got == pytest.approx(
+        {
+            "peak_gflop_per_s": 400e3,
+            "peak_gbytes_per_s": 4000.0,
+            "update_gflop_per_s": 20e3,
+            "update_flop_share": 0.05,
+            "update_gbytes_per_s": 200.0,
+            "update_bytes_share": 0.05,
+            "physics_gbytes_per_s": 400.0,
+            "physics_bytes_share": 0.1,
+        }
+    )
+
+
+def test_peaks(monkeypatch):
+    """Operations and bytes over the time that they take."""
+    monkeypatch.setattr(roofline, "_MATRIX", {"cpu": 100})
+    monkeypatch.setattr(roofline, "_COPY", {"cpu": 1000})
+    calls = []
+
+    def seconds(function, device):
+        function()
+        calls.append(function)
+        return float(len(calls))  # 1 to 5 for the product, whose median is 3, then 6 to 10
+
+    monkeypatch.setattr(roofline, "seconds_per_call", seconds)
+    assert roofline.measure_peaks("cpu", "bfloat16") == Peaks(flop_per_s=2e6 / 3, bytes_per_s=2000 / 8)
