@@ -147,7 +147,7 @@ class Simulator:
         self._step(sense)
 
     def drive(self, steps: int, law: wp.Function, reads: Any) -> None:
-        """Advance every world by some physics steps in one launch, each under torques of its own; the last one senses.
+        """Advance every world by some physics steps, each under torques of its own; the last one senses.
 
         Before each of them, ``law(reads, world, motor, step, position, velocity)`` gives the torque of a motor [N m],
         which is written to ``ctrl``; ``step`` counts from 0, position [rad] and velocity [rad/s] are its joint's.

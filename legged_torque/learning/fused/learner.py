@@ -181,7 +181,14 @@ class FusedLearner:
         """Compute losses and their gradients by the outputs."""
         alg, work, storage = self._alg, self._learning, self._alg.storage
         size = storage.actions.shape[-1]
-        batch = (storage.actions, self._means, storage.actions_log_prob, storage.values, storage.advantages, storage.returns)
+        batch = (
+            storage.actions,
+            self._means,
+            storage.actions_log_prob,
+            storage.values,
+            storage.advantages,
+            storage.returns,
+        )
         numbers = (self._num_chosen, self._num_samples, size, alg.clip_param, alg.value_loss_coef, alg.entropy_coef)
         places, strides, columns = self._places
         samples.losses[(len(work.sums),)](

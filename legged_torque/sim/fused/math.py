@@ -21,17 +21,6 @@ def group_sum(value: float, lanes: int) -> float:
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const unsigned first = (threadIdx.x & 31u) & ~(unsigned(lanes) - 1u);
-    __syncwarp(((1u << lanes) - 1u) << first);
-#endif
-""")
-def group_sync(lanes: int):
-    """Wait until the ``lanes`` threads that share a world are here, and see what each has written to memory."""
-    ...
-
-
 @wp.func
 def group_sum3(value: wp.vec3, lanes: int) -> wp.vec3:
     """Return the sum of a vector over the threads of a world."""
