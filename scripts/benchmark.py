@@ -57,7 +57,7 @@ SHARES = {
 }
 """Heading of each column and its format."""
 LEGEND = """\
-  physics: only the physics steps of one control step; step: env.step; iteration: a whole iteration, with logging
+  physics: one control step of physics alone, with its torques; step: env.step; iteration: all of it, with logging
   x floor: iteration / (physics x control steps of a rollout); steps/s: over whole iterations
   peak: {memory}
   start-up: from building the task to the end of the second iteration, when everything is compiled and captured"""

@@ -168,7 +168,7 @@ def time_iterations(runner: OnPolicyRunner, count: int, at_start: Callable[[int]
 
 
 def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
-    """Time the physics steps of one control step alone, which bound the speed of everything else, and ``env.step``.
+    """Time the physics of one control step alone, torques included, which bounds all else, and ``env.step``.
 
     Physics restarts from the state that training has left every :data:`PHYSICS_STEPS` control steps: nothing resets
     fallen robots here, and they have more contacts. Returned are the medians over the rounds [ms].
@@ -180,9 +180,8 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
     def physics() -> None:
         for tensor, values in zip(state, kept, strict=True):
             tensor.copy_(values)
-        decimation = task.cfg.control.decimation
-        for i in range(PHYSICS_STEPS * decimation):
-            task.sim.step(sense=(i + 1) % decimation == 0)
+        for _ in range(PHYSICS_STEPS):
+            task.run_physics()
 
     def milliseconds(function: Callable[[], object]) -> float:
         return _MS * roofline.seconds_per_call(function, task.device)
