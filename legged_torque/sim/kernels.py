@@ -54,8 +54,10 @@ def push(mask: Mask, velocity: Rows, add: Mask, qvel: Rows):
 
 
 @wp.kernel(enable_backward=False)
-def flag_diverged(qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverged: Mask, overflow_seen: Integers):
-    """Check one world; comparisons are written so that NaN fails them."""
+def flag_diverged(
+    anew: bool, qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverged: Mask, overflow_seen: Integers
+):
+    """Check one world, and forget earlier checks if ``anew``; comparisons are written so that NaN fails them."""
     world = wp.tid()
     good = bool(True)  # a variable; Warp would take True for a constant
     for i in range(qpos.shape[1]):
@@ -63,9 +65,46 @@ def flag_diverged(qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverg
     for i in range(qvel.shape[1]):
         good = good and wp.abs(qvel[world, i]) <= wp.static(MAX_VELOCITY)
         good = good and wp.abs(qacc[world, i]) <= wp.static(MAX_ACCELERATION)
-    if not good:
-        diverged[world] = True
+    if anew or not good:
+        diverged[world] = not good
     overflow_seen[world] = overflow_seen[world] | overflow[world]
+
+
+@wp.kernel(enable_backward=False)
+def choose(
+    seeds: Integers,
+    is_new: Mask,
+    chances: wp.vec4,
+    push_velocity: wp.vec2,
+    push_set_factor: float,
+    new_commands: Mask,
+    new_parameters: Mask,
+    pushed: Mask,
+    added: Mask,
+    velocity: Rows,
+):
+    """Decide what happens in one world, with the chances of commands, parameters, pushes, and of pushes that add."""
+    world = wp.tid()
+    random = wp.rand_init(seeds[world])
+    drawn = wp.vec4(wp.randf(random), wp.randf(random), wp.randf(random), wp.randf(random))
+    new_commands[world] = is_new[world] or drawn[0] < chances[0]
+    new_parameters[world] = is_new[world] or drawn[1] < chances[1]
+    pushed[world] = drawn[2] < chances[2]
+    is_added = drawn[3] < chances[3]
+    added[world] = is_added
+    for i in range(3):
+        share = push_velocity[0] + (push_velocity[1] - push_velocity[0]) * wp.randf(random)
+        velocity[world, i] = wp.where(is_added, 1.0, push_set_factor) * share
+
+
+@wp.kernel(enable_backward=False)
+def draw_uniform(mask: Mask, seeds: Integers, low: Numbers, span: Numbers, values: Rows):
+    """Write all numbers of one world."""
+    world = wp.tid()
+    if mask[world]:
+        random = wp.rand_init(seeds[world])
+        for i in range(values.shape[1]):
+            values[world, i] = low[i] + span[i] * wp.randf(random)
 
 
 @wp.struct
@@ -125,7 +164,12 @@ class Column:
 
 @wp.kernel(enable_backward=False)
 def mend(
-    columns: wp.array(dtype=Column), excused: Mask, diverged: Mask, found: wp.array2d(dtype=wp.int32), counts: Integers
+    columns: wp.array(dtype=Column),
+    excused: Mask,
+    diverged: Mask,
+    marks: Mask,
+    found: wp.array2d(dtype=wp.int32),
+    counts: Integers,
 ):
     """Replace one number of one world if it is not finite; mark the world, and count its tensor unless excused."""
     world, column = wp.tid()  # neighbours in memory are read together
@@ -134,5 +178,6 @@ def mend(
     if not wp.abs(number[0]) <= wp.static(MAX_FLOAT):  # faster than isfinite
         number[0] = place.healthy
         diverged[world] = True
+        marks[world] = True
         if not excused[world] and wp.atomic_max(found, place.tensor, world, 1) == 0:
             wp.atomic_add(counts, place.tensor, 1)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.sim import kernels
 
 
 class UniformCommands:
@@ -13,12 +15,14 @@ class UniformCommands:
 
     Attributes:
         values: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
+        seeds: From which the next draw follows; new ones are written by who draws. Shape: (num_envs,), int32.
     """
 
     def __init__(self, cfg: LeggedRobotCfg, device: str) -> None:
         """Start with commands of 0; they will be drawn from ``cfg.commands.ranges``."""
         ranges = cfg.commands.ranges
         self.values = torch.zeros(cfg.env.num_envs, 3, device=device)
+        self.seeds = torch.zeros(cfg.env.num_envs, dtype=torch.int32, device=device)
         limits = [ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw]
         low, high = torch.tensor(limits, dtype=torch.float32, device=device).unbind(dim=1)
         self._low, self._span = low.clone(), high - low
@@ -32,5 +36,5 @@ class UniformCommands:
 
     def resample(self, mask: Tensor) -> None:
         """Draw new commands in the worlds of ``mask``. Shape: (num_envs,), bool."""
-        drawn = torch.addcmul(self._low, self._span, torch.rand_like(self.values))
-        torch.where(mask.unsqueeze(1), drawn, self.values, out=self.values)
+        arrays = [wp.from_torch(array) for array in (mask, self.seeds, self._low, self._span, self.values)]
+        wp.launch(kernels.draw_uniform, len(mask), arrays, device=arrays[0].device)

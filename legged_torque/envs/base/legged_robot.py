@@ -27,6 +27,7 @@ from legged_torque.sim.health import Health
 from legged_torque.sim.randomization import Parameter, changes_legs
 from legged_torque.sim.simulator import Simulator
 from legged_torque.terrain import make_terrain
+from legged_torque.utils.compiled import compiled
 from legged_torque.utils.config import section_keys, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.math import quat_rotate_inverse
@@ -77,6 +78,7 @@ class LeggedRobot(BaseTask):
         self.observations = Observations(self.observation_terms(), *seen, self.num_envs)
         self.obs_buf = self.observations.buffers
         self.health = Health(watched(self), self.sim.diverged)
+        self._parts = [compiled(part, device) for part in (self._judge, self._add_up, self._finish_step)]
         self.reset()
 
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
@@ -115,11 +117,10 @@ class LeggedRobot(BaseTask):
 
     def _step(self) -> None:
         """Physics, rewards, resets and observations of one control step."""
-        self.sim.clear_diverged()
-        self.sim.flag_diverged()
+        self.sim.flag_diverged(anew=True)
         clip = self.cfg.normalization.clip_actions
         self.action_delay.keep()
-        self.actions.copy_(self._given_actions.nan_to_num().clamp(-clip, clip))
+        torch.clamp(self._given_actions.nan_to_num(), -clip, clip, out=self.actions)
         decimation = self.cfg.control.decimation
         for i in range(decimation):
             if i == 0 or self.cfg.control.refresh_torques:
@@ -131,15 +132,30 @@ class LeggedRobot(BaseTask):
 
     def post_physics_step(self) -> None:
         """Do what follows the physics: termination, rewards, resets, commands, observations."""
-        self._episode_length_buf += 1
-        self.total_steps += self.num_envs * self.num_processes
+        judge, add_up, finish_step = self._parts
+        judge()
+        self.health.check()
+        add_up()
+        self._reset_worlds()
+        finish_step()
+
+    def _judge(self) -> None:
+        """Count the step, look at the state, and compute ends and rewards; torch's operations only, as they compile."""
+        self._episode_length_buf.add_(1)
+        self.total_steps.add_(self.num_envs * self.num_processes)
         self._update_state()
         self.check_termination()
         self.compute_reward()
+        self.health.begin()
+
+    def _add_up(self) -> None:
+        """Add the step to sums over steps, when it is known which worlds are broken; torch's operations only."""
+        self.health.end()
+        self.end_broken_worlds()
+        self.rewards.add_to_episode(self.sim.diverged)
+        self.episode_return.add_(self.rew_buf)
         self.log.add_step(self)
         self.update_feet_air_time()
-        self._reset_worlds()
-        self._finish_step()
 
     def _update_state(self) -> None:
         """Compute what follows from the simulator's state."""
@@ -166,24 +182,20 @@ class LeggedRobot(BaseTask):
     def check_termination(self) -> None:
         """End episodes whose trunk touches the ground, whose state diverged, or whose time is over."""
         touching = self.contacts[:, self.termination_contact_indices].any(dim=1)
-        torch.logical_or(touching, self.sim.diverged, out=self.reset_buf)
-        torch.ge(self._episode_length_buf, self.max_episode_length, out=self.time_out_buf)
-        self.time_out_buf.logical_and_(~self.reset_buf)
-        self.reset_buf.logical_or_(self.time_out_buf)
+        ended = touching | self.sim.diverged
+        time_out = self._episode_length_buf >= self.max_episode_length
+        self.reset_buf.copy_(ended | time_out)
+        self.time_out_buf.copy_(time_out & ~ended)
 
     def compute_reward(self) -> None:
-        """Compute the sum of all terms (Table III); 0 for worlds that diverged, or without terms."""
+        """Compute the sum of all terms (Table III); 0 without terms."""
         if self.reward_names:
             self.rew_buf.copy_(self.rewards.compute(self.total_steps))
-        self.end_broken_worlds()
-        self.rewards.add_to_episode(self.sim.diverged)
-        self.episode_return += self.rew_buf
 
     def end_broken_worlds(self) -> None:
-        """Count worlds in which anything is not finite as diverged, and end their episodes without a reward."""
-        self.health.check()
+        """Count worlds in which anything is not finite, and end their episodes without a reward."""
         diverged = self.sim.diverged
-        self.num_diverged += diverged.sum()
+        self.num_diverged.add_(diverged.sum())
         self.reset_buf.logical_or_(diverged)
         self.time_out_buf.logical_and_(~diverged)
         self.rew_buf.masked_fill_(diverged, 0.0)
@@ -193,25 +205,28 @@ class LeggedRobot(BaseTask):
         return self.rewards.weights(self.total_steps)
 
     def _reset_worlds(self) -> None:
-        """Start a new episode in the worlds of ``reset_buf``; elsewhere draw anew what is due."""
-        mask = self.reset_buf
-        self.events.reset_state(mask)
-        self.terrain.move_to_origin(mask, self.base_pos)
-        for buffer in (self.actions, self.feet_air_time):
-            buffer.masked_fill_(mask.unsqueeze(1), 0.0)
-        self.action_delay.reset(mask)
-        self._episode_length_buf.masked_fill_(mask, 0)
-        self.episode_sums.masked_fill_(mask, 0.0)
-        self.episode_return.masked_fill_(mask, 0.0)
-        self.events.happen(mask)
-        self._update_state()
+        """Put the worlds of ``reset_buf`` where an episode starts; elsewhere draw anew what is due, and push."""
+        self.events.happen(self.reset_buf)
+        self.terrain.move_to_origin(self.reset_buf, self.base_pos)
 
     def compute_observations(self) -> None:
         """Write the observations of this moment."""
         self.observations.compute(self.reset_buf)
 
     def _finish_step(self) -> None:
-        """Compute the observations, and keep what the next step's rewards compare with."""
+        """Forget the episodes that have ended, and look at the state in which all worlds are now."""
+        mask = self.reset_buf
+        for buffer in (self.actions, self.feet_air_time):
+            buffer.masked_fill_(mask.unsqueeze(1), 0.0)
+        self.action_delay.reset(mask)
+        self._episode_length_buf.masked_fill_(mask, 0)
+        self.episode_sums.masked_fill_(mask, 0.0)
+        self.episode_return.masked_fill_(mask, 0.0)
+        self._observe()
+
+    def _observe(self) -> None:
+        """Look at the simulator's state, compute the observations, and keep what the next rewards compare with."""
+        self._update_state()
         self.compute_observations()
         self.last_actions.copy_(self.actions)
         self.last_dof_vel.copy_(self.dof_vel)
@@ -220,8 +235,7 @@ class LeggedRobot(BaseTask):
         """Put all worlds into states as in ``sim.qpos`` and ``sim.qvel``, and observe them; episodes go on."""
         self.sim.qpos.copy_(qpos)
         self.sim.qvel.copy_(qvel)
-        self._update_state()
-        self._finish_step()
+        self._observe()
 
     # ---- construction ------------------------------------------------------------------------------------------------
 
@@ -274,8 +288,8 @@ class LeggedRobot(BaseTask):
             name = type(self).__name__
             raise UserError(f"env.num_actions must be {self.num_actions} for {name}, not {env.num_actions}")
         env.num_actions = self.num_actions
-        actions = torch.zeros(3, self.num_envs, self.num_actions, device=self.device)
-        self._given_actions, self.actions, self.last_actions = actions.unbind()
+        actions = (torch.zeros(self.num_envs, self.num_actions, device=self.device) for _ in range(3))
+        self._given_actions, self.actions, self.last_actions = actions
         self.action_delay = ActionDelay(self.actions, rand.action_delay[1], rand.action_delay_unit, control.decimation)
 
     def _prepare_reward_functions(self) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from legged_torque.envs.base.commands import UniformCommands
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.sim import kernels
 from legged_torque.sim.randomization import Parameter, Randomization
 from legged_torque.sim.simulator import Simulator
 
@@ -16,7 +18,7 @@ PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one, tim
 
 
 class RandomEvents:
-    """Chooses worlds by mask; numbers are drawn for all and kept where they are due, since a step replays as a graph.
+    """Chooses worlds by mask, since a step replays as a graph; torch generates new seeds for every world at a time.
 
     Attributes:
         initial_state: What is drawn at resets.
@@ -37,37 +39,51 @@ class RandomEvents:
         settings = self._settings = cfg.domain_rand
         self._sim, self._commands, self.init_angles = sim, commands, init_angles
         device, n = sim.device, sim.num_envs
-        chances = [cfg.commands.resampling_probability, settings.resampling_probability]
-        chances += [settings.push_probability, PUSH_ADDED]
-        self._probabilities = torch.tensor(chances, device=device).unsqueeze(1)
+        chances = (cfg.commands.resampling_probability, settings.resampling_probability, settings.push_probability)
+        self._chances = wp.vec4(*chances, PUSH_ADDED)
+        self._masks = torch.zeros(4, n, dtype=torch.bool, device=device).unbind()
         self._push_velocity = torch.zeros(n, 3, device=device)
         self.initial_state = Randomization(initial_state, n, device)
         self.parameters = Randomization(parameters, n, device, settings.keep_probability)
+        self._seeds = torch.zeros(4, n, dtype=torch.int32, device=device)
+        commands.seeds, self.initial_state.seeds, self.parameters.seeds = self._seeds[1:]
 
-    def reset_state(self, mask: Tensor) -> None:
-        """Draw states and delays in the worlds of ``mask`` (num_envs,), bool, and clear what the simulator kept."""
-        self._sim.reset(mask)
-        self.initial_state.draw(mask)
-        self._sim.set_orientation(mask, self.init_angles)
+    def draw_commands(self, mask: Tensor) -> None:
+        """Draw commands anew in the worlds of ``mask``. Shape: (num_envs,), bool."""
+        self._seeds.random_()
+        self._commands.resample(mask)
 
     def draw_parameters(self, mask: Tensor) -> None:
         """Draw parameters of robot, ground and controller anew in the worlds of ``mask``. Shape: (num_envs,), bool."""
-        self.parameters.draw(mask)
-        self._sim.update_constants(mask)
+        self._seeds.random_()
+        self._write_parameters(mask)
 
     def happen(self, is_new: Tensor) -> None:
-        """Draw commands and parameters where an episode begins or chance says so, and push where chance says so.
+        """Begin episodes: draw states and delays, and clear what the simulator kept, in the worlds of ``is_new``.
 
-        ``is_new`` (num_envs,), bool, says where an episode begins.
+        There, and where chance says so, draw commands and parameters; push where chance says so. Shape: (num_envs,),
+        bool.
         """
-        chosen = torch.rand(4, self._sim.num_envs, device=self._sim.device) < self._probabilities
-        new_commands, new_parameters = chosen[:2] | is_new
-        push, add = chosen[2:]
+        self._seeds.random_()
+        new_commands, new_parameters, pushed, added = self._choose(is_new)
+        self._sim.reset(is_new)
+        self.initial_state.draw(is_new)
+        self._sim.set_orientation(is_new, self.init_angles)
         self._commands.resample(new_commands)
         if self._settings.randomize_parameters:
-            self.draw_parameters(new_parameters)
+            self._write_parameters(new_parameters)
         if self._settings.push_robots:
-            drawn = torch.empty_like(self._push_velocity).uniform_(*self._settings.push_velocity)
-            where_set = self._settings.push_set_factor * drawn
-            torch.where(add.unsqueeze(1), drawn, where_set, out=self._push_velocity)
-            self._sim.push(push, self._push_velocity, add)
+            self._sim.push(pushed, self._push_velocity, added)
+
+    def _choose(self, is_new: Tensor) -> tuple[Tensor, ...]:
+        """Return where commands and parameters are to be drawn, and where a push happens and where it adds."""
+        pushes = (wp.vec2(*self._settings.push_velocity), self._settings.push_set_factor)
+        seeds, new, *written = map(wp.from_torch, (self._seeds[0], is_new, *self._masks, self._push_velocity))
+        arguments = [seeds, new, self._chances, *pushes, *written]
+        wp.launch(kernels.choose, self._sim.num_envs, arguments, device=seeds.device)
+        return self._masks
+
+    def _write_parameters(self, mask: Tensor) -> None:
+        """Draw parameters from their seeds, and what follows from them."""
+        self.parameters.draw(mask)
+        self._sim.update_constants(mask)

@@ -36,7 +36,7 @@ class Rewards:
         ``functions`` return each term's values, one per world.
         """
         self.names = list(functions)
-        self.terms, self.episode_sums = torch.zeros(2, len(self.names), num_envs, device=device).unbind()
+        self.terms, self.episode_sums = (torch.zeros(len(self.names), num_envs, device=device) for _ in range(2))
         self._functions = list(functions.values())
         self.only_positive = only_positive
         self._scales = torch.tensor([scales[name] for name in self.names], dtype=torch.float32, device=device) * dt
@@ -48,9 +48,9 @@ class Rewards:
 
     def compute(self, total_steps: Tensor) -> Tensor:
         """Compute all terms and return their sum; ``total_steps`` are those of training so far. Shape: (num_envs,)."""
-        torch.stack([function() for function in self._functions], out=self.terms)
-        self.terms *= self.weights(total_steps).unsqueeze(1)
-        total = self.terms.sum(dim=0)
+        terms = torch.stack([function() for function in self._functions]) * self.weights(total_steps).unsqueeze(1)
+        self.terms.copy_(terms)
+        total = terms.sum(dim=0)
         return total.clamp(min=0.0) if self.only_positive else total
 
     def add_to_episode(self, diverged: Tensor) -> None:

@@ -36,7 +36,7 @@ class TaskLog:
                 torch.where(diverged, 0.0, error_yaw),
             ]
         )
-        self._sums += torch.cat([task.episode_sums * finished, rows]).sum(dim=1)
+        self._sums.add_(torch.cat([task.episode_sums * finished, rows]).sum(dim=1))
 
     def read(self, max_episode_length_s: float) -> dict[str, float]:
         """Return the means since the last call and start anew. Waits for the device.
