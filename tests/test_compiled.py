@@ -1,4 +1,4 @@
-"""Parts of a control step that a GPU compiles: they do the same, once compiled for all, and never stop a user's term."""
+"""Parts of a control step that a GPU compiles: they do the same, are compiled once, and stop no term of a user."""
 
 import math
 

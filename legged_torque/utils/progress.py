@@ -80,11 +80,12 @@ class CompileProgress:
         if folder is None:  # Warp is not initialized yet
             return False
         entries = _entries(folder)
-        modules = {name: time_ns for name, time_ns in entries.items() if not _BUILD.search(name)}
+        others = ("lto", TORCH_FOLDER)
+        modules = {n: time_ns for n, time_ns in entries.items() if n not in others and not _BUILD.search(n)}
         if folder != self._folder:
             self._folder, self._before = folder, modules
         # a module that exists for another GPU keeps its name when it is built for this one; its time changes
-        self.modules = sum(self._before.get(name) != time_ns for name, time_ns in modules.items() if name not in ("lto", TORCH_FOLDER))
+        self.modules = sum(self._before.get(name) != time_ns for name, time_ns in modules.items())
         builds = (_BUILD.search(name) for name in [*entries, *_entries(os.path.join(folder, "lto"))])
         return any(build and int(build[1]) == os.getpid() for build in builds)  # other processes share the cache
 
