@@ -314,7 +314,7 @@ def test_reset_touches_only_masked_worlds(make_task, engine, worlds):
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e30, -1e30, 1e12])
 @pytest.mark.parametrize("field", ["qpos", "qvel", "qacc_warmstart"])
 def test_divergence_is_flagged(make_task, field, value):
-    """One bad number anywhere in the state flags its world and no other, until all are looked at anew."""
+    """One bad number anywhere in the state flags its world and no other, until the flags are cleared."""
     sim = make_task("a1_torque", 3).sim
     sim.flag_diverged()
     assert not sim.diverged.any()
@@ -326,7 +326,7 @@ def test_divergence_is_flagged(make_task, field, value):
         state[1, entry] = good
         sim.flag_diverged()
         assert sim.diverged.tolist() == [False, True, False]
-        sim.flag_diverged(anew=True)
+        sim.clear_diverged()
         assert not sim.diverged.any()
 
 

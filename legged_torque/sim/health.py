@@ -68,8 +68,8 @@ class Health:
         """Replace numbers that are not finite, and mark their worlds."""
         self._found.zero_()
         for arguments in (self._causes, self._results):
-            rows = arguments[0]
-            wp.launch(kernels.mend, (len(self._marks), len(rows)), arguments, device=rows.device)
+            parts = -(-len(arguments[0]) // kernels.COLUMNS_PER_THREAD)
+            wp.launch(kernels.mend, (len(self._marks), parts), arguments, device=arguments[0].device)
 
     def end(self) -> None:
         """Count the worlds that are marked."""

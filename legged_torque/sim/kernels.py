@@ -6,6 +6,7 @@ MAX_POSITION = 1e4  # largest position [m, rad] of a world that is still believe
 MAX_VELOCITY = 1e4  # largest velocity [m/s, rad/s] of a world that is still believed
 MAX_ACCELERATION = 1e10  # largest acceleration [m/s^2, rad/s^2] of a world that is still believed
 MAX_FLOAT = 3.4028234663852886e38  # largest float32
+COLUMNS_PER_THREAD = 8  # that ``mend`` looks at, so that a thread waits for many numbers at a time
 
 Mask, Integers, Numbers = wp.array(dtype=wp.bool), wp.array(dtype=wp.int32), wp.array(dtype=wp.float32)
 Rows = wp.array2d(dtype=wp.float32)
@@ -54,20 +55,18 @@ def push(mask: Mask, velocity: Rows, add: Mask, qvel: Rows):
 
 
 @wp.kernel(enable_backward=False)
-def flag_diverged(
-    anew: bool, qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverged: Mask, overflow_seen: Integers
-):
-    """Check one world, and forget earlier checks if ``anew``; comparisons are written so that NaN fails them."""
-    world = wp.tid()
-    good = bool(True)  # a variable; Warp would take True for a constant
-    for i in range(qpos.shape[1]):
-        good = good and wp.abs(qpos[world, i]) <= wp.static(MAX_POSITION)
-    for i in range(qvel.shape[1]):
-        good = good and wp.abs(qvel[world, i]) <= wp.static(MAX_VELOCITY)
-        good = good and wp.abs(qacc[world, i]) <= wp.static(MAX_ACCELERATION)
-    if anew or not good:
-        diverged[world] = not good
-    overflow_seen[world] = overflow_seen[world] | overflow[world]
+def flag_diverged(qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverged: Mask, overflow_seen: Integers):
+    """Check one position, velocity and acceleration of a world; comparisons are written so that NaN fails them."""
+    world, i = wp.tid()  # neighbours in memory are read together
+    if not wp.abs(qpos[world, i]) <= wp.static(MAX_POSITION):
+        diverged[world] = True
+    if i < qvel.shape[1]:
+        if not wp.abs(qvel[world, i]) <= wp.static(MAX_VELOCITY):
+            diverged[world] = True
+        if not wp.abs(qacc[world, i]) <= wp.static(MAX_ACCELERATION):
+            diverged[world] = True
+    if i == 0:
+        overflow_seen[world] = overflow_seen[world] | overflow[world]
 
 
 @wp.kernel(enable_backward=False)
@@ -171,13 +170,17 @@ def mend(
     found: wp.array2d(dtype=wp.int32),
     counts: Integers,
 ):
-    """Replace one number of one world if it is not finite; mark the world, and count its tensor unless excused."""
-    world, column = wp.tid()  # neighbours in memory are read together
-    place = columns[column]
-    number = wp.array(ptr=place.address + wp.uint64(world) * place.stride, shape=(1,), dtype=wp.float32)
-    if not wp.abs(number[0]) <= wp.static(MAX_FLOAT):  # faster than isfinite
-        number[0] = place.healthy
-        diverged[world] = True
-        marks[world] = True
-        if not excused[world] and wp.atomic_max(found, place.tensor, world, 1) == 0:
-            wp.atomic_add(counts, place.tensor, 1)
+    """Replace numbers of one world that are not finite; mark the world, and count their tensors unless excused."""
+    world, part = wp.tid()
+    parts = (columns.shape[0] + wp.static(COLUMNS_PER_THREAD - 1)) // wp.static(COLUMNS_PER_THREAD)
+    for i in range(wp.static(COLUMNS_PER_THREAD)):
+        column = i * parts + part  # neighbours in memory are read together
+        if column < columns.shape[0]:
+            place = columns[column]
+            number = wp.array(ptr=place.address + wp.uint64(world) * place.stride, shape=(1,), dtype=wp.float32)
+            if not wp.abs(number[0]) <= wp.static(MAX_FLOAT):  # faster than isfinite
+                number[0] = place.healthy
+                diverged[world] = True
+                marks[world] = True
+                if not excused[world] and wp.atomic_max(found, place.tensor, world, 1) == 0:
+                    wp.atomic_add(counts, place.tensor, 1)

@@ -44,7 +44,7 @@ class Simulator:
             after one that does not sense, it is what it was ("fused") or 0 ("mujoco_warp"). Shape: (num_envs, geoms).
         contact_force: Net contact force on each sensed geom in the world frame [N], likewise.
             Shape: (num_envs, geoms, 3).
-        diverged: Worlds whose state :meth:`flag_diverged` has found to be not finite or absurdly large.
+        diverged: Worlds whose state was seen to be not finite or absurdly large since the last :meth:`clear_diverged`.
             Shape: (num_envs,), bool.
         xfrc_applied: Force [N] at the centre of mass of each body and torque [N m] on it, in the world frame; zeros
             unless written. None without ``applied_forces``. Shape: (num_envs, nbody, 6).
@@ -172,14 +172,15 @@ class Simulator:
         drawn = (wp.from_torch(mask), wp.from_torch(velocity), wp.from_torch(add))
         self._launch(kernels.push, *drawn, self.data.qvel)
 
-    def flag_diverged(self, anew: bool = False) -> None:
-        """Mark the worlds whose state is not finite or absurdly large; MuJoCo Warp has no such check.
+    def clear_diverged(self) -> None:
+        """Forget which worlds have diverged."""
+        self.diverged.zero_()
 
-        Marks of earlier calls stay unless ``anew``.
-        """
+    def flag_diverged(self) -> None:
+        """Mark the worlds whose state is not finite or absurdly large; MuJoCo Warp has no such check."""
         data = self.data
-        state = (data.qpos, data.qvel, data.qacc_warmstart, data.overflow)
-        self._launch(kernels.flag_diverged, anew, *state, self._diverged, self._overflow)
+        state = [data.qpos, data.qvel, data.qacc_warmstart, data.overflow, self._diverged, self._overflow]
+        wp.launch(kernels.flag_diverged, data.qpos.shape, state, device=self._wp_device)
 
     def check_buffers(self) -> str | None:
         """Return a warning if contacts or constraints were dropped since the start because a buffer was full.

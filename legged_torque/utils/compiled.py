@@ -18,9 +18,12 @@ SETTINGS: dict[str, Any] = {
     "fullgraph": True,  # all or nothing: a part that cannot be compiled fails before anything has run
     "dynamic": False,
     "options": {
+        "aggressive_fusion": True,  # one kernel for what has nothing in common but the number of worlds
         "compile_threads": 1,  # the kernels are few: starting helpers takes longer
         "deterministic": True,  # no choice of kernels by timing, which would change the order of additions
         "fallback_random": True,  # random numbers are torch's own
+        "max_pointwise_cat_inputs": 64,  # observations are written to their places by one kernel
+        "triton.autotune_pointwise": False,
         "unroll_reductions_threshold": 64,  # a sum over joints is made by the thread of the world: one kernel for all
     },
 }

@@ -117,7 +117,8 @@ class LeggedRobot(BaseTask):
 
     def _step(self) -> None:
         """Physics, rewards, resets and observations of one control step."""
-        self.sim.flag_diverged(anew=True)
+        self.sim.clear_diverged()
+        self.sim.flag_diverged()
         clip = self.cfg.normalization.clip_actions
         self.action_delay.keep()
         torch.clamp(self._given_actions.nan_to_num(), -clip, clip, out=self.actions)

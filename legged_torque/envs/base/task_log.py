@@ -18,6 +18,7 @@ class TaskLog:
         self._names = [*reward_names, "steps", "episodes", "length", "return", "diverged", "error_xy", "error_yaw"]
         self._num_terms = len(reward_names)
         self._sums = torch.zeros(len(self._names), device=device)
+        self._of_terms, self._of_steps = self._sums.tensor_split([self._num_terms])
 
     def add_step(self, task: LeggedRobot) -> None:
         """Add one control step, after its rewards and before its resets."""
@@ -25,18 +26,17 @@ class TaskLog:
         error_yaw = (task.commands[:, 2] - task.base_ang_vel[:, 2]).square()
         finished = task.reset_buf.float()
         diverged = task.sim.diverged
-        rows = torch.stack(
-            [
-                torch.ones_like(finished),
-                finished,
-                finished * task.episode_length_buf,
-                finished * task.episode_return,
-                diverged.float(),
-                torch.where(diverged, 0.0, error_xy),
-                torch.where(diverged, 0.0, error_yaw),
-            ]
-        )
-        self._sums.add_(torch.cat([task.episode_sums * finished, rows]).sum(dim=1))
+        rows = [
+            torch.ones_like(finished),
+            finished,
+            finished * task.episode_length_buf,
+            finished * task.episode_return,
+            diverged.float(),
+            torch.where(diverged, 0.0, error_xy),
+            torch.where(diverged, 0.0, error_yaw),
+        ]
+        self._of_terms.add_((task.episode_sums * finished).sum(dim=1))
+        self._of_steps.add_(torch.stack([row.sum() for row in rows]))
 
     def read(self, max_episode_length_s: float) -> dict[str, float]:
         """Return the means since the last call and start anew. Waits for the device.
