@@ -121,7 +121,7 @@ class LeggedRobot(BaseTask):
         self.sim.flag_diverged()
         clip = self.cfg.normalization.clip_actions
         self.action_delay.keep()
-        torch.clamp(self._given_actions.nan_to_num(), -clip, clip, out=self.actions)
+        self.actions.copy_(self._given_actions.nan_to_num().clamp(-clip, clip))
         decimation = self.cfg.control.decimation
         for i in range(decimation):
             if i == 0 or self.cfg.control.refresh_torques:
@@ -289,8 +289,8 @@ class LeggedRobot(BaseTask):
             name = type(self).__name__
             raise UserError(f"env.num_actions must be {self.num_actions} for {name}, not {env.num_actions}")
         env.num_actions = self.num_actions
-        actions = (torch.zeros(self.num_envs, self.num_actions, device=self.device) for _ in range(3))
-        self._given_actions, self.actions, self.last_actions = actions
+        actions = torch.zeros(3, self.num_envs, self.num_actions, device=self.device)
+        self._given_actions, self.actions, self.last_actions = actions.unbind()
         self.action_delay = ActionDelay(self.actions, rand.action_delay[1], rand.action_delay_unit, control.decimation)
 
     def _prepare_reward_functions(self) -> None:
