@@ -150,10 +150,14 @@ class LeggedRobot(BaseTask):
         self.health.begin()
 
     def _add_up(self) -> None:
-        """Add the step to sums over steps, when it is known which worlds are broken; torch's operations only."""
+        """End broken worlds without a reward, now that they are known, and add to sums; torch's operations only."""
+        diverged = self.sim.diverged
         self.health.end()
-        self.end_broken_worlds()
-        self.rewards.add_to_episode(self.sim.diverged)
+        self.num_diverged.add_(diverged.sum())
+        self.reset_buf.logical_or_(diverged)
+        self.time_out_buf.logical_and_(~diverged)
+        self.rew_buf.masked_fill_(diverged, 0.0)
+        self.rewards.add_to_episode(diverged)
         self.episode_return.add_(self.rew_buf)
         self.log.add_step(self)
         self.update_feet_air_time()
@@ -193,14 +197,6 @@ class LeggedRobot(BaseTask):
         if self.reward_names:
             self.rew_buf.copy_(self.rewards.compute(self.total_steps))
 
-    def end_broken_worlds(self) -> None:
-        """Count worlds in which anything is not finite, and end their episodes without a reward."""
-        diverged = self.sim.diverged
-        self.num_diverged.add_(diverged.sum())
-        self.reset_buf.logical_or_(diverged)
-        self.time_out_buf.logical_and_(~diverged)
-        self.rew_buf.masked_fill_(diverged, 0.0)
-
     def reward_weights(self) -> Tensor:
         """Return the weights of the terms at this moment of training, Delta t included. Shape: (terms,)."""
         return self.rewards.weights(self.total_steps)
@@ -216,13 +212,10 @@ class LeggedRobot(BaseTask):
 
     def _finish_step(self) -> None:
         """Forget the episodes that have ended, and look at the state in which all worlds are now."""
-        mask = self.reset_buf
-        for buffer in (self.actions, self.feet_air_time):
-            buffer.masked_fill_(mask.unsqueeze(1), 0.0)
-        self.action_delay.reset(mask)
-        self._episode_length_buf.masked_fill_(mask, 0)
-        self.episode_sums.masked_fill_(mask, 0.0)
-        self.episode_return.masked_fill_(mask, 0.0)
+        per_world = (self.actions.T, self.feet_air_time.T, self.episode_sums, self.episode_return)
+        for buffer in (*per_world, self._episode_length_buf):
+            buffer.masked_fill_(self.reset_buf, 0)
+        self.action_delay.reset(self.reset_buf)
         self._observe()
 
     def _observe(self) -> None:
