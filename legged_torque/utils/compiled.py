@@ -11,7 +11,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from legged_torque.utils.progress import TORCH_FOLDER
+from legged_torque.utils.progress import TORCH_COMPILES, TORCH_FOLDER
 
 SETTINGS: dict[str, Any] = {
     "backend": "inductor",
@@ -61,14 +61,18 @@ class Compiled:
         import torch._dynamo as dynamo  # takes a second, and only a GPU needs it
 
         with torch.inference_mode(False), torch.no_grad():
-            self._run = self._run or self._compile()
             try:
+                if self._run is None:
+                    TORCH_COMPILES.set()
+                    self._run = self._compile()
                 self._run()
             except dynamo.exc.TorchDynamoException as error:  # nothing has run yet
                 name = getattr(self._function, "__qualname__", str(self._function))
                 print(f"Warning: {name} runs uncompiled, which is slower: {reason(error)}.", file=sys.stderr)
                 self._run = self._function
                 self._run()
+            finally:
+                TORCH_COMPILES.clear()
 
     def _compile(self) -> Callable[[], None]:
         """Return what compiles the function when it is called."""
