@@ -31,27 +31,30 @@ def reset_worlds(
             sensordata[world, i] = 0.0
 
 
-@wp.kernel(enable_backward=False)
-def set_orientation(mask: Mask, angles: Rows, qpos: Rows):
-    """Write the quaternion (w, x, y, z) of one world; Warp's own are (x, y, z, w)."""
-    world = wp.tid()
-    if mask[world]:
-        roll = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), angles[world, 0])
-        pitch = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), angles[world, 1])
-        yaw = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angles[world, 2])
-        quat = yaw * pitch * roll
-        qpos[world, 3] = quat[3]
-        for i in range(3):
-            qpos[world, 4 + i] = quat[i]
+@wp.func
+def turn(qpos: Rows, world: int, roll: float, pitch: float, yaw: float):
+    """Write the quaternion (w, x, y, z) of one world's trunk, turned about the world's x, then y, then z axis."""
+    about_x = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), roll)  # Warp's own are (x, y, z, w)
+    about_y = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), pitch)
+    quat = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw) * about_y * about_x
+    qpos[world, 3] = quat[3]
+    for i in range(3):
+        qpos[world, 4 + i] = quat[i]
+
+
+@wp.func
+def push_trunk(qvel: Rows, world: int, velocity: wp.vec3, add: bool):
+    """Set or add the trunk's linear velocity of one world."""
+    for i in range(3):
+        qvel[world, i] = velocity[i] + wp.where(add, qvel[world, i], 0.0)
 
 
 @wp.kernel(enable_backward=False)
 def push(mask: Mask, velocity: Rows, add: Mask, qvel: Rows):
-    """Set or add the trunk's linear velocity of one world."""
+    """Push the trunk of one world."""
     world = wp.tid()
     if mask[world]:
-        for i in range(3):
-            qvel[world, i] = velocity[world, i] + wp.where(add[world], qvel[world, i], 0.0)
+        push_trunk(qvel, world, wp.vec3(velocity[world, 0], velocity[world, 1], velocity[world, 2]), add[world])
 
 
 @wp.kernel(enable_backward=False)
@@ -69,41 +72,54 @@ def flag_diverged(qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverg
         overflow_seen[world] = overflow_seen[world] | overflow[world]
 
 
+@wp.func
+def draw_command(seed: int, low: Numbers, span: Numbers, commands: Rows, world: int):
+    """Write the command of one world."""
+    random = wp.rand_init(seed, 1)
+    for i in range(commands.shape[1]):
+        commands[world, i] = low[i] + span[i] * wp.randf(random)
+
+
 @wp.kernel(enable_backward=False)
-def choose(
-    seeds: Integers,
+def draw_commands(mask: Mask, seeds: Integers, low: Numbers, span: Numbers, commands: Rows):
+    """Draw the command of one world."""
+    world = wp.tid()
+    if mask[world]:
+        draw_command(seeds[world], low, span, commands, world)
+
+
+@wp.kernel(enable_backward=False)
+def happen(
+    # In:
     is_new: Mask,
+    seeds: Integers,
     chances: wp.vec4,
     push_velocity: wp.vec2,
     push_set_factor: float,
-    new_commands: Mask,
+    angles: Rows,
+    low: Numbers,
+    span: Numbers,
+    # Out:
     new_parameters: Mask,
-    pushed: Mask,
-    added: Mask,
-    velocity: Rows,
+    commands: Rows,
+    qpos: Rows,
+    qvel: Rows,
 ):
-    """Decide what happens in one world, with the chances of commands, parameters, pushes, and of pushes that add."""
+    """Let happen in one world what is due, by the chances of commands, parameters, pushes, and of pushes that add."""
     world = wp.tid()
-    random = wp.rand_init(seeds[world])
+    random = wp.rand_init(seeds[world], 0)
     drawn = wp.vec4(wp.randf(random), wp.randf(random), wp.randf(random), wp.randf(random))
-    new_commands[world] = is_new[world] or drawn[0] < chances[0]
+    if is_new[world]:
+        turn(qpos, world, angles[world, 0], angles[world, 1], angles[world, 2])
+    if is_new[world] or drawn[0] < chances[0]:
+        draw_command(seeds[world], low, span, commands, world)
     new_parameters[world] = is_new[world] or drawn[1] < chances[1]
-    pushed[world] = drawn[2] < chances[2]
-    is_added = drawn[3] < chances[3]
-    added[world] = is_added
-    for i in range(3):
-        share = push_velocity[0] + (push_velocity[1] - push_velocity[0]) * wp.randf(random)
-        velocity[world, i] = wp.where(is_added, 1.0, push_set_factor) * share
-
-
-@wp.kernel(enable_backward=False)
-def draw_uniform(mask: Mask, seeds: Integers, low: Numbers, span: Numbers, values: Rows):
-    """Write all numbers of one world."""
-    world = wp.tid()
-    if mask[world]:
-        random = wp.rand_init(seeds[world])
-        for i in range(values.shape[1]):
-            values[world, i] = low[i] + span[i] * wp.randf(random)
+    if drawn[2] < chances[2]:
+        lowest, width = push_velocity[0], push_velocity[1] - push_velocity[0]
+        shares = wp.vec3(wp.randf(random), wp.randf(random), wp.randf(random))
+        velocity = wp.vec3(lowest, lowest, lowest) + width * shares
+        is_added = drawn[3] < chances[3]
+        push_trunk(qvel, world, wp.where(is_added, 1.0, push_set_factor) * velocity, is_added)
 
 
 @wp.struct
@@ -161,6 +177,12 @@ class Column:
     healthy: wp.float32  # what takes its place
 
 
+@wp.func
+def number_of(column: Column, world: int) -> Numbers:
+    """Return one number of a world, as an array of it."""
+    return wp.array(ptr=column.address + wp.uint64(world) * column.stride, shape=(1,), dtype=wp.float32)
+
+
 @wp.kernel(enable_backward=False)
 def mend(
     columns: wp.array(dtype=Column),
@@ -173,14 +195,19 @@ def mend(
     """Replace numbers of one world that are not finite; mark the world, and count their tensors unless excused."""
     world, part = wp.tid()
     parts = (columns.shape[0] + wp.static(COLUMNS_PER_THREAD - 1)) // wp.static(COLUMNS_PER_THREAD)
-    for i in range(wp.static(COLUMNS_PER_THREAD)):
-        column = i * parts + part  # neighbours in memory are read together
-        if column < columns.shape[0]:
-            place = columns[column]
-            number = wp.array(ptr=place.address + wp.uint64(world) * place.stride, shape=(1,), dtype=wp.float32)
-            if not wp.abs(number[0]) <= wp.static(MAX_FLOAT):  # faster than isfinite
-                number[0] = place.healthy
-                diverged[world] = True
-                marks[world] = True
-                if not excused[world] and wp.atomic_max(found, place.tensor, world, 1) == 0:
-                    wp.atomic_add(counts, place.tensor, 1)
+    bad = int(0)
+    for i in range(wp.static(COLUMNS_PER_THREAD)):  # nothing is written here, so that no load waits for another
+        column = wp.min(i * parts + part, columns.shape[0] - 1)  # neighbours in memory are read together
+        number = number_of(columns[column], world)
+        bad += wp.where(wp.abs(number[0]) <= wp.static(MAX_FLOAT), 0, 1)  # faster than isfinite
+    if bad == 0:
+        return
+    for column in range(part, columns.shape[0], parts):
+        place = columns[column]
+        number = number_of(place, world)
+        if not wp.abs(number[0]) <= wp.static(MAX_FLOAT):
+            number[0] = place.healthy
+            diverged[world] = True
+            marks[world] = True
+            if not excused[world] and wp.atomic_max(found, place.tensor, world, 1) == 0:
+                wp.atomic_add(counts, place.tensor, 1)

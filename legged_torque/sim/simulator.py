@@ -156,13 +156,6 @@ class Simulator:
         for rows in self._carried:
             rows.masked_fill_(mask.unsqueeze(1), 0.0)
 
-    def set_orientation(self, mask: Tensor, angles: Tensor) -> None:
-        """Turn the trunks of the worlds in ``mask`` (num_envs,), bool, by roll, pitch and yaw [rad] (num_envs, 3).
-
-        That is about x, then y, then z, all axes of the world.
-        """
-        self._launch(kernels.set_orientation, wp.from_torch(mask), wp.from_torch(angles), self.data.qpos)
-
     def push(self, mask: Tensor, velocity: Tensor, add: Tensor) -> None:
         """Change the velocities of trunks in the worlds of ``mask``. Shape: (num_envs,), bool.
 

@@ -19,6 +19,8 @@ SETTINGS: dict[str, Any] = {
     "dynamic": False,
     "options": {
         "aggressive_fusion": True,  # one kernel for what has nothing in common but the number of worlds
+        "combo_kernels": True,  # one launch for several kernels that do not wait for each other
+        "combo_kernels_autotune": 0,
         "compile_threads": 1,  # the kernels are few: starting helpers takes longer
         "deterministic": True,  # no choice of kernels by timing, which would change the order of additions
         "fallback_random": True,  # random numbers are torch's own

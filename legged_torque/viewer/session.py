@@ -159,7 +159,7 @@ class Session:
     def _apply_command(self) -> None:
         """Give all worlds the chosen command, or one of their own each."""
         self.task.command_generator.hold(self.state.command)
-        self.task.events.draw_commands(torch.ones_like(self.task.reset_buf))
+        self.task.command_generator.resample(torch.ones_like(self.task.reset_buf))
 
     def _apply_mixing(self) -> None:
         """Set the chosen weights, or those of the curriculum. They stay, since only rollouts change them."""

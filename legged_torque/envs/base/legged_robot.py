@@ -299,7 +299,7 @@ class LeggedRobot(BaseTask):
         only_positive = self.cfg.rewards.only_positive_rewards
         self.rewards = Rewards(functions, scales, curricula, only_positive, self.dt, self.num_envs, self.device)
         self.reward_names, self.episode_sums = self.rewards.names, self.rewards.episode_sums
-        self.log = TaskLog(self.reward_names, self.device)
+        self.log = TaskLog(self.reward_names, self.num_envs, self.device)
 
     def _init_random_events(self) -> None:
         """Prepare commands, initial states, random parameters and pushes."""

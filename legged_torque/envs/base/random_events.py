@@ -39,19 +39,13 @@ class RandomEvents:
         settings = self._settings = cfg.domain_rand
         self._sim, self._commands, self.init_angles = sim, commands, init_angles
         device, n = sim.device, sim.num_envs
-        chances = (cfg.commands.resampling_probability, settings.resampling_probability, settings.push_probability)
-        self._chances = wp.vec4(*chances, PUSH_ADDED)
-        self._masks = torch.zeros(4, n, dtype=torch.bool, device=device).unbind()
-        self._push_velocity = torch.zeros(n, 3, device=device)
+        self._new_parameters = torch.zeros(n, dtype=torch.bool, device=device)
         self.initial_state = Randomization(initial_state, n, device)
         self.parameters = Randomization(parameters, n, device, settings.keep_probability)
-        self._seeds = torch.zeros(4, n, dtype=torch.int32, device=device)
-        commands.seeds, self.initial_state.seeds, self.parameters.seeds = self._seeds[1:]
-
-    def draw_commands(self, mask: Tensor) -> None:
-        """Draw commands anew in the worlds of ``mask``. Shape: (num_envs,), bool."""
-        self._seeds.random_()
-        self._commands.resample(mask)
+        self._seeds = torch.zeros(3, n, dtype=torch.int32, device=device)
+        self.initial_state.seeds, self.parameters.seeds = self._seeds[1:]
+        chances = [cfg.commands.resampling_probability, settings.resampling_probability]
+        self._chances = wp.vec4(*chances, settings.push_probability * settings.push_robots, PUSH_ADDED)
 
     def draw_parameters(self, mask: Tensor) -> None:
         """Draw parameters of robot, ground and controller anew in the worlds of ``mask``. Shape: (num_envs,), bool."""
@@ -65,23 +59,17 @@ class RandomEvents:
         bool.
         """
         self._seeds.random_()
-        new_commands, new_parameters, pushed, added = self._choose(is_new)
         self._sim.reset(is_new)
         self.initial_state.draw(is_new)
-        self._sim.set_orientation(is_new, self.init_angles)
-        self._commands.resample(new_commands)
-        if self._settings.randomize_parameters:
-            self._write_parameters(new_parameters)
-        if self._settings.push_robots:
-            self._sim.push(pushed, self._push_velocity, added)
-
-    def _choose(self, is_new: Tensor) -> tuple[Tensor, ...]:
-        """Return where commands and parameters are to be drawn, and where a push happens and where it adds."""
-        pushes = (wp.vec2(*self._settings.push_velocity), self._settings.push_set_factor)
-        seeds, new, *written = map(wp.from_torch, (self._seeds[0], is_new, *self._masks, self._push_velocity))
-        arguments = [seeds, new, self._chances, *pushes, *written]
-        wp.launch(kernels.choose, self._sim.num_envs, arguments, device=seeds.device)
-        return self._masks
+        commands, data, settings = self._commands, self._sim.data, self._settings
+        pushes = (wp.vec2(*settings.push_velocity), settings.push_set_factor)
+        new, seeds = map(wp.from_torch, (is_new, self._seeds[0]))
+        read = map(wp.from_torch, (self.init_angles, commands.low, commands.span))
+        written = map(wp.from_torch, (self._new_parameters, commands.values))
+        arguments = [new, seeds, self._chances, *pushes, *read, *written, data.qpos, data.qvel]
+        wp.launch(kernels.happen, self._sim.num_envs, arguments, device=seeds.device)
+        if settings.randomize_parameters:
+            self._write_parameters(self._new_parameters)
 
     def _write_parameters(self, mask: Tensor) -> None:
         """Draw parameters from their seeds, and what follows from them."""
