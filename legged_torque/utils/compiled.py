@@ -20,11 +20,10 @@ SETTINGS: dict[str, Any] = {
     "options": {
         "aggressive_fusion": True,  # one kernel for what has nothing in common but the number of worlds
         "combo_kernels": True,  # one launch for several kernels that do not wait for each other
-        "combo_kernels_autotune": 0,
+        "combo_kernels_autotune": 0,  # nothing is chosen by timing: that takes time, and additions keep their order
         "compile_threads": 1,  # the kernels are few: starting helpers takes longer
-        "deterministic": True,  # no choice of kernels by timing, which would change the order of additions
+        "deterministic": True,
         "fallback_random": True,  # random numbers are torch's own
-        "max_pointwise_cat_inputs": 64,  # observations are written to their places by one kernel
         "triton.autotune_pointwise": False,
         "unroll_reductions_threshold": 64,  # a sum over joints is made by the thread of the world: one kernel for all
     },
