@@ -130,7 +130,7 @@ class Observations:
         critic = critic.nan_to_num(nan=math.nan, posinf=math.nan, neginf=math.nan)  # not clipped: it must be noticed
         policy = critic[:, : self.policy_size]
         if self._add_noise:
-            policy = torch.addcmul(policy, self._noise, torch.empty_like(policy).uniform_(-1.0, 1.0))
+            policy = torch.addcmul(policy, self._noise, 2.0 * torch.rand(policy.shape, device=policy.device) - 1.0)
         policy = policy.clamp(-self._clip, self._clip)
         self._policy.copy_(self._with_history(policy, is_new))
         self._critic.copy_(critic.clamp(-self._clip, self._clip))
