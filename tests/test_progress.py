@@ -112,6 +112,16 @@ def test_work_that_counts(play):
     assert stream.getvalue().splitlines()[-1].startswith("compiled physics kernels: 1 modules")
 
 
+def test_what_torch_compiles_counts(play):
+    """The line is shown while torch compiles, which has no modules, and its folder is none."""
+    stream = io.StringIO()
+    play.after(1.0, progress.TORCH_COMPILES.set)
+    play.after(1.0, (play.cache / progress.TORCH_FOLDER).mkdir)
+    play.after(3.0, progress.TORCH_COMPILES.clear)
+    assert watch(play, stream).modules == 0
+    assert stream.getvalue().splitlines()[-1] == "compiled physics kernels: 0 modules, 4 s"
+
+
 def test_the_end_of_watching(play):
     """When compilation is over the line is finished, and later nobody looks any more."""
     stream, finished = io.StringIO(), []

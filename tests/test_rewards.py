@@ -266,8 +266,8 @@ def test_reward_is_the_weighted_sum(make_task):
     np.testing.assert_allclose(task.rew_buf, [0.02 * (4.0 + 0.1), 0.0], rtol=1e-5)
     parts = {term: 0.02 * TABLE_III[term] * value for term, value in values.items()}
     assert sum(parts.values()) < -0.1
-    sums = dict(zip(task.reward_names, task.episode_sums[:, 1].tolist(), strict=True))
-    assert sums == pytest.approx(parts, rel=2e-5, abs=1e-9)
+    terms = dict(zip(task.reward_names, task.rewards.terms[:, 1].tolist(), strict=True))
+    assert terms == pytest.approx(parts, rel=2e-5, abs=1e-9)
 
 
 @pytest.mark.parametrize(

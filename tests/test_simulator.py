@@ -351,17 +351,15 @@ def rotation_matrices(roll, pitch, yaw):
 
 def test_orientation(make_task):
     """Roll, pitch and yaw are rotations about the world's axes in this order, in the worlds of the mask."""
-    sim = make_task("a1_torque", 50).sim
-    angles = torch.empty(50, 3).uniform_(-math.pi, math.pi)
+    ranges = {f"domain_rand.init_{name}": [-math.pi, math.pi] for name in ("roll", "pitch", "yaw")}
+    task = make_task("a1_torque", 50, **ranges)
     mask = torch.arange(50) % 2 == 0
-    before = sim.qpos.clone()
-    sim.set_orientation(mask, angles)
-    assert torch.equal(sim.qpos[~mask], before[~mask]) and torch.equal(
-        sim.qpos[:, [0, 1, 2, *range(7, 19)]], before[:, [0, 1, 2, *range(7, 19)]]
-    )
-    for quat, expected in zip(
-        sim.qpos[mask, 3:7].double(), rotation_matrices(*angles[mask].double().numpy().T), strict=True
-    ):
+    before, angles = task.sim.qpos.clone(), task.init_angles.clone()
+    task.events.happen(mask)
+    assert torch.equal(task.sim.qpos[~mask], before[~mask]) and torch.equal(task.init_angles[~mask], angles[~mask])
+    assert not torch.isclose(task.init_angles[mask], angles[mask]).all(dim=1).any()
+    angles = task.init_angles[mask].double().numpy()
+    for quat, expected in zip(task.sim.qpos[mask, 3:7].double(), rotation_matrices(*angles.T), strict=True):
         matrix = np.zeros(9)
         mujoco.mju_quat2Mat(matrix, quat.numpy())
         np.testing.assert_allclose(matrix.reshape(3, 3), expected, atol=1e-6)

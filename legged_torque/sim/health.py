@@ -34,7 +34,11 @@ class Watched:
 
 
 class Health:
-    """Checks all tensors of all worlds in two kernels, inside the step's CUDA graph, and counts on the device."""
+    """Checks all tensors of all worlds in two kernels, inside the step's CUDA graph, and counts on the device.
+
+    A check is :meth:`begin`, :meth:`check` and :meth:`end`; first and last are torch's operations, to be compiled with
+    what else a step does there.
+    """
 
     def __init__(self, watched: Sequence[Watched], diverged: Tensor) -> None:
         """Prepare; what the first world has now takes the place of numbers that are not finite later.
@@ -46,28 +50,30 @@ class Health:
         self._diverged, self._excused, nobody = diverged.new_zeros(3, len(diverged)).unbind()
         self._found = diverged.new_zeros(len(self._watched), len(diverged), dtype=torch.int32)
         self._counts = diverged.new_zeros(len(self._watched), dtype=torch.int32)
-        self._causes = self._arguments(False, nobody)
-        self._results = self._arguments(True, self._excused)
+        self._causes = self._arguments(False, nobody, self._excused)
+        self._results = self._arguments(True, self._excused, self._diverged)
 
-    def _arguments(self, is_result: bool, excused: Tensor) -> list[Any]:
-        """Return the kernel's arguments for the causes or the results."""
+    def _arguments(self, is_result: bool, excused: Tensor, marks: Tensor) -> list[Any]:
+        """Return the kernel's arguments for the causes or the results; ``marks`` are further ones of their worlds."""
         chosen = [(i, tensor) for i, tensor in enumerate(self._watched) if tensor.is_result == is_result]
         rows = [row for i, tensor in chosen for row in columns(i, tensor.numbers)]
         table: wp.array = wp.array(rows, dtype=kernels.Column, device=wp.device_from_torch(excused.device))
-        return [table, *map(wp.from_torch, (excused, self._marks, self._found, self._counts))]
+        return [table, *map(wp.from_torch, (excused, self._marks, marks, self._found, self._counts))]
+
+    def begin(self) -> None:
+        """Note the worlds that have diverged already, whose results are not to blame."""
+        self._excused.copy_(self._marks)
 
     def check(self) -> None:
         """Replace numbers that are not finite, and mark their worlds."""
         self._found.zero_()
-        self._mend(self._causes)
-        self._excused.copy_(self._marks)
-        self._mend(self._results)
-        self._diverged.logical_or_(self._marks)
+        for arguments in (self._causes, self._results):
+            parts = -(-len(arguments[0]) // kernels.COLUMNS_PER_THREAD)
+            wp.launch(kernels.mend, (len(self._marks), parts), arguments, device=arguments[0].device)
 
-    def _mend(self, arguments: list[Any]) -> None:
-        """Run the kernel."""
-        rows = arguments[0]
-        wp.launch(kernels.mend, (len(self._marks), len(rows)), arguments, device=rows.device)
+    def end(self) -> None:
+        """Count the worlds that are marked."""
+        self._diverged.logical_or_(self._marks)
 
     def read(self) -> tuple[float, dict[Watched, int]]:
         """Return what happened since the last call, over all processes that train together, and wait for the device.

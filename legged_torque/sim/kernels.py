@@ -6,6 +6,7 @@ MAX_POSITION = 1e4  # largest position [m, rad] of a world that is still believe
 MAX_VELOCITY = 1e4  # largest velocity [m/s, rad/s] of a world that is still believed
 MAX_ACCELERATION = 1e10  # largest acceleration [m/s^2, rad/s^2] of a world that is still believed
 MAX_FLOAT = 3.4028234663852886e38  # largest float32
+COLUMNS_PER_THREAD = 8  # that ``mend`` looks at, so that a thread waits for many numbers at a time
 
 Mask, Integers, Numbers = wp.array(dtype=wp.bool), wp.array(dtype=wp.int32), wp.array(dtype=wp.float32)
 Rows = wp.array2d(dtype=wp.float32)
@@ -30,42 +31,95 @@ def reset_worlds(
             sensordata[world, i] = 0.0
 
 
-@wp.kernel(enable_backward=False)
-def set_orientation(mask: Mask, angles: Rows, qpos: Rows):
-    """Write the quaternion (w, x, y, z) of one world; Warp's own are (x, y, z, w)."""
-    world = wp.tid()
-    if mask[world]:
-        roll = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), angles[world, 0])
-        pitch = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), angles[world, 1])
-        yaw = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angles[world, 2])
-        quat = yaw * pitch * roll
-        qpos[world, 3] = quat[3]
-        for i in range(3):
-            qpos[world, 4 + i] = quat[i]
+@wp.func
+def turn(qpos: Rows, world: int, roll: float, pitch: float, yaw: float):
+    """Write the quaternion (w, x, y, z) of one world's trunk, turned about the world's x, then y, then z axis."""
+    about_x = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), roll)  # Warp's own are (x, y, z, w)
+    about_y = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), pitch)
+    quat = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw) * about_y * about_x
+    qpos[world, 3] = quat[3]
+    for i in range(3):
+        qpos[world, 4 + i] = quat[i]
+
+
+@wp.func
+def push_trunk(qvel: Rows, world: int, velocity: wp.vec3, add: bool):
+    """Set or add the trunk's linear velocity of one world."""
+    for i in range(3):
+        qvel[world, i] = velocity[i] + wp.where(add, qvel[world, i], 0.0)
 
 
 @wp.kernel(enable_backward=False)
 def push(mask: Mask, velocity: Rows, add: Mask, qvel: Rows):
-    """Set or add the trunk's linear velocity of one world."""
+    """Push the trunk of one world."""
     world = wp.tid()
     if mask[world]:
-        for i in range(3):
-            qvel[world, i] = velocity[world, i] + wp.where(add[world], qvel[world, i], 0.0)
+        push_trunk(qvel, world, wp.vec3(velocity[world, 0], velocity[world, 1], velocity[world, 2]), add[world])
 
 
 @wp.kernel(enable_backward=False)
 def flag_diverged(qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverged: Mask, overflow_seen: Integers):
-    """Check one world; comparisons are written so that NaN fails them."""
-    world = wp.tid()
-    good = bool(True)  # a variable; Warp would take True for a constant
-    for i in range(qpos.shape[1]):
-        good = good and wp.abs(qpos[world, i]) <= wp.static(MAX_POSITION)
-    for i in range(qvel.shape[1]):
-        good = good and wp.abs(qvel[world, i]) <= wp.static(MAX_VELOCITY)
-        good = good and wp.abs(qacc[world, i]) <= wp.static(MAX_ACCELERATION)
-    if not good:
+    """Check one position, velocity and acceleration of a world; comparisons are written so that NaN fails them."""
+    world, i = wp.tid()  # neighbours in memory are read together
+    if not wp.abs(qpos[world, i]) <= wp.static(MAX_POSITION):
         diverged[world] = True
-    overflow_seen[world] = overflow_seen[world] | overflow[world]
+    if i < qvel.shape[1]:
+        if not wp.abs(qvel[world, i]) <= wp.static(MAX_VELOCITY):
+            diverged[world] = True
+        if not wp.abs(qacc[world, i]) <= wp.static(MAX_ACCELERATION):
+            diverged[world] = True
+    if i == 0:
+        overflow_seen[world] = overflow_seen[world] | overflow[world]
+
+
+@wp.func
+def draw_command(seed: int, low: Numbers, span: Numbers, commands: Rows, world: int):
+    """Write the command of one world."""
+    random = wp.rand_init(seed, 1)
+    for i in range(commands.shape[1]):
+        commands[world, i] = low[i] + span[i] * wp.randf(random)
+
+
+@wp.kernel(enable_backward=False)
+def draw_commands(mask: Mask, seeds: Integers, low: Numbers, span: Numbers, commands: Rows):
+    """Draw the command of one world."""
+    world = wp.tid()
+    if mask[world]:
+        draw_command(seeds[world], low, span, commands, world)
+
+
+@wp.kernel(enable_backward=False)
+def happen(
+    # In:
+    is_new: Mask,
+    seeds: Integers,
+    chances: wp.vec4,
+    push_velocity: wp.vec2,
+    push_set_factor: float,
+    angles: Rows,
+    low: Numbers,
+    span: Numbers,
+    # Out:
+    new_parameters: Mask,
+    commands: Rows,
+    qpos: Rows,
+    qvel: Rows,
+):
+    """Let happen in one world what is due, by the chances of commands, parameters, pushes, and of pushes that add."""
+    world = wp.tid()
+    random = wp.rand_init(seeds[world], 0)
+    drawn = wp.vec4(wp.randf(random), wp.randf(random), wp.randf(random), wp.randf(random))
+    if is_new[world]:
+        turn(qpos, world, angles[world, 0], angles[world, 1], angles[world, 2])
+    if is_new[world] or drawn[0] < chances[0]:
+        draw_command(seeds[world], low, span, commands, world)
+    new_parameters[world] = is_new[world] or drawn[1] < chances[1]
+    if drawn[2] < chances[2]:
+        lowest, width = push_velocity[0], push_velocity[1] - push_velocity[0]
+        shares = wp.vec3(wp.randf(random), wp.randf(random), wp.randf(random))
+        velocity = wp.vec3(lowest, lowest, lowest) + width * shares
+        is_added = drawn[3] < chances[3]
+        push_trunk(qvel, world, wp.where(is_added, 1.0, push_set_factor) * velocity, is_added)
 
 
 @wp.struct
@@ -123,16 +177,37 @@ class Column:
     healthy: wp.float32  # what takes its place
 
 
+@wp.func
+def number_of(column: Column, world: int) -> Numbers:
+    """Return one number of a world, as an array of it."""
+    return wp.array(ptr=column.address + wp.uint64(world) * column.stride, shape=(1,), dtype=wp.float32)
+
+
 @wp.kernel(enable_backward=False)
 def mend(
-    columns: wp.array(dtype=Column), excused: Mask, diverged: Mask, found: wp.array2d(dtype=wp.int32), counts: Integers
+    columns: wp.array(dtype=Column),
+    excused: Mask,
+    diverged: Mask,
+    marks: Mask,
+    found: wp.array2d(dtype=wp.int32),
+    counts: Integers,
 ):
-    """Replace one number of one world if it is not finite; mark the world, and count its tensor unless excused."""
-    world, column = wp.tid()  # neighbours in memory are read together
-    place = columns[column]
-    number = wp.array(ptr=place.address + wp.uint64(world) * place.stride, shape=(1,), dtype=wp.float32)
-    if not wp.abs(number[0]) <= wp.static(MAX_FLOAT):  # faster than isfinite
-        number[0] = place.healthy
-        diverged[world] = True
-        if not excused[world] and wp.atomic_max(found, place.tensor, world, 1) == 0:
-            wp.atomic_add(counts, place.tensor, 1)
+    """Replace numbers of one world that are not finite; mark the world, and count their tensors unless excused."""
+    world, part = wp.tid()
+    parts = (columns.shape[0] + wp.static(COLUMNS_PER_THREAD - 1)) // wp.static(COLUMNS_PER_THREAD)
+    bad = int(0)
+    for i in range(wp.static(COLUMNS_PER_THREAD)):  # nothing is written here, so that no load waits for another
+        column = wp.min(i * parts + part, columns.shape[0] - 1)  # neighbours in memory are read together
+        number = number_of(columns[column], world)
+        bad += wp.where(wp.abs(number[0]) <= wp.static(MAX_FLOAT), 0, 1)  # faster than isfinite
+    if bad == 0:
+        return
+    for column in range(part, columns.shape[0], parts):
+        place = columns[column]
+        number = number_of(place, world)
+        if not wp.abs(number[0]) <= wp.static(MAX_FLOAT):
+            number[0] = place.healthy
+            diverged[world] = True
+            marks[world] = True
+            if not excused[world] and wp.atomic_max(found, place.tensor, world, 1) == 0:
+                wp.atomic_add(counts, place.tensor, 1)

@@ -62,7 +62,7 @@ def changes_legs(parameters: Sequence[Parameter]) -> bool:
 
 
 class Randomization:
-    """Draws all parameters of the worlds in a mask in one kernel, from seeds that torch generates, one per world.
+    """Draws all parameters of the worlds in a mask in one kernel, from one seed per world.
 
     Nothing waits for the host and nothing changes its address, so that it may run inside a CUDA graph.
 
@@ -70,6 +70,7 @@ class Randomization:
         parameters: What is drawn.
         sizes: How many numbers of their own the parameters have, by name; those that take others' draws are left out.
         values: These numbers as they are now, from -1, the lowest one possible, to 1. Shape: (num_envs, their sum).
+        seeds: From which the next draw follows; new ones are written by who draws. Shape: (num_envs,), int32.
     """
 
     def __init__(
@@ -108,15 +109,14 @@ class Randomization:
                 rows.append(row)
         self._device = device
         self.values = torch.tensor(at_start, device=device).repeat(num_envs, 1)
-        self._seeds = torch.zeros(num_envs, dtype=torch.int32, device=device)
+        self.seeds = torch.zeros(num_envs, dtype=torch.int32, device=device)
         self._rows: wp.array = wp.array(rows, dtype=kernels.Row, device=device)
 
     def draw(self, mask: Tensor) -> None:
         """Draw all parameters anew in the worlds of ``mask`` (num_envs,), bool; a UserError if worlds share one."""
         if self._without_rows:
             raise UserError(f"random parameters without a row per world: {', '.join(self._without_rows)}")
-        self._seeds.random_()
-        arrays = [wp.from_torch(mask), wp.from_torch(self._seeds), self._rows, wp.from_torch(self.values)]
+        arrays = [wp.from_torch(mask), wp.from_torch(self.seeds), self._rows, wp.from_torch(self.values)]
         wp.launch(kernels.draw, (len(self.values), len(self._rows)), arrays, device=self._device)
 
 

@@ -168,13 +168,6 @@ class Simulator:
         for rows in self._carried:
             rows.masked_fill_(mask.unsqueeze(1), 0.0)
 
-    def set_orientation(self, mask: Tensor, angles: Tensor) -> None:
-        """Turn the trunks of the worlds in ``mask`` (num_envs,), bool, by roll, pitch and yaw [rad] (num_envs, 3).
-
-        That is about x, then y, then z, all axes of the world.
-        """
-        self._launch(kernels.set_orientation, wp.from_torch(mask), wp.from_torch(angles), self.data.qpos)
-
     def push(self, mask: Tensor, velocity: Tensor, add: Tensor) -> None:
         """Change the velocities of trunks in the worlds of ``mask``. Shape: (num_envs,), bool.
 
@@ -191,8 +184,8 @@ class Simulator:
     def flag_diverged(self) -> None:
         """Mark the worlds whose state is not finite or absurdly large; MuJoCo Warp has no such check."""
         data = self.data
-        state = (data.qpos, data.qvel, data.qacc_warmstart, data.overflow)
-        self._launch(kernels.flag_diverged, *state, self._diverged, self._overflow)
+        state = [data.qpos, data.qvel, data.qacc_warmstart, data.overflow, self._diverged, self._overflow]
+        wp.launch(kernels.flag_diverged, data.qpos.shape, state, device=self._wp_device)
 
     def check_buffers(self) -> str | None:
         """Return a warning if contacts or constraints were dropped since the start because a buffer was full.

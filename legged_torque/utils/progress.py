@@ -17,6 +17,8 @@ SHOW_AFTER = 2.0  # seconds of compilation before a line is shown; shorter compi
 QUIET_AFTER = 5.0  # seconds without compilation after which the line is finished
 END_AFTER = 120.0  # seconds without compilation after which watching ends, so that it costs a long training nothing
 _POLL = 0.25
+TORCH_FOLDER = "torch"  # in the folder of Warp's cache, where torch keeps what it compiles
+TORCH_COMPILES = threading.Event()  # set while torch compiles in this process
 _BUILD = re.compile(r"_p(\d+)_t\d+$")  # end of the name of a build folder: process id, thread
 
 
@@ -79,13 +81,15 @@ class CompileProgress:
         if folder is None:  # Warp is not initialized yet
             return False
         entries = _entries(folder)
-        modules = {name: time_ns for name, time_ns in entries.items() if not _BUILD.search(name)}
+        others = ("lto", TORCH_FOLDER)
+        modules = {n: time_ns for n, time_ns in entries.items() if n not in others and not _BUILD.search(n)}
         if folder != self._folder:
             self._folder, self._before = folder, modules
         # a module that exists for another GPU keeps its name when it is built for this one; its time changes
-        self.modules = sum(self._before.get(name) != time_ns for name, time_ns in modules.items() if name != "lto")
+        self.modules = sum(self._before.get(name) != time_ns for name, time_ns in modules.items())
         builds = (_BUILD.search(name) for name in [*entries, *_entries(os.path.join(folder, "lto"))])
-        return any(build and int(build[1]) == os.getpid() for build in builds)  # other processes share the cache
+        is_ours = any(build and int(build[1]) == os.getpid() for build in builds)  # other processes share the cache
+        return is_ours or TORCH_COMPILES.is_set()
 
     def _write(self, text: str, end: str) -> None:
         """Write a line with the progress."""

@@ -36,10 +36,10 @@ class BaseTask(VecEnv):
     def __init__(self, num_envs: int, device: str) -> None:
         """Allocate rewards, ends and counters of ``num_envs`` worlds on the device, "cpu" or "cuda:N"."""
         self.num_envs, self.device = num_envs, device
-        self.rew_buf, self.episode_return = torch.zeros(2, num_envs, device=device).unbind()
-        self.reset_buf, self.time_out_buf = torch.zeros(2, num_envs, dtype=torch.bool, device=device).unbind()
+        self.rew_buf, self.episode_return = (torch.zeros(num_envs, device=device) for _ in range(2))
+        self.reset_buf, self.time_out_buf = (torch.zeros_like(self.rew_buf, dtype=torch.bool) for _ in range(2))
         self._episode_length_buf = torch.zeros(num_envs, dtype=torch.long, device=device)
-        self.total_steps, self.num_diverged = torch.zeros(2, dtype=torch.long, device=device).unbind()
+        self.total_steps, self.num_diverged = (torch.zeros((), dtype=torch.long, device=device) for _ in range(2))
         self.extras = {"time_outs": self.time_out_buf}
         self.step_graph = CudaGraph(self._step, device)
 
@@ -97,8 +97,8 @@ class BaseTask(VecEnv):
 
     @abstractmethod
     def _reset_worlds(self) -> None:
-        """Start a new episode in the worlds of ``reset_buf``."""
+        """Put the worlds of ``reset_buf`` into the state in which an episode starts."""
 
     @abstractmethod
     def _finish_step(self) -> None:
-        """Compute the observations, and keep what the next step compares with."""
+        """Begin the episodes of ``reset_buf``, compute the observations, and keep what the next step compares with."""

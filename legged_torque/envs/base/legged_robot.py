@@ -29,6 +29,7 @@ from legged_torque.sim.health import Health
 from legged_torque.sim.randomization import Parameter, changes_legs
 from legged_torque.sim.simulator import Simulator
 from legged_torque.terrain import make_terrain
+from legged_torque.utils.compiled import compiled
 from legged_torque.utils.config import section_keys, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.math import quat_rotate_inverse
@@ -79,6 +80,7 @@ class LeggedRobot(BaseTask):
         self.observations = Observations(self.observation_terms(), *seen, self.num_envs)
         self.obs_buf = self.observations.buffers
         self.health = Health(watched(self), self.sim.diverged)
+        self._parts = [compiled(part, device) for part in (self._judge, self._add_up, self._finish_step)]
         self.reset()
 
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
@@ -138,15 +140,34 @@ class LeggedRobot(BaseTask):
 
     def post_physics_step(self) -> None:
         """Do what follows the physics: termination, rewards, resets, commands, observations."""
-        self._episode_length_buf += 1
-        self.total_steps += self.num_envs * self.num_processes
+        judge, add_up, finish_step = self._parts
+        judge()
+        self.health.check()
+        add_up()
+        self._reset_worlds()
+        finish_step()
+
+    def _judge(self) -> None:
+        """Count the step, look at the state, and compute ends and rewards; torch's operations only, as they compile."""
+        self._episode_length_buf.add_(1)
+        self.total_steps.add_(self.num_envs * self.num_processes)
         self._update_state()
         self.check_termination()
         self.compute_reward()
+        self.health.begin()
+
+    def _add_up(self) -> None:
+        """End broken worlds without a reward, now that they are known, and add to sums; torch's operations only."""
+        diverged = self.sim.diverged
+        self.health.end()
+        self.num_diverged.add_(diverged.sum())
+        self.reset_buf.logical_or_(diverged)
+        self.time_out_buf.logical_and_(~diverged)
+        self.rew_buf.masked_fill_(diverged, 0.0)
+        self.rewards.add_to_episode(diverged)
+        self.episode_return.add_(self.rew_buf)
         self.log.add_step(self)
         self.update_feet_air_time()
-        self._reset_worlds()
-        self._finish_step()
 
     def _update_state(self) -> None:
         """Compute what follows from the simulator's state."""
@@ -173,52 +194,40 @@ class LeggedRobot(BaseTask):
     def check_termination(self) -> None:
         """End episodes whose trunk touches the ground, whose state diverged, or whose time is over."""
         touching = self.contacts[:, self.termination_contact_indices].any(dim=1)
-        torch.logical_or(touching, self.sim.diverged, out=self.reset_buf)
-        torch.ge(self._episode_length_buf, self.max_episode_length, out=self.time_out_buf)
-        self.time_out_buf.logical_and_(~self.reset_buf)
-        self.reset_buf.logical_or_(self.time_out_buf)
+        ended = touching | self.sim.diverged
+        time_out = self._episode_length_buf >= self.max_episode_length
+        self.reset_buf.copy_(ended | time_out)
+        self.time_out_buf.copy_(time_out & ~ended)
 
     def compute_reward(self) -> None:
-        """Compute the sum of all terms (Table III); 0 for worlds that diverged, or without terms."""
+        """Compute the sum of all terms (Table III); 0 without terms."""
         if self.reward_names:
             self.rew_buf.copy_(self.rewards.compute(self.total_steps))
-        self.end_broken_worlds()
-        self.rewards.add_to_episode(self.sim.diverged)
-        self.episode_return += self.rew_buf
-
-    def end_broken_worlds(self) -> None:
-        """Count worlds in which anything is not finite as diverged, and end their episodes without a reward."""
-        self.health.check()
-        diverged = self.sim.diverged
-        self.num_diverged += diverged.sum()
-        self.reset_buf.logical_or_(diverged)
-        self.time_out_buf.logical_and_(~diverged)
-        self.rew_buf.masked_fill_(diverged, 0.0)
 
     def reward_weights(self) -> Tensor:
         """Return the weights of the terms at this moment of training, Delta t included. Shape: (terms,)."""
         return self.rewards.weights(self.total_steps)
 
     def _reset_worlds(self) -> None:
-        """Start a new episode in the worlds of ``reset_buf``; elsewhere draw anew what is due."""
-        mask = self.reset_buf
-        self.events.reset_state(mask)
-        self.terrain.move_to_origin(mask, self.base_pos)
-        for buffer in (self.actions, self.feet_air_time):
-            buffer.masked_fill_(mask.unsqueeze(1), 0.0)
-        self.action_delay.reset(mask)
-        self._episode_length_buf.masked_fill_(mask, 0)
-        self.episode_sums.masked_fill_(mask, 0.0)
-        self.episode_return.masked_fill_(mask, 0.0)
-        self.events.happen(mask)
-        self._update_state()
+        """Put the worlds of ``reset_buf`` where an episode starts; elsewhere draw anew what is due, and push."""
+        self.events.happen(self.reset_buf)
+        self.terrain.move_to_origin(self.reset_buf, self.base_pos)
 
     def compute_observations(self) -> None:
         """Write the observations of this moment."""
         self.observations.compute(self.reset_buf)
 
     def _finish_step(self) -> None:
-        """Compute the observations, and keep what the next step's rewards compare with."""
+        """Forget the episodes that have ended, and look at the state in which all worlds are now."""
+        per_world = (self.actions.T, self.feet_air_time.T, self.episode_sums, self.episode_return)
+        for buffer in (*per_world, self._episode_length_buf):
+            buffer.masked_fill_(self.reset_buf, 0)
+        self.action_delay.reset(self.reset_buf)
+        self._observe()
+
+    def _observe(self) -> None:
+        """Look at the simulator's state, compute the observations, and keep what the next rewards compare with."""
+        self._update_state()
         self.compute_observations()
         self.last_actions.copy_(self.actions)
         self.last_dof_vel.copy_(self.dof_vel)
@@ -227,8 +236,7 @@ class LeggedRobot(BaseTask):
         """Put all worlds into states as in ``sim.qpos`` and ``sim.qvel``, and observe them; episodes go on."""
         self.sim.qpos.copy_(qpos)
         self.sim.qvel.copy_(qvel)
-        self._update_state()
-        self._finish_step()
+        self._observe()
 
     # ---- construction ------------------------------------------------------------------------------------------------
 
@@ -299,7 +307,7 @@ class LeggedRobot(BaseTask):
         only_positive = self.cfg.rewards.only_positive_rewards
         self.rewards = Rewards(functions, scales, curricula, only_positive, self.dt, self.num_envs, self.device)
         self.reward_names, self.episode_sums = self.rewards.names, self.rewards.episode_sums
-        self.log = TaskLog(self.reward_names, self.device)
+        self.log = TaskLog(self.reward_names, self.num_envs, self.device)
 
     def _init_random_events(self) -> None:
         """Prepare commands, initial states, random parameters and pushes."""

@@ -108,6 +108,7 @@ class Observations:
         sizes = {"policy": self.policy_size * history_length, "critic": len(self._scales)}
         groups = {name: torch.zeros(num_envs, size, device=device) for name, size in sizes.items()}
         self.buffers = TensorDict(groups, batch_size=[num_envs], device=device)
+        self._policy, self._critic = groups["policy"], groups["critic"]
 
     def policy_terms(self) -> list[ObservationTerm]:
         """Return the terms that the policy sees."""
@@ -129,16 +130,16 @@ class Observations:
         critic = critic.nan_to_num(nan=math.nan, posinf=math.nan, neginf=math.nan)  # not clipped: it must be noticed
         policy = critic[:, : self.policy_size]
         if self._add_noise:
-            policy = torch.addcmul(policy, self._noise, torch.empty_like(policy).uniform_(-1.0, 1.0))
+            policy = torch.addcmul(policy, self._noise, 2.0 * torch.rand(policy.shape, device=policy.device) - 1.0)
         policy = policy.clamp(-self._clip, self._clip)
-        self.buffers["policy"].copy_(self._with_history(policy, is_new))
-        torch.clamp(critic, -self._clip, self._clip, out=self.buffers["critic"])
+        self._policy.copy_(self._with_history(policy, is_new))
+        self._critic.copy_(critic.clamp(-self._clip, self._clip))
 
     def _with_history(self, policy: Tensor, is_new: Tensor) -> Tensor:
         """Return the policy's observations followed by those of the steps before."""
         if self._history_length == 1:
             return policy
-        before = self.buffers["policy"][:, : -policy.shape[1]]
+        before = self._policy[:, : -policy.shape[1]]
         copies = policy.repeat(1, self._history_length - 1)
         return torch.cat([policy, torch.where(is_new.unsqueeze(1), copies, before)], dim=1)
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from legged_torque.envs.base.commands import UniformCommands
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.sim import kernels
 from legged_torque.sim.randomization import Parameter, Randomization
 from legged_torque.sim.simulator import Simulator
 
@@ -16,7 +18,7 @@ PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one, tim
 
 
 class RandomEvents:
-    """Chooses worlds by mask; numbers are drawn for all and kept where they are due, since a step replays as a graph.
+    """Chooses worlds by mask, since a step replays as a graph; torch generates new seeds for every world at a time.
 
     Attributes:
         initial_state: What is drawn at resets.
@@ -37,37 +39,39 @@ class RandomEvents:
         settings = self._settings = cfg.domain_rand
         self._sim, self._commands, self.init_angles = sim, commands, init_angles
         device, n = sim.device, sim.num_envs
-        chances = [cfg.commands.resampling_probability, settings.resampling_probability]
-        chances += [settings.push_probability, PUSH_ADDED]
-        self._probabilities = torch.tensor(chances, device=device).unsqueeze(1)
-        self._push_velocity = torch.zeros(n, 3, device=device)
+        self._new_parameters = torch.zeros(n, dtype=torch.bool, device=device)
         self.initial_state = Randomization(initial_state, n, device)
         self.parameters = Randomization(parameters, n, device, settings.keep_probability)
-
-    def reset_state(self, mask: Tensor) -> None:
-        """Draw states and delays in the worlds of ``mask`` (num_envs,), bool, and clear what the simulator kept."""
-        self._sim.reset(mask)
-        self.initial_state.draw(mask)
-        self._sim.set_orientation(mask, self.init_angles)
+        self._seeds = torch.zeros(3, n, dtype=torch.int32, device=device)
+        self.initial_state.seeds, self.parameters.seeds = self._seeds[1:]
+        chances = [cfg.commands.resampling_probability, settings.resampling_probability]
+        self._chances = wp.vec4(*chances, settings.push_probability * settings.push_robots, PUSH_ADDED)
 
     def draw_parameters(self, mask: Tensor) -> None:
         """Draw parameters of robot, ground and controller anew in the worlds of ``mask``. Shape: (num_envs,), bool."""
-        self.parameters.draw(mask)
-        self._sim.update_constants(mask)
+        self._seeds.random_()
+        self._write_parameters(mask)
 
     def happen(self, is_new: Tensor) -> None:
-        """Draw commands and parameters where an episode begins or chance says so, and push where chance says so.
+        """Begin episodes: draw states and delays, and clear what the simulator kept, in the worlds of ``is_new``.
 
-        ``is_new`` (num_envs,), bool, says where an episode begins.
+        There, and where chance says so, draw commands and parameters; push where chance says so. Shape: (num_envs,),
+        bool.
         """
-        chosen = torch.rand(4, self._sim.num_envs, device=self._sim.device) < self._probabilities
-        new_commands, new_parameters = chosen[:2] | is_new
-        push, add = chosen[2:]
-        self._commands.resample(new_commands)
-        if self._settings.randomize_parameters:
-            self.draw_parameters(new_parameters)
-        if self._settings.push_robots:
-            drawn = torch.empty_like(self._push_velocity).uniform_(*self._settings.push_velocity)
-            where_set = self._settings.push_set_factor * drawn
-            torch.where(add.unsqueeze(1), drawn, where_set, out=self._push_velocity)
-            self._sim.push(push, self._push_velocity, add)
+        self._seeds.random_()
+        self._sim.reset(is_new)
+        self.initial_state.draw(is_new)
+        commands, data, settings = self._commands, self._sim.data, self._settings
+        pushes = (wp.vec2(*settings.push_velocity), settings.push_set_factor)
+        new, seeds = map(wp.from_torch, (is_new, self._seeds[0]))
+        read = map(wp.from_torch, (self.init_angles, commands.low, commands.span))
+        written = map(wp.from_torch, (self._new_parameters, commands.values))
+        arguments = [new, seeds, self._chances, *pushes, *read, *written, data.qpos, data.qvel]
+        wp.launch(kernels.happen, self._sim.num_envs, arguments, device=seeds.device)
+        if settings.randomize_parameters:
+            self._write_parameters(self._new_parameters)
+
+    def _write_parameters(self, mask: Tensor) -> None:
+        """Draw parameters from their seeds, and what follows from them."""
+        self.parameters.draw(mask)
+        self._sim.update_constants(mask)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.envs.base.legged_robot_config import LinearChange
+from legged_torque.utils.errors import UserError
 
 
 class Rewards:
@@ -36,8 +37,8 @@ class Rewards:
         ``functions`` return each term's values, one per world.
         """
         self.names = list(functions)
-        self.terms, self.episode_sums = torch.zeros(2, len(self.names), num_envs, device=device).unbind()
-        self._functions = list(functions.values())
+        self.terms, self.episode_sums = (torch.zeros(len(self.names), num_envs, device=device) for _ in range(2))
+        self._functions, self._rows = list(functions.values()), self.terms.unbind()
         self.only_positive = only_positive
         self._scales = torch.tensor([scales[name] for name in self.names], dtype=torch.float32, device=device) * dt
         self._curriculum = LinearCurriculum([curricula.get(name) for name in self.names], device)
@@ -47,10 +48,18 @@ class Rewards:
         return self._scales * self._curriculum(total_steps)
 
     def compute(self, total_steps: Tensor) -> Tensor:
-        """Compute all terms and return their sum; ``total_steps`` are those of training so far. Shape: (num_envs,)."""
-        torch.stack([function() for function in self._functions], out=self.terms)
-        self.terms *= self.weights(total_steps).unsqueeze(1)
-        total = self.terms.sum(dim=0)
+        """Compute all terms and return their sum; ``total_steps`` are those of training so far. Shape: (num_envs,).
+
+        A UserError if a term has another shape.
+        """
+        weights, total = self.weights(total_steps).unbind(), torch.zeros_like(self._rows[0])
+        for name, weight, function, row in zip(self.names, weights, self._functions, self._rows, strict=True):
+            values = function()
+            if values.shape != row.shape:
+                raise UserError(f"reward term '{name}' has the shape {tuple(values.shape)}, not {tuple(row.shape)}")
+            weighted = weight * values
+            row.copy_(weighted)  # row by row: a GPU makes one kernel of all
+            total = total + weighted
         return total.clamp(min=0.0) if self.only_positive else total
 
     def add_to_episode(self, diverged: Tensor) -> None:

@@ -13,11 +13,15 @@ if TYPE_CHECKING:
 class TaskLog:
     """What happened in a task since the last :meth:`read`."""
 
-    def __init__(self, reward_names: list[str], device: str) -> None:
+    def __init__(self, reward_names: list[str], num_envs: int, device: str) -> None:
         """Start with empty sums; names of reward terms are in the order of the task's ``episode_sums``."""
         self._names = [*reward_names, "steps", "episodes", "length", "return", "diverged", "error_xy", "error_yaw"]
         self._num_terms = len(reward_names)
-        self._sums = torch.zeros(len(self._names), device=device)
+        # Of each world, since adding up worlds costs a GPU more than all else here.
+        self._of_terms, self._of_steps = (
+            torch.zeros(count, num_envs, device=device)
+            for count in (self._num_terms, len(self._names) - self._num_terms)
+        )
 
     def add_step(self, task: LeggedRobot) -> None:
         """Add one control step, after its rewards and before its resets."""
@@ -25,18 +29,18 @@ class TaskLog:
         error_yaw = (task.commands[:, 2] - task.base_ang_vel[:, 2]).square()
         finished = task.reset_buf.float()
         diverged = task.sim.diverged
-        rows = torch.stack(
-            [
-                torch.ones_like(finished),
-                finished,
-                finished * task.episode_length_buf,
-                finished * task.episode_return,
-                diverged.float(),
-                torch.where(diverged, 0.0, error_xy),
-                torch.where(diverged, 0.0, error_yaw),
-            ]
-        )
-        self._sums += torch.cat([task.episode_sums * finished, rows]).sum(dim=1)
+        rows = [
+            torch.ones_like(finished),
+            finished,
+            finished * task.episode_length_buf,
+            finished * task.episode_return,
+            diverged.float(),
+            torch.where(diverged, 0.0, error_xy),
+            torch.where(diverged, 0.0, error_yaw),
+        ]
+        self._of_terms.add_(task.episode_sums * finished)
+        for row, number in zip(self._of_steps, rows, strict=True):
+            row.add_(number)
 
     def read(self, max_episode_length_s: float) -> dict[str, float]:
         """Return the means since the last call and start anew. Waits for the device.
@@ -46,8 +50,10 @@ class TaskLog:
         "Tracking/error_yaw" [rad^2/s^2]. "Health/diverged_worlds": worlds that were reset because anything in them was
         not finite.
         """
-        sums = dict(zip(self._names, self._sums.tolist(), strict=True))
-        self._sums.zero_()
+        numbers = torch.cat([self._of_terms, self._of_steps]).sum(dim=1).tolist()
+        sums = dict(zip(self._names, numbers, strict=True))
+        self._of_terms.zero_()
+        self._of_steps.zero_()
         result = {}
         if sums["episodes"]:
             for name in self._names[: self._num_terms]:

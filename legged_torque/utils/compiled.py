@@ -1,0 +1,94 @@
+"""Functions of torch's operations as a few kernels of a GPU, by ``torch.compile``."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import warp as wp
+
+from legged_torque.utils.progress import TORCH_COMPILES, TORCH_FOLDER
+
+SETTINGS: dict[str, Any] = {
+    "backend": "inductor",
+    "fullgraph": True,  # all or nothing: a part that cannot be compiled fails before anything has run
+    "dynamic": False,
+    "options": {
+        "aggressive_fusion": True,  # one kernel for what has nothing in common but the number of worlds
+        "combo_kernels": True,  # one launch for several kernels that do not wait for each other
+        "combo_kernels_autotune": 0,  # nothing is chosen by timing: that takes time, and additions keep their order
+        "compile_threads": 1,  # the kernels are few: starting helpers takes longer
+        "deterministic": True,
+        "fallback_random": True,  # random numbers are torch's own
+        "triton.autotune_pointwise": False,
+        "unroll_reductions_threshold": 64,  # a sum over joints is made by the thread of the world: one kernel for all
+    },
+}
+"""Arguments of ``torch.compile``."""
+MOST_VERSIONS = 256  # of a function: one per task in the process, and per Python number that it reads
+
+
+def can_compile(device: str) -> bool:
+    """Return whether functions are compiled there: on a GPU, if Triton is installed and knows it."""
+    if torch.device(device).type != "cuda" or not importlib.util.find_spec("triton"):
+        return False
+    return torch.cuda.get_device_capability(device) >= (7, 0)
+
+
+def compiled(function: Callable[[], None], device: str) -> Callable[[], None]:
+    """Return a function that does the same with few kernels; on a CPU, and without Triton, it is the function itself.
+
+    It must only run operations of torch, on tensors that keep their addresses; what it writes, it writes in place.
+    It is compiled at the first call, once per machine: the kernels are kept in a folder of Warp's cache. Where that
+    is not possible, a line on standard error says so and names the place, and the function runs as it is.
+    """
+    return Compiled(function) if can_compile(device) else function
+
+
+class Compiled:
+    """A function that is compiled at its first call."""
+
+    def __init__(self, function: Callable[[], None]) -> None:
+        """Prepare; nothing is compiled yet."""
+        self._function = function
+        self._run: Callable[[], None] | None = None
+
+    def __call__(self) -> None:
+        """Do what the function does; always in the same mode of autograd, since each would be compiled by itself."""
+        import torch._dynamo as dynamo  # takes a second, and only a GPU needs it
+
+        with torch.inference_mode(False), torch.no_grad():
+            try:
+                if self._run is None:
+                    TORCH_COMPILES.set()
+                    self._run = self._compile()
+                self._run()
+            except dynamo.exc.TorchDynamoException as error:  # nothing has run yet
+                name = getattr(self._function, "__qualname__", str(self._function))
+                print(f"Warning: {name} runs uncompiled, which is slower: {reason(error)}.", file=sys.stderr)
+                self._run = self._function
+                self._run()
+            finally:
+                TORCH_COMPILES.clear()
+
+    def _compile(self) -> Callable[[], None]:
+        """Return what compiles the function when it is called."""
+        import torch._dynamo as dynamo
+
+        if wp.config.kernel_cache_dir:
+            folder = os.path.join(wp.config.kernel_cache_dir, TORCH_FOLDER)
+            os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", folder)
+        dynamo.config.recompile_limit = max(dynamo.config.recompile_limit, MOST_VERSIONS)
+        return torch.compile(self._function, **SETTINGS)
+
+
+def reason(error: Exception) -> str:
+    """Return in one line why a function cannot be compiled, and the user's line at which it failed."""
+    stack = getattr(error, "real_stack", None)
+    place = f"{stack[-1].name} ({stack[-1].filename}:{stack[-1].lineno})" if stack else "no line is known"
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return f"{place}: {lines[0] if lines else type(error).__name__}"
