@@ -33,7 +33,7 @@ def test_a_part_of_the_attack(tmp_path):
     ("status", "error", "is_changed", "outcome"),
     [
         (2, "error: no\n", False, REFUSED),
-        (2, "compiling physics kernels, once per machine: 1 modules, 3 s\nerror: no\n", False, REFUSED),
+        (2, "compiling kernels, once per machine: 1 modules, 3 s\nerror: no\n", False, REFUSED),
         (2, "error: no\n", True, "files"),
         (2, "error: no\nand more\n", False, "lines"),
         (2, "", False, "lines"),

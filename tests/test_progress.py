@@ -75,8 +75,8 @@ def test_line_in_a_file(play):
     stream = io.StringIO()
     compilation = watch(play, stream)
     assert stream.getvalue().splitlines() == [
-        "compiling physics kernels, once per machine: 1 modules, 2 s",
-        "compiled physics kernels: 4 modules, 6 s",
+        "compiling kernels, once per machine: 1 modules, 2 s",
+        "compiled kernels: 4 modules, 6 s",
     ]
     assert compilation.modules == 4
 
@@ -88,7 +88,7 @@ def test_line_in_a_terminal(play):
     watch(play, stream)
     *rewritten, last = stream.getvalue().split("\r")
     assert len(rewritten) == 4 and all(line.startswith("compiling") and "\n" not in line for line in rewritten)
-    assert last.startswith("compiled physics kernels: 4 modules, 6 s") and last.endswith(" \n")
+    assert last.startswith("compiled kernels: 4 modules, 6 s") and last.endswith(" \n")
 
 
 def test_nothing_to_tell(play):
@@ -109,7 +109,7 @@ def test_work_that_counts(play):
     play.build(["part"], seconds=4.0, folder="lto")
     play.after(0.0, (play.cache / "wp_old" / "module.sm90.cubin").touch)
     assert watch(play, stream).modules == 1
-    assert stream.getvalue().splitlines()[-1].startswith("compiled physics kernels: 1 modules")
+    assert stream.getvalue().splitlines()[-1].startswith("compiled kernels: 1 modules")
 
 
 def test_what_torch_compiles_counts(play):
@@ -119,7 +119,7 @@ def test_what_torch_compiles_counts(play):
     play.after(1.0, (play.cache / progress.TORCH_FOLDER).mkdir)
     play.after(3.0, progress.TORCH_COMPILES.clear)
     assert watch(play, stream).modules == 0
-    assert stream.getvalue().splitlines()[-1] == "compiled physics kernels: 0 modules, 4 s"
+    assert stream.getvalue().splitlines()[-1] == "compiled kernels: 0 modules, 4 s"
 
 
 def test_the_end_of_watching(play):

@@ -40,7 +40,7 @@ def run_here(script, *words, root):
         except SystemExit as stop:
             status = stop.code or 0
     lines = error.getvalue().splitlines(keepends=True)
-    told = [line for line in lines if not line.startswith(("compiling physics kernels", "compiled physics kernels"))]
+    told = [line for line in lines if not line.startswith(("compiling kernels", "compiled kernels"))]
     return status, output.getvalue(), "".join(told)
 
 

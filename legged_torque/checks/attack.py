@@ -19,7 +19,7 @@ REFUSED, ACCEPTED, ENDED = "refused", "accepted", "ended"
 OUTCOMES = (REFUSED, ACCEPTED, ENDED, "traceback", "crash", "timeout", "lines", "files")
 """Refused: exit status 2, one line on standard error, nothing written. Ended: another exit status and no traceback.
 Crash: a signal. Lines and files: refused, but with other lines on standard error, or with something written."""
-COMPILATION = ("compiling physics kernels", "compiled physics kernels")  # how lines begin that are no part of an answer
+COMPILATION = ("compiling kernels", "compiled kernels")  # how lines begin that are no part of an answer
 MEMORY = 8 << 30  # bytes that a case may take
 TIMEOUT = 120  # seconds that a case may take: a robot of another build compiles kernels of its own
 _OUTPUT, _ERROR = ".output", ".error"  # added to the name of a case's folder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import sys
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from legged_torque.utils.progress import TORCH_COMPILES, TORCH_FOLDER
+from legged_torque.utils.progress import TORCH_FOLDER, torch_compiles
 
 SETTINGS: dict[str, Any] = {
     "backend": "inductor",
@@ -62,28 +63,32 @@ class Compiled:
         import torch._dynamo as dynamo  # takes a second, and only a GPU needs it
 
         with torch.inference_mode(False), torch.no_grad():
+            compiling = contextlib.nullcontext() if self._run else torch_compiles()
+            self._run = self._run or self._compile()
             try:
-                if self._run is None:
-                    TORCH_COMPILES.set()
-                    self._run = self._compile()
-                self._run()
+                with compiling:
+                    self._run()
             except dynamo.exc.TorchDynamoException as error:  # nothing has run yet
                 name = getattr(self._function, "__qualname__", str(self._function))
                 print(f"Warning: {name} runs uncompiled, which is slower: {reason(error)}.", file=sys.stderr)
                 self._run = self._function
                 self._run()
-            finally:
-                TORCH_COMPILES.clear()
 
     def _compile(self) -> Callable[[], None]:
         """Return what compiles the function when it is called."""
         import torch._dynamo as dynamo
 
-        if wp.config.kernel_cache_dir:
-            folder = os.path.join(wp.config.kernel_cache_dir, TORCH_FOLDER)
-            os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", folder)
+        keep_kernels()
         dynamo.config.recompile_limit = max(dynamo.config.recompile_limit, MOST_VERSIONS)
         return torch.compile(self._function, **SETTINGS)
+
+
+def keep_kernels() -> None:
+    """Let torch and Triton keep what they compile in Warp's cache, unless the environment names other folders."""
+    if wp.config.kernel_cache_dir:
+        folder = os.path.join(wp.config.kernel_cache_dir, TORCH_FOLDER)
+        os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", folder)
+        os.environ.setdefault("TRITON_CACHE_DIR", os.path.join(folder, "triton"))
 
 
 def reason(error: Exception) -> str:

@@ -8,6 +8,7 @@ import re
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
@@ -18,14 +19,14 @@ QUIET_AFTER = 5.0  # seconds without compilation after which the line is finishe
 END_AFTER = 120.0  # seconds without compilation after which watching ends, so that it costs a long training nothing
 _POLL = 0.25
 TORCH_FOLDER = "torch"  # in the folder of Warp's cache, where torch keeps what it compiles
-TORCH_COMPILES = threading.Event()  # set while torch compiles in this process
+TORCH_COMPILES = threading.Event()  # set while torch or Triton compiles in this process
 _BUILD = re.compile(r"_p(\d+)_t\d+$")  # end of the name of a build folder: process id, thread
 
 
 class CompileProgress:
     """While this context is open, a line on standard error (or ``stream``) reports that kernels are being compiled.
 
-    The line reads "compiling physics kernels, once per machine: 12 modules, 34 s". It is rewritten every second in a
+    The line reads "compiling kernels, once per machine: 12 modules, 34 s". It is rewritten every second in a
     terminal and repeated every ten seconds elsewhere. Nothing is shown if all kernels are in Warp's cache. A thread
     watches the folder of the cache, so Warp needs no change. The context may stay open for a whole training.
     """
@@ -69,7 +70,7 @@ class CompileProgress:
                 if self._seconds >= SHOW_AFTER and now - (self._last_line or -1e9) >= self._interval:
                     self._last_line = now
                     # the cursor returns to the start of the line, so that later output covers it
-                    self._write("compiling physics kernels, once per machine", "\r" if self._terminal else "\n")
+                    self._write("compiling kernels, once per machine", "\r" if self._terminal else "\n")
             elif now - max(start, self._last_build) > END_AFTER:
                 return
             elif pause > QUIET_AFTER:
@@ -100,7 +101,17 @@ class CompileProgress:
         """Replace an unfinished line with its final text, if there is one."""
         if self._last_line is not None:
             self._last_line = None
-            self._write("compiled physics kernels", " " * 40 + "\n" if self._terminal else "\n")
+            self._write("compiled kernels", " " * 40 + "\n" if self._terminal else "\n")
+
+
+@contextlib.contextmanager
+def torch_compiles() -> Iterator[None]:
+    """While this context is open, torch or Triton may compile, which no folder shows."""
+    TORCH_COMPILES.set()
+    try:
+        yield
+    finally:
+        TORCH_COMPILES.clear()
 
 
 def _entries(folder: str) -> dict[str, int]:

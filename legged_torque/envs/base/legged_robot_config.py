@@ -304,7 +304,7 @@ class LeggedRobotCfgPPO(BaseConfig):
         desired_kl: Positive = 0.01  # of the policy before and after an update
         max_learning_rate: Fraction = 1e-2  # upper bound of an adaptive learning rate
         use_clipped_value_loss: bool = True  # whether value changes are clipped too
-        use_mixed_precision: bool = False  # on a GPU with Triton, matrix products of bfloat16 numbers instead of TF32
+        use_mixed_precision: bool = True  # on a GPU with Triton, matrix products of bfloat16 numbers instead of TF32
 
         class symmetry_cfg:  # learning from mirror images as well, with rsl_rl's names
             use_data_augmentation: bool = False  # whether minibatches hold mirror images as well
@@ -317,5 +317,10 @@ class LeggedRobotCfgPPO(BaseConfig):
         rollouts = {"env": {"num_envs": 16, "num_envs_cpu": 16}, "runner": {"num_steps_per_env": 2000}}
         ppo = {"num_learning_epochs": 5, "num_mini_batches": 32, "clip_param": 0.1, "gamma": 0.99, "lam": 0.9}
         ppo |= {"entropy_coef": 5e-4, "learning_rate": 1e-4, "max_grad_norm": 5.0}
-        fixed = {"schedule": "fixed", "symmetry_cfg": {"use_data_augmentation": False}}
+        fixed = {"schedule": "fixed", "symmetry_cfg": {"use_data_augmentation": False}, "use_mixed_precision": False}
         return {"parallel": {}, "paper": {**rollouts, "algorithm": {**ppo, **fixed}}}  # Table II to the letter
+
+    @staticmethod
+    def of_older_runs() -> dict[str, dict]:
+        """Return what runs were trained with whose ``config.yaml`` has no entry for these settings yet."""
+        return {"algorithm": {"use_mixed_precision": False}}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -14,11 +15,27 @@ from legged_torque.learning.fused import products, samples, steps
 from legged_torque.learning.fused.memory import NUMBERS, SAMPLES, TILE, Parameters, Workspace
 from legged_torque.learning.fused.networks import ALIGNMENT, Network, read_network
 from legged_torque.utils import distributed
+from legged_torque.utils.compiled import keep_kernels
+from legged_torque.utils.progress import torch_compiles
 
 if TYPE_CHECKING:
     from legged_torque.learning.ppo import OnDevicePPO
 
 GAE_WORLDS = 64  # worlds of a program
+
+
+def compiles_first(method: Callable) -> Callable:
+    """Let the progress line know when a method of the learner is called for the first time."""
+
+    @functools.wraps(method)
+    def call(self: FusedLearner, *args: Any) -> Any:
+        if method.__name__ in self.compiled:
+            return method(self, *args)
+        self.compiled.add(method.__name__)
+        with torch_compiles():
+            return method(self, *args)
+
+    return call
 
 
 class FusedLearner:
@@ -30,7 +47,9 @@ class FusedLearner:
 
     def __init__(self, alg: OnDevicePPO) -> None:
         """Move an algorithm's parameters into one piece, and its optimizer's state."""
+        keep_kernels()
         self._alg = alg
+        self.compiled: set[str] = set()  # methods whose kernels have been compiled
         self._networks = networks = [network for m in (alg.actor, alg.critic) if (network := read_network(m.mlp))]
         layers = [layer for network in networks for layer in network.layers]
         dtype = torch.bfloat16 if alg.use_mixed_precision else torch.float32
@@ -58,6 +77,7 @@ class FusedLearner:
 
     # ---- acting --------------------------------------------------------------------------------------------------
 
+    @compiles_first
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions and keep the transition. Shape: (num_envs, num_actions)."""
         storage, step = self._alg.storage, self._alg.storage.step
@@ -86,6 +106,7 @@ class FusedLearner:
         storage.dones[step].copy_(dones.view(-1, 1))
         storage.step += 1
 
+    @compiles_first
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute returns and advantages (GAE), these of mean 0 and deviation 1 over the rollout."""
         storage, alg = self._alg.storage, self._alg
@@ -104,6 +125,7 @@ class FusedLearner:
 
     # ---- learning ------------------------------------------------------------------------------------------------
 
+    @compiles_first
     def update_minibatch(self) -> None:
         """Take one gradient step on the chosen samples."""
         alg, work = self._alg, self._learning
