@@ -210,6 +210,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
 
     def collect_rollout(self) -> None:
         """Let curricula that hold for a rollout move on, and fill the storage with one rollout and its returns."""
+        self.env.compile()
         self.env.update_curriculum()
         self._rollout()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable, Sequence
 
 import torch
 from rsl_rl.env import VecEnv
@@ -10,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.sim.graph import CudaGraph
+from legged_torque.utils.compiled import compiled
 
 
 class BaseTask(VecEnv):
@@ -30,6 +32,9 @@ class BaseTask(VecEnv):
     """
 
     obs_buf: TensorDict
+    _parts: Sequence[Callable[[], None]] = ()
+    """What a step does with torch, in the order of the step, between what Warp's kernels do."""
+    _is_compiled = False
     num_processes = 1
     """Processes that train together, each with as many worlds; the runner sets it."""
 
@@ -42,6 +47,16 @@ class BaseTask(VecEnv):
         self.total_steps, self.num_diverged = (torch.zeros((), dtype=torch.long, device=device) for _ in range(2))
         self.extras = {"time_outs": self.time_out_buf}
         self.step_graph = CudaGraph(self._step, device)
+
+    def compile(self) -> None:
+        """Let a GPU with Triton run what a step does with torch as few kernels; trainings do this.
+
+        It takes seconds, at the next step, which thousands of steps win back. Results are the same up to rounding.
+        """
+        if not self._is_compiled:
+            self._is_compiled = True
+            self._parts = [compiled(part, self.device) for part in self._parts]
+            self.step_graph.reset()
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Apply actions for one control step. Shape: (num_envs, num_actions); one that is not finite resets its world.

@@ -29,7 +29,6 @@ from legged_torque.sim.health import Health
 from legged_torque.sim.randomization import Parameter, changes_legs
 from legged_torque.sim.simulator import Simulator
 from legged_torque.terrain import make_terrain
-from legged_torque.utils.compiled import compiled
 from legged_torque.utils.config import section_keys, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.math import quat_rotate_inverse
@@ -80,7 +79,7 @@ class LeggedRobot(BaseTask):
         self.observations = Observations(self.observation_terms(), *seen, self.num_envs)
         self.obs_buf = self.observations.buffers
         self.health = Health(watched(self), self.sim.diverged)
-        self._parts = [compiled(part, device) for part in (self._judge, self._add_up, self._finish_step)]
+        self._parts = (self._judge, self._add_up, self._finish_step)
         self.reset()
 
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
