@@ -95,6 +95,12 @@ def state_of(alg):
     return result | {"lr": torch.as_tensor(alg.learning_rate).clone()}
 
 
+def steps_taken(alg):
+    """The step counters of Adam, which must all agree."""
+    (count,) = {int(entry["step"]) for entry in alg.optimizer.state_dict()["state"].values()}
+    return count
+
+
 def assert_same_state(actual, expected, rtol=2e-5, atol=2e-7):
     """Compare two :func:`state_of`."""
     assert actual.keys() == expected.keys()

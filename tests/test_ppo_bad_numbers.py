@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 from rsl_rl.algorithms import PPO
-from test_ppo import (
+from rollouts import (
     NUM_ACTIONS,
     SAMPLES,
     SETTINGS,
