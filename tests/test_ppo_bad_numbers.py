@@ -5,7 +5,6 @@ import math
 
 import pytest
 import torch
-from rsl_rl.algorithms import PPO
 from rollouts import (
     NUM_ACTIONS,
     SAMPLES,
@@ -20,6 +19,7 @@ from rollouts import (
     state_of,
     steps_taken,
 )
+from rsl_rl.algorithms import PPO
 
 
 def poison(storage, field, value, step=5, world=2):
