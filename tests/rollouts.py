@@ -23,6 +23,18 @@ SETTINGS = {
     "schedule": "fixed",
 }
 
+POISONS = [
+    ("advantages", math.nan),
+    ("advantages", math.inf),
+    ("returns", math.nan),
+    ("returns", 1e30),  # all gradients are finite, their norm is not
+    ("actions", math.nan),
+    ("policy", math.nan),
+    ("critic", math.nan),
+    ("critic", -math.inf),
+]
+"""Fields of a rollout, and what spoils a minibatch with them."""
+
 
 def random_obs(num=WORLDS):
     """Observations of both groups, standard normal."""
@@ -78,6 +90,13 @@ def copy_rollout(source, target, samples=None):
     for old, new in zip(source.distribution_params, target.distribution_params, strict=True):
         put(old, new)
     target.step = target.num_transitions_per_env
+
+
+def poison(storage, field, value, step=5, world=2):
+    """Spoil one sample of a stored rollout; return its number in the flattened rollout."""
+    tensor = storage.observations[field] if field in SIZES else getattr(storage, field)
+    tensor[step, world, 0] = value
+    return step * storage.num_envs + world
 
 
 def parameters(alg):

@@ -10,7 +10,17 @@ import os
 import numpy as np
 import pytest
 import torch
-from rollouts import SETTINGS, SIZES, copy_rollout, make_ppo, parameters, random_obs, record_rollout
+from rollouts import (
+    POISONS,
+    SETTINGS,
+    SIZES,
+    copy_rollout,
+    make_ppo,
+    parameters,
+    poison,
+    random_obs,
+    record_rollout,
+)
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
@@ -185,6 +195,31 @@ def test_a_gradient_that_is_not_finite_changes_nothing():
     losses = dict(zip(LOSS_NAMES, alg.losses.tolist(), strict=True))
     assert losses.pop("skipped_updates") == 1.0
     assert set(losses.values()) == {0.0}
+
+
+@pytest.mark.parametrize(("field", "value"), POISONS)
+def test_a_minibatch_that_is_skipped_leaves_nothing_behind(field, value):
+    """The next one is learned from as if the one before had never been, to the bit."""
+    algorithms = spoiled, twin = make(fuse=True, **KINDS[1]), make(fuse=True, **KINDS[1])
+    for alg in algorithms:
+        record_rollout(alg)
+    poison(spoiled.storage, field, value, step=0, world=2)
+    for alg, firsts in ((spoiled, (0, 60)), (twin, (60,))):
+        for first in firsts:
+            alg.indices.copy_(torch.arange(first, first + alg.batch_size))
+            alg._update_minibatch()
+    assert [float(alg.losses[-1]) for alg in algorithms] == [1.0, 0.0]
+    assert all(map(torch.equal, spoiled.fused.state(), twin.fused.state()))
+
+
+def test_gradients_are_finite_whatever_the_learning_rate():
+    """It is no part of them, nor of the samples that fill up the last tile."""
+    alg = make(fuse=True)
+    record_rollout(alg)
+    alg.learning_rate.fill_(math.inf)
+    choose([alg], 0)
+    alg._update_minibatch()
+    assert all(torch.isfinite(gradient).all() for gradient in alg.fused.gradients())
 
 
 def test_the_critic_learns_alone():

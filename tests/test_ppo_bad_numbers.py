@@ -7,38 +7,19 @@ import pytest
 import torch
 from rollouts import (
     NUM_ACTIONS,
+    POISONS,
     SAMPLES,
     SETTINGS,
-    SIZES,
-    WORLDS,
     assert_same_state,
     copy_rollout,
     make_ppo,
     parameters,
+    poison,
     record_rollout,
     state_of,
     steps_taken,
 )
 from rsl_rl.algorithms import PPO
-
-
-def poison(storage, field, value, step=5, world=2):
-    """Spoil one sample of a stored rollout; return its number in the flattened rollout."""
-    tensor = storage.observations[field] if field in SIZES else getattr(storage, field)
-    tensor[step, world, 0] = value
-    return step * WORLDS + world
-
-
-POISONS = [
-    ("advantages", math.nan),
-    ("advantages", math.inf),
-    ("returns", math.nan),
-    ("returns", 1e30),  # all gradients are finite, their norm is not
-    ("actions", math.nan),
-    ("policy", math.nan),
-    ("critic", math.nan),
-    ("critic", -math.inf),
-]
 
 
 @pytest.mark.parametrize(("field", "value"), POISONS)

@@ -254,9 +254,12 @@ class FusedLearner:
         )  # fmt: skip
 
     def _mirror_map(self, name: str) -> tuple[Tensor, Tensor]:
-        """Return order and signs of the mirror image of observations or actions; without images, they are not read."""
-        symmetry = self._alg.symmetry
-        return symmetry.env.mirror.maps[name] if symmetry else (self._alg.indices, self._alg.learning_rate)
+        """Return order and signs of the mirror image of observations or actions; without images, of no change."""
+        alg = self._alg
+        if alg.symmetry:
+            return alg.symmetry.env.mirror.maps[name]
+        size = (alg.storage.actions if name == "actions" else alg.storage.observations[name]).shape[-1]
+        return torch.arange(size, device=alg.device), torch.ones(size, device=alg.device)
 
     def _deviation_settings(self) -> tuple[Any, float, float, bool]:
         """Return the parameter of the standard deviations, its range, and whether it is a logarithm."""

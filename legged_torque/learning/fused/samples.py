@@ -107,7 +107,8 @@ def losses(
     advantage = tl.load(advantages + chosen, mask=is_sample, other=0.0)
     surrogate = -advantage * ratio
     clipped = -advantage * tl.minimum(tl.maximum(ratio, 1.0 - clip), 1.0 + clip)
-    by_log_prob = tl.where(is_sample & (surrogate >= clipped), surrogate, 0.0) / num_samples * tl.load(actor_learns)
+    unclipped = tl.where(surrogate < clipped, 0.0, surrogate)  # NaN stays NaN, here and below, and is seen in the norm
+    by_log_prob = tl.where(is_sample, unclipped, 0.0) / num_samples * tl.load(actor_learns)
     distance = (action - mean) / std[None, :]
     by_mean = tl.where(used, by_log_prob[:, None] * distance / std[None, :], 0.0)
     share = tl.sum(is_sample.to(tl.float32)) / num_samples  # of this program
@@ -133,7 +134,7 @@ def losses(
         limited = first + tl.minimum(tl.maximum(change, -clip), clip) - target
         inside = tl.where((change >= -clip) & (change <= clip), 2.0 * limited, 0.0)
         squared = limited * limited
-        by_value = tl.where(value_loss >= squared, by_value, inside)
+        by_value = tl.where(value_loss < squared, inside, by_value)
         value_loss = tl.maximum(value_loss, squared)
     by_value = tl.where(is_sample, by_value * value_weight / num_samples, 0.0)
 
