@@ -286,7 +286,19 @@ def test_padding_does_not_matter():
     assert float(alg.losses[0]) == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize("what", ["normalization", "activation", "advantages", "mirror loss", "fixed deviation"])
+PARTS = [
+    "normalization",
+    "activation",
+    "advantages",
+    "mirror loss",
+    "fixed deviation",
+    "losses",
+    "model",
+    "distribution",
+]
+
+
+@pytest.mark.parametrize("what", PARTS)
 def test_what_has_no_kernels_is_left_to_torch(what):
     """Algorithms with other parts are known beforehand."""
     alg = make_ppo()
@@ -300,6 +312,14 @@ def test_what_has_no_kernels_is_left_to_torch(what):
     elif what == "mirror loss":
         alg = make(symmetric=True)
         alg.symmetry.use_mirror_loss = True
+    elif what in ("losses", "model", "distribution"):
+        part = {"losses": alg, "model": alg.critic, "distribution": alg.actor.distribution}[what]
+        part.__class__ = type("Own", (type(part),), {})  # of a user, with methods that kernels do not know
     else:
         alg.actor.distribution.log_std_param.requires_grad_(False)
     assert not can_be_fused(alg)
+
+
+def test_mixed_precision_is_that_of_the_kernels():
+    """An algorithm that works with torch's operations says that it does without."""
+    assert make(use_mixed_precision=True).product_dtype == torch.float32

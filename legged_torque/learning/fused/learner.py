@@ -52,10 +52,9 @@ class FusedLearner:
         self.compiled: set[str] = set()  # methods whose kernels have been compiled
         self._networks = networks = [network for m in (alg.actor, alg.critic) if (network := read_network(m.mlp))]
         layers = [layer for network in networks for layer in network.layers]
-        dtype = torch.bfloat16 if alg.use_mixed_precision else torch.float32
         storage, device = alg.storage, alg.device
         self._std = self._deviation_settings()
-        self._parameters = Parameters(alg.actor, alg.critic, layers, self._std[0], dtype)
+        self._parameters = Parameters(alg.actor, alg.critic, layers, self._std[0], alg.product_dtype)
         self._acting = Workspace(networks, self._parameters, storage.num_envs, learns=False)
         images = 2 if alg.symmetry else 1
         self._num_chosen = alg.batch_size
@@ -267,6 +266,13 @@ class FusedLearner:
         if distribution.std_type == "log":
             return distribution.log_std_param, *distribution.log_std_range, True
         return distribution.std_param, *distribution.std_range, False
+
+
+def fit_in_shared_memory(dtype: torch.dtype, device: str) -> bool:
+    """Return whether a GPU has as much shared memory as the tiles of a matrix product take."""
+    stages = max(settings["num_stages"] for settings in (products.FORWARD, products.BACKWARD))
+    tiles = stages * (SAMPLES + TILE) * ALIGNMENT * dtype.itemsize
+    return tiles <= torch.cuda.get_device_properties(device).shared_memory_per_multiprocessor
 
 
 def _power_of_two(size: int) -> int:
