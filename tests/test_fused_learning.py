@@ -31,7 +31,7 @@ from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, can_be_fused
 
 pytest.importorskip("triton", reason="Triton is there for Linux only")
 if os.environ.get("TRITON_INTERPRET") != "1":
-    pytest.skip("on a GPU kernels run for real: scripts/check_capture.py compares them", allow_module_level=True)
+    pytest.skip("Triton's interpreter is for machines without a GPU: CUDA_VISIBLE_DEVICES=", allow_module_level=True)
 from legged_torque.learning.fused.learner import FusedLearner
 
 STEPS, WORLDS, NUM_ACTIONS = 3, 40, 6
