@@ -23,6 +23,18 @@ SETTINGS = {
     "schedule": "fixed",
 }
 
+POISONS = [
+    ("advantages", math.nan),
+    ("advantages", math.inf),
+    ("returns", math.nan),
+    ("returns", 1e30),  # all gradients are finite, their norm is not
+    ("actions", math.nan),
+    ("policy", math.nan),
+    ("critic", math.nan),
+    ("critic", -math.inf),
+]
+"""Fields of a rollout, and what spoils a minibatch with them."""
+
 
 def random_obs(num=WORLDS):
     """Observations of both groups, standard normal."""
@@ -80,6 +92,13 @@ def copy_rollout(source, target, samples=None):
     target.step = target.num_transitions_per_env
 
 
+def poison(storage, field, value, step=5, world=2):
+    """Spoil one sample of a stored rollout; return its number in the flattened rollout."""
+    tensor = storage.observations[field] if field in SIZES else getattr(storage, field)
+    tensor[step, world, 0] = value
+    return step * storage.num_envs + world
+
+
 def parameters(alg):
     """All parameters, actor's and critic's, by name."""
     models = {"actor": alg.actor, "critic": alg.critic}
@@ -93,6 +112,12 @@ def state_of(alg):
     for index, entry in alg.optimizer.state_dict()["state"].items():
         result |= {f"adam.{index}.{name}": torch.as_tensor(value).clone() for name, value in entry.items()}
     return result | {"lr": torch.as_tensor(alg.learning_rate).clone()}
+
+
+def steps_taken(alg):
+    """The step counters of Adam, which must all agree."""
+    (count,) = {int(entry["step"]) for entry in alg.optimizer.state_dict()["state"].values()}
+    return count
 
 
 def assert_same_state(actual, expected, rtol=2e-5, atol=2e-7):

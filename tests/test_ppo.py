@@ -18,17 +18,12 @@ from rollouts import (
     random_obs,
     record_rollout,
     state_of,
+    steps_taken,
 )
 from rsl_rl.algorithms import PPO
 
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.utils.errors import UserError
-
-
-def steps_taken(alg):
-    """The step counters of Adam, which must all agree."""
-    (count,) = {int(entry["step"]) for entry in alg.optimizer.state_dict()["state"].values()}
-    return count
 
 
 def shift_policy(alg, amount):

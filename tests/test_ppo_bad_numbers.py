@@ -5,40 +5,21 @@ import math
 
 import pytest
 import torch
-from rsl_rl.algorithms import PPO
-from test_ppo import (
+from rollouts import (
     NUM_ACTIONS,
+    POISONS,
     SAMPLES,
     SETTINGS,
-    SIZES,
-    WORLDS,
     assert_same_state,
     copy_rollout,
     make_ppo,
     parameters,
+    poison,
     record_rollout,
     state_of,
     steps_taken,
 )
-
-
-def poison(storage, field, value, step=5, world=2):
-    """Spoil one sample of a stored rollout; return its number in the flattened rollout."""
-    tensor = storage.observations[field] if field in SIZES else getattr(storage, field)
-    tensor[step, world, 0] = value
-    return step * WORLDS + world
-
-
-POISONS = [
-    ("advantages", math.nan),
-    ("advantages", math.inf),
-    ("returns", math.nan),
-    ("returns", 1e30),  # all gradients are finite, their norm is not
-    ("actions", math.nan),
-    ("policy", math.nan),
-    ("critic", math.nan),
-    ("critic", -math.inf),
-]
+from rsl_rl.algorithms import PPO
 
 
 @pytest.mark.parametrize(("field", "value"), POISONS)

@@ -172,7 +172,7 @@ def test_tensors_of_a_users_task_are_found():
     """They are kept wherever they are and wherever their axis of worlds stands; what cannot change is not."""
     env_cfg, _ = task_registry.get_cfgs("a1_position", Options(device="cpu", num_envs=12))
     task, other = OwnTask(env_cfg), OwnTask(env_cfg)
-    assert len(task.mirror._maps) > 0  # made when it is first asked for, with tensors of 12 numbers
+    assert len(task.mirror.maps) > 0  # made when it is first asked for, with tensors of 12 numbers
     task.clock.random_(100)
     task.helper.phases[0].normal_()
     task.by_foot["height"].normal_()

@@ -124,9 +124,11 @@ def take_terminal():
 def test_mujoco_leaves_no_file(tmp_path):
     """Its warnings go to standard error."""
     code = """
-import mujoco, numpy
-from legged_torque.utils.cli import run_script
+import numpy
+from legged_torque.utils.cli import importing, run_script
 def main():
+    with importing():
+        import mujoco
     ball = "<body><freejoint/><geom size='1'/></body>"
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{ball}</worldbody></mujoco>")
     data = mujoco.MjData(model)

@@ -219,7 +219,7 @@ def roll_out(runner):
     with torch.no_grad():
         for parameter in runner.alg.actor.mlp.parameters():
             parameter += 0.02 * torch.randn(parameter.shape)
-    runner.alg._indices.copy_(torch.arange(SAMPLES))
+    runner.alg.indices.copy_(torch.arange(SAMPLES))
     return runner.alg._gather()
 
 

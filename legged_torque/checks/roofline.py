@@ -73,7 +73,7 @@ def work(alg: OnDevicePPO, sim: Simulator, decimation: int) -> dict[str, Any]:
     "update_dtype" is the kind of numbers that an update multiplies.
     """
     return {
-        "update_dtype": str(update_dtype(alg)).removeprefix("torch."),
+        "update_dtype": str(alg.product_dtype).removeprefix("torch."),
         "update_flop": update_flop(alg),
         "update_bytes": update_bytes(alg),
         "physics_bytes": physics_bytes(sim, decimation),
@@ -101,14 +101,9 @@ def flop_per_sample(model: nn.Module) -> int:
     return 2 * (2 * first + 3 * sum(others))
 
 
-def update_dtype(alg: OnDevicePPO) -> torch.dtype:
-    """Return the kind of numbers that are multiplied, which activations are kept as."""
-    return torch.bfloat16 if alg.use_mixed_precision else torch.float32
-
-
 def update_bytes(alg: OnDevicePPO) -> int:
     """Return the bytes that an update reads and writes if it does so once, see above."""
-    storage, width = alg.storage, update_dtype(alg).itemsize
+    storage, width = alg.storage, alg.product_dtype.itemsize  # of activations, too
     groups = {*alg.actor.obs_groups, *alg.critic.obs_groups}
     stored: list[Tensor] = [storage.observations[name] for name in groups]
     stored += [storage.actions, storage.actions]  # and their means

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import torch
@@ -16,8 +15,10 @@ from torch.utils._pytree import tree_map
 from legged_torque.envs.base.symmetry import with_mirror_images
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.fused.networks import read_network
+from legged_torque.learning.multi_head import MultiHeadModel
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
+from legged_torque.utils.compiled import can_compile
 from legged_torque.utils.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ class OnDevicePPO(PPO):
     """
 
     optimizer: torch.optim.Adam
+    use_mixed_precision: bool
 
     def __init__(
         self,
@@ -79,6 +81,7 @@ class OnDevicePPO(PPO):
         self.losses = torch.zeros(len(LOSS_NAMES), device=self.device)
         self.indices = torch.zeros(self.batch_size, dtype=torch.long, device=self.device)
         self.fused = self._fuse()
+        self.use_mixed_precision = self.use_mixed_precision and self.fused is not None  # torch's operations do without
         self.update_graph = CudaGraph(self._update_minibatch, self.device)  # the update from one minibatch
 
     def learn_actor(self, enabled: bool) -> None:
@@ -149,13 +152,18 @@ class OnDevicePPO(PPO):
         """Return the standard deviations of the actions that were sampled last. Shape: (..., num_actions)."""
         return self.fused.action_std() if self.fused else self.actor.output_std
 
+    @property
+    def product_dtype(self) -> torch.dtype:
+        """Kind of numbers that matrix products take; those of float32 may be TF32."""
+        return torch.bfloat16 if self.use_mixed_precision else torch.float32
+
     def _fuse(self) -> FusedLearner | None:
         """Return what acts and learns in few kernels; None where that needs something that is not there."""
-        if torch.device(self.device).type != "cuda" or not find_spec("triton") or not can_be_fused(self):
+        if not can_compile(self.device) or not can_be_fused(self):
             return None
-        from legged_torque.learning.fused.learner import FusedLearner  # imports Triton
+        from legged_torque.learning.fused.learner import FusedLearner, can_multiply  # imports Triton
 
-        return FusedLearner(self)
+        return FusedLearner(self) if can_multiply(self.product_dtype, self.device) else None
 
     def _state(self) -> list[Tensor]:
         """Return the weights, and the optimizer's moments and counters, which do not exist before the first step."""
@@ -275,10 +283,12 @@ def flattened(tensors: list[Tensor]) -> Tensor:
 
 
 def can_be_fused(alg: OnDevicePPO) -> bool:
-    """Return whether there are kernels for all that an algorithm asks for."""
+    """Return whether there are kernels for all that an algorithm asks for; classes of a user's may do anything."""
     models, symmetry = (alg.actor, alg.critic), alg.symmetry
     return (
-        isinstance(alg.actor.distribution, GaussianDistribution)
+        type(alg) is OnDevicePPO
+        and all(type(model) in (MLPModel, MultiHeadModel) for model in models)
+        and type(alg.actor.distribution) is GaussianDistribution
         and all(read_network(model.mlp) and not model.obs_normalization for model in models)
         and all(parameter.requires_grad for model in models for parameter in model.parameters())
         and not alg.normalize_advantage_per_mini_batch

@@ -125,7 +125,7 @@ class LeggedRobot(BaseTask):
         self.post_physics_step()
 
     def run_physics(self) -> None:
-        """Do the physics steps of a control step: one launch if control law and motors have Warp functions."""
+        """Do the physics steps of a control step, with torques inside if control law and motors name Warp functions."""
         decimation, refresh = self.cfg.control.decimation, self.cfg.control.refresh_torques
         drive = self._drive.get() if refresh and self.sim.is_fused else None
         if drive:

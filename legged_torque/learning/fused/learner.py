@@ -52,10 +52,9 @@ class FusedLearner:
         self.compiled: set[str] = set()  # methods whose kernels have been compiled
         self._networks = networks = [network for m in (alg.actor, alg.critic) if (network := read_network(m.mlp))]
         layers = [layer for network in networks for layer in network.layers]
-        dtype = torch.bfloat16 if alg.use_mixed_precision else torch.float32
         storage, device = alg.storage, alg.device
         self._std = self._deviation_settings()
-        self._parameters = Parameters(alg.actor, alg.critic, layers, self._std[0], dtype)
+        self._parameters = Parameters(alg.actor, alg.critic, layers, self._std[0], alg.product_dtype)
         self._acting = Workspace(networks, self._parameters, storage.num_envs, learns=False)
         images = 2 if alg.symmetry else 1
         self._num_chosen = alg.batch_size
@@ -254,9 +253,12 @@ class FusedLearner:
         )  # fmt: skip
 
     def _mirror_map(self, name: str) -> tuple[Tensor, Tensor]:
-        """Return order and signs of the mirror image of observations or actions; without images, they are not read."""
-        symmetry = self._alg.symmetry
-        return symmetry.env.mirror.maps[name] if symmetry else (self._alg.indices, self._alg.learning_rate)
+        """Return order and signs of the mirror image of observations or actions; without images, of no change."""
+        alg = self._alg
+        if alg.symmetry:
+            return alg.symmetry.env.mirror.maps[name]
+        size = (alg.storage.actions if name == "actions" else alg.storage.observations[name]).shape[-1]
+        return torch.arange(size, device=alg.device), torch.ones(size, device=alg.device)
 
     def _deviation_settings(self) -> tuple[Any, float, float, bool]:
         """Return the parameter of the standard deviations, its range, and whether it is a logarithm."""
@@ -264,6 +266,14 @@ class FusedLearner:
         if distribution.std_type == "log":
             return distribution.log_std_param, *distribution.log_std_range, True
         return distribution.std_param, *distribution.std_range, False
+
+
+def can_multiply(dtype: torch.dtype, device: str) -> bool:
+    """Return whether a GPU multiplies bfloat16 and TF32, and has the shared memory that the tiles of a product take."""
+    stages = max(settings["num_stages"] for settings in (products.FORWARD, products.BACKWARD))
+    tiles = stages * (SAMPLES + TILE) * ALIGNMENT * dtype.itemsize
+    properties = torch.cuda.get_device_properties(device)
+    return properties.major >= 8 and tiles <= properties.shared_memory_per_block_optin
 
 
 def _power_of_two(size: int) -> int:

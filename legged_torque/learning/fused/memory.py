@@ -196,7 +196,8 @@ class Workspace:
                         ends = source.elu and first_reader[source] is layer
                         sizes = [aligned(source.size) - first, self._parameters.sum_column[source] + first]
                         written = [self.place(source) + first, source.block.width, *sizes]
-                        tiles.append([*read, *written, int(source in there), int(ends)])
+                        adds = source.size - first if source in there else 0
+                        tiles.append([*read, *written, adds, int(ends)])
                     offset += aligned(source.size)
                     there.add(source)
             result.append(tiles)

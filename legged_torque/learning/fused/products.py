@@ -63,8 +63,8 @@ def input_gradient(
     """Write the gradient of one tile of what a layer reads, g W times the slope of the ELU that made it, and its sum.
 
     The sum over the samples is the gradient of biases. Table: 0 place and 1 stride of g, 2 its columns, 3 place and
-    4 stride of W, 5 place and 6 stride of the result, 7 its columns, 8 column of the sums, 9 whether to add the result
-    to what is there, 10 whether an ELU made what the layer reads.
+    4 stride of W, 5 place and 6 stride of the result, 7 its columns, 8 column of the sums, 9 to how many columns of
+    what is there the result is added, 10 whether an ELU made what the layer reads.
     """
     row = table + tl.program_id(0) * COLUMNS
     first = tl.program_id(1).to(tl.int64) * SAMPLES
@@ -85,7 +85,8 @@ def input_gradient(
         w += STEP * w_stride
     here = samples[:, None] * result_stride + columns[None, :]
     if adds != 0:
-        total += tl.load(gradients + place + here, mask=kept, other=0.0).to(tl.float32)
+        there = kept & (columns < adds)[None, :]  # not to the zeros behind: NaN, once it is there, would stay
+        total += tl.load(gradients + place + here, mask=there, other=0.0).to(tl.float32)
     if has_elu != 0:
         value = tl.load(values + place + here, mask=kept, other=0.0).to(tl.float32)
         total = tl.where(value > 0.0, total, total * (value + 1.0))

@@ -75,6 +75,29 @@ def log_probability(action, mean, std, is_action):
 
 
 @triton.jit
+def divergence(old_mean, old_std, mean, std):
+    """Return the KL divergence of each action's distribution from the one that it was drawn from."""
+    variance_ratio = (old_std / std) * (old_std / std)
+    moved = (old_mean - mean) / std[None, :]
+    return 0.5 * (variance_ratio[None, :] + moved * moved - 1.0 - tl.log(variance_ratio)[None, :])
+
+
+@triton.jit
+def squared_error(value, first, target, clip, CLIP_VALUES: tl.constexpr):
+    """Return the squared errors of values, which may be clipped around ``first``, and their gradients."""
+    error = value - target
+    loss, by_value = error * error, 2.0 * error
+    if CLIP_VALUES:
+        change = value - first
+        limited = first + tl.minimum(tl.maximum(change, -clip), clip) - target
+        inside = tl.where((change >= -clip) & (change <= clip), 2.0 * limited, 0.0)
+        squared = limited * limited
+        by_value = tl.where(loss < squared, inside, by_value)
+        loss = tl.maximum(loss, squared)
+    return loss, by_value
+
+
+@triton.jit
 def losses(
     outputs, std_parameter, low, high, old_std, indices, order, signs, actions, means, log_probs, values, advantages,
     returns, actor_learns, gradients, places, strides, sums, sums_stride, sum_columns, num_chosen, num_samples, size,
@@ -107,7 +130,8 @@ def losses(
     advantage = tl.load(advantages + chosen, mask=is_sample, other=0.0)
     surrogate = -advantage * ratio
     clipped = -advantage * tl.minimum(tl.maximum(ratio, 1.0 - clip), 1.0 + clip)
-    by_log_prob = tl.where(is_sample & (surrogate >= clipped), surrogate, 0.0) / num_samples * tl.load(actor_learns)
+    unclipped = tl.where(surrogate < clipped, 0.0, surrogate)  # NaN stays NaN, here and below, and is seen in the norm
+    by_log_prob = tl.where(is_sample, unclipped, 0.0) / num_samples * tl.load(actor_learns)
     distance = (action - mean) / std[None, :]
     by_mean = tl.where(used, by_log_prob[:, None] * distance / std[None, :], 0.0)
     share = tl.sum(is_sample.to(tl.float32)) / num_samples  # of this program
@@ -118,23 +142,12 @@ def losses(
 
     old_mean = tl.load(means + chosen[:, None] * size + columns[None, :], mask=used, other=0.0)
     old = tl.load(old_std + columns, mask=is_action, other=1.0)
-    variance_ratio = (old / std) * (old / std)
-    moved = (old_mean - mean) / std[None, :]
-    divergence = 0.5 * (variance_ratio[None, :] + moved * moved - 1.0 - tl.log(variance_ratio)[None, :])
-    kl = tl.sum(tl.where(used & (samples < num_chosen)[:, None], divergence, 0.0))
+    kl = tl.sum(tl.where(used & (samples < num_chosen)[:, None], divergence(old_mean, old, mean, std), 0.0))
 
     value = tl.load(outputs + samples * (size + 1) + size, mask=is_sample, other=0.0)
+    first = tl.load(values + chosen, mask=is_sample, other=0.0)
     target = tl.load(returns + chosen, mask=is_sample, other=0.0)
-    error = value - target
-    value_loss, by_value = error * error, 2.0 * error
-    if CLIP_VALUES:
-        first = tl.load(values + chosen, mask=is_sample, other=0.0)
-        change = value - first
-        limited = first + tl.minimum(tl.maximum(change, -clip), clip) - target
-        inside = tl.where((change >= -clip) & (change <= clip), 2.0 * limited, 0.0)
-        squared = limited * limited
-        by_value = tl.where(value_loss >= squared, by_value, inside)
-        value_loss = tl.maximum(value_loss, squared)
+    value_loss, by_value = squared_error(value, first, target, clip, CLIP_VALUES)
     by_value = tl.where(is_sample, by_value * value_weight / num_samples, 0.0)
 
     place = tl.load(places + columns, mask=is_action, other=0)
