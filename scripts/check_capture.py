@@ -38,7 +38,7 @@ def main() -> None:
     with importing():
         task_registry.get_cfgs(options.task, options)  # mistakes are told before anything is built
         device = resolve_device(args.device)
-        from legged_torque.checks.capture import compare_capture
+        from legged_torque.checks.capture import KERNEL_TOLERANCE, compare_capture, compare_kernels
     print(f"{args.task} on {device_name(device)}: with CUDA graphs against without")
     if device == "cpu":
         print("a CPU has no graphs: this compares two runs that are the same")
@@ -50,6 +50,10 @@ def main() -> None:
             print(f"{name:<22}", " | ".join(f"{number:9.2e}" for number in astuple(difference)))
             if not difference.within(args.tolerance):
                 too_far.append(f"{name} of iteration {iteration}")
+    for network, error in compare_kernels(plain).items():
+        print(f"gradient of {network}: kernels against torch's autograd {error:.2e} (norm of the difference)")
+        if not error <= KERNEL_TOLERANCE:
+            too_far.append(f"gradient of {network}")
     captured.close()
     if too_far:
         sys.exit(f"beyond the tolerance of {args.tolerance:g}: {', '.join(too_far)}")

@@ -12,6 +12,8 @@ from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.task_registry import set_seed
 
 WARM_UP_ITERATIONS = 2  # iterations before everything is replayed: the first runs as it is, the second captures
+KERNEL_TOLERANCE = 0.05
+"""Accepted relative error of the gradients by the update's kernels: products of bfloat16 numbers are right to 0.4%."""
 NOISE_FACTOR = 3.0
 """Accepted difference, in differences of two runs without graphs, where only the order of additions differs."""
 _LEARNED_FROM = ("observations", "actions", "values", "actions_log_prob", "returns", "advantages")
@@ -52,6 +54,36 @@ def compare_capture(plain: OnPolicyRunner, captured: OnPolicyRunner, seed: int) 
     return {name: _compare(actual[name], value, repeated[name]) for name, value in expected.items()}
 
 
+@torch.no_grad()
+def compare_kernels(runner: OnPolicyRunner) -> dict[str, float]:
+    """Compare the gradients of the update's kernels with autograd's, for the first samples of the last rollout.
+
+    Returns:
+        By network: the norm of the difference, relative to that of autograd's gradient; nothing without kernels.
+    """
+    alg = runner.alg
+    if not alg.fused:
+        return {}
+    alg.indices.copy_(torch.arange(alg.batch_size))
+    before, rate = [tensor.clone() for tensor in alg.fused.state()], alg.learning_rate.clone()
+    alg.fused.update_minibatch()
+    fused = [gradient.clone() for gradient in alg.fused.gradients()]
+    for tensor, value in zip([*alg.fused.state(), alg.learning_rate], [*before, rate], strict=True):
+        tensor.copy_(value)
+    alg.fused.round_weights()
+    alg.optimizer.zero_grad()
+    with torch.enable_grad():
+        alg.loss()[0].backward()
+    result, start = {}, 0
+    for name, network in {"actor": alg.actor, "critic": alg.critic}.items():
+        exact = torch.cat([parameter.grad.flatten() for parameter in network.parameters()])
+        parts = fused[start : start + len(list(network.parameters()))]
+        start += len(parts)
+        found = torch.cat([gradient.flatten() for gradient in parts])
+        result[name] = float((found - exact).norm() / exact.norm())
+    return result
+
+
 def warm_up(runner: OnPolicyRunner) -> None:
     """Run the iterations after which everything that can be captured is replayed."""
     runner.alg.train_mode()
@@ -83,7 +115,8 @@ def _iterate(
     runner.collect_rollout()
     result = {f"observations {group}": value.clone() for group, value in storage.observations.items()}
     result |= {name: getattr(storage, name).clone() for name in ("actions", "rewards", "returns")}
-    learned_from = [getattr(storage, name) for name in _LEARNED_FROM] + list(storage.distribution_params)
+    mean, _ = storage.distribution_params  # the deviations are those of the same networks
+    learned_from = [*(getattr(storage, name) for name in _LEARNED_FROM), mean]
     rollout = rollout or [tensor.clone() for tensor in learned_from]
     for tensor, value in zip(learned_from, rollout, strict=True):
         tensor.copy_(value)

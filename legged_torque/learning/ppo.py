@@ -195,8 +195,8 @@ class OnDevicePPO(PPO):
         else:
             self._update_by_autograd()
 
-    def _update_by_autograd(self) -> None:
-        """Take the step with torch's operations."""
+    def loss(self) -> tuple[Tensor, Tensor]:
+        """Return the loss of the samples of ``indices`` by torch's operations, and the first numbers of LOSS_NAMES."""
         batch = self._gather()
         if self.symmetry:
             self.symmetry.augment_batch(batch, self.batch_size)
@@ -212,6 +212,12 @@ class OnDevicePPO(PPO):
             mirror_loss = self.symmetry.compute_loss(self.actor, batch, self.batch_size)
             actor_loss = actor_loss + self.symmetry.mirror_loss_coeff * mirror_loss
         loss = self.actor_learns * actor_loss + self.value_loss_coef * value_loss
+        return loss, torch.stack([value_loss, surrogate_loss, entropy, kl]).detach()
+
+    def _update_by_autograd(self) -> None:
+        """Take the step with torch's operations."""
+        loss, numbers = self.loss()
+        kl = numbers[3]
         self.optimizer.zero_grad()
         loss.backward()
         if self.is_multi_gpu:
@@ -222,7 +228,7 @@ class OnDevicePPO(PPO):
         gradient_norm = torch.linalg.vector_norm(norms)
         self._skip.copy_(~torch.isfinite(gradient_norm))
         self.optimizer.step()
-        numbers = torch.stack([value_loss, surrogate_loss, entropy, kl, gradient_norm, norms[1]]).detach()
+        numbers = torch.cat([numbers, torch.stack([gradient_norm, norms[1]])])
         kept = torch.where(self._skip.bool(), 0.0, numbers)
         self.losses += torch.cat([kept, self._skip.unsqueeze(0)])
 

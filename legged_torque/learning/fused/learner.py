@@ -69,7 +69,7 @@ class FusedLearner:
         self._norms = torch.zeros(2, steps.PARTS, device=device)
         self._scalars = torch.zeros(5, device=device)  # see :func:`~legged_torque.learning.fused.steps.settle`
         self._means, self._stds = torch.zeros_like(storage.actions), torch.zeros(size, device=device)
-        storage.distribution_params = (self._means, self._stds)  # the deviations are the same for all samples
+        storage.distribution_params = (self._means, self._stds.expand_as(self._means))  # the same for all samples
         self._maps = [[self._mirror_map(group) for group in model.obs_groups] for model in (alg.actor, alg.critic)]
         self._action_map = self._mirror_map("actions")
         self.share_state(alg.optimizer)
@@ -273,7 +273,7 @@ def can_multiply(dtype: torch.dtype, device: str) -> bool:
     stages = max(settings["num_stages"] for settings in (products.FORWARD, products.BACKWARD))
     tiles = stages * (SAMPLES + TILE) * ALIGNMENT * dtype.itemsize
     properties = torch.cuda.get_device_properties(device)
-    return properties.major >= 8 and tiles <= properties.shared_memory_per_block_optin
+    return properties.major >= 8 and tiles <= properties.shared_memory_per_multiprocessor
 
 
 def _power_of_two(size: int) -> int:
