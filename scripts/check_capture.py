@@ -1,4 +1,4 @@
-"""Check that training does the same with and without CUDA graphs: ``python scripts/check_capture.py``."""
+"""Check that graphs and kernels of a GPU train as torch does without: ``python scripts/check_capture.py``."""
 
 from __future__ import annotations
 

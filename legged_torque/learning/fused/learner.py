@@ -180,9 +180,11 @@ class FusedLearner:
             order, signs = maps[i] if maps else (group, group)
             target = (work.place(network.inputs), network.inputs.block.width, column)
             counts = (self._num_chosen, self._num_samples if maps else len(group), group.shape[1])
-            samples.observe[(work.rows // samples.ROWS,)](
+            columns = _power_of_two(group.shape[1])
+            rows = max(1, min(samples.ROWS, samples.NUMBERS // columns))
+            samples.observe[(work.rows // rows,)](
                 group, self._alg.indices, order, signs, work.values, *target, *counts,
-                CHOOSE=bool(maps), ROWS=samples.ROWS, COLUMNS=_power_of_two(group.shape[1]),
+                CHOOSE=bool(maps), ROWS=rows, COLUMNS=columns,
             )  # fmt: skip
             column += group.shape[1]
 

@@ -7,6 +7,7 @@ import triton
 import triton.language as tl
 
 ROWS = 16  # samples of a program that writes what it reads
+NUMBERS = 4096  # that it reads at most, where a sample has not more
 
 
 @triton.jit
