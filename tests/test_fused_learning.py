@@ -26,7 +26,7 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 
-from legged_torque.checks.capture import compare_kernels
+from legged_torque.checks.capture import KERNEL_TOLERANCE, compare_kernels
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.multi_head import MultiHeadModel
 from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, can_be_fused
@@ -337,7 +337,7 @@ def test_the_check_on_a_gpu_compares_with_autograd():
     assert set(errors) == {"actor", "critic"}
     assert max(errors.values()) < 1e-4
     assert all(torch.equal(old, new) for old, new in zip(before, alg.fused.state(), strict=True))
-    alg.fused.gradients = lambda: [1.1 * gradient for gradient in FusedLearner.gradients(alg.fused)]
-    assert min(compare_kernels(runner).values()) > 0.05
+    alg.fused.gradients = lambda: [1.2 * gradient for gradient in FusedLearner.gradients(alg.fused)]
+    assert min(compare_kernels(runner).values()) > KERNEL_TOLERANCE
     alg.fused = None
     assert compare_kernels(runner) == {}

@@ -26,7 +26,6 @@ SETTINGS: dict[str, Any] = {
         "deterministic": True,
         "fallback_random": True,  # random numbers are torch's own
         "triton.autotune_pointwise": False,
-        "unroll_reductions_threshold": 64,  # a sum over joints is made by the thread of the world: one kernel for all
     },
 }
 """Arguments of ``torch.compile``."""
