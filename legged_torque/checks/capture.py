@@ -13,8 +13,8 @@ from legged_torque.utils.task_registry import set_seed
 
 WARM_UP_ITERATIONS = 2  # iterations before everything is replayed: the first runs as it is, the second captures
 KERNEL_TOLERANCE = 0.1
-"""Accepted relative error of gradients by the update's kernels. Products of bfloat16 numbers are right to 0.4%, but most
-of the samples' gradients cancel: 3% for an actor that has just begun to learn."""
+"""Accepted relative error of gradients by the update's kernels. Products of bfloat16 numbers are right to 0.4%, but the
+gradients of samples mostly cancel: 3% for an actor that has just begun to learn."""
 NOISE_FACTOR = 3.0
 """Accepted difference, in differences of two runs without graphs, where only the order of additions differs."""
 _LEARNED_FROM = ("observations", "actions", "values", "actions_log_prob", "returns", "advantages")
