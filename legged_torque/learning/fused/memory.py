@@ -92,10 +92,14 @@ class Workspace:
     Attributes:
         rows: Samples, up to whole tiles in each part.
         values: What all layers have computed, and inputs. Shape: (numbers,).
-        gradients: Gradients of the loss by these, except for the inputs; None without learning. Shape: (numbers,).
         outputs: Outputs of the actor, then of the critic, in float32. Shape: (rows, outputs).
         forward: A table for each stage, whose layers do not depend on each other, and whether it has outputs.
-        backward: The same for gradients of what layers read.
+
+    What learns has these as well:
+
+    Attributes:
+        gradients: Gradients of the loss by the values, except for the inputs. Shape: (numbers,).
+        backward: A table for each stage of gradients of what layers read.
         weight_tiles: The table for gradients of weights.
         partial: Room for these gradients from each part of the samples. Shape: (parts, ``room``).
         sums: Room for sums over the samples of a tile: numbers, then gradients. Shape: (tiles, columns).
