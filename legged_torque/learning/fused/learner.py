@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.learning.fused import products, samples, steps
-from legged_torque.learning.fused.memory import NUMBERS, SAMPLES, TILE, Parameters, Workspace
+from legged_torque.learning.fused.memory import NUMBERS, SAMPLES, TILE, LearningWorkspace, Parameters, Workspace
 from legged_torque.learning.fused.networks import ALIGNMENT, Network, read_network
 from legged_torque.utils import distributed
 from legged_torque.utils.compiled import keep_kernels
@@ -55,11 +55,11 @@ class FusedLearner:
         storage, device = alg.storage, alg.device
         self._std = self._deviation_settings()
         self._parameters = Parameters(alg.actor, alg.critic, layers, self._std[0], alg.product_dtype)
-        self._acting = Workspace(networks, self._parameters, storage.num_envs, learns=False)
+        self._acting = Workspace(networks, self._parameters, storage.num_envs)
         images = 2 if alg.symmetry else 1
         self._num_chosen = alg.batch_size
         self._num_samples = images * alg.batch_size
-        self._learning = Workspace(networks, self._parameters, self._num_samples, learns=True)
+        self._learning = LearningWorkspace(networks, self._parameters, self._num_samples)
         self._places = self._learning.output_places(networks)
         size, flat = storage.actions.shape[-1], self._parameters.flat
         self._gradient = torch.zeros(len(flat) + NUMBERS, device=device)

@@ -90,26 +90,14 @@ class Workspace:
     """What the networks compute for a number of samples, and tables that say which tile of which product is where.
 
     Attributes:
-        rows: Samples, up to whole tiles in each part.
+        rows: Samples, up to whole tiles.
         values: What all layers have computed, and inputs. Shape: (numbers,).
         outputs: Outputs of the actor, then of the critic, in float32. Shape: (rows, outputs).
         forward: A table for each stage, whose layers do not depend on each other, and whether it has outputs.
-
-    What learns has these as well:
-
-    Attributes:
-        gradients: Gradients of the loss by the values, except for the inputs. Shape: (numbers,).
-        backward: A table for each stage of gradients of what layers read.
-        weight_tiles: The table for gradients of weights.
-        partial: Room for these gradients from each part of the samples. Shape: (parts, ``room``).
-        sums: Room for sums over the samples of a tile: numbers, then gradients. Shape: (tiles, columns).
     """
 
-    def __init__(self, networks: Sequence[Network], parameters: Parameters, num_samples: int, learns: bool) -> None:
-        """Allocate for samples and, if it ``learns``, for gradients."""
-        parts = MAX_PARTS if learns else 1
-        while parts > 1 and num_samples < parts * SAMPLES_PER_PART:
-            parts //= 2
+    def __init__(self, networks: Sequence[Network], parameters: Parameters, num_samples: int, parts: int = 1) -> None:
+        """Allocate for samples, which will be treated in ``parts`` of as many tiles each."""
         self.rows = -(-num_samples // (parts * SAMPLES)) * parts * SAMPLES
         weights, device = parameters.weights, parameters.weights.device
         self._parameters = parameters
@@ -118,8 +106,6 @@ class Workspace:
         inputs = [network.inputs.block for network in networks]
         written = [layer.target.block for network in networks for layer in network.layers]
         for block in [*dict.fromkeys(written), *inputs]:
-            if block is inputs[0]:
-                with_gradients = room
             self._places[block] = room
             room += block.width * self.rows
         self.values = weights.new_zeros(room + TILE)  # a tile may read beyond
@@ -132,29 +118,10 @@ class Workspace:
         for stage in stages(chains):
             has_outputs = any(layer.first_output is not None for layer in stage)
             self.forward.append((self._table(self._forward_tiles(stage, first_output)), has_outputs))
-        if learns:
-            self.gradients = weights.new_zeros(with_gradients + TILE)
-            self.backward = [self._table(tiles) for tiles in self._backward_tiles(networks)]
-            layers = [layer for network in networks for layer in network.layers]
-            self.weight_tiles = self._table([tile for layer in layers for tile in self._weight_tiles(layer)])
-            self.partial = torch.zeros(parts, parameters.room, device=device)
-            self.sums = torch.zeros(self.rows // SAMPLES, len(parameters.destination), device=device)
 
     def place(self, columns: Columns) -> int:
         """Return where columns begin in ``values`` and ``gradients``."""
         return self._places[columns.block] + columns.start
-
-    def output_places(self, networks: Sequence[Network]) -> Tensor:
-        """Return where the gradient by each output of the networks begins, its stride and its column of ``sums``.
-
-        Shape: (3, outputs), int64.
-        """
-        places = []
-        for network in networks:
-            for target in network.outputs():
-                first, column = self.place(target), self._parameters.sum_column[target]
-                places += [(first + i, target.block.width, column + i) for i in range(target.size)]
-        return torch.tensor(places, device=self.values.device).T.contiguous()
 
     def _table(self, tiles: list[list[int]]) -> Tensor:
         """Return tiles as a table on the device."""
@@ -175,6 +142,45 @@ class Workspace:
                 sizes = [aligned(target.size) - first, target.size - first]
                 tiles.append([*read, *written, *sizes, bias + first, int(target.elu), output, self.outputs.shape[1]])
         return tiles
+
+
+class LearningWorkspace(Workspace):
+    """The same with room for gradients.
+
+    Attributes:
+        gradients: Gradients of the loss by the values, except for the inputs. Shape: (numbers,).
+        backward: A table for each stage of gradients of what layers read.
+        weight_tiles: The table for gradients of weights.
+        partial: Room for these gradients from each part of the samples. Shape: (parts, ``room``).
+        sums: Room for sums over the samples of a tile: numbers, then gradients. Shape: (tiles, columns).
+    """
+
+    def __init__(self, networks: Sequence[Network], parameters: Parameters, num_samples: int) -> None:
+        """Allocate for samples."""
+        parts = MAX_PARTS
+        while parts > 1 and num_samples < parts * SAMPLES_PER_PART:
+            parts //= 2
+        super().__init__(networks, parameters, num_samples, parts)
+        inputs = min(self.place(network.inputs) for network in networks)  # which stand behind all else
+        self.gradients = parameters.weights.new_zeros(inputs + TILE)
+        self.backward = [self._table(tiles) for tiles in self._backward_tiles(networks)]
+        layers = [layer for network in networks for layer in network.layers]
+        self.weight_tiles = self._table([tile for layer in layers for tile in self._weight_tiles(layer)])
+        device = self.values.device
+        self.partial = torch.zeros(parts, parameters.room, device=device)
+        self.sums = torch.zeros(self.rows // SAMPLES, len(parameters.destination), device=device)
+
+    def output_places(self, networks: Sequence[Network]) -> Tensor:
+        """Return where the gradient by each output of the networks begins, its stride and its column of ``sums``.
+
+        Shape: (3, outputs), int64.
+        """
+        places = []
+        for network in networks:
+            for target in network.outputs():
+                first, column = self.place(target), self._parameters.sum_column[target]
+                places += [(first + i, target.block.width, column + i) for i in range(target.size)]
+        return torch.tensor(places, device=self.values.device).T.contiguous()
 
     def _backward_tiles(self, networks: Sequence[Network]) -> list[list[list[int]]]:
         """Return the tiles of all stages for the kernel ``input_gradient``."""
