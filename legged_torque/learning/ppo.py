@@ -18,7 +18,7 @@ from legged_torque.learning.fused.networks import read_network
 from legged_torque.learning.multi_head import MultiHeadModel
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
-from legged_torque.utils.compiled import can_compile
+from legged_torque.utils.compiled import has_triton
 from legged_torque.utils.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ class OnDevicePPO(PPO):
 
     def _fuse(self) -> FusedLearner | None:
         """Return what acts and learns in few kernels; None where that needs something that is not there."""
-        if not can_compile(self.device) or not can_be_fused(self):
+        if not has_triton(self.device) or not can_be_fused(self):
             return None
         from legged_torque.learning.fused.learner import FusedLearner, can_multiply  # imports Triton
 

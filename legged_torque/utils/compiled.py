@@ -29,18 +29,24 @@ SETTINGS: dict[str, Any] = {
     },
 }
 """Arguments of ``torch.compile``."""
+FIRST_TORCH = (2, 10)  # whose compiler promises the same bits in every process ("deterministic")
 MOST_VERSIONS = 256  # of a function: one per task in the process, and per Python number that it reads
 
 
-def can_compile(device: str) -> bool:
-    """Return whether functions are compiled there: on a GPU, if Triton is installed and knows it."""
+def has_triton(device: str) -> bool:
+    """Return whether Triton's kernels run there: on a GPU that it knows, if it is installed."""
     if torch.device(device).type != "cuda" or not importlib.util.find_spec("triton"):
         return False
     return torch.cuda.get_device_capability(device) >= (7, 0)
 
 
+def can_compile(device: str) -> bool:
+    """Return whether functions are compiled there: by Triton, and by a torch that knows the settings above."""
+    return has_triton(device) and tuple(map(int, torch.__version__.split(".")[:2])) >= FIRST_TORCH
+
+
 def compiled(function: Callable[[], None], device: str) -> Callable[[], None]:
-    """Return a function that does the same with few kernels; on a CPU, and without Triton, it is the function itself.
+    """Return a function that does the same with few kernels; the function itself where it cannot be compiled.
 
     It must only run operations of torch, on tensors that keep their addresses; what it writes, it writes in place.
     It is compiled at the first call, once per machine: the kernels are kept in a folder of Warp's cache. Where that
