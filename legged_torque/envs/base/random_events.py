@@ -47,11 +47,6 @@ class RandomEvents:
         chances = [cfg.commands.resampling_probability, settings.resampling_probability]
         self._chances = wp.vec4(*chances, settings.push_probability * settings.push_robots, PUSH_ADDED)
 
-    def draw_parameters(self, mask: Tensor) -> None:
-        """Draw parameters of robot, ground and controller anew in the worlds of ``mask``. Shape: (num_envs,), bool."""
-        self._seeds.random_()
-        self._write_parameters(mask)
-
     def happen(self, is_new: Tensor) -> None:
         """Begin episodes: draw states and delays, and clear what the simulator kept, in the worlds of ``is_new``.
 
@@ -69,9 +64,5 @@ class RandomEvents:
         arguments = [new, seeds, self._chances, *pushes, *read, *written, data.qpos, data.qvel]
         wp.launch(kernels.happen, self._sim.num_envs, arguments, device=seeds.device)
         if settings.randomize_parameters:
-            self._write_parameters(self._new_parameters)
-
-    def _write_parameters(self, mask: Tensor) -> None:
-        """Draw parameters from their seeds, and what follows from them."""
-        self.parameters.draw(mask)
-        self._sim.update_constants(mask)
+            self.parameters.draw(self._new_parameters)
+            self._sim.update_constants(self._new_parameters)
