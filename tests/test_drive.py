@@ -134,6 +134,28 @@ def test_when_torch_computes(make_task, engine, refresh):
     assert notes == (["drive"] if engine == "fused" and refresh else ["step"] * 4)
 
 
+class Uneven(LeggedRobot):
+    """Another scale of the actions for every joint."""
+
+    def _init_buffers(self):
+        super()._init_buffers()
+        self.action_scale = torch.linspace(0.1, 0.4, self.num_dof).repeat(self.num_envs, 1)
+
+
+def test_scales_that_differ_between_joints():
+    """The kernel reads them as torch does."""
+    cfg = A1Cfg()
+    cfg.env.num_envs, cfg.control.decimation, cfg.domain_rand.randomize_parameters = 2, 1, False
+    task = Uneven(cfg)
+    notes, actions = launches(task), torch.linspace(-2.0, 2.0, 24).view(2, 12)
+    pos, vel = task.dof_pos.clone(), task.dof_vel.clone()
+    target = task.default_dof_pos + torch.linspace(0.1, 0.4, 12) * actions
+    task.step(actions)
+    assert notes == ["drive"]
+    expected = (20.0 * (target - pos) - 0.5 * vel).clamp(-TORQUE_LIMIT, TORQUE_LIMIT)
+    torch.testing.assert_close(task.torques, expected, rtol=1e-5, atol=1e-5)
+
+
 class Doubled(LeggedRobot):
     """Overrides the torques in torch only."""
 

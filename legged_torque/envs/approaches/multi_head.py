@@ -9,7 +9,7 @@ from legged_torque.envs.approaches.multi_head_config import MultiHeadCfg as Mult
 from legged_torque.envs.approaches.multi_head_config import MultiHeadCfgPPO as MultiHeadCfgPPO
 from legged_torque.envs.approaches.multi_head_config import TorqueMultiHeadCfg as TorqueMultiHeadCfg
 from legged_torque.envs.base.actions import ActionTerm, position_residual, torque
-from legged_torque.envs.base.control_laws import PdControl, pd_torque, pd_torques
+from legged_torque.envs.base.control_laws import PdControl, of_joint, pd_torque, pd_torques
 from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.motors.drive import in_kernel
@@ -29,7 +29,7 @@ def mixed_torque(
     task: MultiHeadControl, actions: wp.array[float], world: int, joint: int, pos: float, vel: float
 ) -> float:
     """Return the torque of one joint."""
-    torque = task.torque_scale[world, 0] * actions[task.pd.default_dof_pos.shape[0] + joint]
+    torque = of_joint(task.torque_scale, world, joint) * actions[task.pd.default_dof_pos.shape[0] + joint]
     return task.mixing[0] * pd_torque(task.pd, actions, world, joint, pos, vel) + task.mixing[1] * torque
 
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from legged_torque.envs.approaches.torque_config import TorqueCfg as TorqueCfg
 from legged_torque.envs.approaches.torque_config import TorqueCfgPPO as TorqueCfgPPO
 from legged_torque.envs.base.actions import ActionTerm, torque
+from legged_torque.envs.base.control_laws import of_joint
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.motors.drive import in_kernel
 
@@ -24,7 +25,7 @@ def scaled_torque(
     task: TorqueControl, actions: wp.array[float], world: int, joint: int, pos: float, vel: float
 ) -> float:
     """Return the torque of one joint."""
-    return task.torque_scale[world, 0] * actions[joint]
+    return of_joint(task.torque_scale, world, joint) * actions[joint]
 
 
 class TorqueRobot(LeggedRobot):

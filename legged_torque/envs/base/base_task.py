@@ -51,7 +51,7 @@ class BaseTask(VecEnv):
     def compile(self) -> None:
         """Let a GPU with Triton run what a step does with torch as few kernels; trainings do this.
 
-        It takes seconds, at the next step, which thousands of steps win back. Results are the same up to rounding.
+        It takes seconds, at the next step, which some ten thousand steps win back. Results are the same up to rounding.
         """
         if not self._is_compiled:
             self._is_compiled = True

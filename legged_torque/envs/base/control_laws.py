@@ -29,8 +29,14 @@ class PdControl:
 
 
 @wp.func
+def of_joint(scales: wp.array2d[float], world: int, joint: int) -> float:
+    """Return a joint's scale; a single column is for all joints, as where torch broadcasts."""
+    return scales[world, wp.min(joint, scales.shape[1] - 1)]  # type: ignore[attr-defined]
+
+
+@wp.func
 def pd_torque(task: PdControl, actions: wp.array[float], world: int, joint: int, pos: float, vel: float) -> float:
     """Return what :func:`pd_torques` does, of one joint."""
     target = task.default_dof_pos[joint] + task.joint_offset[world, joint]
-    target += task.action_scale[world, 0] * actions[joint]
+    target += of_joint(task.action_scale, world, joint) * actions[joint]
     return task.p_gains[world, joint] * (target - pos) - task.d_gains[world, joint] * vel
