@@ -187,7 +187,7 @@ def test_parallel_preset_is_the_default(task):
         "algorithm.num_mini_batches": 4,
         "algorithm.learning_rate": 1e-3,
         "algorithm.schedule": "adaptive",
-        "algorithm.desired_kl": 0.01,
+        "algorithm.desired_kl": 0.02,
         "algorithm.lam": 0.95,
         "algorithm.max_grad_norm": 1.0,
         "algorithm.clip_param": 0.2,

@@ -51,9 +51,10 @@ class OnDevicePPO(PPO):
         learning_rate: float = 1e-3,
         optimizer: str = "adam",
         max_learning_rate: float = 1e-2,
+        annealing_start: float = 1.0,
         **kwargs,
     ) -> None:
-        """Create the algorithm; arguments are rsl_rl's, and an upper bound of the adaptive learning rate."""
+        """Create the algorithm; arguments are rsl_rl's, a bound of the adaptive learning rate, and :meth:`anneal`'s."""
         if optimizer not in ("adam", "adamw"):  # of these torch can skip a step on the device
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
         if kwargs.get("rnd_cfg"):
@@ -72,6 +73,9 @@ class OnDevicePPO(PPO):
             )
         self.learning_rates = (MIN_LEARNING_RATE, max_learning_rate)
         self.learning_rate = torch.tensor(learning_rate, device=self.device)
+        self.annealing_start, self._first_rate = annealing_start, learning_rate
+        self.kl_target = torch.tensor(self.desired_kl or 0.0, device=self.device)  # of the adaptive learning rate
+        self.entropy_weight = torch.tensor(self.entropy_coef, device=self.device)
         self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
         make_optimizer = type(self.optimizer)
         self.optimizer = make_optimizer(self._parameters, lr=self.learning_rate, fused=True, capturable=True)
@@ -87,6 +91,19 @@ class OnDevicePPO(PPO):
     def learn_actor(self, enabled: bool) -> None:
         """Say whether the next updates train the policy too, or the value function alone."""
         self.actor_learns.fill_(float(enabled))
+
+    def anneal(self, progress: float) -> None:
+        """Make the next update smaller, after this share of the training.
+
+        From the share ``annealing_start`` on, the weight of the entropy and the wanted KL divergence fall linearly to
+        0. The adaptive learning rate follows the latter; a fixed learning rate falls itself.
+        """
+        left = min(1.0, (1.0 - progress) / max(1.0 - self.annealing_start, 1e-9))
+        self.entropy_weight.fill_(left * self.entropy_coef)
+        if self.schedule == "adaptive":
+            self.kl_target.fill_(left * self.desired_kl)
+        else:
+            self.learning_rate.fill_(left * self._first_rate)
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions and keep the transition, with a copy of observations that a task may overwrite in its step."""
@@ -207,7 +224,7 @@ class OnDevicePPO(PPO):
         kl = self._mean_kl(batch)
         surrogate_loss = self._surrogate_loss(batch, log_prob)
         value_loss = self._value_loss(batch, values)
-        actor_loss = surrogate_loss - self.entropy_coef * entropy
+        actor_loss = surrogate_loss - self.entropy_weight * entropy
         if self.symmetry and self.symmetry.use_mirror_loss:
             mirror_loss = self.symmetry.compute_loss(self.actor, batch, self.batch_size)
             actor_loss = actor_loss + self.symmetry.mirror_loss_coeff * mirror_loss
@@ -261,8 +278,8 @@ class OnDevicePPO(PPO):
     def _adapt_learning_rate(self, kl: Tensor) -> None:
         """Steer the learning rate by the mean KL divergence."""
         if self.schedule == "adaptive":
-            lower = kl > 2.0 * self.desired_kl
-            higher = (kl < 0.5 * self.desired_kl) & (kl > 0.0)
+            lower = kl > 2.0 * self.kl_target
+            higher = (kl < 0.5 * self.kl_target) & (kl > 0.0)
             factor = torch.where(lower, 1.0 / 1.5, torch.where(higher, 1.5, 1.0))
             factor = torch.where(self.actor_learns.bool(), factor, 1.0)  # a policy that stays says nothing
             self.learning_rate.mul_(factor).clamp_(*self.learning_rates)

@@ -111,6 +111,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
                 self._wait()
                 collected = time.perf_counter()
                 self.alg.learn_actor(self.current_learning_iteration >= warmup)
+                self.alg.anneal(self.current_learning_iteration / total_it)
                 losses = self.alg.update()
                 measured = self._evaluate(losses, start) | guard.add_iteration(losses["skipped_updates"])
                 learned = time.perf_counter()

@@ -297,12 +297,13 @@ class LeggedRobotCfgPPO(BaseConfig):
         gamma: Share = 0.98  # discount per control step
         lam: Share = 0.95  # lambda of GAE
         value_loss_coef: NotNegative = 1.0  # weight of the value loss
-        entropy_coef: NotNegative = 5e-4  # weight of the entropy bonus
+        entropy_coef: NotNegative = 5e-3  # weight of the entropy bonus
         learning_rate: Fraction = 1e-3  # of Adam; the first one if it adapts
         max_grad_norm: Positive = 1.0  # gradients of actor and critic are clipped to this norm
         schedule: Literal["adaptive", "fixed"] = "adaptive"  # adaptive: steered by the KL divergence
-        desired_kl: Positive = 0.01  # of the policy before and after an update
+        desired_kl: Positive = 0.02  # of the policy before and after an update
         max_learning_rate: Fraction = 1e-2  # upper bound of an adaptive learning rate
+        annealing_start: Share = 0.5  # of the training; then the rate (or desired_kl) and the entropy bonus fall to 0
         use_clipped_value_loss: bool = True  # whether value changes are clipped too
         use_mixed_precision: bool = True  # on a GPU with Triton, matrix products of bfloat16 numbers instead of TF32
 
@@ -317,10 +318,11 @@ class LeggedRobotCfgPPO(BaseConfig):
         rollouts = {"env": {"num_envs": 16, "num_envs_cpu": 16}, "runner": {"num_steps_per_env": 2000}}
         ppo = {"num_learning_epochs": 5, "num_mini_batches": 32, "clip_param": 0.1, "gamma": 0.99, "lam": 0.9}
         ppo |= {"entropy_coef": 5e-4, "learning_rate": 1e-4, "max_grad_norm": 5.0}
-        fixed = {"schedule": "fixed", "symmetry_cfg": {"use_data_augmentation": False}, "use_mixed_precision": False}
+        fixed = {"schedule": "fixed", "annealing_start": 1.0, "use_mixed_precision": False}
+        fixed |= {"symmetry_cfg": {"use_data_augmentation": False}}
         return {"parallel": {}, "paper": {**rollouts, "algorithm": {**ppo, **fixed}}}  # Table II to the letter
 
     @staticmethod
     def of_older_runs() -> dict[str, dict]:
         """Return what runs were trained with whose ``config.yaml`` has no entry for these settings yet."""
-        return {"algorithm": {"use_mixed_precision": False}}
+        return {"algorithm": {"use_mixed_precision": False, "annealing_start": 1.0}}

@@ -212,7 +212,7 @@ class FusedLearner:
             storage.advantages,
             storage.returns,
         )
-        numbers = (self._num_chosen, self._num_samples, size, alg.clip_param, alg.value_loss_coef, alg.entropy_coef)
+        numbers = (self._num_chosen, self._num_samples, size, alg.clip_param, alg.value_loss_coef, alg.entropy_weight)
         places, strides, columns = self._places
         samples.losses[(len(work.sums),)](
             work.outputs, *self._std[:3], self._stds, alg.indices, *self._action_map, *batch, alg.actor_learns,
@@ -244,7 +244,7 @@ class FusedLearner:
         beta1, beta2 = group["betas"]
         steps.settle[(1,)](
             self._numbers, self._norms, alg.learning_rate, alg.actor_learns, self.adam_steps, self._scalars, alg.losses,
-            alg.max_grad_norm, alg.desired_kl, *alg.learning_rates, math.log(beta1), math.log(beta2),
+            alg.max_grad_norm, alg.kl_target, *alg.learning_rates, math.log(beta1), math.log(beta2),
             ADAPTIVE=alg.schedule == "adaptive", PARTS=steps.PARTS,
         )  # fmt: skip
         decay = group["weight_decay"] if isinstance(alg.optimizer, torch.optim.AdamW) else 0.0

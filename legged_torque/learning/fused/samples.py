@@ -137,7 +137,7 @@ def losses(
     by_mean = tl.where(used, by_log_prob[:, None] * distance / std[None, :], 0.0)
     share = tl.sum(is_sample.to(tl.float32)) / num_samples  # of this program
     by_std = tl.sum(tl.where(used, by_log_prob[:, None] * (distance * distance - 1.0), 0.0), 0)
-    by_std = (by_std - entropy_weight * share * tl.load(actor_learns)) / std * slope
+    by_std = (by_std - tl.load(entropy_weight) * share * tl.load(actor_learns)) / std * slope
     half_log_two_pi_e = 1.4189385332046727
     entropy = share * tl.sum(tl.where(is_action, half_log_two_pi_e + tl.log(std), 0.0))
 

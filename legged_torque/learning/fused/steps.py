@@ -48,7 +48,7 @@ def sum_squares(gradient, actor_size, size, squares, PARTS: tl.constexpr, BLOCK:
 
 @triton.jit
 def settle(
-    numbers, squares, learning_rate, actor_learns, steps, scalars, sums, max_norm, desired_kl, lowest_rate,
+    numbers, squares, learning_rate, actor_learns, steps, scalars, sums, max_norm, kl_target, lowest_rate,
     highest_rate, log_beta1, log_beta2, ADAPTIVE: tl.constexpr, PARTS: tl.constexpr,
 ):  # fmt: skip
     """Adapt the learning rate, decide whether to skip the step, count it, and add up the numbers of the update.
@@ -59,7 +59,8 @@ def settle(
     kl = tl.load(numbers + 3)
     rate = tl.load(learning_rate)
     if ADAPTIVE:
-        factor = tl.where(kl > 2.0 * desired_kl, 1.0 / 1.5, tl.where((kl < 0.5 * desired_kl) & (kl > 0.0), 1.5, 1.0))
+        wanted = tl.load(kl_target)
+        factor = tl.where(kl > 2.0 * wanted, 1.0 / 1.5, tl.where((kl < 0.5 * wanted) & (kl > 0.0), 1.5, 1.0))
         factor = tl.where(tl.load(actor_learns) > 0.0, factor, 1.0)  # a policy that stays says nothing
         rate = tl.minimum(tl.maximum(rate * factor, lowest_rate), highest_rate)
         tl.store(learning_rate, rate)
