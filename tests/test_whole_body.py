@@ -25,14 +25,14 @@ AT_REST = WholeBodySettings(
 """No wish but to accelerate nothing."""
 
 
-def make_trial(num_envs, name="a1_torque", **env):
+def make_trial(num_envs, **env):
     """A task that starts standing trials."""
-    cfg, _ = task_registry.get_cfgs(name)
+    cfg, _ = task_registry.get_cfgs("a1_torque")
     use_standing_trials(cfg)
     for key, value in {"num_envs": num_envs, **env}.items():
         setattr(cfg.env, key, value)
     torch.manual_seed(1)
-    return task_registry.make_env(name, Options(device="cpu"), cfg)[0]
+    return task_registry.make_env("a1_torque", Options(device="cpu"), cfg)[0]
 
 
 def make_controller(task, num_states, settings=None):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 import warp as wp
 from torch import Tensor
@@ -102,6 +104,11 @@ class MultiHeadTwoRatesRobot(MultiHeadRobot):
     """
 
     cfg: MultiHeadTwoRatesCfg
+
+    def action_terms(self) -> list[ActionTerm]:
+        """Return the terms of multi-head control, of which the positions are held."""
+        positions, torques = super().action_terms()
+        return [dataclasses.replace(positions, interval=self.cfg.control.position_interval), torques]
 
     def run_physics(self) -> None:
         """Hold position actions where new ones are not due; an episode starts with new ones."""
