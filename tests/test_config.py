@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 import yaml
-from settings import COMBINATIONS, TASKS, error_of, flatten, get, get_cfgs, parse
+from settings import TASKS, error_of, flatten, get, get_cfgs, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.cli import run_script
@@ -161,7 +161,7 @@ TABLE_II = {
 }
 
 
-@pytest.mark.parametrize("task", TASKS + COMBINATIONS)
+@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("device", ["cpu", "gpu"])
 def test_paper_preset_is_table_ii(task, device, monkeypatch):
     """16 worlds of 2000 steps, minibatches of 1000 samples, 110e6 steps, and every other line of the table."""
@@ -176,7 +176,7 @@ def test_paper_preset_is_table_ii(task, device, monkeypatch):
     assert num_iterations(SimpleNamespace(num_envs=16), train_cfg) == 3438  # 110e6 / 32000 = 3437.5
 
 
-@pytest.mark.parametrize("task", TASKS + COMBINATIONS)
+@pytest.mark.parametrize("task", TASKS)
 def test_parallel_preset_is_the_default(task):
     """Section 7 (c) of the design: 4096 worlds on a GPU, rollouts of 24 steps, an adaptive learning rate."""
     default, named = get_cfgs(task=task), get_cfgs("--preset=parallel", task=task)
