@@ -7,6 +7,8 @@ from legged_torque.utils.args import Parser, add_task_args, add_train_args, opti
 from legged_torque.utils.errors import UserError
 
 TASKS = ["a1_position", "a1_torque", "a1_torque_gravity", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
+COMBINATIONS = ["a1_torque_curriculum_multihead", "a1_torque_gravity_curriculum", "a1_torque_gravity_multihead"]
+COMBINATIONS += ["a1_torque_curriculum_high", "a1_multihead_two_rates"]
 
 
 def parse(*words):

@@ -100,6 +100,7 @@ def test_only_the_fused_engine_drives():
         ("a1_torque", {"domain_rand.action_delay": [0, 9], "control.decimation": 3}),
         ("a1_multihead", {"domain_rand.action_delay": [1, 2], "domain_rand.action_delay_unit": "control_steps"}),
         ("a1_torque_multihead", {"domain_rand.action_delay": [2, 6]}),
+        ("a1_multihead_two_rates", {"domain_rand.action_delay": [0, 5], "init_state.pos": [0.0, 0.0, 0.3]}),
     ],
 )
 def test_as_in_torch(make_task, name, settings):

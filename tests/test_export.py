@@ -75,7 +75,8 @@ def measured(task, world):
     return State(*(part[world].numpy().copy() for part in parts), quaternion=task.base_quat[world].numpy().copy())
 
 
-PARITY = [(name, settings) for name in TASKS for settings in ("default", "changed")]
+TWO_RATES = "a1_multihead_two_rates"
+PARITY = [(name, settings) for name in [*TASKS, TWO_RATES] for settings in ("default", "changed")]
 
 
 @pytest.mark.parametrize(("name", "settings"), [*PARITY, ("a1_torque_multihead", "torques_once")])
@@ -116,7 +117,7 @@ def test_parity(make_task, tmp_path, name, settings):
             np.testing.assert_allclose(ours, torques, **close)
     if settings == "changed":
         assert largest == 1.5 and np.abs(actions).max() == pytest.approx(0.2)  # both were clipped
-        assert obs["policy"].shape[1] == 3 * (33 + task.num_actions)
+        assert obs["policy"].shape[1] == 3 * (33 + task.num_actions + (name == TWO_RATES))  # and its phase
 
 
 @pytest.mark.parametrize(("name", "end"), [("a1_torque_multihead", 0.0), ("a1_multihead", 0.1)])
@@ -293,7 +294,7 @@ def test_unknown_terms_are_refused(make_task, tmp_path, monkeypatch):
     height = ObservationTerm("height_scan", lambda: torch.zeros(3, 7), None)
     changes = {
         "observation term 'height_scan'; it has projected_gravity, angular_velocity, command, joint_position, "
-        "joint_velocity, last_action": ("observation_terms", lambda task: [*own_terms(task), height]),
+        "joint_velocity, last_action, position_phase": ("observation_terms", lambda task: [*own_terms(task), height]),
         "action term 'impedance'; it has position_residual, torque": (
             "action_terms",
             lambda task: [ActionTerm("impedance", task.action_scale, "rad", "")],

@@ -18,7 +18,7 @@ from legged_torque.control.gravity_pretraining import (
     exchange,
     follow,
     histogram,
-    imitation_loss,
+    imitation_errors,
     learn_to_stand,
     make_controller,
     pretrain,
@@ -102,15 +102,15 @@ def follow_noting(task, controller, act, num_configurations, num_steps):
 
     Returns:
         What :func:`follow` returns, and what was noted: positions, velocities, contacts of the feet, control steps
-        since the start of the episode, and the torques that were given. Each is (num_steps, configurations, ...).
+        since the start of the episode, and the actions that were taken. Each is (num_steps, configurations, ...).
     """
     noted = []
 
     def noting(task):
-        torques = act(task)
-        state = (task.sim.qpos, task.sim.qvel, task.feet_contact > 0, task.episode_length_buf, torques)
+        actions = act(task)
+        state = (task.sim.qpos, task.sim.qvel, task.feet_contact > 0, task.episode_length_buf, actions)
         noted.append([part.clone() for part in state])
-        return torques
+        return actions
 
     followed = follow(task, controller, noting, num_configurations, num_steps)
     parts = [torch.stack(part).unflatten(0, (-1, num_steps)) for part in zip(*noted, strict=True)]
@@ -169,7 +169,7 @@ def test_pairs_are_what_the_controller_does(task, controller, who):
 
     There are more configurations than worlds, and not a multiple of them.
     """
-    act = act_by_controller(controller) if who == "controller" else lambda task: 3.0 * torch.randn(16, 12)
+    act = act_by_controller(controller) if who == "controller" else lambda task: torch.randn(16, 12)
     torch.manual_seed(1)
     followed, (qpos, qvel, touching, _, given) = follow_noting(task, controller, act, 21, 5)
     dynamics = RobotDynamics(task.sim.mj_model, 21 * 5, "cpu", task.foot_names)
@@ -178,7 +178,7 @@ def test_pairs_are_what_the_controller_does(task, controller, who):
     torques = decided.total.unflatten(0, (5, 21))
     assert touching.any(dim=2)[-1].float().mean() > 0.2 and torques.abs().max() > 5.0
     torch.testing.assert_close(TORQUE_SCALE * followed.actions, torques, rtol=0, atol=1e-3)
-    assert (torch.allclose(given, torques, atol=1e-3)) == (who == "controller")
+    assert (torch.allclose(TORQUE_SCALE * given, torques, atol=1e-3)) == (who == "controller")
     torch.testing.assert_close(followed.mean_torques, torques.abs().sum(dim=2) / 12, rtol=0, atol=1e-3)
     force, moment = decided.wrench_residual.unflatten(0, (5, 21)).split(3, dim=2)
     residuals = (force.square().sum(dim=2) + (moment / 0.2).square().sum(dim=2)).sqrt() / WEIGHT
@@ -194,7 +194,7 @@ def test_pairs_are_what_the_controller_does(task, controller, who):
     torch.testing.assert_close(seen[..., 9:21], angles)
     torch.testing.assert_close(seen[..., 21:33], 0.05 * qvel[..., 6:])
     assert (seen[0, :, LAST_ACTION] == 0.0).all()
-    torch.testing.assert_close(seen[1:, :, LAST_ACTION], given[:-1] / TORQUE_SCALE)
+    torch.testing.assert_close(seen[1:, :, LAST_ACTION], given[:-1])
 
 
 def test_without_another_one_the_controller_acts(task, controller):
@@ -327,8 +327,8 @@ def test_last_actions_are_exchanged(history):
     assert torch.equal(after[order][..., 17:], before[..., 17:])
 
 
-def test_loss_by_hand(task):
-    """It is the mean square error on the pairs and on their mirror images."""
+def test_errors_by_hand(task):
+    """Errors are those on the pairs and on their mirror images."""
     actor = make_actor(task)
     pairs = Pairs(torch.randn(30, 45), torch.randn(30, 12))
     pairs.observations[:, LAST_ACTION] = 0.0  # so that exchanging them changes nothing
@@ -336,8 +336,7 @@ def test_loss_by_hand(task):
         there = actor({"policy": pairs.observations}) - pairs.actions
         mirrored = pairs.observations[:, OTHER_SIDE_SEEN] * SEEN_SIGNS
         here = actor({"policy": mirrored}) - pairs.actions[:, OTHER_SIDE] * JOINT_SIGNS
-    expected = (there.square().sum() + here.square().sum()) / (2 * 30 * 12)
-    torch.testing.assert_close(imitation_loss(task, actor, pairs).detach(), expected)
+    torch.testing.assert_close(imitation_errors(task, actor, pairs).detach(), torch.cat([there, here]))
 
 
 def test_supervision(task):

@@ -4,7 +4,7 @@ import math
 from typing import Annotated, Literal
 
 import pytest
-from settings import TASKS, error_of, flatten, get_cfgs
+from settings import COMBINATIONS, TASKS, error_of, flatten, get_cfgs
 
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.config import Section, section_keys, set_by_path, to_dict
@@ -30,7 +30,7 @@ def with_bad_number(value, bad):
     return bad if isinstance(value, (int, float)) and not isinstance(value, bool) else None
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", TASKS + COMBINATIONS)
 def test_every_setting_has_a_type(task):
     """It stands beside the default, in the class or one of its bases."""
     for cfg in get_cfgs(task=task):
@@ -39,7 +39,7 @@ def test_every_setting_has_a_type(task):
             assert set(settings) <= types_of(type(section)).keys(), path
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", TASKS + COMBINATIONS)
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30, True, "text", [], {}])
 def test_no_number_may_be_anything(task, bad):
     """A number that is not finite or absurdly large, or something else in its place, is refused by its name."""

@@ -5,7 +5,7 @@ import inspect
 
 import pytest
 import torch
-from settings import TASKS, error_of, flatten, parse
+from settings import COMBINATIONS, TASKS, error_of, flatten, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -17,9 +17,10 @@ from legged_torque.utils.task_registry import TaskRegistry
 
 
 def test_registered_tasks():
-    """The five approaches are there, each with settings of its own."""
-    assert task_registry.names() == TASKS
-    classes = {name: task_registry.get_task_class(name).__name__ for name in TASKS}
+    """The approaches and what combines them are there, each with settings of its own."""
+    names = task_registry.names()
+    assert names == TASKS + COMBINATIONS
+    classes = {name: task_registry.get_task_class(name).__name__ for name in names}
     assert classes == {
         "a1_position": "LeggedRobot",
         "a1_torque": "TorqueRobot",
@@ -27,8 +28,13 @@ def test_registered_tasks():
         "a1_torque_curriculum": "TorqueCurriculumRobot",
         "a1_torque_multihead": "MultiHeadRobot",
         "a1_multihead": "MultiHeadRobot",
+        "a1_torque_curriculum_multihead": "CurriculumMultiHeadRobot",
+        "a1_torque_gravity_curriculum": "TorqueCurriculumRobot",
+        "a1_torque_gravity_multihead": "MultiHeadRobot",
+        "a1_torque_curriculum_high": "TorqueCurriculumRobot",
+        "a1_multihead_two_rates": "MultiHeadTwoRatesRobot",
     }
-    for name in TASKS:
+    for name in names:
         env_cfg, train_cfg = task_registry.get_cfgs(name)
         assert env_cfg.env.num_actions is None  # follows from the approach and the robot
         assert train_cfg.runner.experiment_name == name
@@ -40,7 +46,7 @@ def test_unknown_task(function, name):
     """The nearest task is proposed and all are listed."""
     line = error_of(getattr(task_registry, function), name)
     assert line.startswith(f"unknown task '{name}'; did you mean 'a1_position'? allowed: ")
-    assert line.split("allowed: ")[1].split(", ") == sorted(TASKS)
+    assert line.split("allowed: ")[1].split(", ") == sorted(TASKS + COMBINATIONS)
 
 
 def test_name_without_a_near_match():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from settings import TASKS, error_of, flatten, get_cfgs
+from settings import COMBINATIONS, TASKS, error_of, flatten, get_cfgs
 
 from legged_torque.envs import task_registry
 from legged_torque.utils import runs
@@ -77,7 +77,7 @@ def test_run_folders_sort_by_time(tmp_path):
     assert named.name.startswith(plain.name[:10]) and named.name.endswith("_wide")
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", TASKS + COMBINATIONS)
 def test_config_file_round_trip(task, tmp_path):
     """What a run has written gives the same settings again, of the same types; versions of all packages are there."""
     words = ["--preset=paper", "--set=rewards.scales.torques=-1e-7", "--set=actor.hidden_dims=[8, 4]", "--run_name=7"]

@@ -35,6 +35,8 @@ CONFIGS = (
     (multi_head_config, "TorqueMultiHeadCfg"),
     (multi_head_config, "MultiHeadCfg"),
     (multi_head_config, "MultiHeadCfgPPO"),
+    (multi_head_config, "MultiHeadTwoRatesCfg"),
+    (multi_head_config, "MultiHeadTwoRatesCfgPPO"),
 )
 """Config classes in the order of the page."""
 

@@ -1,4 +1,7 @@
-"""Gravity pre-training (paper, III-A): a torque policy learns to stand from what the whole-body controller does."""
+"""Gravity pre-training (paper, III-A): a torque policy learns to stand from what the whole-body controller does.
+
+It works for every approach that says which actions lead to given torques (``TorqueRobot.actions_for``).
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,6 @@ import copy
 import dataclasses
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +18,14 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.control.dynamics import RobotDynamics
-from legged_torque.control.standing import measure_standing, place_on_ground, use_standing_trials
+from legged_torque.control.standing import (
+    Act,
+    actions_for,
+    check_torques,
+    measure_standing,
+    place_on_ground,
+    use_standing_trials,
+)
 from legged_torque.control.whole_body import WholeBodyController, WholeBodySettings, WholeBodyTorques
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.utils.config import to_dict
@@ -26,7 +35,6 @@ from legged_torque.utils.random_state import own_random_numbers, seeded_state
 from legged_torque.utils.task_registry import task_registry
 from legged_torque.utils.threads import single_threaded
 
-Act = Callable[[LeggedRobot], Tensor]  # returns the torques for a task's state [N m]; (num_envs, num_dof)
 STANDING_SECONDS = 5.0  # time after which the learned policy must stand
 
 
@@ -35,7 +43,7 @@ class Pairs:
     """What the policy sees, and the actions that the controller takes there."""
 
     observations: Tensor  # group "policy" of the task's observations. Shape: (pairs, size)
-    actions: Tensor  # torques of the controller over the torque scale. Shape: (pairs, num_actions)
+    actions: Tensor  # those that lead to the controller's torques. Shape: (pairs, num_actions)
 
     def split(self, size: int) -> list[Pairs]:
         """Return the pairs in parts of at most ``size``."""
@@ -69,6 +77,7 @@ def pretrain(name: str, env_cfg: Any, train_cfg: Any, device: str) -> tuple[MLPM
     use_standing_trials(cfg, env_cfg.control.decimation)
     with own_random_numbers(device, seeded_state(device, settings.seed)):
         task = task_registry.get_task_class(name)(cfg, device)
+        check_torques(task)
         actor = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=None)[0].alg.actor
         controller = make_controller(task, WholeBodySettings(**to_dict(settings.controller)))
         start = time.perf_counter()
@@ -137,7 +146,7 @@ class Followed:
 
     # All shapes begin with (num_steps, configurations).
     observations: Tensor  # what the policy sees. Shape: (..., size)
-    actions: Tensor  # the controller's torques over the torque scale. Shape: (..., num_actions)
+    actions: Tensor  # those that lead to the controller's torques. Shape: (..., num_actions)
     mean_torques: Tensor  # mean absolute torque of the controller [N m]
     residuals: Tensor  # see :func:`residual_share`
     upright: Tensor  # whether the robot has not fallen before, bool
@@ -156,9 +165,9 @@ def follow(
         for _ in range(num_steps):
             decided = controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0)
             observations = task.get_observations()["policy"]
-            torques, residuals = decided.total, residual_share(controller, decided)
-            steps.append([observations, torques / task.torque_scale, torques.abs().mean(dim=1), residuals, upright])
-            task.step((act(task) if act else torques) / task.torque_scale)  # they hold for a control step
+            actions, residuals = actions_for(task, decided.total), residual_share(controller, decided)
+            steps.append([observations, actions, decided.total.abs().mean(dim=1), residuals, upright])
+            task.step(act(task) if act else actions)  # they hold for a control step
             upright = upright & ~task.reset_buf
         count = min(task.num_envs, num_configurations - start)
         parts.append([torch.stack(numbers)[:, :count] for numbers in zip(*steps, strict=True)])
@@ -205,7 +214,7 @@ def supervise(task: LeggedRobot, actor: MLPModel, collection: Collection, settin
     """Train the actor's mean on the pairs and on their mirror images by their mean square error.
 
     Last actions are shuffled; otherwise the policy would copy them and could not correct its own mistakes. Returns the
-    root mean square errors after every epoch [N m], "training" and "held_out".
+    root mean square errors of the torque actions after every epoch [N m], "training" and "held_out".
     """
     num_batches = math.ceil(len(collection.training.actions) / settings.batch_size)
     optimizer = torch.optim.Adam(actor.parameters(), lr=settings.learning_rate)
@@ -214,14 +223,15 @@ def supervise(task: LeggedRobot, actor: MLPModel, collection: Collection, settin
     for epoch in range(settings.num_epochs):
         losses = []
         for pairs in collection.training.shuffled().split(settings.batch_size):
-            loss = imitation_loss(task, actor, pairs)
+            wrong = imitation_errors(task, actor, pairs)
             optimizer.zero_grad()
-            loss.backward()
+            wrong.square().mean().backward()
             optimizer.step()
             schedule.step()
-            losses.append(loss.detach())
+            losses.append(of_torques(task, wrong.detach()))
         with torch.no_grad():
-            held_out = [imitation_loss(task, actor, pairs) for pairs in collection.held_out.split(settings.batch_size)]
+            batches = collection.held_out.split(settings.batch_size)
+            held_out = [of_torques(task, imitation_errors(task, actor, pairs)) for pairs in batches]
         for name, values in (("training", losses), ("held_out", held_out)):
             errors[name].append(task.cfg.control.torque_scale * float(torch.stack(values).mean().sqrt()))
         now = ", ".join(f"{name.replace('_', ' ')} {values[-1]:.2f} N m" for name, values in errors.items())
@@ -229,13 +239,18 @@ def supervise(task: LeggedRobot, actor: MLPModel, collection: Collection, settin
     return errors
 
 
-def imitation_loss(task: LeggedRobot, actor: MLPModel, pairs: Pairs) -> Tensor:
-    """Return the mean square error of the actor's mean actions on pairs and their mirror images. Scalar."""
+def imitation_errors(task: LeggedRobot, actor: MLPModel, pairs: Pairs) -> Tensor:
+    """Return the errors of the actor's mean actions on pairs and their mirror images. Shape: (2 pairs, num_actions)."""
     observations = exchange(pairs.observations, task.observations.policy_columns("last_action"))
     observations = torch.cat([observations, task.mirror("policy", observations)])
     actions = torch.cat([pairs.actions, task.mirror("actions", pairs.actions)])
     predicted = actor(TensorDict({"policy": observations}, [len(observations)]))
-    return (predicted - actions).square().mean()
+    return predicted - actions
+
+
+def of_torques(task: LeggedRobot, wrong: Tensor) -> Tensor:
+    """Return the mean square of the errors of torque actions, which are the last ones. Scalar."""
+    return wrong[:, -task.num_dof :].square().mean()
 
 
 def exchange(observations: Tensor, columns: list[int]) -> Tensor:
@@ -254,18 +269,18 @@ def make_controller(task: LeggedRobot, settings: WholeBodySettings | None = None
 
 
 def act_by_controller(controller: WholeBodyController) -> Act:
-    """Return the function that asks the controller for the torques of a task's state [N m]."""
-    return lambda task: controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0).total
+    """Return the function that asks the controller for the torques of a task's state, and gives them."""
+    return lambda task: actions_for(task, controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0).total)
 
 
 def act_by_policy(actor: MLPModel) -> Act:
-    """Return the function that asks a policy for its mean torques [N m]."""
+    """Return the function that asks a policy for its mean actions."""
 
-    def torques(task: LeggedRobot) -> Tensor:
+    def actions(task: LeggedRobot) -> Tensor:
         with torch.no_grad():
-            return task.torque_scale * actor(task.get_observations())
+            return actor(task.get_observations())
 
-    return torques
+    return actions
 
 
 def histogram(values: Tensor, highest: float, bins: int = 50) -> dict[str, list[float]]:

@@ -17,6 +17,7 @@ from legged_torque.utils.config import update_from_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import apply_perturbation
 
+Act = Callable[[LeggedRobot], Tensor]  # returns the actions for a task's state; (num_envs, num_actions)
 START_CLEARANCE = (0.0, 0.02)  # lowest and highest clearance of the lowest foot at the start [m]
 MAX_DRAWS = 20  # how often states are drawn until no other part of the robot is below the ground
 LOWEST_HEIGHT = 0.2  # lowest height of a standing robot's trunk [m]
@@ -83,23 +84,37 @@ def is_standing(task: LeggedRobot) -> Tensor:
     return upright & only_feet & slow  # falls before are not known here, see measure_standing
 
 
-def measure_standing(task: LeggedRobot, torques: Callable[[LeggedRobot], Tensor], duration: float) -> StandingResult:
-    """Let a controller or policy act from the present state on, and see who stands in the end.
+def actions_for(task: LeggedRobot, torques: Tensor) -> Tensor:
+    """Return the actions that lead to torques in the present state of a task, see :class:`TorqueRobot`.
 
-    The task's actions are torques; call :func:`place_on_ground` before. Worlds that it resets, because the trunk
-    touched the ground or the state diverged, have fallen. ``torques`` returns those of its next control step [N m]
-    (num_envs, num_dof); which feet touch the ground is best told by ``task.feet_contact``. The duration [s] is shorter
-    than an episode. A UserError if it is not, or if the task cannot apply torques.
+    Shapes: (num_envs, num_dof) [N m] to (num_envs, num_actions). A UserError if the task's actions are not torques.
     """
     if not isinstance(task, TorqueRobot):
-        raise UserError("torques can only be measured in a task whose actions are torques, such as a1_torque")
+        raise UserError(f"the actions of {type(task).__name__} are not torques, as those of TorqueRobot are")
+    return task.actions_for(torques)
+
+
+def check_torques(task: LeggedRobot) -> None:
+    """Raise a UserError if a task cannot give any torques that are wanted of it."""
+    wanted = torch.linspace(-5.0, 5.0, task.num_dof, device=task.device).expand_as(task.dof_pos)
+    if not torch.allclose(task._compute_torques(actions_for(task, wanted)), wanted, atol=1e-3):
+        raise UserError(f"{type(task).__name__} cannot give the torques that its actions_for is asked for")
+
+
+def measure_standing(task: LeggedRobot, act: Act, duration: float) -> StandingResult:
+    """Let a controller or policy act from the present state on, and see who stands in the end.
+
+    Call :func:`place_on_ground` before. Worlds that the task resets, because the trunk touched the ground or the state
+    diverged, have fallen. Which feet touch the ground is best told to ``act`` by ``task.feet_contact``. The duration
+    [s] is shorter than an episode. A UserError if it is not.
+    """
     steps = round(duration / task.dt)
     if steps >= task.max_episode_length:
         raise UserError(f"{duration} s do not fit into an episode of {task.max_episode_length * task.dt:g} s")
     upright = torch.ones(task.num_envs, dtype=torch.bool, device=task.device)
     total, count = (torch.zeros((), device=task.device) for _ in range(2))
     for _ in range(steps):
-        task.step(torques(task) / task.torque_scale)
+        task.step(act(task))
         upright &= ~task.reset_buf
         total += (task.torques.abs().mean(dim=1) * upright).sum()
         count += upright.sum()

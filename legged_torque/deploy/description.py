@@ -31,7 +31,8 @@ COMMENTS = {
     "actions": "terms in order; actions are clipped first. Torque: the sum over terms of mixing_weight times\n"
     "position_residual: stiffness * (nominal_pose + scale * action - q) - damping * qd\n"
     "torque: scale * action\n"
-    "then clipped to torque_limits",
+    "then clipped to torque_limits; actions of a term with an interval are held for as many control steps, from the\n"
+    "start of an episode on: those in between do not count, nor as last_action",
     "gains": "stiffness Kp [N m/rad], damping Kd [N m s/rad]",
     "torque_limits": "[N m]",
     "timing": "[Hz]; actions hold for decimation physics steps; refresh_torques: torques are computed anew from q and\n"
@@ -145,7 +146,12 @@ def _check_terms(description: dict[str, Any], where: str) -> None:
     num_joints = len(description["joint_order"])
     observations, actions, network = (description[key] for key in ("observations", "actions", "network"))
     num_actions = sum(term["size"] for term in actions["terms"])
-    sizes = {"joint_position": num_joints, "joint_velocity": num_joints, "last_action": num_actions}
+    sizes = {
+        "joint_position": num_joints,
+        "joint_velocity": num_joints,
+        "last_action": num_actions,
+        "position_phase": 1,
+    }
     for section, default in ((observations, 3), (actions, num_joints)):
         names = [term["name"] for term in section["terms"]]
         for term in section["terms"]:

@@ -192,6 +192,7 @@ def _action_terms(task: LeggedRobot) -> list[dict[str, Any]]:
             "unit": term.unit,
             "mixing_weight": 1.0 if term.weight is None else _plain(term.weight),
             "meaning": term.meaning,
+            **({"interval": term.interval} if term.interval > 1 else {}),
         }
         for term in task.action_terms()
     ]

@@ -44,7 +44,7 @@ class Policy:
         joint_order: Names of the joints, in the order of all vectors of joints.
         nominal_pose: Shape: (joints,) [rad].
         torque_limits: Lowest and highest torques. Shape: (2, joints) [N m].
-        last_action: Clipped actions of the last step; 0 after a reset. Shape: (actions,).
+        last_action: Actions that acted in the last step, clipped; 0 after a reset. Shape: (actions,).
         session: The network in onnxruntime.
     """
 
@@ -66,6 +66,7 @@ class Policy:
         gains = self.description["gains"]
         self._stiffness, self._damping = self._by_joint(gains["stiffness"]), self._by_joint(gains["damping"])
         self._action_terms = self.description["actions"]["terms"]
+        self._intervals = {term["name"]: term.get("interval", 1) for term in self._action_terms}
         self._action_clip = self.description["actions"]["clip"]
         terms = self.description["observations"]["terms"]
         self._terms = [term["name"] for term in terms]
@@ -77,6 +78,7 @@ class Policy:
 
     def reset(self) -> None:
         """Start a new episode: forget the last action and the history."""
+        self._steps = 0
         self.last_action = np.zeros(self.description["network"]["num_actions"], self.dtype)
         self._history: np.ndarray | None = None
 
@@ -93,6 +95,7 @@ class Policy:
             "joint_position": self._joints(state.joint_positions) - self.nominal_pose,
             "joint_velocity": self._joints(state.joint_velocities),
             "last_action": self.last_action,
+            "position_phase": [self._phase("position_residual")],
         }
         now = np.concatenate([np.asarray(values[name], self.dtype) for name in self._terms])
         if now.shape != self._scale.shape:
@@ -105,11 +108,17 @@ class Policy:
         return self._history.copy()
 
     def act(self, obs: np.ndarray) -> np.ndarray:
-        """Return clipped mean actions, kept as ``last_action``; a UserError if not finite. Shape: (actions,)."""
+        """Return clipped mean actions, or held ones where new ones are not due, kept as ``last_action``.
+
+        Call it once per control step. A UserError if they are not finite. Shape: (actions,).
+        """
         (actions,) = self.session.run(["actions"], {"obs": np.asarray(obs, np.float32)[np.newaxis]})
         if not np.isfinite(actions).all():  # such actions must not reach a robot
             raise UserError("the network's actions are not finite: check the observations")
-        self.last_action = np.clip(actions[0], *self._action_clip).astype(self.dtype)
+        new = np.clip(actions[0], *self._action_clip).astype(self.dtype)
+        is_due = np.repeat([self._phase(name) == 0.0 for name in self._intervals], len(self.joint_order))
+        self.last_action = np.where(is_due, new, self.last_action)
+        self._steps += 1
         return self.last_action.copy()
 
     def torques(self, actions: np.ndarray, joint_positions: np.ndarray, joint_velocities: np.ndarray) -> np.ndarray:
@@ -126,6 +135,11 @@ class Policy:
                 torque = self._stiffness * error - self._damping * self._joints(joint_velocities)
             total += self.dtype(term["mixing_weight"]) * torque
         return np.clip(total, *self.torque_limits)
+
+    def _phase(self, name: str) -> float:
+        """Return the share of its interval for which the actions of a term have been held; 0: new ones are due."""
+        interval = self._intervals.get(name, 1)
+        return self._steps % interval / interval
 
     def _by_joint(self, values: dict[str, Any]) -> np.ndarray:
         """Return values by joint in the policy's order. Shape: (joints, ...)."""

@@ -22,7 +22,7 @@ class A1TorqueCfgPPO(torque.TorqueCfgPPO, A1CfgPPO):
 
 
 class A1TorqueGravityCfgPPO(torque_gravity.TorqueGravityCfgPPO, A1CfgPPO):
-    """Training of ``a1_torque`` from a policy that stands."""
+    """Training of torque control from a policy that stands."""
 
 
 class A1TorqueCurriculumCfg(torque_curriculum.TorqueCurriculumCfg, A1Cfg):
@@ -33,8 +33,34 @@ class A1TorqueCurriculumCfgPPO(torque_curriculum.TorqueCurriculumCfgPPO, A1CfgPP
     """Its training."""
 
 
+class A1TorqueCurriculumHighCfg(A1TorqueCurriculumCfg):
+    """The same with a higher nominal pose: its feet are below the same places of the trunk, and 0.33 m below it.
+
+    With links of 0.2 m, a thigh angle t and a calf angle c, a foot is 0.4 cos(c / 2) away from its thigh's joint, and
+    t + c / 2 turns that line backwards. In the lower pose it is 0.015 m behind the joint at the front, 0.072 m at the
+    rear. 0.32 m below it, the distance is 0.3203 and 0.3281 m: c = -2 acos(0.8009) and -2 acos(0.8202), and t is
+    atan(0.015 / 0.32) - c / 2 and atan(0.072 / 0.32) - c / 2. Of the 0.32 m, hips of 0.1 rad leave 0.310 m below the
+    trunk (0.32 cos(0.1) - 0.0838 sin(0.1)), and the foot's radius adds 0.02 m.
+    """
+
+    class init_state:
+        default_joint_angles = (
+            {"FR_hip_joint": -0.1, "FR_thigh_joint": 0.69, "FR_calf_joint": -1.28}
+            | {"FL_hip_joint": 0.1, "FL_thigh_joint": 0.69, "FL_calf_joint": -1.28}
+            | {"RR_hip_joint": -0.1, "RR_thigh_joint": 0.83, "RR_calf_joint": -1.22}
+            | {"RL_hip_joint": 0.1, "RL_thigh_joint": 0.83, "RL_calf_joint": -1.22}
+        )
+
+    class rewards:
+        base_height_target = 0.33
+
+
 class A1TorqueMultiHeadCfg(multi_head.TorqueMultiHeadCfg, A1Cfg):
     """A1 with positions and torques; the PD part fades to 0."""
+
+
+class A1CurriculumMultiHeadCfg(multi_head.CurriculumMultiHeadCfg, A1Cfg):
+    """A1 with positions and torques that is first rewarded for its nominal pose; the PD part fades to 0."""
 
 
 class A1MultiHeadCfg(multi_head.MultiHeadCfg, A1Cfg):
@@ -42,13 +68,27 @@ class A1MultiHeadCfg(multi_head.MultiHeadCfg, A1Cfg):
 
 
 class A1MultiHeadCfgPPO(multi_head.MultiHeadCfgPPO, A1CfgPPO):
-    """Training of both."""
+    """Training of all of them."""
+
+
+class A1GravityMultiHeadCfgPPO(torque_gravity.TorqueGravityCfgPPO, A1MultiHeadCfgPPO):
+    """Training from a policy whose torque head stands."""
+
+
+class A1MultiHeadTwoRatesCfg(multi_head.MultiHeadTwoRatesCfg, A1Cfg):
+    """A1 with positions at 50 Hz and torques at 200 Hz; the PD part fades to 0.1."""
+
+
+class A1MultiHeadTwoRatesCfgPPO(multi_head.MultiHeadTwoRatesCfgPPO, A1CfgPPO):
+    """Its training."""
 
 
 _ROBOT = "legged_torque.envs.base.legged_robot:LeggedRobot"
 _TORQUE = "legged_torque.envs.approaches.torque:TorqueRobot"
 _CURRICULUM = "legged_torque.envs.approaches.torque_curriculum:TorqueCurriculumRobot"
 _MULTI_HEAD = "legged_torque.envs.approaches.multi_head:MultiHeadRobot"
+_CURRICULUM_MULTI_HEAD = "legged_torque.envs.approaches.multi_head:CurriculumMultiHeadRobot"
+_TWO_RATES = "legged_torque.envs.approaches.multi_head:MultiHeadTwoRatesRobot"
 
 for name, robot, env_cfg, train_cfg in (
     ("a1_position", _ROBOT, A1Cfg, A1CfgPPO),
@@ -57,5 +97,10 @@ for name, robot, env_cfg, train_cfg in (
     ("a1_torque_curriculum", _CURRICULUM, A1TorqueCurriculumCfg, A1TorqueCurriculumCfgPPO),
     ("a1_torque_multihead", _MULTI_HEAD, A1TorqueMultiHeadCfg, A1MultiHeadCfgPPO),
     ("a1_multihead", _MULTI_HEAD, A1MultiHeadCfg, A1MultiHeadCfgPPO),
+    ("a1_torque_curriculum_multihead", _CURRICULUM_MULTI_HEAD, A1CurriculumMultiHeadCfg, A1MultiHeadCfgPPO),
+    ("a1_torque_gravity_curriculum", _CURRICULUM, A1TorqueCurriculumCfg, A1TorqueGravityCfgPPO),
+    ("a1_torque_gravity_multihead", _MULTI_HEAD, A1TorqueMultiHeadCfg, A1GravityMultiHeadCfgPPO),
+    ("a1_torque_curriculum_high", _CURRICULUM, A1TorqueCurriculumHighCfg, A1TorqueCurriculumCfgPPO),
+    ("a1_multihead_two_rates", _TWO_RATES, A1MultiHeadTwoRatesCfg, A1MultiHeadTwoRatesCfgPPO),
 ):
     task_registry.register(name, robot, env_cfg(), train_cfg())

@@ -6,8 +6,6 @@ again wherever these are the same, and refused where they are not.
 
 from __future__ import annotations
 
-from functools import reduce
-from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +28,15 @@ SPACES = {
         "control",
         "normalization",
     ),
-    "train": ("actor.class_name", "actor.hidden_dims", "actor.activation", "obs_groups.actor"),
+    "train": (
+        "actor.class_name",
+        "actor.hidden_dims",
+        "actor.head_hidden_dims",
+        "actor.activation",
+        "obs_groups.actor",
+    ),
 }
-"""Settings of task and training in which a pre-trained policy must agree: observations, actions and network."""
+"""Settings of task and training, if they have them, in which a pre-trained policy must agree: what it sees and does."""
 STANDARD_DEVIATION = "distribution."
 """Start of the names of parameters that are not taken over: how much a training explores is its own setting."""
 
@@ -104,9 +108,11 @@ def read_pretrained(file: Path) -> dict[str, Any]:
 
 def spaces(env_cfg: Any, train_cfg: Any) -> dict[str, Any]:
     """Return the settings of :data:`SPACES`, by dotted path."""
-    settings = {"env": to_dict(env_cfg), "train": to_dict(train_cfg)}
-    result: dict[str, Any] = {}
-    for part, paths in SPACES.items():
-        for path in paths:
-            result |= flat(reduce(getitem, path.split("."), settings[part]), path)
-    return result
+    entries = {"env": flat(to_dict(env_cfg)), "train": flat(to_dict(train_cfg))}
+    return {
+        name: value
+        for part, paths in SPACES.items()
+        for path in paths
+        for name, value in entries[part].items()
+        if f"{name}.".startswith(f"{path}.")
+    }

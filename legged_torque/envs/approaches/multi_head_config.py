@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from legged_torque.envs.approaches.torque_curriculum_config import TorqueCurriculumCfg
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO, LinearChange
 from legged_torque.utils.config import Section
 from legged_torque.utils.limits import Count, Sizes
@@ -32,6 +35,38 @@ class MultiHeadCfg(TorqueMultiHeadCfg):
                 end = 0.1
 
 
+class CurriculumMultiHeadCfg(TorqueMultiHeadCfg, TorqueCurriculumCfg):
+    """Settings of torque multi-head control with the rewards of the torque curriculum."""
+
+
+STEPS = 4  # control steps at 200 Hz of one at 50 Hz
+
+
+class MultiHeadTwoRatesCfg(MultiHeadCfg):
+    """Settings of multi-head control with torques at 200 Hz and positions at 50 Hz, the paper's future work.
+
+    What happens by chance in a control step is as frequent in time as at 50 Hz.
+    """
+
+    class commands:
+        resampling_probability = 0.0005  # per control step: about every 10 s at 200 Hz
+
+    class control:
+        decimation = 1  # control steps are physics steps
+        position_interval: Count = 4  # control steps for which position actions are held
+
+    class domain_rand:
+        resampling_probability = 0.0005
+        push_probability = 0.0005
+
+    def perturbations(self) -> dict[str, dict]:
+        """Return those of 50 Hz, with as many pushes per second."""
+        named = super().perturbations()
+        for changes in named.values():
+            changes["domain_rand"]["push_probability"] /= STEPS
+        return named
+
+
 class MultiHeadCfgPPO(LeggedRobotCfgPPO):
     """Training of multi-head control."""
 
@@ -39,3 +74,24 @@ class MultiHeadCfgPPO(LeggedRobotCfgPPO):
         class_name = "legged_torque.learning.multi_head:MultiHeadModel"  # Figure 2
         hidden_dims = [512, 256]  # shared by both heads
         head_hidden_dims: Sizes = [128]  # of either head
+
+
+class MultiHeadTwoRatesCfgPPO(MultiHeadCfgPPO):
+    """Training of multi-head control with two rates: discounts per second and evaluated time are those at 50 Hz."""
+
+    class runner:
+        num_steps_per_env = 48
+
+    class evaluation:
+        num_samples = 128_000  # world steps of one evaluation: as much time as at 50 Hz
+
+    class algorithm:
+        num_mini_batches = 8  # of as many samples as at 50 Hz
+        gamma, lam = 0.98**0.25, 0.95**0.25
+
+    def presets(self) -> dict[str, dict[str, Any]]:
+        """Return those of 50 Hz, with the same discounts per second."""
+        named = super().presets()
+        for algorithm in (changes.get("algorithm", {}) for changes in named.values()):
+            algorithm |= {key: algorithm[key] ** (1 / STEPS) for key in ("gamma", "lam") if key in algorithm}
+        return named

@@ -29,7 +29,7 @@ def scaled_torque(
 
 
 class TorqueRobot(LeggedRobot):
-    """A robot whose actions are torques."""
+    """A robot whose actions are torques, or torques and more."""
 
     def action_terms(self) -> list[ActionTerm]:
         """Return one torque per joint."""
@@ -39,3 +39,7 @@ class TorqueRobot(LeggedRobot):
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """tau = torque_scale a [N m]. Shapes: (num_envs, num_dof)."""
         return self.torque_scale * actions
+
+    def actions_for(self, torques: Tensor) -> Tensor:
+        """Return the actions that lead to torques [N m] in the present state. Shape: (num_envs, num_actions)."""
+        return torques / self.torque_scale

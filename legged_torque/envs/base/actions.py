@@ -19,6 +19,7 @@ class ActionTerm:
     unit: str  # of scale times action
     meaning: str  # what scale times action is
     weight: Tensor | None = None  # of its torques, a scalar on the device; None is 1
+    interval: int = 1  # control steps for which its actions are held, from the start of an episode on
 
 
 def position_residual(scale: Tensor, weight: Tensor | None = None) -> ActionTerm:

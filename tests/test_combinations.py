@@ -1,0 +1,295 @@
+"""The paper's future work: approaches combined, a higher nominal pose, and positions and torques at two rates."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from settings import error_of, get_cfgs, parse, torques_in_torch
+from test_action_delay import HIGH_UP, time_out
+from test_control import CONVERGED, NOMINAL, TORQUE_LIMIT, pd_by_hand, random_state
+from test_resume import content, differences, start, train
+from test_symmetry import mirror_policy
+
+from legged_torque.control import gravity_pretraining
+from legged_torque.control.gravity_pretraining import (
+    act_by_policy,
+    follow,
+    make_controller,
+    pretrain,
+)
+from legged_torque.control.standing import check_torques, use_standing_trials
+from legged_torque.control.whole_body import WholeBodySettings
+from legged_torque.envs import A1TorqueCfg, task_registry
+from legged_torque.envs.approaches.torque import TorqueRobot
+from legged_torque.utils.config import to_dict
+
+CURRICULUM, GRAVITY_CURRICULUM = "a1_torque_curriculum_multihead", "a1_torque_gravity_curriculum"
+GRAVITY, HIGH, TWO_RATES = "a1_torque_gravity_multihead", "a1_torque_curriculum_high", "a1_multihead_two_rates"
+PRETRAINING = {"num_configurations": 80, "num_steps": 6, "num_rounds": 2, "num_epochs": 20, "batch_size": 32}
+INTERVAL = 4  # control steps of two rates for which position actions are held
+
+
+def to_steps(task, total_steps):
+    """Bring a task to a moment of training."""
+    task.total_steps.fill_(total_steps)
+    task.update_curriculum()
+
+
+# ------------------------------------------------------------------------------------- curriculum with multi-head
+
+
+def test_curriculum_with_multi_head(make_task):
+    """Torques are eq. 7 with a PD part that fades to 0; rewards have the nominal pose's, with its own weights."""
+    task = make_task(CURRICULUM, 3)
+    to_steps(task, 25_000_000)
+    q, qd, action = random_state(task)
+    expected = 0.5008 * pd_by_hand(action[:, :12], q, qd) + 4.0 * action[:, 12:]
+    np.testing.assert_allclose(task._compute_torques(torch.tensor(action).float()), expected, rtol=1e-4, atol=1e-4)
+    reward = np.exp(-0.5 * np.square(q - NOMINAL).sum(axis=1))
+    np.testing.assert_allclose(task._reward_nominal_position(), reward, rtol=1e-4)
+    place = task.reward_names.index("nominal_position")
+    for total_steps, weight in ((0, 20.0), (2_500_000, 10.5), (5_000_000, 1.0), (50_000_000, 1.0)):
+        to_steps(task, total_steps)
+        assert task.reward_weights()[place].item() == pytest.approx(0.02 * weight)
+    tracking = task.cfg.rewards.curriculum.tracking_lin_vel
+    assert (tracking.t_start, tracking.t_end) == (3_000_000, 13_000_000)
+
+
+# ------------------------------------------------------------------------------------------- gravity with the others
+
+
+def test_gravity_with_curriculum():
+    """The task is that of the curriculum, the training that of gravity pre-training."""
+    env_cfg, train_cfg = map(to_dict, get_cfgs(task=GRAVITY_CURRICULUM))
+    others = to_dict(get_cfgs(task="a1_torque_curriculum")[0]), to_dict(get_cfgs(task="a1_torque_gravity")[1])
+    others[1]["runner"]["experiment_name"] = GRAVITY_CURRICULUM
+    assert (env_cfg, train_cfg) == others
+
+
+@pytest.mark.parametrize("total_steps", [0, 25_000_000, 60_000_000])
+def test_actions_for_torques(make_task, total_steps):
+    """At every weight of the PD part it gives nothing, and the torque part gives what is wanted."""
+    task = make_task(GRAVITY, 3)
+    to_steps(task, total_steps)
+    q, qd, _ = random_state(task)
+    wanted = torch.linspace(-20.0, 20.0, 36).view(3, 12)
+    actions = task.actions_for(wanted)
+    np.testing.assert_allclose(pd_by_hand(actions[:, :12].numpy(), q, qd), 0.0, atol=1e-4)
+    np.testing.assert_allclose(4.0 * actions[:, 12:], wanted, rtol=1e-5)
+    torch.testing.assert_close(task._compute_torques(actions), wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_a_torque_head_is_pretrained(monkeypatch):
+    """The network as a whole, and its torque head alone, come nearer to the controller than before."""
+    monkeypatch.setattr(gravity_pretraining, "STANDING_SECONDS", 0.1)  # not looked at here
+    words = [f"--set=pretraining.{name}={value}" for name, value in PRETRAINING.items()]
+    env_cfg, train_cfg = get_cfgs("--num_envs=16", *words, task=GRAVITY)
+    actor, report = pretrain(GRAVITY, env_cfg, train_cfg, "cpu")
+    errors = report["rms_error"]["held_out"]
+    assert len(errors) == 2 * 20 and errors[-1] < 0.8 * errors[0]
+
+    use_standing_trials(env_cfg, 4)
+    task = task_registry.make_env(GRAVITY, parse(), env_cfg)[0]
+    untrained = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=None)[0].alg.actor
+    controller = make_controller(task, WholeBodySettings(**to_dict(train_cfg.pretraining.controller)))
+    wrong = []
+    for policy in (untrained, actor):
+        torch.manual_seed(7)
+        seen = []
+
+        def noting(task, policy=policy, seen=seen):
+            actions = act_by_policy(policy)(task)
+            seen.append(torch.stack([task._compute_torques(actions), 4.0 * actions[:, 12:]]))
+            return actions
+
+        wanted = 4.0 * follow(task, controller, noting, 16, 8).actions[..., 12:]
+        wrong.append((torch.stack(seen, dim=1) - wanted).square().mean(dim=(1, 2, 3)).sqrt())
+    assert wrong[1][0] < wrong[0][0] and wrong[1][1] < 0.7 * wrong[0][1]
+
+
+class Doubled(TorqueRobot):
+    """Gives twice the torques that it is asked for."""
+
+    def _compute_torques(self, actions):
+        return 2.0 * super()._compute_torques(actions)
+
+
+def test_who_cannot_give_torques(make_task):
+    """A task is refused by the name of its class if its actions are no torques or lead to others than wanted."""
+    gravity = get_cfgs(task="a1_torque_gravity")[1]
+    cfg = get_cfgs("--num_envs=1", task="a1_position")[0]
+    told = "the actions of LeggedRobot are not torques"
+    assert told in error_of(pretrain, "a1_position", cfg, gravity, "cpu")
+    cfg = A1TorqueCfg()
+    cfg.env.num_envs = 1
+    told = "cannot give the torques that its actions_for is asked for"
+    assert error_of(check_torques, Doubled(cfg)) == f"Doubled {told}"
+    assert told in error_of(check_torques, make_task(GRAVITY, 1, **{"control.mixing.torque.start": 0.0}))
+    for name in ("a1_torque", "a1_torque_curriculum", CURRICULUM, GRAVITY):
+        check_torques(make_task(name, 1))
+
+
+# ---------------------------------------------------------------------------------------------------- the higher pose
+
+
+def test_higher_pose(make_task):
+    """In MuJoCo's kinematics its feet touch the ground at 0.33 m, below the same places as in the lower pose."""
+    task, low = make_task(HIGH, 1), make_task("a1_torque_curriculum", 1)
+    model = task.sim.mj_model
+    feet = [model.geom(name).id for name in task.foot_names]
+    places = []
+    for pose in (task.default_dof_pos, low.default_dof_pos):
+        data = mujoco.MjData(model)
+        data.qpos[:7], data.qpos[7:] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], pose
+        mujoco.mj_kinematics(model, data)
+        places.append(data.geom_xpos[feet])
+    np.testing.assert_allclose(0.02 - places[0][:, 2], 0.33, atol=5e-4)  # with the radius of a foot
+    np.testing.assert_allclose(places[0][:, :2], places[1][:, :2], atol=4e-3)
+    assert task.cfg.rewards.base_height_target == 0.33
+    assert (
+        (task.dof_pos_limits[:, 0] < task.default_dof_pos) & (task.default_dof_pos < task.dof_pos_limits[:, 1])
+    ).all()
+    task.dof_pos.copy_(task.default_dof_pos)
+    assert task._reward_nominal_position().item() == 1.0
+    error = np.square(task.default_dof_pos.numpy() - NOMINAL).sum()
+    task.dof_pos.copy_(low.default_dof_pos)
+    assert task._reward_nominal_position().item() == pytest.approx(math.exp(-0.5 * error), rel=1e-4)
+
+
+# ---------------------------------------------------------------------------------------------------------- two rates
+
+
+def send(task, count, num_worlds, seed=0):
+    """Act at random for some control steps; return what was sent. Shape: (steps, worlds, 24)."""
+    sent = 2.0 * torch.randn(count, num_worlds, 24, generator=torch.Generator().manual_seed(seed))
+    for actions in sent:
+        task.step(actions)
+    return sent.numpy()
+
+
+def held(sent):
+    """The actions that act: positions of every fourth control step of an episode, torques of each."""
+    result = sent.copy()
+    for step in range(len(sent)):
+        result[step, :, :12] = sent[step // INTERVAL * INTERVAL, :, :12]
+    return result
+
+
+@pytest.mark.parametrize("where", ["kernel", "torch"])
+def test_positions_are_held(make_task, where):
+    """Each control step is one of plain MuJoCo, with the newest torques and PD targets of every fourth step."""
+    task = make_task(TWO_RATES, 2, **HIGH_UP, **CONVERGED)
+    assert task.dt == pytest.approx(0.005) and task.max_episode_length == 4000
+    if where == "torch":
+        torques_in_torch(task)
+    to_steps(task, 25_000_000)
+    random_state(task)
+    model, worlds = task.sim.mj_model, []
+    for world in range(2):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = task.sim.qpos[world], task.sim.qvel[world]
+        worlds.append(data)
+    generator = np.random.default_rng(2)
+    for step in range(2 * INTERVAL + 1):
+        actions = generator.normal(size=(2, 24))
+        if step % INTERVAL == 0:
+            positions = actions[:, :12]
+        task.step(torch.tensor(actions).float())
+        for world, data in enumerate(worlds):
+            torque = 0.55072 * pd_by_hand(positions[world], data.qpos[7:], data.qvel[6:]) + 4.0 * actions[world, 12:]
+            data.ctrl[:] = np.clip(torque, -TORQUE_LIMIT, TORQUE_LIMIT)
+            mujoco.mj_step(model, data)
+            np.testing.assert_allclose(task.torques[world], data.ctrl, atol=3e-2)
+            np.testing.assert_allclose(task.dof_pos[world], data.qpos[7:], atol=2e-3)
+
+
+def test_what_is_observed_of_two_rates(make_task):
+    """The phase of the interval, and the actions that act; both start anew with an episode, in its world alone."""
+    task = make_task(TWO_RATES, 2, **HIGH_UP)
+    (column,), actions = (
+        task.observations.policy_columns("position_phase"),
+        task.observations.policy_columns("last_action"),
+    )
+    assert task.obs_buf["policy"].shape[1] == 58 and task.get_observations()["policy"][:, column].tolist() == [0.0, 0.0]
+    phases, seen, sent = [], [], []
+    for step in range(10):
+        if step == 5:  # the last one of the first world's episode
+            time_out(task, [0])
+        sent.append(2.0 * torch.randn(2, 24))
+        obs = task.step(sent[-1])[0]
+        for group in ("policy", "critic"):
+            torch.testing.assert_close(obs[group][:, column], obs["policy"][:, column])
+        phases.append(obs["policy"][:, column].tolist())
+        seen.append(obs["policy"][:, actions].numpy())
+    first, second = zip(*phases, strict=True)
+    assert first == (0.25, 0.5, 0.75, 0.0, 0.25, 0.0, 0.25, 0.5, 0.75, 0.0)
+    assert second == (0.25, 0.5, 0.75, 0.0, 0.25, 0.5, 0.75, 0.0, 0.25, 0.5)
+    sent = torch.stack(sent).numpy()
+    expected = held(sent)
+    expected[6:, 0] = held(sent[6:])[:, 0]
+    expected[5, 0] = 0.0
+    np.testing.assert_array_equal(np.stack(seen), expected)
+
+
+@pytest.mark.parametrize("delay", [3, 6])
+def test_two_rates_behind_a_delay(make_task, delay):
+    """What is delayed is what acts: held positions and torques arrive together."""
+    task = make_task(TWO_RATES, 2, **HIGH_UP, **{"domain_rand.action_delay": [delay, delay]})
+    torques_in_torch(task)
+    states, step = [], task.sim.step
+
+    def noted_step(sense=True):
+        states.append([part.numpy().copy() for part in (task.torques, task.dof_pos, task.dof_vel)])
+        step(sense)
+
+    task.sim.step = noted_step
+    sent = held(send(task, 12, 2))
+    for i, (torques, q, qd) in enumerate(states):
+        action = sent[i - delay] if i >= delay else np.zeros((2, 24))
+        expected = np.clip(pd_by_hand(action[:, :12], q, qd) + 4.0 * action[:, 12:], -TORQUE_LIMIT, TORQUE_LIMIT)
+        np.testing.assert_allclose(torques, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_two_rates_in_the_mirror(make_task):
+    """The phase is the same in the mirror; the rest is reflected as ever, in every step of a history."""
+    task = make_task(TWO_RATES, 2, **{"env.history_length": 2})
+    seen = torch.randn(5, 2 * 58)
+    mirrored = task.mirror("policy", seen).view(5, 2, 58)
+    parts = seen.view(5, 2, 58)
+    assert torch.equal(mirrored[..., 57], parts[..., 57])
+    for step in range(2):
+        torch.testing.assert_close(mirrored[:, step, :57], mirror_policy(parts[:, step, :57]))
+
+
+def test_two_rates_are_the_same_per_second():
+    """Discounts, random events and evaluated time at 200 Hz are what they are at 50 Hz."""
+    fast, slow = get_cfgs(task=TWO_RATES), get_cfgs(task="a1_multihead")
+    for words in ((), ("--preset=paper",)):
+        algorithms = [get_cfgs(*words, task=task)[1].algorithm for task in (TWO_RATES, "a1_multihead")]
+        for name in ("gamma", "lam"):
+            assert getattr(algorithms[0], name) ** 4 == pytest.approx(getattr(algorithms[1], name))
+    assert fast[1].evaluation.num_samples == 4 * slow[1].evaluation.num_samples
+    chances = [cfg[0].commands.resampling_probability for cfg in (fast, slow)]
+    chances += [cfg[0].domain_rand.resampling_probability for cfg in (fast, slow)]
+    chances += [cfg[0].domain_rand.push_probability for cfg in (fast, slow)]
+    named = [cfg[0].perturbations() for cfg in (fast, slow)]
+    assert named[0].keys() == named[1].keys()
+    for name in named[0]:
+        chances += [each[name]["domain_rand"].pop("push_probability") for each in named]
+    assert [4 * chance for chance in chances[::2]] == pytest.approx(chances[1::2])
+    assert named[0] == named[1]
+    assert fast[0].control.mixing.pd.end == 0.1
+
+
+def test_two_rates_resumed(tmp_path):
+    """Held actions go on: three iterations and one more are four, to the bit, in the middle of intervals."""
+    words = [f"--task={TWO_RATES}", "--set=runner.num_steps_per_env=3", "--set=env.history_length=1"]
+    words += ["--set=evaluation.interval=0"]
+    whole, part = (train(tmp_path / name, count, *words) for name, count in (("whole", 4), ("part", 3)))
+    assert (part.env.episode_length_buf % INTERVAL != 0).any()
+    resumed = start(tmp_path / "resumed", *words, "--resume", f"--load_run={part.log_dir}")
+    resumed.claim_log_dir({})
+    resumed.learn(1, init_at_random_ep_len=True)
+    assert not differences(content(whole, 4), content(resumed, 4))
