@@ -179,6 +179,7 @@ def test_dry_run(name, tmp_path):
         ({"train": {"env.num_actions": 5}}, "train.env.num_actions cannot be set: it comes from the tasks"),
         ({"train": {"asset.file": "missing.xml"}}, "cannot load the robot 'missing.xml': there is no such file"),
         ({"train": {"seed": 3}}, "train.seed cannot be set: it comes from seeds"),
+        ({"train": {"evaluation.also": ["low"]}}, "train.evaluation.also cannot be set: it comes from environments"),
         ({"evaluation": {"num_env": 3}}, "unknown evaluation key 'num_env'; did you mean 'num_envs'?"),
         ({"evaluation": {"num_steps": 0}}, "evaluation.num_steps must be a whole number of at least 1, not 0"),
     ],

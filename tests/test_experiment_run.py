@@ -44,6 +44,9 @@ while done < 4 and not stopped and not (behaviour == "early" and done == 2):
     while behaviour == "slow" and done == 3 and not stopped:
         time.sleep(0.02)
 zipfile.ZipFile(run / f"model_{done}.pt", "w").close()
+if behaviour.startswith("measure"):
+    for name in behaviour.split()[1:]:
+        (run / name).touch()
 """
 
 STAND_IN_EVALUATE = """
@@ -261,6 +264,24 @@ def test_lost_and_broken_results_are_made_again(stage, tmp_path):
     changed = {path.name for path, state in contents(out).items() if before.get(path) != state}
     cells = {lost.parent.name, broken.parent.name}
     assert changed == {"result_high.json", "result_low.json", "evaluate.log", "lock", *cells}
+
+
+def test_what_a_training_has_measured_is_not_evaluated_again(stage, tmp_path):
+    """Trainings measure in all environments of their cells; only where none did, a process evaluates."""
+    file, out = write(tmp_path / "m.yaml", SMALL | {"tasks": ["a1_torque"]}), tmp_path / "out"
+    words = [file, f"--out={out}", "--device=cpu"]
+    (stage / "behaviour").write_text("measure evaluations.csv evaluations_high.csv")
+    status, output, error = experiment_here(*words, tmp_path=tmp_path)
+    assert (status, error) == (0, "") and "1 of 1 cells are done" in output and "evaluation in" not in output
+    assert not list(out.glob("*/result*")) and "'--set=evaluation.also=[\"high\"]'" in (
+        next(out.glob("*/train.log")).read_text()
+    )
+    next(out.glob("*/*/evaluations_high.csv")).unlink()
+    assert experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1] == "a1_torque-low-s1: evaluate in high\n"
+    (checkpoint,) = out.glob("*/*/model_4.pt")
+    checkpoint.rename(checkpoint.with_name("model_3.pt"))  # a training that is not whole has measured nothing for good
+    listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1]
+    assert listed == "a1_torque-low-s1: resume after 3 of 4 iterations, evaluate in low, high\n"
 
 
 def test_results_of_another_training_are_not_kept(stage, tmp_path):

@@ -170,18 +170,20 @@ def test_parts_are_merged(tmp_path):
 
 def test_what_counts_of_a_run():
     """Evaluations from step 90 million on; of a shorter run the last 18 percent; elsewhere the result."""
-    run = CellResult(CELL, rows=[{"steps": 1e6 * million} for million in range(1, 111)])
+    run = CellResult(CELL, {"low": [{"steps": 1e6 * million} for million in range(1, 111)]})
     run.results["high"] = {"steps": 5e6}
     assert [row["steps"] / 1e6 for row in run.counted_rows("low", 90e6)] == list(range(90, 111))
     assert [row["steps"] / 1e6 for row in run.counted_rows("low", 109e6)] == [109, 110]
     del run.rows[50:]
     assert [row["steps"] / 1e6 for row in run.counted_rows("low", 90e6)] == list(range(41, 51))
     assert run.counted_rows("high", 90e6) == [{"steps": 5e6}] and run.counted_rows("doubled", 90e6) == []
+    run.rows_in["high"] = [{"steps": 30e6}, {"steps": 50e6}]
+    assert run.counted_rows("high", 90e6) == [{"steps": 50e6}]  # they count in place of the result
 
 
 def test_finished_runs():
     """A run is finished if less than an interval between evaluations is left; without settings it has 110 million."""
-    run = CellResult(CELL, rows=[{"steps": 99e6}, {"steps": 104e6}], configs=[])
+    run = CellResult(CELL, {"low": [{"steps": 99e6}, {"steps": 104e6}]}, configs=[])
     assert run.total_steps == 110_000_000 and not run.is_finished(104e6)
     run.configs.append(SETTINGS | {"max_iterations": 108})
     assert run.total_steps == 108_000_000 and run.is_finished(104e6) and not run.is_finished(103e6)

@@ -15,13 +15,15 @@ from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
-from legged_torque.utils.runs import checkpoint_number, load_config, newest_checkpoint
+from legged_torque.utils.runs import checkpoint_number, evaluations_file, load_config, newest_checkpoint
 
 SETTINGS_FILE = "experiment.yaml"  # copy of the description, in the folder of the results
 CELL_SETTINGS = {
     "seed": "seeds",
     "runner.experiment_name": "tasks, environments and seeds",
     "env.num_actions": "the tasks",
+    "evaluation.perturbation": "environments",
+    "evaluation.also": "environments",
 }
 """Settings that ``train`` must not change, and the keys that they come from."""
 EVALUATION = {"num_envs": 256, "num_steps": 2000}
@@ -30,7 +32,7 @@ EVALUATION = {"num_envs": 256, "num_steps": 2000}
 
 @dataclass(frozen=True)
 class Cell:
-    """One training and the evaluations of its last checkpoint."""
+    """One training, and evaluations while it trains or, in environments without them, of its last checkpoint."""
 
     folder: Path
     task: str
@@ -51,9 +53,16 @@ class Cell:
         """Return the file that an evaluation writes; it becomes the result when the evaluation is complete."""
         return self.folder / f"result_{environment}.json.part"
 
+    def rows_file(self, run_dir: Path, environment: str) -> Path:
+        """Return the file of a run's evaluations in an environment while it trained."""
+        return evaluations_file(run_dir, "" if environment == self.environment else environment)
+
     def missing(self) -> list[str]:
-        """Return the perturbations without a readable result."""
-        return [name for name in self.evaluated_in if not is_json(self.result_file(name))]
+        """Return the perturbations without a readable result that a whole training was not evaluated in either."""
+        missing = [name for name in self.evaluated_in if not is_json(self.result_file(name))]
+        runs = list(self.folder.glob("*/")) if missing else []
+        measured = [name for name in missing if any(self.rows_file(run, name).is_file() for run in runs)]
+        return [name for name in missing if name not in measured] if measured and is_trained(self) else missing
 
 
 @dataclass(frozen=True)
@@ -178,21 +187,36 @@ def step_command(matrix: Matrix, cell: Cell, state: CellState, device: str) -> l
         words.append("--resume")
     else:
         words += [f"--seed={cell.seed}", f"--perturbation={cell.environment}"]
-        words += [f"--set={word}" for word in matrix.set_words()]
+        also = [name for name in cell.evaluated_in if name != cell.environment]
+        words += [f"--set={word}" for word in [*matrix.set_words(), f"evaluation.also={json.dumps(also)}"]]
         words += [f"--ranges={matrix.ranges}"] if matrix.ranges else []
     return [sys.executable, str(SCRIPTS_DIR / "train.py"), *words]
 
 
 def cell_state(cell: Cell) -> CellState:
     """Return the progress of a cell; UserError if its newest run with a checkpoint does not say how long it is."""
+    return CellState(*iterations(cell), cell.missing())
+
+
+def iterations(cell: Cell) -> tuple[int, int | None]:
+    """Return iterations before a cell's last checkpoint and those of the training, as :class:`CellState` has them."""
     for run_dir in sorted(cell.folder.glob("*/"), reverse=True):
         newest = newest_checkpoint(run_dir)
         if newest:
             total = load_config(run_dir).get("max_iterations")
             if type(total) is not int:
                 raise UserError(f"the settings of the run '{run_dir}' lack max_iterations")
-            return CellState(checkpoint_number(newest), total, cell.missing())
-    return CellState(0, None, cell.missing())
+            return checkpoint_number(newest), total
+    return 0, None
+
+
+def is_trained(cell: Cell) -> bool:
+    """Return whether the training of a cell is whole, as far as its files can be read."""
+    try:
+        done, total = iterations(cell)
+    except UserError:  # told when it is the cell's turn
+        return False
+    return total is not None and done >= total
 
 
 def is_json(file: Path) -> bool:

@@ -85,13 +85,13 @@ def run_problems(run: CellResult, from_step: float) -> list[str]:
         if count:
             problems.append(f"{count} of the {len(rows)} evaluations that count have no {metric.name}")
     for name in run.cell.evaluated_in:
-        result = run.results.get(name)
+        counted = run.counted_rows(name, from_step)
         if name == run.cell.environment:
             continue
-        if result is None:
+        if not counted:
             problems.append(f"not evaluated in {name}")
-        elif not run.is_finished(result["steps"]):
-            problems.append(f"evaluated in {name} after {result['steps'] / MILLION:.4g} of {total}")
+        elif not run.is_finished(counted[-1]["steps"]):
+            problems.append(f"evaluated in {name} after {counted[-1]['steps'] / MILLION:.4g} of {total}")
     return problems
 
 
@@ -143,9 +143,9 @@ def table_one(experiment: Experiment, table: Table, from_step: float) -> list[st
     return [
         f"Mean ± standard error over seeds (number of seeds, of {num_planned} that were planned). A seed's",
         "number is the mean of its evaluations during training, in the environment of training, from step",
-        f"{from_step / MILLION:g} million on, or of the last {LAST_SHARE:.0%} if training has not come that far. The",
-        "exception is `doubled`: trained in `high_frequency`, with the last checkpoint evaluated in `doubled`. The",
-        "paper's column is the mean of all evaluations after step 90 million.",
+        f"{from_step / MILLION:g} million on, or of the last {LAST_SHARE:.0%} if training has not come that far.",
+        "`doubled` is trained in `high_frequency` and evaluated in `doubled` as well while it trains, or else has the",
+        "number of the last checkpoint. The paper's numbers are means of all evaluations after step 90 million.",
         "**Bold**: significantly better than every other task of the column (see Differences). †: seeds are missing",
         "or trainings are not finished, so the number will change. Tracking % is better when higher, all else when",
         "lower. The paper's means are of four seeds; it prints no errors, and no numbers of default torque control.",
@@ -159,7 +159,7 @@ def other_table(table: Table) -> list[str]:
     columns = [name for name in table if not is_of_paper(name)]
     if not columns:
         return ["None were planned."]
-    text = "Trained -> evaluated: metrics of the last checkpoint, over seeds as above. The paper has no such numbers."
+    text = "Trained -> evaluated, over seeds and evaluations as above. The paper has no such numbers."
     return [text, "", *metric_table(table, columns)]
 
 

@@ -31,11 +31,16 @@ class CellResult:
     """What there is of a training that has begun."""
 
     cell: Cell
-    rows: list[Row] = field(default_factory=list)  # evaluations during training, merged over its runs
+    rows_in: dict[str, list[Row]] = field(default_factory=dict)  # evaluations during training, by environment
     results: dict[str, Row] = field(default_factory=dict)  # evaluations of the last checkpoint, by environment
     configs: list[dict[str, Any]] = field(default_factory=list)  # config.yaml of its runs
     devices: set[str] = field(default_factory=set)  # where it was trained and evaluated
     notes: list[str] = field(default_factory=list)  # problems with its files
+
+    @property
+    def rows(self) -> list[Row]:
+        """Evaluations during training in its own environment."""
+        return self.rows_in.get(self.cell.environment, [])
 
     @property
     def steps(self) -> float:
@@ -59,11 +64,12 @@ class CellResult:
         return steps + interval > self.total_steps
 
     def counted_rows(self, evaluated: str, from_step: float) -> list[Row]:
-        """Return the evaluations in an environment that count for Table I."""
-        if evaluated != self.cell.environment:
+        """Return the evaluations in an environment that count for Table I, or else that of the last checkpoint."""
+        rows = self.rows_in.get(evaluated, [])
+        if not rows:
             return [self.results[evaluated]] if evaluated in self.results else []
         first = from_step if self.steps >= from_step else (1.0 - LAST_SHARE) * self.steps
-        return [row for row in self.rows if row["steps"] >= first]
+        return [row for row in rows if row["steps"] >= first]
 
 
 @dataclass
@@ -142,9 +148,11 @@ def read_cell(cell: Cell) -> CellResult:
                 result.devices.add(str(result.configs[-1].get("device")))
             except UserError as error:
                 result.notes.append(str(error))
-        rows = read_rows(run_dir / "evaluations.csv", result.notes)
-        if rows:
-            result.rows = [row for row in result.rows if row["steps"] < rows[0]["steps"]] + rows
+        for name in dict.fromkeys([cell.environment, *cell.evaluated_in]):
+            rows = read_rows(cell.rows_file(run_dir, name), result.notes)
+            if rows:
+                before = [row for row in result.rows_in.get(name, []) if row["steps"] < rows[0]["steps"]]
+                result.rows_in[name] = before + rows
     for file in sorted([*cell.folder.glob("result_*.json"), *cell.folder.glob("*/result_*.json")]):
         try:
             values = json.loads(file.read_text(encoding="utf-8"))
@@ -206,7 +214,7 @@ def holm(p_values: list[float | None]) -> list[float | None]:
 
 
 def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
-    """Write all summaries as CSV, and every evaluation during training as compressed CSV."""
+    """Write all summaries as CSV, and every evaluation during training as compressed CSV, with names of columns."""
     names = [metric.name for metric in CURVE_METRICS]
     summaries: list[list[Any]] = [["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean"]]
     keys = [(task, column, name) for column, cells in table.items() for task in cells for name in names]
@@ -216,9 +224,11 @@ def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
         summaries.append([task, column, name, *numbers, paper_value(task, column, name)])
     evaluations: list[list[Any]] = [["task", "environment", "seed", "steps", *names]]
     runs = sorted(experiment.runs, key=lambda run: run.cell.name)
-    for cell, row in ((run.cell, row) for run in runs for row in run.rows):
-        values = [row[name] if math.isfinite(row[name]) else None for name in names]
-        evaluations.append([cell.task, cell.environment, cell.seed, row["steps"], *values])
+    for cell, evaluated, rows in ((run.cell, *entry) for run in runs for entry in run.rows_in.items()):
+        for row in rows:
+            values = [row[name] if math.isfinite(row[name]) else None for name in names]
+            column = column_name(cell.environment, evaluated)
+            evaluations.append([cell.task, column, cell.seed, row["steps"], *values])
     (out / TABLE_FILE).write_bytes(csv_bytes(summaries))
     (out / EVALUATIONS_FILE).write_bytes(gzip.compress(csv_bytes(evaluations), mtime=0))  # the same bytes every time
 

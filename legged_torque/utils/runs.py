@@ -17,6 +17,7 @@ from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.files import is_whole_archive, part_of, remove_stale_parts, told_by_name, write_whole
 
 CONFIG_FILE = "config.yaml"
+EVALUATIONS_FILE = "evaluations.csv"  # a row per evaluation during training
 _CHECKPOINT = "model_"
 _PACKAGES = ("legged_torque", "torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib", "numpy")
 
@@ -44,6 +45,17 @@ def claim_run_dir(run_dir: Path, config: dict[str, Any]) -> Path:
                     raise
                 candidate = run_dir.with_name(f"{run_dir.name}_{number}")
     raise AssertionError("there is always another number")
+
+
+def tagged(word: str, name: str) -> str:
+    """Return a word for something that may have a name: ``<word>_<name>``, or the word alone without one."""
+    return f"{word}_{name}" if name else word
+
+
+def evaluations_file(run_dir: Path, environment: str = "") -> Path:
+    """Return the file of a run's evaluations while it trained, or of those in one of ``evaluation.also``."""
+    file = run_dir / EVALUATIONS_FILE
+    return file.with_stem(tagged(file.stem, environment))
 
 
 def find_run(log_root: Path, load_run: str | None) -> Path:
