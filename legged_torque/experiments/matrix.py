@@ -195,28 +195,30 @@ def step_command(matrix: Matrix, cell: Cell, state: CellState, device: str) -> l
 
 def cell_state(cell: Cell) -> CellState:
     """Return the progress of a cell; UserError if its newest run with a checkpoint does not say how long it is."""
-    return CellState(*iterations(cell), cell.missing())
+    newest = last_checkpoint(cell)
+    if newest is None:
+        return CellState(0, None, cell.missing())
+    config, iterations = load_config(newest.parent), checkpoint_number(newest)
+    total = config.get("max_iterations")
+    if type(total) is not int:
+        raise UserError(f"the settings of the run '{newest.parent}' lack max_iterations")
+    return CellState(iterations, total, cell.missing())
 
 
-def iterations(cell: Cell) -> tuple[int, int | None]:
-    """Return iterations before a cell's last checkpoint and those of the training, as :class:`CellState` has them."""
-    for run_dir in sorted(cell.folder.glob("*/"), reverse=True):
-        newest = newest_checkpoint(run_dir)
-        if newest:
-            total = load_config(run_dir).get("max_iterations")
-            if type(total) is not int:
-                raise UserError(f"the settings of the run '{run_dir}' lack max_iterations")
-            return checkpoint_number(newest), total
-    return 0, None
+def last_checkpoint(cell: Cell) -> Path | None:
+    """Return the file of a cell's last checkpoint that is not damaged, or None."""
+    runs = sorted(cell.folder.glob("*/"), reverse=True)
+    return next(filter(None, map(newest_checkpoint, runs)), None)
 
 
 def is_trained(cell: Cell) -> bool:
-    """Return whether the training of a cell is whole, as far as its files can be read."""
+    """Return whether the training of a cell is whole; not so if its settings cannot be read, which is told later."""
+    newest = last_checkpoint(cell)
     try:
-        done, total = iterations(cell)
-    except UserError:  # told when it is the cell's turn
+        total = load_config(newest.parent).get("max_iterations") if newest else None
+    except UserError:
         return False
-    return total is not None and done >= total
+    return newest is not None and type(total) is int and checkpoint_number(newest) >= total
 
 
 def is_json(file: Path) -> bool:
