@@ -145,7 +145,7 @@ def read_cell(cell: Cell) -> CellResult:
         if (run_dir / CONFIG_FILE).is_file():
             try:
                 result.configs.append(load_config(run_dir))
-                result.devices.add(str(result.configs[-1].get("device")))
+                result.devices.add(str(result.configs[-1].get("device_name", result.configs[-1].get("device"))))
             except UserError as error:
                 result.notes.append(str(error))
         for name in dict.fromkeys([cell.environment, *cell.evaluated_in]):
@@ -222,13 +222,14 @@ def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
         found = table[column][task].get(name)
         numbers = [found.mean, found.standard_error, len(found.values)] if found else [None, None, 0]
         summaries.append([task, column, name, *numbers, paper_value(task, column, name)])
-    evaluations: list[list[Any]] = [["task", "environment", "seed", "steps", *names]]
+    of_rows = ["steps", "seconds", *names]
+    evaluations: list[list[Any]] = [["task", "environment", "seed", *of_rows]]
     runs = sorted(experiment.runs, key=lambda run: run.cell.name)
     for cell, evaluated, rows in ((run.cell, *entry) for run in runs for entry in run.rows_in.items()):
+        column = column_name(cell.environment, evaluated)
         for row in rows:
-            values = [row[name] if math.isfinite(row[name]) else None for name in names]
-            column = column_name(cell.environment, evaluated)
-            evaluations.append([cell.task, column, cell.seed, row["steps"], *values])
+            values = [row[name] if math.isfinite(row[name]) else None for name in of_rows]
+            evaluations.append([cell.task, column, cell.seed, *values])
     (out / TABLE_FILE).write_bytes(csv_bytes(summaries))
     (out / EVALUATIONS_FILE).write_bytes(gzip.compress(csv_bytes(evaluations), mtime=0))  # the same bytes every time
 
