@@ -24,7 +24,6 @@ from legged_torque.utils.files import part_of, remove_stale_parts, write_whole
 from legged_torque.utils.runs import package_versions
 
 Files = dict[str, bytes]  # contents by path below the folder of the results
-SEND_EVERY = 60.0  # seconds between checkpoints that are brought home while a training goes on
 _BEING_WRITTEN = re.compile(r"\.\d+\.part(/|$)")
 _LOG = "output.log"
 
@@ -43,13 +42,19 @@ class News:
 class NodeStep:
     """A process of a step, in a folder of its own; Ray makes an actor of it."""
 
-    def __init__(self, words: list[str], files: Files, versions: dict[str, str], device: str) -> None:
-        """Start a script, given by name and arguments, unless ``versions`` are not those of this machine."""
+    def __init__(
+        self, words: list[str], files: Files, versions: dict[str, str], device: str, send_every: float
+    ) -> None:
+        """Start a script, given by name and arguments, unless ``versions`` are not those of this machine.
+
+        Checkpoints of a training that goes on are sent at most every ``send_every`` seconds.
+        """
         import ray
 
         name = ray.util.get_node_ip_address()
         gpus = ray.get_runtime_context().get_accelerator_ids().get("GPU", [])
         self._place = f"{name} cuda:{gpus[0]}" if gpus else f"{name} {device}"
+        self._send_every = send_every
         self._process: subprocess.Popen[bytes] | None = None
         self._refusal = difference(f"{name} ({socket.gethostname()})", versions, versions_here())
         if self._refusal:
@@ -88,7 +93,7 @@ class NodeStep:
 
     def _changed_files(self, has_ended: bool) -> Files:
         """Return files that are new or have changed, once the process has ended, or with a new checkpoint."""
-        if not has_ended and time.monotonic() - self._sent_at < SEND_EVERY:
+        if not has_ended and time.monotonic() - self._sent_at < self._send_every:
             return {}
         now = stamps(self._root)
         changed = [name for name, stamp in now.items() if self._sent.get(name) != stamp]
