@@ -9,14 +9,17 @@ from legged_torque.utils.rendering import without_renderer
 end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
+import argparse
 import sys
 from pathlib import Path
 
-from legged_torque.experiments.job import find_workers
+from legged_torque.experiments.job import CPU_JOBS, GPU_JOBS, Launcher
+from legged_torque.experiments.local_launcher import LocalLauncher
 from legged_torque.experiments.matrix import SETTINGS_FILE, cell_state, check_same, read_matrix
 from legged_torque.experiments.run import ExperimentRun, claim_folder
 from legged_torque.utils.args import Parser
 from legged_torque.utils.cli import check_output, importing, run_script
+from legged_torque.utils.errors import UserError, unknown_name
 
 
 def main() -> None:
@@ -24,23 +27,40 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("file", type=Path, help="description of the matrix, see experiments/")
     parser.add_argument("--out", type=Path, help="folder of the results; default: logs/experiments/<name of the file>")
-    help_text = "auto, cpu or cuda:N; auto uses all GPUs with one run on each, or else the CPU"
+    help_text = "auto, cpu or cuda:N; auto uses all GPUs, or else the CPU"
     parser.add_argument("--device", default="auto", help=help_text)
-    parser.add_argument("--jobs", type=int, help="runs at a time on the CPU; default: 1")
+    help_text = f"runs at a time on each device; default: {GPU_JOBS} on a GPU, {CPU_JOBS} on the CPU"
+    parser.add_argument("--jobs", type=int, help=help_text)
+    help_text = "where runs are started: on this machine (local), or on the machines of a Ray cluster (ray)"
+    parser.add_argument("--launcher", default="local", help=help_text)
+    parser.add_argument("--address", help="of the Ray cluster; default: auto, the one that this machine belongs to")
     parser.add_argument("--dry-run", action="store_true", help="only list what is left to do")
     args = parser.parse_args()
     with importing():
         matrix = read_matrix(args.file)
     out = (args.out or Path("logs", "experiments", args.file.stem)).resolve()
     check_output(out / SETTINGS_FILE)
-    workers = find_workers(args.device, args.jobs)
+    launcher = make_launcher(args)
     if args.dry_run:
         check_same(matrix, out)
         for cell in matrix.cells(out):
             print(f"{cell.name}: {cell_state(cell)}")
         return
     claim_folder(matrix, args.file, out)
-    sys.exit(ExperimentRun(matrix, out, workers).run())
+    sys.exit(ExperimentRun(matrix, out, launcher).run())
+
+
+def make_launcher(args: argparse.Namespace) -> Launcher:
+    """Return what starts the runs."""
+    if args.launcher == "ray":
+        from legged_torque.experiments.ray_launcher import RayLauncher
+
+        return RayLauncher(args.address or "auto", args.device, args.jobs)
+    if args.launcher != "local":
+        raise unknown_name("launcher", args.launcher, ["local", "ray"])
+    if args.address:
+        raise UserError("--address is that of a Ray cluster: give --launcher ray as well")
+    return LocalLauncher(args.device, args.jobs)
 
 
 if __name__ == "__main__":

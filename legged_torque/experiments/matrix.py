@@ -15,7 +15,13 @@ from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
-from legged_torque.utils.runs import checkpoint_number, evaluations_file, load_config, newest_checkpoint
+from legged_torque.utils.runs import (
+    checkpoint_number,
+    evaluations_file,
+    load_config,
+    newest_checkpoint,
+    steps_per_iteration,
+)
 
 SETTINGS_FILE = "experiment.yaml"  # copy of the description, in the folder of the results
 CELL_SETTINGS = {
@@ -102,6 +108,7 @@ class CellState:
     iterations: int  # of training before its last checkpoint
     total: int | None  # of the whole training; None if it has no checkpoint
     missing: list[str]  # perturbations without a readable result
+    steps: int = 0  # of all worlds in these iterations; 0 if the settings of the run do not say
 
     @property
     def step(self) -> str:
@@ -175,14 +182,14 @@ def read_plan(file: Path) -> Matrix:
     return matrix
 
 
-def step_command(matrix: Matrix, cell: Cell, state: CellState, device: str) -> list[str]:
-    """Return the command line of a cell's next step on a device, named as ``--device`` takes it."""
+def step_words(matrix: Matrix, cell: Cell, state: CellState, device: str) -> list[str]:
+    """Return the script of a cell's next step and its arguments, for a device named as ``--device`` takes it."""
     words = [f"--task={cell.task}", f"--log_root={cell.folder.parent}", f"--experiment_name={cell.name}"]
     words.append(f"--device={device}")
     if state.step == "evaluate":
         name, numbers = state.missing[0], matrix.evaluation
         words += [f"--perturbation={name}", f"--num_envs={numbers['num_envs']}", f"--steps={numbers['num_steps']}"]
-        return [sys.executable, str(SCRIPTS_DIR / "evaluate.py"), *words, f"--json={cell.part_file(name)}"]
+        return ["evaluate.py", *words, f"--json={cell.part_file(name)}"]
     if state.step == "resume":
         words.append("--resume")
     else:
@@ -190,7 +197,12 @@ def step_command(matrix: Matrix, cell: Cell, state: CellState, device: str) -> l
         also = [name for name in cell.evaluated_in if name != cell.environment]
         words += [f"--set={word}" for word in [*matrix.set_words(), f"evaluation.also={json.dumps(also)}"]]
         words += [f"--ranges={matrix.ranges}"] if matrix.ranges else []
-    return [sys.executable, str(SCRIPTS_DIR / "train.py"), *words]
+    return ["train.py", *words]
+
+
+def command_of(words: list[str]) -> list[str]:
+    """Return the command line that runs a script, given by its name and its arguments, on this machine."""
+    return [sys.executable, str(SCRIPTS_DIR / words[0]), *words[1:]]
 
 
 def cell_state(cell: Cell) -> CellState:
@@ -202,7 +214,7 @@ def cell_state(cell: Cell) -> CellState:
     total = config.get("max_iterations")
     if type(total) is not int:
         raise UserError(f"the settings of the run '{newest.parent}' lack max_iterations")
-    return CellState(iterations, total, cell.missing())
+    return CellState(iterations, total, cell.missing(), iterations * (steps_per_iteration(config) or 0))
 
 
 def last_checkpoint(cell: Cell) -> Path | None:

@@ -17,7 +17,7 @@ from legged_torque.experiments.curves import CURVE_METRICS, Row, read_rows, to_r
 from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, read_plan
 from legged_torque.experiments.paper_values import ENVIRONMENTS, paper_value
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.runs import CONFIG_FILE, load_config
+from legged_torque.utils.runs import CONFIG_FILE, load_config, steps_per_iteration
 
 LAST_SHARE = 0.18
 """Fraction of final evaluations averaged for unfinished runs: that of steps 90 to 110 million in a whole one."""
@@ -50,13 +50,9 @@ class CellResult:
     @property
     def total_steps(self) -> int:
         """Steps of the whole training according to its settings, or else the paper's."""
-        try:
-            config = self.configs[-1]
-            rollout = config["env"]["env"]["num_envs"], config["train"]["runner"]["num_steps_per_env"]
-            factors = (config["max_iterations"], *rollout, config.get("processes", 1))
-        except (IndexError, KeyError, TypeError):
-            return PAPER_STEPS
-        return math.prod(factors) if all(type(factor) is int for factor in factors) else PAPER_STEPS
+        config = self.configs[-1] if self.configs else {}
+        steps, iterations = steps_per_iteration(config), config.get("max_iterations")
+        return steps * iterations if steps is not None and type(iterations) is int else PAPER_STEPS
 
     def is_finished(self, steps: float) -> bool:
         """Return whether fewer steps are left than lie between two evaluations."""

@@ -33,6 +33,7 @@ SPACES = {
     "train": ("actor.class_name", "actor.hidden_dims", "actor.activation", "obs_groups.actor"),
 }
 """Settings of task and training in which a pre-trained policy must agree: observations, actions and network."""
+PRETRAINED = "pretrained"  # folder of pre-trained policies, in that of all experiments
 STANDARD_DEVIATION = "distribution."
 """Start of the names of parameters that are not taken over: how much a training explores is its own setting."""
 
@@ -41,7 +42,7 @@ def pretrained_file(task: str, train_cfg: Any, log_root: str | None = None) -> P
     """Return where a task's pre-trained policy is kept: ``pretraining.file``, or in the folder of all experiments."""
     if train_cfg.pretraining.file:
         return Path(train_cfg.pretraining.file)
-    return all_experiments_dir(log_root) / "pretrained" / f"{task}.pt"
+    return all_experiments_dir(log_root) / PRETRAINED / f"{task}.pt"
 
 
 def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib.metadata
 import itertools
+import math
 import platform
 from datetime import datetime
 from pathlib import Path
@@ -131,6 +132,16 @@ def load_config(run_dir: Path) -> dict[str, Any]:
     if not text.endswith("\n...\n") if text.startswith("---") else not isinstance(config.get("versions"), dict):
         raise UserError(f"'{file}' is not whole: its end is missing")
     return config
+
+
+def steps_per_iteration(config: dict[str, Any]) -> int | None:
+    """Return how many steps of all worlds an iteration of a run takes, by its settings; None if they do not say."""
+    try:
+        rollout = config["env"]["env"]["num_envs"], config["train"]["runner"]["num_steps_per_env"]
+    except (KeyError, TypeError):
+        return None
+    factors = (*rollout, config.get("processes", 1))
+    return math.prod(factors) if all(type(factor) is int for factor in factors) else None
 
 
 def package_versions() -> dict[str, str]:
