@@ -79,10 +79,11 @@ def check(args: argparse.Namespace, folder: Path) -> bool:
 
 
 def train_words(args: argparse.Namespace) -> list[str]:
-    """Return the words of ``train.py`` that the options stand for, with an evaluation after every iteration."""
+    """Return the words of ``train.py`` that the options stand for, with two evaluations after every iteration."""
     names = ("task", "seed", "perturbation", "ranges", "device", "num_envs")
     words = [f"--{name}={getattr(args, name)}" for name in names if getattr(args, name) is not None]
-    changes = ["evaluation.interval=1", f"runner.save_interval={SAVE_INTERVAL}", *args.set]
+    changes = ["evaluation.interval=1", f"evaluation.also=[{args.perturbation}]", "evaluation.also_from=1"]
+    changes += [f"runner.save_interval={SAVE_INTERVAL}", *args.set]
     return [*words, "--logger=none", *(f"--set={change}" for change in changes)]
 
 

@@ -9,14 +9,19 @@ from legged_torque.utils.rendering import without_renderer
 end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
+import argparse
+import contextlib
 import sys
 from pathlib import Path
 
-from legged_torque.experiments.job import find_workers
+from legged_torque.experiments.job import CPU_JOBS, GPU_JOBS, MPS_JOBS, Launcher
+from legged_torque.experiments.local_launcher import LocalLauncher
 from legged_torque.experiments.matrix import SETTINGS_FILE, cell_state, check_same, read_matrix
+from legged_torque.experiments.mps import multi_process_service
 from legged_torque.experiments.run import ExperimentRun, claim_folder
 from legged_torque.utils.args import Parser
 from legged_torque.utils.cli import check_output, importing, run_script
+from legged_torque.utils.errors import UserError, unknown_name
 
 
 def main() -> None:
@@ -24,23 +29,49 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("file", type=Path, help="description of the matrix, see experiments/")
     parser.add_argument("--out", type=Path, help="folder of the results; default: logs/experiments/<name of the file>")
-    help_text = "auto, cpu or cuda:N; auto uses all GPUs with one run on each, or else the CPU"
+    help_text = "auto, cpu or cuda:N; auto uses all GPUs, or else the CPU"
     parser.add_argument("--device", default="auto", help=help_text)
-    parser.add_argument("--jobs", type=int, help="runs at a time on the CPU; default: 1")
+    help_text = (
+        f"runs at a time on each device; default: {GPU_JOBS} on a GPU, {MPS_JOBS} with --mps, {CPU_JOBS} on the CPU"
+    )
+    parser.add_argument("--jobs", type=int, help=help_text)
+    help_text = "let runs on a GPU compute at once instead of in turns, by NVIDIA's Multi-Process Service"
+    parser.add_argument("--mps", action="store_true", help=help_text)
+    help_text = "where runs are started: on this machine (local), or on the machines of a Ray cluster (ray)"
+    parser.add_argument("--launcher", default="local", help=help_text)
+    parser.add_argument("--address", help="of the Ray cluster; default: auto, the one that this machine belongs to")
     parser.add_argument("--dry-run", action="store_true", help="only list what is left to do")
     args = parser.parse_args()
     with importing():
         matrix = read_matrix(args.file)
     out = (args.out or Path("logs", "experiments", args.file.stem)).resolve()
     check_output(out / SETTINGS_FILE)
-    workers = find_workers(args.device, args.jobs)
+    launcher = make_launcher(args)
     if args.dry_run:
         check_same(matrix, out)
         for cell in matrix.cells(out):
             print(f"{cell.name}: {cell_state(cell)}")
         return
-    claim_folder(matrix, args.file, out)
-    sys.exit(ExperimentRun(matrix, out, workers).run())
+    with multi_process_service() if args.mps else contextlib.nullcontext():
+        claim_folder(matrix, args.file, out)
+        status = ExperimentRun(matrix, out, launcher).run()
+    sys.exit(status)
+
+
+def make_launcher(args: argparse.Namespace) -> Launcher:
+    """Return what starts the runs."""
+    if args.launcher == "ray":
+        from legged_torque.experiments.ray_launcher import RayLauncher
+
+        if args.mps:
+            raise UserError("--mps is for this machine; on a cluster, start the service on each node")
+        return RayLauncher(args.address or "auto", args.device, args.jobs)
+    if args.launcher != "local":
+        raise unknown_name("launcher", args.launcher, ["local", "ray"])
+    if args.address:
+        raise UserError("--address is that of a Ray cluster: give --launcher ray as well")
+    jobs = args.jobs or (MPS_JOBS if args.mps else None)
+    return LocalLauncher(args.device, jobs)
 
 
 if __name__ == "__main__":

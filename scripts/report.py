@@ -8,32 +8,42 @@ without_renderer()  # before anything imports mujoco
 
 from pathlib import Path
 
+from legged_torque.experiments.blocks import to_html, to_markdown
 from legged_torque.experiments.figures import draw_all
-from legged_torque.experiments.report import missing_lines, report
+from legged_torque.experiments.report import find_videos, missing_lines, report
 from legged_torque.experiments.results import read_experiment, summarize, write_tables
 from legged_torque.utils.args import Parser
 from legged_torque.utils.cli import check_at_least, check_output, run_script
 
 
 def main() -> None:
-    """Read the results, draw figures, write tables and the report."""
+    """Read the results, draw figures, write tables and the report: as Markdown, and as one page for a browser."""
     parser = Parser(__doc__)
     parser.add_argument("experiment", type=Path, help="folder of results that experiment.py has made")
     parser.add_argument("--out", type=Path, required=True, help="folder for the report, its tables and figures")
     help_text = "step from which evaluations count; default: %(default).0f, where the paper's Table I begins to average"
     parser.add_argument("--from_step", type=float, default=90e6, help=help_text)
+    help_text = "folder with videos <task>.mp4, .webm or .gif, which the page is to hold"
+    parser.add_argument("--videos", type=Path, help=help_text)
     args = parser.parse_args()
     check_at_least(args, 0, "from_step")
-    file = args.out / "report.md"
+    file, page = args.out / "report.md", args.out / "report.html"
     check_output(file)
+    check_output(page)
     experiment = read_experiment(args.experiment)
+    videos = find_videos(args.videos, experiment.plan.tasks) if args.videos else {}
     table = summarize(experiment, args.from_step)
     args.out.mkdir(parents=True, exist_ok=True)
     figures = draw_all(experiment, table, args.out)
-    file.write_text(report(experiment, table, args.from_step, figures, args.out), encoding="utf-8")
+    blocks, title = (
+        report(experiment, table, args.from_step, figures, args.out, videos),
+        f"Results of {experiment.folder.resolve().name}",
+    )
+    file.write_text(to_markdown(title, blocks), encoding="utf-8")
+    page.write_text(to_html(title, blocks), encoding="utf-8")
     write_tables(experiment, table, args.out)
     missing = len(missing_lines(experiment, args.from_step))
-    print(f"{file}, {len(figures)} figures; missing or not finished: {missing} lines")
+    print(f"{file}, {page.name}, {len(figures)} figures; missing or not finished: {missing} lines")
 
 
 if __name__ == "__main__":

@@ -99,7 +99,7 @@ def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: 
     """Create the run's folder with its settings, and print where it is and how to watch it."""
     device, num_processes = runner.env.device, distributed.world_size()
     settings = {"task": options.task, "preset": options.preset or DEFAULT_PRESET, "device": device}
-    settings |= {"processes": num_processes, "max_iterations": total}
+    settings |= {"device_name": device_name(device), "processes": num_processes, "max_iterations": total}
     runner.claim_log_dir(settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     place = device_name(device) if num_processes == 1 else f"{num_processes} x {device_name(device)}"
     print(f"Training {options.task} on {place}: {num_processes * runner.env.num_envs} worlds, {total} iterations.")

@@ -76,9 +76,9 @@ def perturb(name):
     return flatten(get_cfgs()[0].perturbations()[name])
 
 
-def rows_of(runner):
+def rows_of(runner, name="evaluations.csv"):
     """The rows that a runner has written, None without a file."""
-    file = Path(runner.log_dir) / "evaluations.csv"
+    file = Path(runner.log_dir) / name
     if not file.exists():
         return None
     header, *lines = file.read_text().splitlines()
@@ -133,17 +133,19 @@ def test_what_a_row_says(make_runner, noted, samples, most, worlds, count):
 
 def test_training_does_not_notice(make_runner):
     """With and without evaluations, networks, observations and the random numbers to come are the same bit by bit."""
-    results = []
-    for interval in (0, 16):
-        runner = make_runner("a1_torque_multihead", 3, perturbation="low", **{"evaluation.interval": interval})
+    results, rows = [], []
+    for interval, also in ((0, []), (16, []), (16, ["high"])):
+        settings = {"evaluation.interval": interval, "evaluation.also": also, "evaluation.also_from": 32}
+        runner = make_runner("a1_torque_multihead", 3, perturbation="low", **settings)
         torch.manual_seed(5)
         runner.learn(3)
-        assert (rows_of(runner) is None) == (interval == 0)
+        rows.append(rows_of(runner) and [{**row, "seconds": 0.0} for row in rows_of(runner)])
         result = {**runner.alg.actor.state_dict(prefix="actor."), **runner.alg.critic.state_dict(prefix="critic.")}
         result |= dict(runner.env.get_observations().items()) | {"std": runner.alg.actor.output_std}
         result |= {"lr": runner.alg.learning_rate, "next": torch.rand(5), "commands": runner.env.commands}
         results.append({name: value.detach().clone() for name, value in result.items()})
-    assert all(torch.equal(results[1][name], value) for name, value in results[0].items())
+    assert all(torch.equal(result[name], value) for result in results[1:] for name, value in results[0].items())
+    assert rows[0] is None and len(rows[1]) == 3 and rows[1] == rows[2]  # further evaluations change no other
 
 
 def test_worlds_settle_before_the_first_evaluation(make_runner, noted, monkeypatch):
@@ -199,8 +201,28 @@ def test_environment_of_the_evaluation(make_runner, noted, chosen, expected):
         assert all(get(task.cfg, path) == value for path, value in perturb(name).items())
 
 
+def test_further_environments(make_runner, noted):
+    """They are measured from their step on, in worlds of their own that settle on their own, and logged apart."""
+    also = {"evaluation.also": ["high", "none"], "evaluation.also_from": 30, "evaluation.interval": 16}
+    runner = make_runner(perturbation="low", **also, **{"runner.logger": "tensorboard"})
+    runner.learn(3)
+    tasks = [notes[0].task for notes in by_evaluation(noted, runner.env)]
+    assert [tasks.index(task) for task in tasks] == [0, 0, 2, 3, 0, 2, 3]
+    for task, name in zip(tasks[1:4], ("low", "high", "none"), strict=True):
+        assert all(get(task.cfg, path) == value for path, value in perturb(name).items())
+    rows = {name: rows_of(runner, f"evaluations{name}.csv") for name in ("", "_high", "_none")}
+    assert [[row["steps"] for row in each] for each in rows.values()] == [[16, 32, 48], [32, 48], [32, 48]]
+    assert len({row["height"] for each in rows.values() for row in each}) == 7
+    runner.logger.writer.flush()
+    events = EventAccumulator(runner.log_dir).Reload().Scalars("Evaluation_high/height")
+    assert [event.value for event in events] == pytest.approx([row["height"] for row in rows["_high"]], rel=1e-5)
+
+
 def test_unknown_environment(make_runner, tmp_path):
     """It is told at once, with the nearest name, and nothing is written."""
+    assert "unknown evaluation.also 'hihg'; did you mean 'high'?" in error_of(
+        make_runner, **{"evaluation.also": ["low", "hihg"]}
+    )
     line = error_of(make_runner, **{"evaluation.perturbation": "hihg"})
     assert line.startswith("unknown evaluation.perturbation 'hihg'; did you mean 'high'?")
     result = run_here("train.py", *SMALL, "--set=evaluation.perturbation=hihg", "--max_iterations=1", root=tmp_path)

@@ -58,7 +58,7 @@ def device_check():
     code = (
         "from pathlib import Path; import torch, warp; from warp._src import context\n"
         "from legged_torque.experiments.matrix import read_matrix\n"
-        "from legged_torque.experiments.job import find_workers\n"
+        "from legged_torque.experiments.local_launcher import find_workers\n"
         f"read_matrix(Path({str(ROOT / 'experiments' / 'low.yaml')!r})); find_workers('auto', None)\n"
         "print(torch.cuda.is_initialized(), context.runtime)"
     )
@@ -139,7 +139,9 @@ def test_what_is_done_is_not_done_again(finished, tmp_path):
     before = contents(out)
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert (status, error, contents(out)) == (0, "", before)
-    assert output == f"1 of 1 cells are done in {out}\n1 of 1 cells are done.\n"
+    first, spent, last = output.splitlines()
+    assert (first, last) == (f"1 of 1 cells are done in {out}", "1 of 1 cells are done.")
+    assert " of CPU time for training; 640 steps of training, " in spent
 
 
 @pytest.mark.parametrize("name", ["paper", "low", "smoke"])
@@ -179,6 +181,7 @@ def test_dry_run(name, tmp_path):
         ({"train": {"env.num_actions": 5}}, "train.env.num_actions cannot be set: it comes from the tasks"),
         ({"train": {"asset.file": "missing.xml"}}, "cannot load the robot 'missing.xml': there is no such file"),
         ({"train": {"seed": 3}}, "train.seed cannot be set: it comes from seeds"),
+        ({"train": {"evaluation.also": ["low"]}}, "train.evaluation.also cannot be set: it comes from environments"),
         ({"evaluation": {"num_env": 3}}, "unknown evaluation key 'num_env'; did you mean 'num_envs'?"),
         ({"evaluation": {"num_steps": 0}}, "evaluation.num_steps must be a whole number of at least 1, not 0"),
     ],

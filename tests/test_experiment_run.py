@@ -5,25 +5,28 @@ import fcntl
 import io
 import json
 import os
+import re
 import signal
 import threading
 import time
 
 import pytest
 import torch
-from settings import error_of
 from test_experiment import SMALL, experiment_here, wait_for, write
 from test_scripts import assert_told_in_one_line, contents
 
 from legged_torque.experiments import matrix as experiment
 from legged_torque.experiments import run as experiment_run
-from legged_torque.experiments.job import find_workers
+from legged_torque.experiments.job import GPU_JOBS
+from legged_torque.experiments.local_launcher import LocalLauncher, find_workers
 from legged_torque.experiments.matrix import read_matrix
 from legged_torque.experiments.run import ExperimentRun, time_left
 
 STAND_IN_TRAIN = """
 import os, signal, sys, time, zipfile
 from pathlib import Path
+SETTINGS = '''{task: t, env: {env: {num_envs: 5}}, train: {runner: {num_steps_per_env: 2}}, max_iterations: 4,
+versions: {}}'''
 options = dict(word.lstrip("-").partition("=")[::2] for word in sys.argv[1:])
 cell = Path(options["log_root"]) / options["experiment_name"]
 behaviour = Path(__file__).with_name("behaviour").read_text()
@@ -35,15 +38,21 @@ runs = sorted(cell.glob("run_*"))
 done = max((int(file.stem[6:]) for file in runs[-1].glob("model_*")), default=0) if runs else 0
 run = cell / f"run_{len(runs)}"
 run.mkdir()
-(run / "config.yaml").write_text("{task: t, env: {}, train: {}, max_iterations: 4, versions: {}}")
+(run / "config.yaml").write_text(SETTINGS)
 stopped = []
 signal.signal(signal.SIGTERM, lambda *_: stopped.append(1))
+if behaviour.startswith("killed") and not (behaviour.endswith("once") and done):
+    zipfile.ZipFile(run / "model_2.pt", "w").close()
+    os.kill(os.getpid(), signal.SIGKILL)
 while done < 4 and not stopped and not (behaviour == "early" and done == 2):
     print(f"Learning iteration {done}/4", flush=True)
     done += 1
     while behaviour == "slow" and done == 3 and not stopped:
         time.sleep(0.02)
 zipfile.ZipFile(run / f"model_{done}.pt", "w").close()
+if behaviour.startswith("measure"):
+    for name in behaviour.split()[1:]:
+        (run / name).touch()
 """
 
 STAND_IN_EVALUATE = """
@@ -113,17 +122,36 @@ def test_a_damaged_checkpoint_does_not_block_its_cell(stage, tmp_path):
 
 
 def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
-    """The exit status is 1, the last lines of its log are shown, and the next call tries it again, and only it."""
+    """It is tried once more, after the others; the exit status is 1, the last lines of its log are shown.
+
+    The next call tries it again, and only it.
+    """
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (stage / "behaviour").write_text("fail a1_position-low-s1")
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert status == 1 and "1 of 2 cells are done." in output
+    assert output.count("training has failed with exit status 1; it will be tried again | ") == 1
     assert error.startswith("a1_position-low-s1: training has failed with exit status 1\n")
     assert str(out / "a1_position-low-s1" / "train.log") in error and error.endswith("    something broke\n")
     (stage / "behaviour").write_text("")
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert (status, error) == (0, "") and "2 of 2 cells are done." in output
-    assert order(stage) == ["a1_position-low-s1", "a1_torque-low-s1", "a1_position-low-s1"]
+    both = ["a1_position-low-s1", "a1_torque-low-s1"]
+    assert order(stage) == [*both, both[0], both[0]]
+
+
+@pytest.mark.parametrize("behaviour", ["killed once", "killed"])
+def test_a_training_that_is_killed_is_tried_again(stage, tmp_path, behaviour):
+    """It goes on from its last checkpoint, in the same call; if that does not help, the cell is given up."""
+    file, out = write(tmp_path / "m.yaml", SMALL | {"tasks": ["a1_torque"]}), tmp_path / "out"
+    (stage / "behaviour").write_text(behaviour)
+    status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
+    assert "a1_torque-low-s1: training was ended by signal 9; it will be tried again | " in output
+    assert order(stage) == ["a1_torque-low-s1", "a1_torque-low-s1 resumed"]
+    if behaviour == "killed":
+        assert status == 1 and error.startswith("a1_torque-low-s1: training from iteration 2 on was ended by signal 9")
+    else:
+        assert (status, error) == (0, "") and (out / "a1_torque-low-s1" / "result_high.json").is_file()
 
 
 @pytest.mark.parametrize(
@@ -197,7 +225,7 @@ def test_two_experiments_share_a_folder(stage, tmp_path):
     """Each cell is trained once, and both end when all is done."""
     file, out = write(tmp_path / "m.yaml", SMALL | {"seeds": [1, 2, 3]}), tmp_path / "out"
     matrix, statuses = read_matrix(file), []
-    runs = [ExperimentRun(matrix, out, find_workers("cpu", 1)) for _ in range(2)]
+    runs = [ExperimentRun(matrix, out, LocalLauncher("cpu", 1)) for _ in range(2)]
     threads = [threading.Thread(target=lambda run=run: statuses.append(run.run())) for run in runs]
     for thread in threads:
         thread.start()
@@ -260,7 +288,25 @@ def test_lost_and_broken_results_are_made_again(stage, tmp_path):
     assert json.loads(broken.read_text())["perturbation"] == "low"
     changed = {path.name for path, state in contents(out).items() if before.get(path) != state}
     cells = {lost.parent.name, broken.parent.name}
-    assert changed == {"result_high.json", "result_low.json", "evaluate.log", "lock", *cells}
+    assert changed == {"result_high.json", "result_low.json", "evaluate.log", "lock", "times.json", *cells}
+
+
+def test_what_a_training_has_measured_is_not_evaluated_again(stage, tmp_path):
+    """Trainings measure in all environments of their cells; only where none did, a process evaluates."""
+    file, out = write(tmp_path / "m.yaml", SMALL | {"tasks": ["a1_torque"]}), tmp_path / "out"
+    words = [file, f"--out={out}", "--device=cpu"]
+    (stage / "behaviour").write_text("measure evaluations.csv evaluations_high.csv")
+    status, output, error = experiment_here(*words, tmp_path=tmp_path)
+    assert (status, error) == (0, "") and "1 of 1 cells are done" in output and "evaluation in" not in output
+    assert not list(out.glob("*/result*")) and "'--set=evaluation.also=[\"high\"]'" in (
+        next(out.glob("*/train.log")).read_text()
+    )
+    next(out.glob("*/*/evaluations_high.csv")).unlink()
+    assert experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1] == "a1_torque-low-s1: evaluate in high\n"
+    (checkpoint,) = out.glob("*/*/model_4.pt")
+    checkpoint.rename(checkpoint.with_name("model_3.pt"))  # a training that is not whole has measured nothing for good
+    listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1]
+    assert listed == "a1_torque-low-s1: resume after 3 of 4 iterations, evaluate in low, high\n"
 
 
 def test_results_of_another_training_are_not_kept(stage, tmp_path):
@@ -278,7 +324,7 @@ def test_live_line(stage, tmp_path):
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     stream = io.StringIO()
     stream.isatty = lambda: True
-    run = ExperimentRun(read_matrix(file), out, find_workers("cpu", 1))
+    run = ExperimentRun(read_matrix(file), out, LocalLauncher("cpu", 1))
     run._shown = -experiment_run.SHOW_EVERY
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(stream):
         patch.setattr(experiment_run, "SHOW_EVERY", 0.05)
@@ -295,20 +341,49 @@ def test_live_line(stage, tmp_path):
 
 
 def test_workers(monkeypatch):
-    """Every visible GPU gets one worker, which sees only that GPU; on the CPU there are as many as wanted."""
+    """Every visible GPU gets workers that see only that GPU, the first ones on different GPUs; so does the CPU."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 12)
     assert [worker.device for worker in find_workers("auto", 3)] == ["cpu"] * 3
-    assert len(find_workers("cpu", None)) == 1
+    assert [worker.variables for worker in find_workers("cpu", None)] == [{}]
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     for visible, names in {None: ["0", "1"], "3,5": ["3", "5"]}.items():
         monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
         if visible:
             monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-        workers = find_workers("auto", None)
-        assert [worker.variables for worker in workers] == [{"CUDA_VISIBLE_DEVICES": name} for name in names]
-        assert [(worker.name, worker.device) for worker in workers] == [("cuda:0", "cuda:0"), ("cuda:1", "cuda:0")]
-        assert [worker.variables for worker in find_workers("cuda:1", None)] == [{"CUDA_VISIBLE_DEVICES": names[1]}]
-    assert "--jobs is for the CPU" in error_of(find_workers, "auto", 2)
-    assert len(find_workers("cpu", 2)) == 2
+        workers = find_workers("auto", 2)
+        expected = [{"CUDA_VISIBLE_DEVICES": name, "OMP_NUM_THREADS": "3"} for name in names * 2]
+        assert [worker.variables for worker in workers] == expected
+        assert [(worker.name, worker.device) for worker in workers] == [("cuda:0", "cuda:0"), ("cuda:1", "cuda:0")] * 2
+        assert [worker.variables for worker in find_workers("cuda:1", 1)] == [{"CUDA_VISIBLE_DEVICES": names[1]}]
+    assert len(find_workers("auto", None)) == 2 * GPU_JOBS and len(find_workers("cpu", 2)) == 2
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    assert all("OMP_NUM_THREADS" not in worker.variables for worker in find_workers("auto", 3))
+
+
+def test_device_time(stage, tmp_path):
+    """Two that share a device count half each; steps are those of the trainings; all calls are added up."""
+    (stage / "behaviour").write_text("slow")
+    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
+    words = [file, f"--out={out}", "--device=cpu"]
+    thread = threading.Thread(target=lambda: (time.sleep(1.5), os.kill(os.getpid(), signal.SIGTERM)))
+    thread.start()
+    start = time.monotonic()
+    status, _, _ = experiment_here(*words, "--jobs=2", tmp_path=tmp_path)
+    took = time.monotonic() - start
+    thread.join()
+    cells = [out / f"{task}-low-s1" for task in SMALL["tasks"]]
+    first = [json.loads((cell / "times.json").read_text()) for cell in cells]
+    assert status == 130 and [times["steps"] for times in first] == [3 * 2 * 5] * 2
+    shares = [times["seconds"]["cpu training"] for times in first]
+    assert shares[0] == pytest.approx(shares[1], abs=0.1) and 0.5 < sum(shares) < took
+    (stage / "behaviour").write_text("")
+    status, output, _ = experiment_here(*words, tmp_path=tmp_path)
+    second = [json.loads((cell / "times.json").read_text()) for cell in cells]
+    assert status == 0 and [times["steps"] for times in second] == [4 * 2 * 5] * 2
+    assert all(b["seconds"]["cpu training"] > a["seconds"]["cpu training"] for a, b in zip(first, second, strict=True))
+    assert all(times["seconds"].keys() == {"cpu training", "cpu evaluation"} for times in second)
+    assert re.search(r"of CPU time for training; 80 steps of training, \d+ per second of their device time\n", output)
 
 
 def test_time_left():

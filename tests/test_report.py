@@ -170,18 +170,20 @@ def test_parts_are_merged(tmp_path):
 
 def test_what_counts_of_a_run():
     """Evaluations from step 90 million on; of a shorter run the last 18 percent; elsewhere the result."""
-    run = CellResult(CELL, rows=[{"steps": 1e6 * million} for million in range(1, 111)])
+    run = CellResult(CELL, {"low": [{"steps": 1e6 * million} for million in range(1, 111)]})
     run.results["high"] = {"steps": 5e6}
     assert [row["steps"] / 1e6 for row in run.counted_rows("low", 90e6)] == list(range(90, 111))
     assert [row["steps"] / 1e6 for row in run.counted_rows("low", 109e6)] == [109, 110]
     del run.rows[50:]
     assert [row["steps"] / 1e6 for row in run.counted_rows("low", 90e6)] == list(range(41, 51))
     assert run.counted_rows("high", 90e6) == [{"steps": 5e6}] and run.counted_rows("doubled", 90e6) == []
+    run.rows_in["high"] = [{"steps": 30e6}, {"steps": 50e6}]
+    assert run.counted_rows("high", 90e6) == [{"steps": 50e6}]  # they count in place of the result
 
 
 def test_finished_runs():
     """A run is finished if less than an interval between evaluations is left; without settings it has 110 million."""
-    run = CellResult(CELL, rows=[{"steps": 99e6}, {"steps": 104e6}], configs=[])
+    run = CellResult(CELL, {"low": [{"steps": 99e6}, {"steps": 104e6}]}, configs=[])
     assert run.total_steps == 110_000_000 and not run.is_finished(104e6)
     run.configs.append(SETTINGS | {"max_iterations": 108})
     assert run.total_steps == 108_000_000 and run.is_finished(104e6) and not run.is_finished(103e6)
@@ -273,15 +275,11 @@ def test_table(report):
 def test_evaluations(report):
     """All evaluations during training, in one table."""
     _, _, evaluations = report
-    assert list(evaluations[0]) == ["task", "environment", "seed", "steps", *ALL_METRICS]
+    assert list(evaluations[0]) == ["task", "environment", "seed", "steps", "seconds", *ALL_METRICS]
     assert len(evaluations) == 4 * 5 + 5
     row = next(row for row in evaluations if row["environment"] == "high_frequency" and row["seed"] == "2")
-    assert (row["task"], row["steps"], row["track_percentage"], row["height"]) == (
-        "a1_position",
-        "10000000",
-        "0.1",
-        "1.0",
-    )
+    cells = ("task", "steps", "seconds", "track_percentage", "height")
+    assert [row[name] for name in cells] == ["a1_position", "10000000", "10.5", "0.1", "1.0"]
 
 
 def test_same_bytes_again(report, folder, tmp_path):
@@ -301,7 +299,7 @@ def test_no_folder_of_this_machine(report, tmp_path):
 def test_what_is_missing(report):
     """Cells without data, unfinished runs and missing evaluations are told at the top."""
     text, _, _ = report
-    top = text.partition("## Table I")[0]
+    top = text.partition("## What is missing")[2].partition("\n## ")[0]
     assert "- `a1_multihead` in low: no data, no training has begun." in top
     assert "- `a1_torque` in high_frequency: no data, no training has begun." in top
     assert "- `a1_torque` in low: no training has begun with seed 2." in top
@@ -313,9 +311,8 @@ def test_what_is_missing(report):
 def test_text(report):
     """Numbers stand beside the paper's, marked where they are not final, and the test and the commands are named."""
     text, _, _ = report
-    assert (
-        "| Track % [share] | `a1_position` (PD) | 0.7500 ± 0.0500 (2) | 0.7642 | 0.5500 ± 0.0500 (2) | 0.7163 |" in text
-    )
+    low, often = "≈ 0.7500 ± 0.0500 (2), -1.9% | 0.7642", "✗ 0.5500 ± 0.0500 (2), -23.2% | 0.7163"
+    assert f"| Track % [share] | `a1_position` (PD) | {low} | {often} |" in text
     assert "| Track % [share] | `a1_torque` (Default torque) | 0.5000 (1) † | – | – | – |" in text
     assert "| `a1_position` (PD) | 0.6500 ± 0.0500 (2) |" in text.partition("## In other environments")[2]
     assert "Welch's t-test" in text and "Holm's correction" in text
@@ -335,7 +332,7 @@ def test_significant_differences(tmp_path, monkeypatch):
     assert run_script(tmp_path / "e", "--out", tmp_path / "out") == 0
     text = (tmp_path / "out" / "report.md").read_text()
     assert "Nothing: all trainings and evaluations are complete." in text
-    assert "| `a1_position` (PD) | **0.7020 ± 0.0006 (3)** | 0.7642 |" in text
+    assert "| `a1_position` (PD) | ✗ **0.7020 ± 0.0006 (3)**, -8.1% | 0.7642 |" in text
     assert "| Track xy [m²/s²] | `a1_torque` (Default torque) | **5.0200 ± 0.0058 (3)** | – |" in text
     p = holm([welch([0.701, 0.702, 0.703], [0.501, 0.502, 0.503]), 0.0, 0.0])[0]
     assert p < 0.05 and "| `a1_position` - `a1_torque` | **+0.2000, p = " in text
@@ -346,14 +343,14 @@ def test_figures(folder, tmp_path):
     """All figures are there as PNG, and none without data."""
     pytest.importorskip("matplotlib", reason="figures need matplotlib: pip install -e .[plots]")
     assert run_script(folder, "--out", tmp_path / "out") == 0
-    for name in ("figure3", "figure5a", "figure5b", "figure6", "figure7"):
+    for name in ("figure3", "figure3overseconds", "figure5a", "figure5b", "figure6", "figure7"):
         assert (tmp_path / "out" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert f"({name}.png)" in (tmp_path / "out" / "report.md").read_text()
     write_experiment(tmp_path / "empty")
     assert run_script(tmp_path / "empty", "--out", tmp_path / "out2") == 0
     assert not list((tmp_path / "out2").glob("figure*"))
     assert (
-        "No Figure 3, Figure 5a, Figure 5b, Figure 6, Figure 7: there are no data"
+        "No Figure 3, Figure 3 over seconds, Figure 5a, Figure 5b, Figure 6, Figure 7: there are no data"
         in (tmp_path / "out2" / "report.md").read_text()
     )
 
@@ -368,11 +365,11 @@ def test_labels_of_curves(folder):
 
 def test_notes_of_curves():
     """Labels tell seeds that are missing and how far unfinished ones are."""
-    curve = lambda million, finished: figures.Curve([0.0, million * 1e6], [0.0, 1.0], finished)  # noqa: E731
-    assert figures.progress_note([curve(110, True)] * 4, 4) == ""
-    assert figures.progress_note([curve(110, True)] * 2, 4) == " (2 of 4 seeds)"
-    assert figures.progress_note([curve(60, False)] * 2, 4) == " (2 of 4 seeds, up to 60e6 steps)"
-    assert figures.progress_note([curve(110, True), curve(57, False)], 2) == " (2 of 2 seeds, up to 57–110e6 steps)"
+    curve = lambda end, finished: figures.Curve([0.0, end], [0.0, 1.0], finished)  # noqa: E731
+    assert figures.progress_note([curve(110, True)] * 4, 4, " s") == ""
+    assert figures.progress_note([curve(110, True)] * 2, 4, " s") == " (2 of 4 seeds)"
+    assert figures.progress_note([curve(60, False)] * 2, 4, "e6 steps") == " (2 of 4 seeds, up to 60e6 steps)"
+    assert figures.progress_note([curve(110, True), curve(57, False)], 2, " s") == " (2 of 2 seeds, up to 57–110 s)"
 
 
 @pytest.mark.parametrize("package", ["matplotlib", "scipy.stats"])

@@ -12,6 +12,7 @@ from legged_torque.checks.reproducible import Training, compare, kill_often, val
 SMALL = ["--task=a1_torque", "--device=cpu", "--num_envs=3", "--perturbation=low", "--logger=none"]
 SMALL += ["--set=runner.num_steps_per_env=4", "--set=algorithm.num_mini_batches=1", "--set=actor.hidden_dims=[8]"]
 SMALL += ["--set=critic.hidden_dims=[8]", "--set=evaluation.interval=1", "--set=evaluation.num_samples=6"]
+SMALL += ["--set=evaluation.also=[high]", "--set=evaluation.also_from=24"]
 
 
 def train(folder, *words):
@@ -40,14 +41,16 @@ def test_the_same_again(trained, tmp_path):
         assert result.different == [] and result.compared > 60
     names = dict(values({"checkpoint": torch.load(trained.checkpoint(), weights_only=True)}))
     assert {"checkpoint.infos.worlds", "checkpoint.infos.random_states.0.cpu", "checkpoint.iter"} <= names.keys()
-    assert "checkpoint.optimizer_state_dict.state.0.exp_avg" in names and len(trained.evaluations()) == 3
+    assert "checkpoint.optimizer_state_dict.state.0.exp_avg" in names
+    counts = {name: len(rows) for name, rows in trained.evaluations().items()}
+    assert counts == {"evaluations.csv": 3, "evaluations_high.csv": 2}
 
 
 def test_another_seed_is_found(trained, tmp_path):
     """Everything that is learned differs."""
     other = train(tmp_path / "other", "--max_iterations=3 --seed=9")
     different = compare("x", trained, other).different
-    assert {"checkpoint.actor_state_dict.mlp.0.weight", "evaluations.0.track_xy"} <= set(different)
+    assert {"checkpoint.actor_state_dict.mlp.0.weight", "evaluations.csv.0.track_xy"} <= set(different)
     assert "checkpoint.iter" not in different and not any("seconds" in name for name in different)
 
 

@@ -25,6 +25,7 @@ WORDS = ["--task=a1_torque_multihead", f"--num_envs={WORLDS}", "--perturbation=l
 WORDS += ["--set=runner.num_steps_per_env=4", "--set=algorithm.num_mini_batches=2", "--set=runner.save_interval=1"]
 WORDS += ["--set=actor.hidden_dims=[8, 8]", "--set=actor.head_hidden_dims=[8]", "--set=critic.hidden_dims=[8]"]
 WORDS += ["--set=evaluation.interval=24", "--set=evaluation.num_samples=60", "--set=env.episode_length_s=0.2"]
+WORDS += ["--set=evaluation.also=[high]", "--set=evaluation.also_from=48"]
 WORDS += ["--set=env.history_length=2", "--set=domain_rand.action_delay=[0, 3]"]
 
 
@@ -94,9 +95,10 @@ def test_two_and_two_are_four(whole, half, tmp_path):
     resumed.learn(2, init_at_random_ep_len=True)
     first, second = content(whole, 4), content(resumed, 4)
     assert len(first) > 100 and first["infos.worlds"] and not differences(first, second)
-    rows = [(Path(runner.log_dir) / "evaluations.csv").read_text().splitlines() for runner in (whole, half, resumed)]
-    assert len(rows[0]) == 5  # with the header
-    assert without_seconds(rows[0]) == without_seconds(rows[1] + rows[2][1:])
+    for name, count in {"evaluations.csv": 4, "evaluations_high.csv": 3}.items():
+        rows = [(Path(runner.log_dir) / name).read_text().splitlines() for runner in (whole, half, resumed)]
+        assert len(rows[0]) == count + 1  # with the header
+        assert without_seconds(rows[0]) == without_seconds(rows[1] + rows[2][1:])
 
 
 def test_two_and_two_are_four_with_mujoco_warp(tmp_path):
@@ -247,7 +249,14 @@ def test_worlds_of_a_large_training_are_small(tmp_path):
 def test_only_the_last_worlds_are_kept(half):
     """They are those of the last checkpoint, and are no checkpoint themselves."""
     files = {path.name for path in Path(half.log_dir).iterdir() if path.is_file()}
-    assert files == {"config.yaml", "evaluations.csv", "model_1.pt", "model_2.pt", "worlds_2.pt"}
+    assert files == {
+        "config.yaml",
+        "evaluations.csv",
+        "evaluations_high.csv",
+        "model_1.pt",
+        "model_2.pt",
+        "worlds_2.pt",
+    }
 
 
 @pytest.mark.parametrize("ends_at", ["worlds_3.pt", "model_3.pt"])

@@ -9,9 +9,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from legged_torque.learning.evaluator import EVALUATIONS_FILE
 from legged_torque.utils.errors import TrainingError
-from legged_torque.utils.runs import CONFIG_FILE
+from legged_torque.utils.runs import CONFIG_FILE, EVALUATIONS_FILE
 
 TRACKING = (0.70, 0.75)
 """Shares of the commanded velocity, by ``track_percentage`` of the evaluations during training."""

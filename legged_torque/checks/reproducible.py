@@ -24,9 +24,8 @@ from torch import Tensor
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.learning import checkpoint
-from legged_torque.learning.evaluator import EVALUATIONS_FILE
 from legged_torque.utils.files import is_whole_archive
-from legged_torque.utils.runs import CONFIG_FILE, checkpoint_number, find_checkpoint, find_run
+from legged_torque.utils.runs import CONFIG_FILE, EVALUATIONS_FILE, checkpoint_number, find_checkpoint, find_run
 
 TIMES = ("seconds",)  # what may differ, by name, in checkpoints and evaluations
 MOST_ITERATIONS = 3  # of a training before it is killed
@@ -91,12 +90,13 @@ class Training:
         """Return the file from which training goes on."""
         return find_checkpoint(find_run(self._experiment, None), None) if self._has_checkpoint() else None
 
-    def evaluations(self) -> list[dict[str, str]]:
-        """Return the rows of all evaluations; those of a later run replace what it has repeated."""
-        rows: list[dict[str, str]] = []
-        for file in sorted(self._experiment.glob(f"*/{EVALUATIONS_FILE}")):
+    def evaluations(self) -> dict[str, list[dict[str, str]]]:
+        """Return the rows of all evaluations by their file; those of a later run replace what it has repeated."""
+        rows: dict[str, list[dict[str, str]]] = {}
+        for file in sorted(self._experiment.glob(f"*/{Path(EVALUATIONS_FILE).stem}*.csv")):
             new = list(csv.DictReader(file.read_text().rpartition("\n")[0].splitlines()))
-            rows = [row for row in rows if not new or int(row["steps"]) < int(new[0]["steps"])] + new
+            before = rows.get(file.name, [])
+            rows[file.name] = [row for row in before if not new or int(row["steps"]) < int(new[0]["steps"])] + new
         return rows
 
     def broken(self) -> list[str]:
@@ -143,7 +143,7 @@ def compare(name: str, first: Training, second: Training) -> Comparison:
     for training in (first, second):
         file = training.checkpoint()
         assert file is not None, f"'{training.folder}' has no checkpoint"
-        content = {"checkpoint": checkpoint.read(file, "checkpoint", "cpu"), "evaluations": training.evaluations()}
+        content = {"checkpoint": checkpoint.read(file, "checkpoint", "cpu"), **training.evaluations()}
         contents.append(dict(values(content)))
     one, other = contents
     names = one.keys() | other.keys()

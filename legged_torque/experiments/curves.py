@@ -22,7 +22,7 @@ CURVE_METRICS = (*METRICS, Metric("critic_gradient_norm", "", "Gradient norm of 
 """The metrics of an evaluation during training."""
 
 Row = dict[str, float]
-"""One evaluation: "steps" and all of :data:`CURVE_METRICS`; NaN where nothing was measured."""
+"""One evaluation: "steps", "seconds" of training and :data:`CURVE_METRICS`; NaN where nothing was measured."""
 
 
 @dataclass
@@ -89,6 +89,6 @@ def read_rows(file: Path, notes: list[str]) -> list[Row]:
 
 def to_row(entry: Mapping[str, Any]) -> Row:
     """Return an evaluation from the cells of a line or the entries of a JSON object; empty ones are NaN."""
-    cells = {metric.name: entry.get(metric.name) for metric in CURVE_METRICS}
+    cells = {name: entry.get(name) for name in ("seconds", *(metric.name for metric in CURVE_METRICS))}
     values = {name: math.nan if cell in (None, "") else float(cell) for name, cell in cells.items()}
     return {"steps": int(float(entry["steps"])), **values}

@@ -35,18 +35,31 @@ STYLES = {  # colours of Okabe and Ito, which colour-blind readers can tell apar
     "a1_multihead": ("#CC79A7", (0, (6, 1, 1, 1, 1, 1)), "---"),
 }
 """Colour, line style and hatch of each task."""
-OTHER_STYLES = (("#000000", "-", "++"), ("#777777", "--", "oo"), ("#999933", "-.", "**"))
+OTHER_STYLES = (
+    ("#777777", "-", "++"),
+    ("#999933", "-.", "**"),
+    ("#882255", "--", "oo"),
+    ("#44AA99", (0, (4, 2, 1, 2)), "||"),
+    ("#332288", (0, (8, 2)), "OO"),
+    ("#000000", ":", "+++"),
+)
+"""Those of tasks that the paper does not have, in the order of the plan."""
 SEED_LINES = ("-.", "-", "--", ":")  # line styles by seed modulo four, where single trainings are shown
 CURVES = {
-    "Figure 3": ("track_percentage", "linear"),
-    "Figure 5a": ("height", "linear"),
-    "Figure 5b": ("critic_gradient_norm", "log"),
+    "Figure 3": ("track_percentage", "linear", "steps"),
+    "Figure 3 over seconds": ("track_percentage", "linear", "seconds"),
+    "Figure 5a": ("height", "linear", "steps"),
+    "Figure 5b": ("critic_gradient_norm", "log", "steps"),
 }
-"""Metric and scale of its axis, by title."""
+"""Metric, scale of its axis, and what it is drawn over, by title."""
+AXES = {
+    "steps": (MILLION, "environment steps [millions]", "e6 steps"),
+    "seconds": (1.0, "time of training [s]", " s"),
+}
+"""What curves are drawn over: its unit, the label of its axis, and how notes call the unit."""
 BARS = {"Figure 6": ("low", "high"), "Figure 7": ("high_frequency", "doubled")}  # columns of Table I, by title
 FIGURES = (*CURVES, *BARS)
 SINGLE_CURVES = ("track_percentage", "track_xy", "cost_of_transport")  # metrics that are shown of single trainings
-STEPS_LABEL = "environment steps [millions]"
 METRICS_BY_NAME = {metric.name: metric for metric in CURVE_METRICS}
 UNFINISHED_ALPHA = 0.45
 CUT_AT = 3.0  # largest height of a panel of bars, in medians of the values that it shows
@@ -58,9 +71,9 @@ Style = tuple[str, Any, str]  # colour, line style and hatch
 
 @dataclass
 class Curve:
-    """The finite values of a metric of one training, and the steps of their evaluations. Shapes: (points,)."""
+    """The finite values of a metric of one training, and where they are drawn on the other axis. Shapes: (points,)."""
 
-    steps: np.ndarray
+    places: np.ndarray  # in the unit of :data:`AXES`
     values: np.ndarray
     is_finished: bool = True
 
@@ -98,21 +111,22 @@ def draw_single_curves(runs: list[LearningCurve]) -> Figure:
             color, _, hatch = style(tasks, run.task)
             for curve in metric_curves(run.rows, name):
                 draw_curve(axis, [curve], str(run), (color, SEED_LINES[run.seed % len(SEED_LINES)], hatch))
-        axis.set(title=METRICS_BY_NAME[name].label, xlabel=STEPS_LABEL, xlim=(0, None), ylim=(0, None))
+        axis.set(title=METRICS_BY_NAME[name].label, xlabel=AXES["steps"][1], xlim=(0, None), ylim=(0, None))
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize="small")
     return figure
 
 
 def draw_curves(experiment: Experiment, title: str) -> Figure | None:
-    """Draw a metric over the steps of training, a panel per environment; return None without data."""
-    name, scale = CURVES[title]
+    """Draw a metric over steps or time of training, a panel per environment; return None without data."""
+    name, scale, over = CURVES[title]
+    unit, label_over, note = AXES[over]
     plan, panels = experiment.plan, {}
     order = [*ENVIRONMENTS, *plan.environments]  # those of Table I first
     for environment in sorted(plan.environments, key=order.index):
         curves: dict[str, list[Curve]] = {}
         for run in (run for task in plan.tasks for run in experiment.runs_of(task, environment)):
-            for curve in metric_curves(run.rows, name, run.is_finished(run.steps)):
+            for curve in metric_curves(run.rows, name, over, run.is_finished(run.steps)):
                 curves.setdefault(run.cell.task, []).append(curve)
         if curves:
             panels[environment] = curves
@@ -121,12 +135,12 @@ def draw_curves(experiment: Experiment, title: str) -> Figure | None:
     width = max(7.0, 5.5 * len(panels))
     grid = {"figsize": (width, 5.6), "sharey": True, "squeeze": False, "layout": "constrained"}
     figure, axes = load_pyplot().subplots(1, len(panels), **grid)
-    end = max(run.total_steps for run in experiment.runs) / MILLION
+    end = 1.02 * max(run.total_steps for run in experiment.runs) / unit if over == "steps" else None
     for axis, (environment, curves) in zip(axes[0], panels.items(), strict=True):
         for task, seeds in curves.items():
-            label = f"{MODELS.get(task, task)}{progress_note(seeds, len(plan.seeds))}"
+            label = f"{MODELS.get(task, task)}{progress_note(seeds, len(plan.seeds), note)}"
             draw_curve(axis, seeds, label, style(plan.tasks, task))
-        axis.set(xlabel=STEPS_LABEL, xlim=(0, 1.02 * end), yscale=scale)
+        axis.set(xlabel=label_over, xlim=(0, end), yscale=scale)
         axis.set_title(ENVIRONMENTS.get(environment, environment))
         axis.grid(alpha=0.3)
         # below the axis: labels of unfinished curves are long and would hide others
@@ -141,38 +155,38 @@ def draw_curves(experiment: Experiment, title: str) -> Figure | None:
     return figure
 
 
-def metric_curves(rows: list[Row], name: str, is_finished: bool = True) -> list[Curve]:
+def metric_curves(rows: list[Row], name: str, over: str = "steps", is_finished: bool = True) -> list[Curve]:
     """Return the curve of a metric in the evaluations of a training; none without finite values."""
-    points = [(row["steps"], row[name]) for row in rows if math.isfinite(row[name])]
+    points = [(row[over], row[name]) for row in rows if math.isfinite(row[over]) and math.isfinite(row[name])]
     if not points:
         return []
-    steps, values = np.array(points, dtype=float).T
-    return [Curve(steps, values, is_finished)]
+    places, values = np.array(points, dtype=float).T
+    return [Curve(places / AXES[over][0], values, is_finished)]
 
 
-def progress_note(seeds: list[Curve], num_planned: int) -> str:
+def progress_note(seeds: list[Curve], num_planned: int, unit: str) -> str:
     """Return the addition to the label of an incomplete task; nothing if the task is complete."""
     if all(curve.is_finished for curve in seeds):
         return "" if len(seeds) == num_planned else f" ({len(seeds)} of {num_planned} seeds)"
-    ends = sorted(curve.steps[-1] / MILLION for curve in seeds)
+    ends = sorted(curve.places[-1] for curve in seeds)
     texts = dict.fromkeys([f"{ends[0]:.3g}", f"{ends[-1]:.3g}"])
-    return f" ({len(seeds)} of {num_planned} seeds, up to {'–'.join(texts)}e6 steps)"
+    return f" ({len(seeds)} of {num_planned} seeds, up to {'–'.join(texts)}{unit})"
 
 
 def draw_curve(axis: Axes, seeds: list[Curve], label: str, styles: Style) -> None:
     """Draw the mean over the seeds with its standard error, and a cross where an unfinished training ends."""
     color, line, _ = styles
-    steps = np.unique(np.concatenate([curve.steps for curve in seeds]))
-    values = np.array([np.interp(steps, curve.steps, curve.values, left=np.nan, right=np.nan) for curve in seeds])
+    places = np.unique(np.concatenate([curve.places for curve in seeds]))
+    values = np.array([np.interp(places, curve.places, curve.values, left=np.nan, right=np.nan) for curve in seeds])
     count = np.isfinite(values).sum(axis=0)
     mean = np.nansum(values, axis=0) / count
-    axis.plot(steps / MILLION, mean, color=color, linestyle=line, linewidth=1.6, label=label)
+    axis.plot(places, mean, color=color, linestyle=line, linewidth=1.6, label=label)
     if len(seeds) > 1:
         error = np.sqrt(np.nansum((values - mean) ** 2, axis=0) / np.maximum(count - 1, 1) / count)
         error[count < 2] = np.nan
-        axis.fill_between(steps / MILLION, mean - error, mean + error, color=color, alpha=0.2, linewidth=0)
-    ends = np.array([curve.steps[-1] for curve in seeds if not curve.is_finished])
-    axis.plot(ends / MILLION, np.interp(ends, steps, mean), "x", color=color, markersize=7, markeredgewidth=1.8)
+        axis.fill_between(places, mean - error, mean + error, color=color, alpha=0.2, linewidth=0)
+    ends = np.array([curve.places[-1] for curve in seeds if not curve.is_finished])
+    axis.plot(ends, np.interp(ends, places, mean), "x", color=color, markersize=7, markeredgewidth=1.8)
 
 
 def draw_bars(experiment: Experiment, table: Table, title: str) -> Figure | None:

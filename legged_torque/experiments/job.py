@@ -1,75 +1,124 @@
-"""Processes of an experiment: a step of a cell runs in its own process, on a worker."""
+"""Steps of an experiment's cells: what runs on a worker, wherever a launcher has started it."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import fcntl
 import os
 import re
 import shlex
-import signal
-import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Protocol
 
-from legged_torque.experiments.matrix import Cell, CellState
-from legged_torque.utils.devices import resolve_device
+from legged_torque.experiments.matrix import Cell, CellState, Matrix, cell_state, command_of, is_json, step_words
+from legged_torque.experiments.times import read_times, write_times
 from legged_torque.utils.errors import UserError
 
+CPU_JOBS, GPU_JOBS, MPS_JOBS = 1, 2, 4
+"""Runs at a time on each CPU, GPU, and GPU with ``--mps``, unless ``--jobs`` says otherwise: more are hardly faster."""
 MAX_JOBS = 1000
+LOST = 256
+"""Exit status of a step whose machine is gone: no process ends with it."""
+_KEEP_EVERY = 20.0  # seconds between writes of the device time
 _TAIL = 65536  # bytes that are read from the end of a log
 _ITERATION = re.compile(r"Learning iteration (\d+)/(\d+)")
-_LIBC = ctypes.CDLL(None)
-_PR_SET_PDEATHSIG = 1  # Linux
+
+
+class Process(Protocol):
+    """A step that runs somewhere, with the part of ``subprocess.Popen`` that is needed."""
+
+    @property
+    def pid(self) -> int:
+        """Id of a process on this machine, for people to read."""
+
+    @property
+    def returncode(self) -> int | None:
+        """Exit status: None until the end is noticed, negative after a signal, or :data:`LOST`."""
+
+    def poll(self) -> int | None:
+        """Look whether the step has ended, and return ``returncode``."""
+
+    def terminate(self) -> None:
+        """Ask the step to end: a training finishes its iteration and saves, after a second request it ends at once."""
+
+    def wait(self) -> int:
+        """Wait for the end, and return ``returncode``."""
+
+
+class Launcher(Protocol):
+    """Where steps run."""
+
+    def workers(self) -> list[Worker]:
+        """Return what there is to give steps to; a worker with a job stays."""
+
+    def start(
+        self, matrix: Matrix, cell: Cell, state: CellState, worker: Worker, log: BinaryIO, lock: BinaryIO
+    ) -> Process:
+        """Start a step, which writes to the open ``log``, and holds the cell's open ``lock`` file if it can."""
 
 
 @dataclass
 class Worker:
-    """A device that runs one process at a time."""
+    """What runs one step at a time."""
 
-    name: str  # the user's: "cpu", "cuda:1"
+    name: str  # of its device, for the user: "cpu", "cuda:1", "10.0.0.3 cuda:1"; empty while a step waits for a machine
     device: str  # the --device of its processes
     variables: dict[str, str]  # additional environment variables of its processes
     job: Job | None = None
 
 
 class Job:
-    """A step of a cell in its own process, which writes to ``log``."""
+    """A step of a cell, which writes to ``log``."""
 
     def __init__(
-        self, cell: Cell, state: CellState, lock: BinaryIO, cell_start: float, command: list[str], worker: Worker
+        self, matrix: Matrix, cell: Cell, lock: BinaryIO, cell_start: float, worker: Worker, launcher: Launcher
     ) -> None:
-        """Start the process, which gets SIGTERM if this process ends.
+        """Start the cell's next step; results that do not belong to its training are removed before.
 
-        ``lock`` is the cell's open lock file: the process holds it too, and its id is written to it. ``cell_start`` is
-        when the work on the cell began, by ``time.monotonic()`` [s].
+        ``lock`` is the cell's open lock file, to which the process's id is written. ``cell_start`` is when the work on
+        the cell began, by ``time.monotonic()`` [s].
         """
-        self.cell, self.state, self.lock, self.cell_start = cell, state, lock, cell_start
-        self.log = cell.folder / ("evaluate.log" if state.step == "evaluate" else "train.log")
+        self.cell, self.lock, self.cell_start, self.state = cell, lock, cell_start, cell_state(cell)
+        if self.state.step != "evaluate":  # they would be results of another training
+            for name in cell.evaluated_in:
+                cell.result_file(name).unlink(missing_ok=True)
+        self._times, self._kept = read_times(cell.folder), time.monotonic()
+        self._kind = f"{'cpu' if worker.device == 'cpu' else 'gpu'} {self._step_name}"
+        self.log = cell.folder / ("evaluate.log" if self.state.step == "evaluate" else "train.log")
+        words = step_words(matrix, cell, self.state, worker.device)
         with open(self.log, "ab") as file:
-            file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {shlex.join(command)}\n".encode())
+            file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {shlex.join(command_of(words))}\n".encode())
             file.flush()
             self._log_start = file.tell()  # size of the file when the step began [bytes]
-            self.process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                env=os.environ | {"PYTHONUNBUFFERED": "1"} | worker.variables,
-                pass_fds=[lock.fileno()],
-                start_new_session=True,  # Ctrl-C reaches only this process, which passes it on
-                preexec_fn=end_with_parent if sys.platform == "linux" else None,
-            )
+            self.process = launcher.start(matrix, cell, self.state, worker, file, lock)
         self.start = time.monotonic()
         with contextlib.suppress(OSError):  # the id is only for people to read
             lock.truncate(0)
             lock.write(f"{self.process.pid}\n".encode())
             lock.flush()
+
+    @property
+    def _step_name(self) -> str:
+        """The kind of step."""
+        return "evaluation" if self.state.step == "evaluate" else "training"
+
+    def add_time(self, seconds: float) -> None:
+        """Count device time of the step [s]."""
+        self._times.seconds[self._kind] = self._times.seconds.get(self._kind, 0.0) + seconds
+
+    def times_are_due(self) -> bool:
+        """Return whether it is time to keep the device time, lest a kill lose it."""
+        return time.monotonic() - self._kept >= _KEEP_EVERY
+
+    def keep_times(self) -> None:
+        """Write the device time and the steps of training so far; a UserError if that is not possible."""
+        self._kept = time.monotonic()
+        if self.process.returncode is not None:  # to look for checkpoints takes a while
+            self._times.steps = cell_state(self.cell).steps
+        write_times(self.cell.folder, self._times)
 
     def output(self) -> str:
         """Return the end of the log that the process has written so far."""
@@ -93,14 +142,34 @@ class Job:
             return f"evaluation in {self.state.missing[0]}"
         return "training" if self.state.step == "train" else f"training from iteration {self.state.iterations} on"
 
+    def problem(self) -> str:
+        """Return why an ended step has failed, or an empty text; a complete result gets its final name."""
+        try:
+            return self._problem()
+        except (OSError, UserError) as error:
+            return str(error)
+
+    def _problem(self) -> str:
+        """As :meth:`problem`, with what may go wrong while it looks."""
+        status = self.process.returncode or 0
+        if status == LOST:
+            return f"the machine was lost during {self.step_text()}"
+        if status:
+            how = f"was ended by signal {-status}" if status < 0 else f"has failed with exit status {status}"
+            return f"{self.step_text()} {how}"
+        if self.state.step != "evaluate":
+            state = cell_state(self.cell)
+            how_far = f"after {state.iterations} of {state.total} iterations" if state.total else "without a checkpoint"
+            return f"training has ended {how_far}" if state.step in ("train", "resume") else ""
+        name = self.state.missing[0]
+        if not is_json(self.cell.part_file(name)):
+            return f"{self.step_text()} has left no readable '{self.cell.part_file(name)}'"
+        self.cell.part_file(name).replace(self.cell.result_file(name))
+        return ""
+
     def __str__(self) -> str:
         """Describe the step in a few words, with its progress."""
         return f"{self.cell.name} {'evaluation' if self.state.step == 'evaluate' else f'{self.fraction():.0%}'}"
-
-
-def end_with_parent() -> None:
-    """Ask the system to send SIGTERM to this process when its parent ends for any reason."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def try_lock(file: Path) -> BinaryIO | None:
@@ -113,25 +182,3 @@ def try_lock(file: Path) -> BinaryIO | None:
         lock.close()
         return None
     return lock
-
-
-def find_workers(device: str, jobs: int | None) -> list[Worker]:
-    """Return the workers: one per GPU ("auto": all GPUs if any), or ``jobs`` on the CPU; UserError if not possible."""
-    import torch
-
-    first = resolve_device(device)  # does not create a CUDA context
-    if jobs is not None and jobs < 1:
-        raise UserError(f"--jobs must be at least 1, not {jobs}")
-    if jobs is not None and jobs > MAX_JOBS:
-        raise UserError(f"--jobs must be at most {MAX_JOBS}, not {jobs}")
-    if first == "cpu":
-        jobs, variables = jobs or 1, {}
-        if jobs > 1 and "OMP_NUM_THREADS" not in os.environ:  # they share the cores
-            variables["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // jobs))
-        return [Worker("cpu", "cpu", variables) for _ in range(jobs)]
-    if jobs is not None:
-        raise UserError("--jobs is for the CPU; a GPU takes one run at a time")
-    numbers = range(torch.cuda.device_count()) if device == "auto" else [int(first.removeprefix("cuda:"))]
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    names = visible.split(",") if visible else [str(i) for i in range(torch.cuda.device_count())]
-    return [Worker(f"cuda:{i}", "cuda:0", {"CUDA_VISIBLE_DEVICES": names[i].strip()}) for i in numbers]

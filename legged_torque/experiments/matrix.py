@@ -15,13 +15,21 @@ from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.config import parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
-from legged_torque.utils.runs import checkpoint_number, load_config, newest_checkpoint
+from legged_torque.utils.runs import (
+    checkpoint_number,
+    evaluations_file,
+    load_config,
+    newest_checkpoint,
+    steps_per_iteration,
+)
 
 SETTINGS_FILE = "experiment.yaml"  # copy of the description, in the folder of the results
 CELL_SETTINGS = {
     "seed": "seeds",
     "runner.experiment_name": "tasks, environments and seeds",
     "env.num_actions": "the tasks",
+    "evaluation.perturbation": "environments",
+    "evaluation.also": "environments",
 }
 """Settings that ``train`` must not change, and the keys that they come from."""
 EVALUATION = {"num_envs": 256, "num_steps": 2000}
@@ -30,7 +38,7 @@ EVALUATION = {"num_envs": 256, "num_steps": 2000}
 
 @dataclass(frozen=True)
 class Cell:
-    """One training and the evaluations of its last checkpoint."""
+    """One training, and evaluations while it trains or, in environments without them, of its last checkpoint."""
 
     folder: Path
     task: str
@@ -51,9 +59,16 @@ class Cell:
         """Return the file that an evaluation writes; it becomes the result when the evaluation is complete."""
         return self.folder / f"result_{environment}.json.part"
 
+    def rows_file(self, run_dir: Path, environment: str) -> Path:
+        """Return the file of a run's evaluations in an environment while it trained."""
+        return evaluations_file(run_dir, "" if environment == self.environment else environment)
+
     def missing(self) -> list[str]:
-        """Return the perturbations without a readable result."""
-        return [name for name in self.evaluated_in if not is_json(self.result_file(name))]
+        """Return the perturbations without a readable result that a whole training was not evaluated in either."""
+        missing = [name for name in self.evaluated_in if not is_json(self.result_file(name))]
+        runs = list(self.folder.glob("*/")) if missing else []
+        measured = [name for name in missing if any(self.rows_file(run, name).is_file() for run in runs)]
+        return [name for name in missing if name not in measured] if measured and is_trained(self) else missing
 
 
 @dataclass(frozen=True)
@@ -93,6 +108,7 @@ class CellState:
     iterations: int  # of training before its last checkpoint
     total: int | None  # of the whole training; None if it has no checkpoint
     missing: list[str]  # perturbations without a readable result
+    steps: int = 0  # of all worlds in these iterations; 0 if the settings of the run do not say
 
     @property
     def step(self) -> str:
@@ -166,33 +182,55 @@ def read_plan(file: Path) -> Matrix:
     return matrix
 
 
-def step_command(matrix: Matrix, cell: Cell, state: CellState, device: str) -> list[str]:
-    """Return the command line of a cell's next step on a device, named as ``--device`` takes it."""
+def step_words(matrix: Matrix, cell: Cell, state: CellState, device: str) -> list[str]:
+    """Return the script of a cell's next step and its arguments, for a device named as ``--device`` takes it."""
     words = [f"--task={cell.task}", f"--log_root={cell.folder.parent}", f"--experiment_name={cell.name}"]
     words.append(f"--device={device}")
     if state.step == "evaluate":
         name, numbers = state.missing[0], matrix.evaluation
         words += [f"--perturbation={name}", f"--num_envs={numbers['num_envs']}", f"--steps={numbers['num_steps']}"]
-        return [sys.executable, str(SCRIPTS_DIR / "evaluate.py"), *words, f"--json={cell.part_file(name)}"]
+        return ["evaluate.py", *words, f"--json={cell.part_file(name)}"]
     if state.step == "resume":
         words.append("--resume")
     else:
         words += [f"--seed={cell.seed}", f"--perturbation={cell.environment}"]
-        words += [f"--set={word}" for word in matrix.set_words()]
+        also = [name for name in cell.evaluated_in if name != cell.environment]
+        words += [f"--set={word}" for word in [*matrix.set_words(), f"evaluation.also={json.dumps(also)}"]]
         words += [f"--ranges={matrix.ranges}"] if matrix.ranges else []
-    return [sys.executable, str(SCRIPTS_DIR / "train.py"), *words]
+    return ["train.py", *words]
+
+
+def command_of(words: list[str]) -> list[str]:
+    """Return the command line that runs a script, given by its name and its arguments, on this machine."""
+    return [sys.executable, str(SCRIPTS_DIR / words[0]), *words[1:]]
 
 
 def cell_state(cell: Cell) -> CellState:
     """Return the progress of a cell; UserError if its newest run with a checkpoint does not say how long it is."""
-    for run_dir in sorted(cell.folder.glob("*/"), reverse=True):
-        newest = newest_checkpoint(run_dir)
-        if newest:
-            total = load_config(run_dir).get("max_iterations")
-            if type(total) is not int:
-                raise UserError(f"the settings of the run '{run_dir}' lack max_iterations")
-            return CellState(checkpoint_number(newest), total, cell.missing())
-    return CellState(0, None, cell.missing())
+    newest = last_checkpoint(cell)
+    if newest is None:
+        return CellState(0, None, cell.missing())
+    config, iterations = load_config(newest.parent), checkpoint_number(newest)
+    total = config.get("max_iterations")
+    if type(total) is not int:
+        raise UserError(f"the settings of the run '{newest.parent}' lack max_iterations")
+    return CellState(iterations, total, cell.missing(), iterations * (steps_per_iteration(config) or 0))
+
+
+def last_checkpoint(cell: Cell) -> Path | None:
+    """Return the file of a cell's last checkpoint that is not damaged, or None."""
+    runs = sorted(cell.folder.glob("*/"), reverse=True)
+    return next(filter(None, map(newest_checkpoint, runs)), None)
+
+
+def is_trained(cell: Cell) -> bool:
+    """Return whether the training of a cell is whole; not so if its settings cannot be read, which is told later."""
+    newest = last_checkpoint(cell)
+    try:
+        total = load_config(newest.parent).get("max_iterations") if newest else None
+    except UserError:
+        return False
+    return newest is not None and type(total) is int and checkpoint_number(newest) >= total
 
 
 def is_json(file: Path) -> bool:

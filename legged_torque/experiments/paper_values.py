@@ -55,6 +55,15 @@ TABLE_I = {
 }
 """Means by metric and task, one for each of :data:`ENVIRONMENTS`."""
 
+PAPER_TASKS = tuple(dict.fromkeys(task for _, task in TABLE_I))
+"""The tasks of Table I."""
+
+
+def paper_column(environment: str, metric: str) -> dict[str, float]:
+    """Return the means of a column of Table I by task."""
+    place = list(ENVIRONMENTS).index(environment)
+    return {task: TABLE_I[metric, task][place] for task in PAPER_TASKS}
+
 
 def paper_value(task: str, environment: str, metric: str) -> float | None:
     """Return a mean of Table I; None if the paper has none."""

@@ -1,11 +1,16 @@
-"""The report of an experiment, as Markdown."""
+"""The report of an experiment, in blocks that become Markdown and HTML."""
 
 from __future__ import annotations
 
 import math
+from datetime import timedelta
 from itertools import combinations
 from pathlib import Path
 
+import yaml
+
+from legged_torque.experiments.against_paper import MEANINGS, best_torque, count, judge, number_text
+from legged_torque.experiments.blocks import VIDEO_TYPES, Block, Bullets, Code, Grid, Heading, Paragraph, Picture
 from legged_torque.experiments.curves import MILLION
 from legged_torque.experiments.figures import FIGURES, file_name
 from legged_torque.experiments.matrix import SETTINGS_FILE
@@ -22,40 +27,42 @@ from legged_torque.experiments.results import (
     compare,
     is_of_paper,
 )
+from legged_torque.utils.config import flat
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import Metric
-from legged_torque.utils.paths import portable_path
+from legged_torque.utils.paths import portable_path, without_machine
 
 SIGNIFICANT = 0.05
 BASELINES = ("a1_position", "a1_torque")
 
 
-def report(experiment: Experiment, table: Table, from_step: float, figures: list[str], out: Path) -> str:
-    """Return the report that ``out`` is to hold, beside the figures with the given titles."""
+def report(
+    experiment: Experiment, table: Table, from_step: float, figures: list[str], out: Path, videos: dict[str, Path]
+) -> list[Block]:
+    """Return the report that ``out`` is to hold, beside the figures with the given titles.
+
+    ``videos`` are files by task; only the HTML page has them.
+    """
     missing = missing_lines(experiment, from_step)
-    sections = {
-        "What is missing": missing or ["Nothing: all trainings and evaluations are complete."],
+    complete = Paragraph("Nothing: all trainings and evaluations are complete.")
+    sections: dict[str, list[Block]] = {
         "Table I": table_one(experiment, table, from_step),
+        "Best torque method against the paper's best": best_torque(table),
+        "What is missing": [Bullets(missing) if missing else complete],
         "In other environments than those of training": other_table(table),
         "Differences": differences(table),
-        "Figures": figure_lines(figures),
-        "How it was made": setup_lines(experiment, from_step, out),
+        "Figures": figure_blocks(figures, out),
+        "Videos": [Picture(MODELS.get(task, task), file) for task, file in videos.items()],
+        "How it was made": setup_blocks(experiment, from_step, out),
     }
-    lines = [f"# Results of {experiment.folder.resolve().name}"]
-    for title, section in sections.items():
-        lines += ["", f"## {title}", "", *section]
-    return "\n".join(lines) + "\n"
-
-
-def markdown_table(header: list[str], rows: list[list[str]]) -> list[str]:
-    """Return the lines of a table."""
-    return [f"| {' | '.join(row)} |" for row in [header, ["---"] * len(header), *rows]]
+    return [block for title, section in sections.items() if section for block in (Heading(title), *section)]
 
 
 def missing_lines(experiment: Experiment, from_step: float) -> list[str]:
     """Return a line for everything planned that is missing, unfinished or unreadable."""
     lines, plan = [], experiment.plan
     for task, environment in ((task, environment) for environment in plan.environments for task in plan.tasks):
-        place, runs = f"- `{task}` in {environment}", experiment.runs_of(task, environment)
+        place, runs = f"`{task}` in {environment}", experiment.runs_of(task, environment)
         begun = [run.cell.seed for run in runs]
         if not runs:
             lines.append(f"{place}: no data, no training has begun.")
@@ -65,7 +72,7 @@ def missing_lines(experiment: Experiment, from_step: float) -> list[str]:
         problems = {run.cell.seed: "; ".join(run_problems(run, from_step)) for run in runs}
         lines += [f"{place}, seed {seed}: {text}." for seed, text in problems.items() if text]
     if experiment.unplanned:
-        lines.append(f"- Left out, as experiment.yaml does not name them: {', '.join(experiment.unplanned)}.")
+        lines.append(f"Left out, as experiment.yaml does not name them: {', '.join(experiment.unplanned)}.")
     return lines
 
 
@@ -85,13 +92,13 @@ def run_problems(run: CellResult, from_step: float) -> list[str]:
         if count:
             problems.append(f"{count} of the {len(rows)} evaluations that count have no {metric.name}")
     for name in run.cell.evaluated_in:
-        result = run.results.get(name)
+        counted = run.counted_rows(name, from_step)
         if name == run.cell.environment:
             continue
-        if result is None:
+        if not counted:
             problems.append(f"not evaluated in {name}")
-        elif not run.is_finished(result["steps"]):
-            problems.append(f"evaluated in {name} after {result['steps'] / MILLION:.4g} of {total}")
+        elif not run.is_finished(counted[-1]["steps"]):
+            problems.append(f"evaluated in {name} after {counted[-1]['steps'] / MILLION:.4g} of {total}")
     return problems
 
 
@@ -101,14 +108,16 @@ def marked(text: str, is_significant: bool, *summaries: Summary) -> str:
     return text if all(summary.is_final for summary in summaries) else f"{text} †"
 
 
-def number(cells: Cells, task: str, metric: Metric) -> str:
-    """Return an entry of Table I: mean, standard error, number of seeds; bold if significantly the best."""
-    summary, digits = cells[task].get(metric.name), metric.digits
+def number(cells: Cells, task: str, metric: Metric, paper: float | None) -> str:
+    """Return an entry of Table I: sign, mean, standard error, seeds, and by how much it is better than the paper's."""
+    summary = cells[task].get(metric.name)
     if summary is None:
         return "–"
-    error = "" if summary.standard_error is None else f" ± {summary.standard_error:.{digits}f}"
-    text = f"{summary.mean:.{digits}f}{error} ({len(summary.values)})"
-    return marked(text, is_best(cells, task, metric), summary)
+    text = marked(number_text(metric, summary), is_best(cells, task, metric), summary)
+    if paper is None:
+        return text
+    verdict = judge(metric, summary, paper)
+    return f"{verdict.sign} {text}, {verdict.share:+.1%}"
 
 
 def is_best(cells: Cells, task: str, metric: Metric) -> bool:
@@ -116,12 +125,12 @@ def is_best(cells: Cells, task: str, metric: Metric) -> bool:
     means = {name: cell[metric.name].mean for name, cell in cells.items() if metric.name in cell}
     pairs = list(combinations(means, 2))
     own = [p for pair, p in zip(pairs, compare(cells, metric.name, pairs), strict=True) if task in pair]
-    best = (min if metric.lower_is_better else max)(means.values())
+    best = max(means.values(), key=lambda mean: metric.gain(mean, 0.0))
     return means[task] == best and bool(own) and all(p is not None and p < SIGNIFICANT for p in own)
 
 
-def metric_table(table: Table, columns: list[str]) -> list[str]:
-    """Return the lines of a table with a row per metric and task, and the paper's values beside ours if it has any."""
+def metric_table(table: Table, columns: list[str]) -> Grid:
+    """Return a table with a row per metric and task, and the paper's values beside ours if it has any."""
     header = ["metric", "task"]
     for column in columns:
         header += [column, "paper"] if is_of_paper(column) else [column]
@@ -129,64 +138,64 @@ def metric_table(table: Table, columns: list[str]) -> list[str]:
     for metric, task in ((metric, task) for metric in PAPER_METRICS for task in table[columns[0]]):
         row = [metric.label, f"`{task}` ({MODELS[task]})" if task in MODELS else f"`{task}`"]
         for column in columns:
-            row.append(number(table[column], task, metric))
+            paper = paper_value(task, column, metric.name)
+            row.append(number(table[column], task, metric, paper))
             if is_of_paper(column):
-                paper = paper_value(task, column, metric.name)
                 row.append("–" if paper is None else f"{paper:.{metric.digits}f}")
         rows.append(row)
-    return markdown_table(header, rows)
+    return Grid(header, rows)
 
 
-def table_one(experiment: Experiment, table: Table, from_step: float) -> list[str]:
+def table_one(experiment: Experiment, table: Table, from_step: float) -> list[Block]:
     """Return Table I next to the paper's."""
-    num_planned = len(experiment.plan.seeds)
-    return [
-        f"Mean ± standard error over seeds (number of seeds, of {num_planned} that were planned). A seed's",
-        "number is the mean of its evaluations during training, in the environment of training, from step",
-        f"{from_step / MILLION:g} million on, or of the last {LAST_SHARE:.0%} if training has not come that far. The",
-        "exception is `doubled`: trained in `high_frequency`, with the last checkpoint evaluated in `doubled`. The",
-        "paper's column is the mean of all evaluations after step 90 million.",
-        "**Bold**: significantly better than every other task of the column (see Differences). †: seeds are missing",
-        "or trainings are not finished, so the number will change. Tracking % is better when higher, all else when",
-        "lower. The paper's means are of four seeds; it prints no errors, and no numbers of default torque control.",
-        "",
-        *metric_table(table, [name for name in table if is_of_paper(name)]),
-    ]
+    texts = (
+        count(table),
+        f"Mean ± standard error over seeds (number of seeds, of {len(experiment.plan.seeds)} that were planned), and "
+        "by how much it is better than the paper's. Tracking % is better when higher, all else when lower. A seed's "
+        f"number is the mean of its evaluations during training from step {from_step / MILLION:g} million on, or of "
+        f"the last {LAST_SHARE:.0%} if training has not come that far. `doubled` is trained in `high_frequency` and "
+        "evaluated in `doubled` as well while it trains, or else has the number of the last checkpoint. The paper's "
+        "numbers are means of four seeds and of all evaluations after step 90 million; it prints no errors, and no "
+        "numbers of default torque control.",
+        "**Bold**: significantly better than every other task of the column (see Differences). †: seeds are missing or "
+        "trainings are not finished, so the number will change. With one seed, the standard error counts as 0.",
+    )
+    legend = Grid(["sign", "meaning"], list(MEANINGS.items()))
+    return [*map(Paragraph, texts), legend, metric_table(table, [name for name in table if is_of_paper(name)])]
 
 
-def other_table(table: Table) -> list[str]:
+def other_table(table: Table) -> list[Block]:
     """Return the metrics in environments other than those of training, which the paper does not have."""
     columns = [name for name in table if not is_of_paper(name)]
-    if not columns:
-        return ["None were planned."]
-    text = "Trained -> evaluated: metrics of the last checkpoint, over seeds as above. The paper has no such numbers."
-    return [text, "", *metric_table(table, columns)]
+    text = "Trained -> evaluated, over seeds and evaluations as above. The paper has no such numbers."
+    return [Paragraph(text), metric_table(table, columns)] if columns else [Paragraph("None were planned.")]
 
 
-def differences(table: Table) -> list[str]:
+def differences(table: Table) -> list[Block]:
     """Return tests of all pairs of tasks in each column of Table I, and of each task against the baselines."""
-    lines = [
-        "First minus second task, and the p value of a two-sided Welch's t-test over seeds with Holm's correction.",
-        "The tests of one metric in one table are one family.",
-        f"**Bold**: p < {SIGNIFICANT}. †: seeds are missing or trainings are not finished. With so few seeds, a",
-        "difference may be real without being significant. Tasks without data are left out.",
-    ]
+    text = (
+        "First minus second task, and the p value of a two-sided Welch's t-test over seeds with Holm's correction. The "
+        f"tests of one metric in one table are one family. **Bold**: p < {SIGNIFICANT}. †: seeds are missing or "
+        "trainings are not finished. With so few seeds, a difference may be real without being significant. Tasks "
+        "without data are left out."
+    )
+    blocks: list[Block] = [Paragraph(text)]
     for column in filter(is_of_paper, table):
         cells = table[column]
-        lines += ["", f"### {column}"]
+        blocks.append(Heading(column, 3))
         tasks = [task for task in cells if cells[task]]
         families = {"All pairs": list(combinations(tasks, 2))}
         for baseline in (task for task in BASELINES if task in tasks):
             families[f"Against `{baseline}`"] = [(task, baseline) for task in tasks if task != baseline]
         for title, pairs in families.items():
             if all(p is None for metric in PAPER_METRICS for p in compare(cells, metric.name, pairs)):
-                lines += ["", f"{title}: no test is possible; it takes at least two seeds of two tasks."]
+                blocks.append(Paragraph(f"{title}: no test is possible; it takes at least two seeds of two tasks."))
             else:
-                lines += ["", f"{title}:", "", *difference_table(cells, pairs)]
-    return lines
+                blocks += [Paragraph(f"{title}:"), difference_table(cells, pairs)]
+    return blocks
 
 
-def difference_table(cells: Cells, pairs: list[tuple[str, str]]) -> list[str]:
+def difference_table(cells: Cells, pairs: list[tuple[str, str]]) -> Grid:
     """Return the differences of pairs of tasks in all metrics, with their p values."""
     rows = [[f"`{first}` - `{second}`"] for first, second in pairs]
     for metric in PAPER_METRICS:
@@ -199,35 +208,71 @@ def difference_table(cells: Cells, pairs: list[tuple[str, str]]) -> list[str]:
             p_text = "no p value" if p is None else f"p = {p:.2g}"
             text = f"{one.mean - other.mean:+.{metric.digits}f}, {p_text}"
             row.append(marked(text, p is not None and p < SIGNIFICANT, one, other))
-    return markdown_table(["pair", *(metric.label for metric in PAPER_METRICS)], rows)
+    return Grid(["pair", *(metric.label for metric in PAPER_METRICS)], rows)
 
 
-def figure_lines(figures: list[str]) -> list[str]:
-    """Return the figures, and which of the paper's are absent."""
-    lines = [f"![{title}]({file_name(title)})\n" for title in figures]
+def figure_blocks(figures: list[str], out: Path) -> list[Block]:
+    """Return the figures, and which of them are absent."""
+    blocks: list[Block] = [Picture(title, out / file_name(title)) for title in figures]
     absent = [title for title in FIGURES if title not in figures]
     if absent:
-        lines.append(f"No {', '.join(absent)}: there are no data for it.")
-    return [*lines, f"The numbers are in `{TABLE_FILE}`, all evaluations in `{EVALUATIONS_FILE}`."]
+        blocks.append(Paragraph(f"No {', '.join(absent)}: there are no data for it."))
+    return [*blocks, Paragraph(f"The numbers are in `{TABLE_FILE}`, all evaluations in `{EVALUATIONS_FILE}`.")]
 
 
-def setup_lines(experiment: Experiment, from_step: float, out: Path) -> list[str]:
-    """Return machines, versions, the plan and the commands that repeat the experiment."""
+def find_videos(folder: Path, tasks: list[str]) -> dict[str, Path]:
+    """Return the videos in a folder by their tasks, after which they are named; a UserError if there are none."""
+    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    videos = {file.stem: file for file in files if file.stem in tasks and file.suffix in VIDEO_TYPES}
+    if not videos:
+        raise UserError(f"there is no video in '{folder}' that is named <task>{', <task>'.join(VIDEO_TYPES)}")
+    return {task: videos[task] for task in tasks if task in videos}
+
+
+def setup_blocks(experiment: Experiment, from_step: float, out: Path) -> list[Block]:
+    """Return machines, times, versions, settings, the plan and the commands that repeat the experiment."""
     devices = sorted({device for run in experiment.runs for device in run.devices})
     configs = [config for run in experiment.runs for config in run.configs]
     packages = [config["versions"] for config in configs if isinstance(config.get("versions"), dict)]
     versions = {", ".join(f"{name} {version}" for name, version in entry.items()) for entry in packages}
     plan = (experiment.folder / SETTINGS_FILE).read_text(encoding="utf-8", errors="replace")
     folder, report_folder = portable_path(experiment.folder), portable_path(out)
+    items = [f"Devices, as named in settings and results: {', '.join(devices) or 'unknown'}"]
+    items += [f"Versions: {text}" for text in sorted(versions) or ["unknown"]]
+    commands = f"python scripts/experiment.py {folder}/experiment.yaml --out {folder}_again\n"
+    commands += f"python scripts/report.py {folder}_again --out {report_folder}_again --from_step {from_step:.0f}"
     return [
-        f"- Devices, as named in settings and results: {', '.join(devices) or 'unknown'}",
-        *(f"- Versions: {text}" for text in sorted(versions) or ["unknown"]),
-        "- Plan (`experiment.yaml`); all settings of a training are in its `config.yaml`:",
-        f"\n```yaml\n{plan.rstrip()}\n```\n",
-        "To repeat it:",
-        "",
-        "```bash",
-        f"python scripts/experiment.py {folder}/experiment.yaml --out {folder}_again",
-        f"python scripts/report.py {folder}_again --out {report_folder}_again --from_step {from_step:.0f}",
-        "```",
+        Bullets([*items, *time_texts(experiment)]),
+        Paragraph("Plan (`experiment.yaml`):"),
+        Code(plan, "yaml"),
+        Paragraph("To repeat it:"),
+        Code(commands, "bash"),
+        *settings_blocks(experiment),
     ]
+
+
+def time_texts(experiment: Experiment) -> list[str]:
+    """Return how long training took, if it is known."""
+    ends = [run.rows[-1] for run in experiment.runs if run.rows and run.rows[-1]["seconds"] > 0.0]
+    if not ends:
+        return []
+    seconds, steps = sum(row["seconds"] for row in ends), sum(row["steps"] for row in ends)
+    text = f"{len(ends)} trainings took {timedelta(seconds=round(seconds))} in all, with their evaluations: "
+    text += f"{seconds / len(ends):.4g} s and {steps / seconds / MILLION:.3g} million steps/s each on average"
+    return [f"{text}. Those that share a device are slower."]
+
+
+def settings_blocks(experiment: Experiment) -> list[Block]:
+    """Return the settings of a training of each task in the first environment, and in which of them tasks differ."""
+    environment = next(iter(experiment.plan.environments))
+    runs = {task: experiment.runs_of(task, environment) for task in experiment.plan.tasks}
+    configs = {task: without_machine(some[0].configs[-1]) for task, some in runs.items() if some and some[0].configs}
+    settings = {task: flat({key: config[key] for key in ("env", "train")}) for task, config in configs.items()}
+    paths = dict.fromkeys(path for values in settings.values() for path in values)
+    rows = [[f"`{path}`", *(str(values.get(path, "–")) for values in settings.values())] for path in paths]
+    different = [row for row in rows if len(set(row[1:])) > 1]
+    grid = Grid(["setting", *(f"`{task}`" for task in settings)], different)
+    text = f"Settings of trainings in `{environment}` that differ between tasks; the `config.yaml` of each run has all."
+    texts = {f"All settings of `{task}`": yaml.safe_dump(config, sort_keys=False) for task, config in configs.items()}
+    blocks: list[Block] = [Paragraph(text), grid] if different else []
+    return blocks + [Code(text, "yaml", title) for title, text in texts.items()]

@@ -17,7 +17,7 @@ from legged_torque.experiments.curves import CURVE_METRICS, Row, read_rows, to_r
 from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, read_plan
 from legged_torque.experiments.paper_values import ENVIRONMENTS, paper_value
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.runs import CONFIG_FILE, load_config
+from legged_torque.utils.runs import CONFIG_FILE, load_config, steps_per_iteration
 
 LAST_SHARE = 0.18
 """Fraction of final evaluations averaged for unfinished runs: that of steps 90 to 110 million in a whole one."""
@@ -31,11 +31,16 @@ class CellResult:
     """What there is of a training that has begun."""
 
     cell: Cell
-    rows: list[Row] = field(default_factory=list)  # evaluations during training, merged over its runs
+    rows_in: dict[str, list[Row]] = field(default_factory=dict)  # evaluations during training, by environment
     results: dict[str, Row] = field(default_factory=dict)  # evaluations of the last checkpoint, by environment
     configs: list[dict[str, Any]] = field(default_factory=list)  # config.yaml of its runs
     devices: set[str] = field(default_factory=set)  # where it was trained and evaluated
     notes: list[str] = field(default_factory=list)  # problems with its files
+
+    @property
+    def rows(self) -> list[Row]:
+        """Evaluations during training in its own environment."""
+        return self.rows_in.get(self.cell.environment, [])
 
     @property
     def steps(self) -> float:
@@ -45,13 +50,9 @@ class CellResult:
     @property
     def total_steps(self) -> int:
         """Steps of the whole training according to its settings, or else the paper's."""
-        try:
-            config = self.configs[-1]
-            rollout = config["env"]["env"]["num_envs"], config["train"]["runner"]["num_steps_per_env"]
-            factors = (config["max_iterations"], *rollout, config.get("processes", 1))
-        except (IndexError, KeyError, TypeError):
-            return PAPER_STEPS
-        return math.prod(factors) if all(type(factor) is int for factor in factors) else PAPER_STEPS
+        config = self.configs[-1] if self.configs else {}
+        steps, iterations = steps_per_iteration(config), config.get("max_iterations")
+        return steps * iterations if steps is not None and type(iterations) is int else PAPER_STEPS
 
     def is_finished(self, steps: float) -> bool:
         """Return whether fewer steps are left than lie between two evaluations."""
@@ -59,11 +60,12 @@ class CellResult:
         return steps + interval > self.total_steps
 
     def counted_rows(self, evaluated: str, from_step: float) -> list[Row]:
-        """Return the evaluations in an environment that count for Table I."""
-        if evaluated != self.cell.environment:
+        """Return the evaluations in an environment that count for Table I, or else that of the last checkpoint."""
+        rows = self.rows_in.get(evaluated, [])
+        if not rows:
             return [self.results[evaluated]] if evaluated in self.results else []
         first = from_step if self.steps >= from_step else (1.0 - LAST_SHARE) * self.steps
-        return [row for row in self.rows if row["steps"] >= first]
+        return [row for row in rows if row["steps"] >= first]
 
 
 @dataclass
@@ -139,12 +141,14 @@ def read_cell(cell: Cell) -> CellResult:
         if (run_dir / CONFIG_FILE).is_file():
             try:
                 result.configs.append(load_config(run_dir))
-                result.devices.add(str(result.configs[-1].get("device")))
+                result.devices.add(str(result.configs[-1].get("device_name", result.configs[-1].get("device"))))
             except UserError as error:
                 result.notes.append(str(error))
-        rows = read_rows(run_dir / "evaluations.csv", result.notes)
-        if rows:
-            result.rows = [row for row in result.rows if row["steps"] < rows[0]["steps"]] + rows
+        for name in dict.fromkeys([cell.environment, *cell.evaluated_in]):
+            rows = read_rows(cell.rows_file(run_dir, name), result.notes)
+            if rows:
+                before = [row for row in result.rows_in.get(name, []) if row["steps"] < rows[0]["steps"]]
+                result.rows_in[name] = before + rows
     for file in sorted([*cell.folder.glob("result_*.json"), *cell.folder.glob("*/result_*.json")]):
         try:
             values = json.loads(file.read_text(encoding="utf-8"))
@@ -206,7 +210,7 @@ def holm(p_values: list[float | None]) -> list[float | None]:
 
 
 def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
-    """Write all summaries as CSV, and every evaluation during training as compressed CSV."""
+    """Write all summaries as CSV, and every evaluation during training as compressed CSV, with names of columns."""
     names = [metric.name for metric in CURVE_METRICS]
     summaries: list[list[Any]] = [["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean"]]
     keys = [(task, column, name) for column, cells in table.items() for task in cells for name in names]
@@ -214,11 +218,14 @@ def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
         found = table[column][task].get(name)
         numbers = [found.mean, found.standard_error, len(found.values)] if found else [None, None, 0]
         summaries.append([task, column, name, *numbers, paper_value(task, column, name)])
-    evaluations: list[list[Any]] = [["task", "environment", "seed", "steps", *names]]
+    of_rows = ["steps", "seconds", *names]
+    evaluations: list[list[Any]] = [["task", "environment", "seed", *of_rows]]
     runs = sorted(experiment.runs, key=lambda run: run.cell.name)
-    for cell, row in ((run.cell, row) for run in runs for row in run.rows):
-        values = [row[name] if math.isfinite(row[name]) else None for name in names]
-        evaluations.append([cell.task, cell.environment, cell.seed, row["steps"], *values])
+    for cell, evaluated, rows in ((run.cell, *entry) for run in runs for entry in run.rows_in.items()):
+        column = column_name(cell.environment, evaluated)
+        for row in rows:
+            values = [row[name] if math.isfinite(row[name]) else None for name in of_rows]
+            evaluations.append([cell.task, column, cell.seed, *values])
     (out / TABLE_FILE).write_bytes(csv_bytes(summaries))
     (out / EVALUATIONS_FILE).write_bytes(gzip.compress(csv_bytes(evaluations), mtime=0))  # the same bytes every time
 

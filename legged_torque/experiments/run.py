@@ -1,26 +1,30 @@
-"""Runs a matrix of trainings, one process per GPU. Finished steps are skipped and interrupted ones resumed."""
+"""Runs a matrix of trainings on the workers of a launcher. Finished steps are skipped, interrupted ones resumed."""
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
 from datetime import datetime, timedelta
 from pathlib import Path
 from statistics import fmean
 from types import FrameType
 from typing import BinaryIO
 
-from legged_torque.experiments.job import Job, Worker, try_lock
-from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, cell_state, check_same, is_json, step_command
+from legged_torque.experiments.job import LOST, Job, Launcher, Worker, try_lock
+from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, check_same
+from legged_torque.experiments.times import add_up, describe, read_times
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import held
 from legged_torque.utils.interrupt import StopRequest
 
 POLL = 0.2  # seconds between checks of the processes
 SHOW_EVERY = 1.0  # seconds between updates of the live line
+RETRIES = 1  # of a step that has failed, from its last checkpoint, before its cell is given up
+MAX_LOST = 10  # machines that a step may lose before its cell is given up
 
 
 class CountedStop(StopRequest):
@@ -37,16 +41,18 @@ class CountedStop(StopRequest):
 class ExperimentRun:
     """Trains and evaluates all cells of a matrix."""
 
-    def __init__(self, matrix: Matrix, out: Path, workers: list[Worker]) -> None:
+    def __init__(self, matrix: Matrix, out: Path, launcher: Launcher) -> None:
         """Find the cells that are not done; nothing is written or started yet. ``out`` is an absolute path."""
-        self.matrix, self.out, self.workers = matrix, out, workers
+        self.matrix, self.out, self._launcher = matrix, out, launcher
         cells = matrix.cells(out)
         self.queue = [cell for cell in cells if cell.missing()]
         self._num_cells, self._num_done = len(cells), len(cells) - len(self.queue)
         self._failures: list[str] = []  # a message per failed cell
         self._reported: set[Cell] = set()  # cells reported to be held by another process
+        self._failed: Counter[Cell] = Counter()  # how often a cell's present step has failed
+        self._lost: Counter[Cell] = Counter()  # how often its machine was lost
         self._durations: list[float] = []  # of cells finished here [s]
-        self._start = time.monotonic()
+        self._start = self._counted = time.monotonic()
         self._shown = 0.0  # when the live line was last updated [s]
 
     def run(self) -> int:
@@ -59,7 +65,8 @@ class ExperimentRun:
                     if stop.count > passed_on:
                         passed_on = stop.count
                         self._ask_to_stop()
-                    for worker in self.workers:
+                    self._count_time()
+                    for worker in list(self._launcher.workers()):
                         self._attend(worker, stop.requested)
                     self._show_live_line()
                     time.sleep(POLL)
@@ -67,6 +74,9 @@ class ExperimentRun:
             self._ask_to_stop()  # after an exception too no process is left running
             for job in self._jobs():
                 job.process.wait()
+        spent = describe(add_up(read_times(cell.folder) for cell in self.matrix.cells(self.out)))
+        if spent:
+            print(spent)
         print(f"{self._num_done} of {self._num_cells} cells are done.", flush=True)
         for failure in self._failures:
             print(failure, file=sys.stderr)
@@ -76,7 +86,7 @@ class ExperimentRun:
 
     def _jobs(self) -> list[Job]:
         """Return the jobs that are running."""
-        return [worker.job for worker in self.workers if worker.job is not None]
+        return [worker.job for worker in self._launcher.workers() if worker.job is not None]
 
     def _attend(self, worker: Worker, stopping: bool) -> None:
         """Finish a worker's step if its process has ended, and give it the next step if it is free."""
@@ -104,31 +114,25 @@ class ExperimentRun:
             lock.close()
 
     def _start_step(self, worker: Worker, cell: Cell, lock: BinaryIO, cell_start: float) -> None:
-        """Start a process for the next step of a cell."""
+        """Start the next step of a cell."""
         try:
-            state = cell_state(cell)
-            if state.step != "evaluate":  # they would be results of another training
-                for name in cell.evaluated_in:
-                    cell.result_file(name).unlink(missing_ok=True)
-            command = step_command(self.matrix, cell, state, worker.device)
-            worker.job = Job(cell, state, lock, cell_start, command, worker)
+            worker.job = Job(self.matrix, cell, lock, cell_start, worker, self._launcher)
         except (OSError, subprocess.SubprocessError, UserError) as error:
             self._fail(cell, lock, str(error))
 
     def _end_step(self, worker: Worker, job: Job, stopping: bool) -> None:
-        """Record the outcome of a step whose process has ended, and continue with its cell."""
-        try:
-            problem = self._problem(job)
-        except (OSError, UserError) as error:
-            problem = str(error)
+        """Record the outcome of a step that has ended, and continue with its cell."""
+        problem = job.problem()
+        self._keep_times(job)
         if problem and not stopping:
-            self._fail(job.cell, job.lock, problem, job)
+            self._try_again_or_fail(job, problem)
             return
         is_done = not job.cell.missing()
         if is_done:
             self._num_done += 1
             self._durations.append(time.monotonic() - job.cell_start)
         if not problem:
+            self._failed[job.cell] = self._lost[job.cell] = 0
             took = timedelta(seconds=round(time.monotonic() - job.start))
             self._print(f"{job.cell.name}: {job.step_text()} on {worker.name} took {took} | {self._progress()}")
         if is_done or stopping:
@@ -137,21 +141,17 @@ class ExperimentRun:
         else:
             self._start_step(worker, job.cell, job.lock, job.cell_start)
 
-    def _problem(self, job: Job) -> str:
-        """Return the failure of an ended step, or an empty text; a complete result gets its final name."""
-        status = job.process.returncode
-        if status:
-            how = f"was ended by signal {-status}" if status < 0 else f"has failed with exit status {status}"
-            return f"{job.step_text()} {how}"
-        if job.state.step != "evaluate":
-            state = cell_state(job.cell)
-            how_far = f"after {state.iterations} of {state.total} iterations" if state.total else "without a checkpoint"
-            return f"training has ended {how_far}" if state.step in ("train", "resume") else ""
-        name = job.state.missing[0]
-        if not is_json(job.cell.part_file(name)):
-            return f"{job.step_text()} has left no readable '{job.cell.part_file(name)}'"
-        job.cell.part_file(name).replace(job.cell.result_file(name))
-        return ""
+    def _try_again_or_fail(self, job: Job, problem: str) -> None:
+        """Let a step that has failed be tried again, from its last checkpoint, or give up its cell."""
+        is_lost = job.process.returncode == LOST
+        tries, most = (self._lost, MAX_LOST) if is_lost else (self._failed, RETRIES)
+        tries[job.cell] += 1
+        if tries[job.cell] > most:
+            self._fail(job.cell, job.lock, problem, job)
+            return
+        job.lock.close()
+        self.queue.insert(0 if is_lost else len(self.queue), job.cell)
+        self._print(f"{job.cell.name}: {problem}; it will be tried again | {self._progress()}")
 
     def _fail(self, cell: Cell, lock: BinaryIO, reason: str, job: Job | None = None) -> None:
         """Give up a cell; the last ten lines of the job's log are printed at the end."""
@@ -159,6 +159,25 @@ class ExperimentRun:
         lines = [f"the last lines of {job.log}:", *job.output().splitlines()[-10:]] if job else []
         self._failures.append("\n    ".join([f"{cell.name}: {reason}", *lines]))
         self._print(f"{cell.name}: {reason} | {self._progress()}")
+
+    def _count_time(self) -> None:
+        """Count the time since the last call for all steps, those of one device sharing it."""
+        now = time.monotonic()
+        passed, self._counted = now - self._counted, now
+        busy = [worker for worker in self._launcher.workers() if worker.job is not None and worker.name]
+        sharing = Counter(worker.name for worker in busy)
+        for worker in busy:
+            assert worker.job is not None
+            worker.job.add_time(passed / sharing[worker.name])
+            if worker.job.times_are_due():
+                self._keep_times(worker.job)
+
+    def _keep_times(self, job: Job) -> None:
+        """Write the device time of a cell; that it cannot be written is told, and work goes on."""
+        try:
+            job.keep_times()
+        except (OSError, UserError) as error:
+            self._print(f"{job.cell.name}: its device time is not kept: {error}")
 
     def _ask_to_stop(self) -> None:
         """Ask all processes to end. A training finishes its iteration and saves; a second request ends it at once."""
@@ -170,7 +189,7 @@ class ExperimentRun:
     def _progress(self) -> str:
         """Describe the progress of all cells and the time left; cells in training count in part."""
         cells = self._num_cells - self._num_done - len(self._failures) - sum(job.fraction() for job in self._jobs())
-        left = time_left(self._durations, cells, len(self.workers))
+        left = time_left(self._durations, cells, len(self._launcher.workers()))
         text = "time left unknown yet" if left is None else f"{timedelta(seconds=round(left))} left"
         elapsed = timedelta(seconds=round(time.monotonic() - self._start))
         return f"{self._num_done} of {self._num_cells} cells done, {elapsed}, {text}"
@@ -192,8 +211,7 @@ def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
     """Create the folder of the results, and copy the matrix's file into it; UserError if it has other settings."""
     check_same(matrix, out)  # before anything is created
     out.mkdir(parents=True, exist_ok=True)
-    with open(out / "lock", "a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # another process may do the same right now
+    with held(out / "lock"):  # another process may do the same right now
         check_same(matrix, out)
         copy, text = out / SETTINGS_FILE, file.read_bytes()
         if not copy.is_file() or copy.read_bytes() != text:

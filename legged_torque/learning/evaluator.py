@@ -18,13 +18,19 @@ from legged_torque.envs.base.metrics import WalkingMetrics
 from legged_torque.learning.worlds import pack, unpack, world_tensors
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils.config import section_keys
+from legged_torque.utils.errors import unknown_name
 from legged_torque.utils.files import told_by_name
 from legged_torque.utils.options import apply_perturbation
 from legged_torque.utils.random_state import own_random_numbers, seeded_state
+from legged_torque.utils.runs import tagged
 
-EVALUATIONS_FILE = "evaluations.csv"  # in a run's folder: a row per evaluation
+SEED = 10_000  # added to the seed of a training, once for its first evaluator, twice for the second, and so on
 SETTLING_TIME = 2.0
 """Least simulated time before the first evaluation [s], in whole evaluations: all robots start from random states."""
+
+
+Policy = Callable[[TensorDict], Tensor]
+"""Observations to actions."""
 
 
 class TrainingEvaluator:
@@ -35,7 +41,7 @@ class TrainingEvaluator:
     with and without it. Robots stuck under an early policy stay stuck until time-out, so early metrics lag.
     """
 
-    def __init__(self, task: LeggedRobot, policy: Callable[[TensorDict], Tensor], settings: dict, seed: int) -> None:
+    def __init__(self, task: LeggedRobot, policy: Policy, settings: dict, seed: int) -> None:
         """Build the worlds; ``settings`` are ``evaluation`` of those of the training, the seed is its own.
 
         Curricula follow from the counters of ``task``, the one of the training. ``policy`` returns mean actions.
@@ -85,6 +91,54 @@ class TrainingEvaluator:
                 commands = self._env.commands.clone()
                 obs = self._env.step(self._policy(obs))[0]
                 self._metrics.add_step(commands)
+
+
+class TrainingEvaluators:
+    """The evaluators of a training, each built when it is first asked for.
+
+    Their names are those of the environments of ``evaluation.also``; "" is the one of ``evaluation.perturbation``.
+    """
+
+    def __init__(self, task: LeggedRobot, policy: Policy, settings: dict, seed: int) -> None:
+        """Take what :class:`TrainingEvaluator` does, with the training's seed; a UserError if a name is not known."""
+        self._task, self._policy, self._settings, self._seed = task, policy, settings, seed
+        self._names = list(dict.fromkeys(["", *settings["also"]]))
+        self._built: dict[str, TrainingEvaluator] = {}
+        known = task.cfg.perturbations()
+        if settings["perturbation"] not in ("", *known):
+            raise unknown_name("evaluation.perturbation", settings["perturbation"], known)
+        for name in settings["also"]:
+            if name not in known:
+                raise unknown_name("evaluation.also", name, known)
+
+    def due(self, before: int, steps: int) -> list[str]:
+        """Return the names of those that shall measure, after a rollout from ``before`` to ``steps``."""
+        interval = self._settings["interval"]
+        if interval == 0 or steps // interval == before // interval:
+            return []
+        return [name for name in self._names if not name or steps >= self._settings["also_from"]]
+
+    def get(self, name: str) -> TrainingEvaluator:
+        """Return an evaluator."""
+        if name not in self._built:
+            settings = self._settings | ({"perturbation": name} if name else {})
+            seed = self._seed + SEED * (1 + self._names.index(name))
+            self._built[name] = TrainingEvaluator(self._task, self._policy, settings, seed)
+        return self._built[name]
+
+    def state(self) -> dict[str, Any]:
+        """Return the states of all that are built, with keys "evaluation" and "evaluation_<name>"."""
+        return {tagged("evaluation", name): evaluator.state() for name, evaluator in self._built.items()}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from a :meth:`state`, which may hold other entries; a UserError if it does not fit."""
+        for name in self._names:
+            if state.get(tagged("evaluation", name)):
+                self.get(name).load_state(state[tagged("evaluation", name)])
+
+    def clear(self) -> None:
+        """Let all start anew."""
+        self._built.clear()
 
 
 def evaluation_cfg(cfg: Any, num_envs: int, perturbation: str = "") -> Any:

@@ -17,6 +17,7 @@ from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.utils.cli import check_output
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import held
 from legged_torque.utils.task_registry import all_experiments_dir
 
 SPACES = {
@@ -37,6 +38,7 @@ SPACES = {
     ),
 }
 """Settings of task and training, if they have them, in which a pre-trained policy must agree: what it sees and does."""
+PRETRAINED = "pretrained"  # folder of pre-trained policies, in that of all experiments
 STANDARD_DEVIATION = "distribution."
 """Start of the names of parameters that are not taken over: how much a training explores is its own setting."""
 
@@ -45,14 +47,19 @@ def pretrained_file(task: str, train_cfg: Any, log_root: str | None = None) -> P
     """Return where a task's pre-trained policy is kept: ``pretraining.file``, or in the folder of all experiments."""
     if train_cfg.pretraining.file:
         return Path(train_cfg.pretraining.file)
-    return all_experiments_dir(log_root) / "pretrained" / f"{task}.pt"
+    return all_experiments_dir(log_root) / PRETRAINED / f"{task}.pt"
 
 
 def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> None:
-    """Make a task's pre-trained policy if its file is missing; a UserError if the file's does not fit the task."""
+    """Make a task's pre-trained policy if its file is missing; a UserError if the file's does not fit the task.
+
+    Of trainings that start at the same time one makes it, and the others wait.
+    """
     if not file.exists():
-        print(f"There is no pre-trained policy '{file}' yet; making it.", flush=True)
-        make_pretrained(file, task, env_cfg, train_cfg, device)
+        with held(file.with_name(f"{file.name}.lock")):
+            if not file.exists():
+                print(f"There is no pre-trained policy '{file}' yet; making it.", flush=True)
+                make_pretrained(file, task, env_cfg, train_cfg, device)
     check_spaces(file, env_cfg, train_cfg)
     print(f"Starting from the pre-trained policy '{file}'.")
 

@@ -13,7 +13,7 @@ from rsl_rl import runners
 import legged_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning import checkpoint
-from legged_torque.learning.evaluator import EVALUATIONS_FILE, TrainingEvaluator, append_row
+from legged_torque.learning.evaluator import TrainingEvaluators, append_row
 from legged_torque.learning.guard import TrainingGuard
 from legged_torque.learning.log_writer import NoLogWriter
 from legged_torque.learning.ppo import OnDevicePPO
@@ -33,9 +33,7 @@ from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.files import told_by_name
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.random_state import random_state, restore_random_state
-from legged_torque.utils.runs import checkpoint_file, claim_run_dir
-
-EVALUATION_SEED = 10_000  # added to the seed of a training for that of its evaluations
+from legged_torque.utils.runs import checkpoint_file, claim_run_dir, evaluations_file, tagged
 
 
 class OnPolicyRunner(runners.OnPolicyRunner):
@@ -62,10 +60,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             for group in groups or [""]:
                 if group not in env.obs_buf:
                     raise unknown_name(f"observation group in obs_groups.{key}", group, map(str, env.obs_buf.keys()))
-        perturbation = train_cfg["evaluation"]["perturbation"]
-        if perturbation and perturbation not in env.cfg.perturbations():
-            raise unknown_name("evaluation.perturbation", perturbation, env.cfg.perturbations())
         super().__init__(env, train_cfg, log_dir, device)
+        self._evaluators = TrainingEvaluators(env, self.alg.actor, self.cfg["evaluation"], self.cfg["seed"])
         self.logger.device = "cpu"  # where numbers are averaged that are on the host anyway
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         self.log_dir = log_dir
@@ -80,7 +76,6 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         env.step_graph.enabled = self.alg.update_graph.enabled = self.cfg["capture"]
         enabled = self.cfg["capture"] and self.cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS
         self._rollout = CudaGraph(self._collect, device, enabled)
-        self._evaluator: TrainingEvaluator | None = None
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train, and leave a checkpoint; Ctrl-C ends training after the current iteration, a second one at once.
@@ -191,7 +186,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         try:
             self._restore_worlds(Path(path), infos.get("worlds"))
         except UserError as error:
-            self._evaluator = None
+            self._evaluators.clear()
             if self.gpu_global_rank == 0:
                 print(f"The worlds start anew: {error}.")
         self.continue_random_numbers(infos)
@@ -242,31 +237,26 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             torch.cuda.synchronize(self.device)
 
     def _evaluate(self, losses: dict, iteration_start: float) -> dict[str, float]:
-        """Measure the policy if it is time, note it in the run's folder, and return what is to be logged."""
-        settings = self.cfg["evaluation"]
+        """Measure the policy where it is time, note it in the run's folder, and return what is to be logged."""
         steps = int(self.env.total_steps)
         before = steps - self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
-        interval = settings["interval"]
-        if self.logger.writer is None or interval == 0 or steps // interval == before // interval:
+        due = self._evaluators.due(before, steps)
+        if self.logger.writer is None or not due:
             return {}
         start = time.perf_counter()
         seconds = self._seconds_before + self.logger.tot_time + start - iteration_start
-        self._evaluator = self._evaluator or self._make_evaluator()
-        metrics = self._evaluator.evaluate()
-        row = {"steps": steps, "iteration": self.current_learning_iteration + 1, "seconds": seconds, **metrics}
-        row["critic_gradient_norm"] = losses["critic_gradient_norm"]
-        assert self.log_dir is not None  # there is a writer only where something is kept
-        try:
-            append_row(Path(self.log_dir) / EVALUATIONS_FILE, row)
-        except UserError as error:  # training goes on: what is learned is worth more
-            print(f"Warning: an evaluation is not kept: {error}.", file=sys.stderr)
-        logged = {f"Evaluation/{name}": value for name, value in metrics.items()}
+        when = {"steps": steps, "iteration": self.current_learning_iteration + 1, "seconds": seconds}
+        logged: dict[str, float] = {}
+        for name in due:
+            metrics = self._evaluators.get(name).evaluate()
+            logged |= {f"{tagged('Evaluation', name)}/{metric}": value for metric, value in metrics.items()}
+            row = {**when, **metrics, "critic_gradient_norm": losses["critic_gradient_norm"]}
+            assert self.log_dir is not None  # there is a writer only where something is kept
+            try:
+                append_row(evaluations_file(Path(self.log_dir), name), row)
+            except UserError as error:  # training goes on: what is learned is worth more
+                print(f"Warning: an evaluation is not kept: {error}.", file=sys.stderr)
         return {**logged, "Perf/evaluation_time": time.perf_counter() - start}
-
-    def _make_evaluator(self) -> TrainingEvaluator:
-        """Build what evaluates the policy."""
-        seed = self.cfg["seed"] + EVALUATION_SEED
-        return TrainingEvaluator(self.env, self.alg.actor, self.cfg["evaluation"], seed)
 
     def _prepare_log(self, start_it: int, total_it: int, times: dict, losses: dict, measured: dict) -> None:
         """Read the numbers of one iteration from the device, for :meth:`_write_log`."""
@@ -320,7 +310,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         """
         mine = {
             "worlds": pack(world_tensors(self.env), self.env.num_envs),
-            "evaluation": self._evaluator and self._evaluator.state(),
+            **self._evaluators.state(),
             "returns": torch.tensor(self.logger.rewbuffer, dtype=torch.float64),
             "lengths": torch.tensor(self.logger.lenbuffer, dtype=torch.float64),
         }
@@ -342,9 +332,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             if len(processes) != self.gpu_world_size:
                 raise UserError(f"{len(processes)} processes have trained, now there are {self.gpu_world_size}")
             mine = processes[self.gpu_global_rank]
-            if mine["evaluation"]:
-                self._evaluator = self._make_evaluator()
-                self._evaluator.load_state(mine["evaluation"])
+            self._evaluators.load_state(mine)
             unpack(mine["worlds"], world_tensors(self.env), self.env.num_envs)
             self.logger.rewbuffer.extend(mine["returns"].tolist())
             self.logger.lenbuffer.extend(mine["lengths"].tolist())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import re
 import shutil
@@ -42,6 +43,20 @@ def write_whole(file: Path, content: bytes) -> None:
             os.replace(part, file)
         finally:
             part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def held(lock: Path) -> Iterator[None]:
+    """Hold a lock file, which exists meanwhile, when others have let it go; a UserError if it cannot be written."""
+    with told_by_name(lock):
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        stream = lock.open("ab")
+    with stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
 
 
 def remove_stale_parts(folder: Path) -> None:

@@ -42,6 +42,12 @@ class Metric:
         """The title with the unit."""
         return f"{self.title} [{self.unit.replace('^2', '²')}]" if self.unit else self.title
 
+    def gain(self, value: float, other: float) -> float:
+        """Return by how much a value is better than another one; negative if it is worse."""
+        if self.lower_is_better is None:
+            raise ValueError(f"neither direction of {self.name} is better")
+        return other - value if self.lower_is_better else value - other
+
 
 METRICS = (
     Metric("track_percentage", "", "Track % [share]", False, in_paper=True),  # the paper prints 0.76, not 76

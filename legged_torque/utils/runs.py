@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib.metadata
 import itertools
+import math
 import platform
 from datetime import datetime
 from pathlib import Path
@@ -17,6 +18,7 @@ from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.files import is_whole_archive, part_of, remove_stale_parts, told_by_name, write_whole
 
 CONFIG_FILE = "config.yaml"
+EVALUATIONS_FILE = "evaluations.csv"  # a row per evaluation during training
 _CHECKPOINT = "model_"
 _PACKAGES = ("legged_torque", "torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib", "numpy")
 
@@ -44,6 +46,17 @@ def claim_run_dir(run_dir: Path, config: dict[str, Any]) -> Path:
                     raise
                 candidate = run_dir.with_name(f"{run_dir.name}_{number}")
     raise AssertionError("there is always another number")
+
+
+def tagged(word: str, name: str) -> str:
+    """Return a word for something that may have a name: ``<word>_<name>``, or the word alone without one."""
+    return f"{word}_{name}" if name else word
+
+
+def evaluations_file(run_dir: Path, environment: str = "") -> Path:
+    """Return the file of a run's evaluations while it trained, or of those in one of ``evaluation.also``."""
+    file = run_dir / EVALUATIONS_FILE
+    return file.with_stem(tagged(file.stem, environment))
 
 
 def find_run(log_root: Path, load_run: str | None) -> Path:
@@ -119,6 +132,16 @@ def load_config(run_dir: Path) -> dict[str, Any]:
     if not text.endswith("\n...\n") if text.startswith("---") else not isinstance(config.get("versions"), dict):
         raise UserError(f"'{file}' is not whole: its end is missing")
     return config
+
+
+def steps_per_iteration(config: dict[str, Any]) -> int | None:
+    """Return how many steps of all worlds an iteration of a run takes, by its settings; None if they do not say."""
+    try:
+        rollout = config["env"]["env"]["num_envs"], config["train"]["runner"]["num_steps_per_env"]
+    except (KeyError, TypeError):
+        return None
+    factors = (*rollout, config.get("processes", 1))
+    return math.prod(factors) if all(type(factor) is int for factor in factors) else None
 
 
 def package_versions() -> dict[str, str]:

@@ -264,6 +264,8 @@ class LeggedRobotCfgPPO(BaseConfig):
         num_samples: Count = 32_000  # world steps of one evaluation: the paper's 16 worlds x 2000 steps
         num_envs: Worlds = 4000  # worlds, at most as many as train
         perturbation: str = ""  # environment, one of ``perturbations``; empty: that of the training
+        also: list[str] = []  # further environments, measured in worlds of their own into evaluations_<name>.csv
+        also_from: Number = 90_000_000  # environment steps from which those are measured, as in the paper's Table I
 
     class pretraining:  # a policy that is made by supervision before training starts, and from which it starts
         function: str = ""  # what makes it: "module:function"; empty: training starts from random networks

@@ -1,0 +1,44 @@
+"""NVIDIA's Multi-Process Service (MPS): processes that share a GPU run their kernels at once instead of in turns."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterator
+
+from legged_torque.utils.errors import UserError
+
+PROGRAM = "nvidia-cuda-mps-control"
+FOLDERS = ("CUDA_MPS_PIPE_DIRECTORY", "CUDA_MPS_LOG_DIRECTORY")
+
+
+@contextlib.contextmanager
+def multi_process_service() -> Iterator[None]:
+    """Let processes that start while this context is open share GPUs by a service of their own.
+
+    A UserError if this machine has none.
+    """
+    with tempfile.TemporaryDirectory(prefix="mps-") as folder:
+        before = {name: os.environ.get(name) for name in FOLDERS}
+        os.environ |= dict.fromkeys(FOLDERS, folder)
+        try:
+            control(["-d"])
+            try:
+                yield
+            finally:
+                control([], "quit\n")
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def control(arguments: list[str], commands: str = "") -> None:
+    """Call NVIDIA's program; a UserError if it is missing or refuses."""
+    try:
+        subprocess.run([PROGRAM, *arguments], input=commands, text=True, capture_output=True, check=True)
+    except FileNotFoundError:
+        raise UserError(f"--mps needs the program {PROGRAM}, which comes with NVIDIA's driver") from None
+    except subprocess.CalledProcessError as error:
+        raise UserError(f"--mps: {PROGRAM} says: {(error.stderr or error.stdout).strip()}") from None
