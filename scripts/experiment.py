@@ -70,8 +70,7 @@ def make_launcher(args: argparse.Namespace) -> Launcher:
         raise unknown_name("launcher", args.launcher, ["local", "ray"])
     if args.address:
         raise UserError("--address is that of a Ray cluster: give --launcher ray as well")
-    jobs = args.jobs or (MPS_JOBS if args.mps else None)
-    return LocalLauncher(args.device, jobs)
+    return LocalLauncher(args.device, MPS_JOBS if args.mps and args.jobs is None else args.jobs)
 
 
 if __name__ == "__main__":

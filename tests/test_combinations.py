@@ -286,7 +286,7 @@ def test_two_rates_are_the_same_per_second():
 def test_two_rates_resumed(tmp_path):
     """Held actions go on: three iterations and one more are four, to the bit, in the middle of intervals."""
     words = [f"--task={TWO_RATES}", "--set=runner.num_steps_per_env=3", "--set=env.history_length=1"]
-    words += ["--set=evaluation.interval=0"]
+    words += ["--set=evaluation.interval=0", "--set=algorithm.annealing_start=1"]
     whole, part = (train(tmp_path / name, count, *words) for name, count in (("whole", 4), ("part", 3)))
     assert (part.env.episode_length_buf % INTERVAL != 0).any()
     resumed = start(tmp_path / "resumed", *words, "--resume", f"--load_run={part.log_dir}")

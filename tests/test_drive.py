@@ -243,7 +243,7 @@ class WeakInKernel(IdealMotors):
 def test_motors(make_task, monkeypatch, motors, launch):
     """Motors act as their own method or function says; one that lacks a function takes the task to torch."""
     monkeypatch.setitem(MOTORS, "weak", motors)
-    task = make_task("a1_torque", 2, **HIGH_UP, **{"motors.model": "weak"})
+    task = make_task("a1_torque", 2, **HIGH_UP, **{"motors.model": "weak", "control.torque_scale": 4.0})
     notes = launches(task)
     task.step(torch.full((2, 12), 3.0))
     assert set(notes) == {launch} and (task.torques == 6.0).all()
