@@ -136,6 +136,7 @@ def test_training_does_not_notice(make_runner):
     results, rows = [], []
     for interval, also in ((0, []), (16, []), (16, ["high"])):
         settings = {"evaluation.interval": interval, "evaluation.also": also, "evaluation.also_from": 32}
+        settings["runner.run_name"] = f"run_{len(rows)}"  # folders that are not the same in the same second
         runner = make_runner("a1_torque_multihead", 3, perturbation="low", **settings)
         torch.manual_seed(5)
         runner.learn(3)

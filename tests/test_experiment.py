@@ -144,7 +144,7 @@ def test_what_is_done_is_not_done_again(finished, tmp_path):
     assert " of CPU time for training; 640 steps of training, " in spent
 
 
-@pytest.mark.parametrize("name", ["paper", "low", "smoke"])
+@pytest.mark.parametrize("name", ["paper", "hard", "low", "smoke"])
 def test_dry_run(name, tmp_path):
     """The experiments of this repository are valid; ``--dry-run`` lists their cells and touches nothing."""
     out = tmp_path / "out"

@@ -27,6 +27,7 @@ from legged_torque.experiments.results import (
     compare,
     is_of_paper,
 )
+from legged_torque.experiments.times import add_up, describe, read_times
 from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import Metric
@@ -252,14 +253,15 @@ def setup_blocks(experiment: Experiment, from_step: float, out: Path) -> list[Bl
 
 
 def time_texts(experiment: Experiment) -> list[str]:
-    """Return how long training took, if it is known."""
+    """Return how long training took, and how much time of devices the experiment, as far as it is known."""
     ends = [run.rows[-1] for run in experiment.runs if run.rows and run.rows[-1]["seconds"] > 0.0]
-    if not ends:
-        return []
-    seconds, steps = sum(row["seconds"] for row in ends), sum(row["steps"] for row in ends)
-    text = f"{len(ends)} trainings took {timedelta(seconds=round(seconds))} in all, with their evaluations: "
-    text += f"{seconds / len(ends):.4g} s and {steps / seconds / MILLION:.3g} million steps/s each on average"
-    return [f"{text}. Those that share a device are slower."]
+    texts = [describe(add_up(read_times(run.cell.folder) for run in experiment.runs))]
+    if ends:
+        seconds, steps = (sum(row[name] for row in ends) for name in ("seconds", "steps"))
+        text = f"{len(ends)} trainings took {timedelta(seconds=round(seconds))} in all, with their evaluations: "
+        text += f"{seconds / len(ends):.4g} s and {steps / seconds / MILLION:.3g} million steps/s each on average"
+        texts.append(f"{text}; those that shared a device were slower for it")
+    return [text for text in texts if text]
 
 
 def settings_blocks(experiment: Experiment) -> list[Block]:
