@@ -151,9 +151,8 @@ def test_dry_run(name, tmp_path):
     file = ROOT / "experiments" / f"{name}.yaml"
     status, output, error = experiment_here(file, f"--out={out}", "--dry-run", "--device=cpu", tmp_path=tmp_path)
     assert (status, error) == (0, "") and not out.exists()
-    assert len(output.splitlines()) == {"paper": 84, "low": 12, "smoke": 2}[name]
-    where = "low" if name == "paper" else "low, high"
-    assert output.splitlines()[0] == f"a1_position-low-s1: train, evaluate in {where}"
+    assert len(output.splitlines()) == {"paper": 84, "hard": 28, "low": 12, "smoke": 2}[name]
+    assert output.splitlines()[0].startswith("a1_position-low-s1: train, evaluate in low")
     assert ("a1_multihead-high_frequency-s4: train, evaluate in high_frequency, doubled" in output) == (name == "paper")
 
 
