@@ -306,6 +306,9 @@ class LeggedRobotCfgPPO(BaseConfig):
         desired_kl: Positive = 0.02  # of the policy before and after an update
         max_learning_rate: Fraction = 1e-2  # upper bound of an adaptive learning rate
         annealing_start: Share = 0.5  # of the training; then the rate (or desired_kl) and the entropy bonus fall to 0
+        advantage_epsilon: Positive = (
+            1e-8  # added to the standard deviation of advantages: larger damps noise without reward
+        )
         use_clipped_value_loss: bool = True  # whether value changes are clipped too
         use_mixed_precision: bool = True  # on a GPU with Triton, matrix products of bfloat16 numbers instead of TF32
 

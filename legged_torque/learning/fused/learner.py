@@ -115,8 +115,7 @@ class FusedLearner:
             storage.rewards, storage.dones, storage.values, last_values, storage.returns, storage.advantages,
             storage.num_transitions_per_env, storage.num_envs, alg.gamma, alg.lam, WORLDS=GAE_WORLDS, num_warps=2,
         )  # fmt: skip
-        advantages = storage.advantages
-        advantages.copy_((advantages - advantages.mean()) / (advantages.std() + 1e-8))
+        alg.normalize(storage.advantages)
 
     def action_std(self) -> Tensor:
         """Return the standard deviations of actions when they were last sampled. Shape: (num_actions,)."""
