@@ -55,8 +55,10 @@ class OnDevicePPO(PPO):
         advantage_epsilon: float = 1e-8,
         **kwargs,
     ) -> None:
-        """Create the algorithm. Arguments are rsl_rl's, an upper bound of the adaptive learning rate, :meth:`anneal`'s,
-        and what is added to the standard deviation of advantages before they are divided by it.
+        """Create the algorithm.
+
+        Arguments are rsl_rl's, an upper bound of the adaptive learning rate, that of :meth:`anneal`, and what is added
+        to the standard deviation of advantages before they are divided by it.
         """
         if optimizer not in ("adam", "adamw"):  # of these torch can skip a step on the device
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
