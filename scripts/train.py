@@ -1,6 +1,7 @@
 """Train a policy: ``python scripts/train.py --task=a1_torque_multihead``.
 
-On several GPUs of a machine: ``torchrun --standalone --nproc_per_node=2 scripts/train.py --task=a1_torque_multihead``.
+On several GPUs of a machine: ``torchrun --standalone --nproc_per_node=2 scripts/train.py --task=a1_torque_multihead``;
+on several machines: docs/howto/cluster.md.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from legged_torque.envs import task_registry
 from legged_torque.utils import distributed
 from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of
 from legged_torque.utils.cli import check_output, importing, run_script
-from legged_torque.utils.config import to_dict
+from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.options import DEFAULT_PRESET, Options
-from legged_torque.utils.runs import CONFIG_FILE, new_run_dir
+from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, package_versions
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, set_seed
 
 if TYPE_CHECKING:
@@ -44,6 +45,10 @@ def main() -> None:
         if options.preset:
             raise UserError("--preset cannot be given with --resume, which keeps the settings of the run")
         with importing():
+            if distributed.world_size() > 1:
+                from legged_torque.learning.run_of_first import take_run_of_first
+
+                take_run_of_first(options)
             run = task_registry.load_run(options)
         env_cfg, train_cfg = run.env_cfg, run.train_cfg
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
@@ -54,7 +59,8 @@ def main() -> None:
         with importing():
             env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     folder = experiment_dir(train_cfg, options.log_root)
-    check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)
+    if distributed.rank() == 0:  # the others write nothing
+        check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)
     with importing():
         from legged_torque.utils.progress import CompileProgress
     set_seed(train_cfg.seed)
@@ -76,6 +82,8 @@ def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
     if starts_pretrained:
         start_from(runner, pretrained)  # the other processes get the networks of the first one
     total = options.max_iterations or num_iterations(env, train_cfg)
+    settings = {"env": to_dict(env_cfg), "train": to_dict(train_cfg), "version": package_versions()}
+    distributed.check_same(flat({**settings, "task": options.task, "max_iterations": total}))
     remaining = total - runner.current_learning_iteration
     if remaining < 1:
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -18,11 +19,13 @@ from settings import error_of, parse
 from test_ppo import make_ppo, record_rollout, state_of
 from test_random_stream import upcoming
 
+from legged_torque.checks.reproducible import equal, values
 from legged_torque.envs import task_registry
 from legged_torque.learning.guard import PATIENCE
 from legged_torque.utils import distributed
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import TrainingError
+from legged_torque.utils.runs import checkpoint_number, find_checkpoint
 from legged_torque.utils.task_registry import num_iterations, set_seed
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -30,6 +33,7 @@ WORLDS, STEPS = 2, 4
 ALL_STEPS = 2 * WORLDS * STEPS
 """Environment steps of an iteration of both processes."""
 SMALL = [f"--num_envs={WORLDS}", f"--set=runner.num_steps_per_env={STEPS}", "--set=algorithm.num_mini_batches=2"]
+SCRIPT = ["--task=a1_position", "--device=cpu", "--logger=none", "--set=runner.save_interval=20", *SMALL]
 FORMULA = {"num_mini_batches": 1, "schedule": "adaptive", "max_grad_norm": 1e6, "learning_rate": 1e-3}
 MULTI_GPU = {"world_size": 2, "local_rank": 0}
 
@@ -135,10 +139,10 @@ def main(folder):
 # --------------------------------------------------------------------------------------------------- the tests
 
 
-def torchrun(*words):
-    """Start two processes that find each other."""
+def torchrun(*words, launch=("--standalone", "--nproc_per_node=2")):
+    """Start processes that find each other, two on this machine unless ``launch`` says otherwise."""
     environment = os.environ | {"PYTHONUNBUFFERED": "1", "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", *map(str, words)]
+    command = [sys.executable, "-m", "torch.distributed.run", *launch, *map(str, words)]
     return subprocess.Popen(
         command, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
     )
@@ -278,26 +282,57 @@ def test_bad_numbers_in_one_process_are_skipped_by_both(together):
         assert same(before, after)
 
 
-def test_train_script_in_two_processes(tmp_path):
-    """One folder, one set of prints, and Ctrl-C saves the iteration that both have finished."""
-    words = ["--task=a1_position", "--device=cpu", f"--log_root={tmp_path}", "--logger=none", *SMALL]
-    with torchrun(ROOT / "scripts" / "train.py", *words, "--max_iterations=100000") as process:
-        output = ""
+@pytest.fixture(scope="module")
+def script(tmp_path_factory):
+    """A run of train.py that Ctrl-C has ended, the run as it was at iteration 20, and what was printed."""
+    folder, output = tmp_path_factory.mktemp("script"), ""
+    with torchrun(ROOT / "scripts" / "train.py", *SCRIPT, f"--log_root={folder}", "--max_iterations=100000") as process:
         for line in process.stdout:
             output += line
-            if "Learning iteration 2/" in line:
+            if "Learning iteration 20/" in line:
+                (run,) = (folder / "a1_position").iterdir()
+                kept = shutil.copytree(run, folder / "kept" / "a1_position" / run.name)
                 process.send_signal(signal.SIGINT)
                 break
         output += process.communicate(timeout=120)[0]
-    (run,) = (tmp_path / "a1_position").iterdir()
-    (checkpoint,) = run.glob("model_*")
-    count = int(checkpoint.stem.removeprefix("model_"))
+    return run, kept, output
+
+
+def test_train_script_in_two_processes(script):
+    """One folder, one set of prints, and Ctrl-C saves the iteration that both have finished."""
+    run, _, output = script
+    checkpoint = find_checkpoint(run, None)
+    count = checkpoint_number(checkpoint)
     state = torch.load(checkpoint, weights_only=True)
     config = yaml.safe_load((run / "config.yaml").read_text())
-    assert count >= 3 and state["infos"]["total_timesteps"] == count * ALL_STEPS
+    assert count > 20 and state["infos"]["total_timesteps"] == count * ALL_STEPS
     assert config["processes"] == 2 and config["env"]["env"]["num_envs"] == WORLDS
     assert output.count("Training a1_position on 2 x CPU") == output.count("Learning iteration 1/") == 1
     assert f"{2 * WORLDS} worlds" in output and output.count(f"The run is in {run}") == 1
+
+
+def test_two_machines_without_shared_files(script, tmp_path):
+    """A process on each goes on from the run that the first has; they learn what two on one machine do, bit by bit."""
+    run, kept, _ = script
+    checkpoint = find_checkpoint(run, None)
+    shutil.copytree(kept.parents[1], tmp_path / "0")
+    (tmp_path / "1").mkdir()
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    master = ("--nnodes=2", "--nproc_per_node=1", "--master_addr=127.0.0.1", f"--master_port={port}")
+    words = [ROOT / "scripts" / "train.py", *SCRIPT, f"--max_iterations={checkpoint_number(checkpoint)}", "--resume"]
+    both = [
+        torchrun(*words, f"--log_root={tmp_path / str(node)}", launch=(*master, f"--node_rank={node}"))
+        for node in range(2)
+    ]
+    outputs = [process.communicate(timeout=120)[0] for process in both]
+    assert [process.returncode for process in both] == [0, 0], outputs
+    assert "Training a1_position on 2 x CPU" in outputs[0] and "start anew" not in outputs[0]
+    assert "Learning iteration" not in outputs[1] and not list((tmp_path / "1").iterdir())
+    (resumed,) = (path for path in (tmp_path / "0" / "a1_position").iterdir() if path.name != kept.name)
+    one, other = (dict(values(torch.load(file, weights_only=True))) for file in (checkpoint, resumed / checkpoint.name))
+    assert one.keys() == other.keys() and not [name for name in one if not equal(one[name], other[name])]
 
 
 # --------------------------------------------------------------------------------------------------- without processes
@@ -339,6 +374,28 @@ def test_processes_that_torchrun_has_not_started(second_of_two):
     """A stray WORLD_SIZE is told in one line."""
     second_of_two.delenv("MASTER_ADDR", raising=False)
     assert error_of(distributed.join, "cpu").startswith("WORLD_SIZE is 2, but torchrun has not started this process")
+
+
+def test_processes_that_do_not_meet(second_of_two):
+    """Where the first process should be nobody answers: one line, no traceback."""
+    second_of_two.setenv("MASTER_ADDR", "127.0.0.1")
+    second_of_two.setenv("MASTER_PORT", "1")
+
+    def give_up(*_args, **_kwargs):
+        raise torch.distributed.DistNetworkError("The client socket has timed out\nwith a trace")
+
+    second_of_two.setattr(torch.distributed, "init_process_group", give_up)  # minutes later
+    line = error_of(distributed.join, "cpu")
+    assert line == "the 2 processes do not find each other: The client socket has timed out"
+
+
+def test_processes_with_other_settings(second_of_two):
+    """The first setting that differs is told."""
+    second_of_two.setattr(distributed, "gather", lambda mine: [mine, {**mine, "env.env.num_envs": 3}])
+    line = error_of(distributed.check_same, {"task": "t", "env.env.num_envs": 2})
+    assert line.endswith("must have the same settings: env.env.num_envs is 3 in process 1, but 2 in the first one")
+    second_of_two.setattr(distributed, "gather", lambda mine: [mine, dict(mine)])
+    distributed.check_same({"task": "t", "weight": float("nan")})
 
 
 def test_one_process_asks_nobody():

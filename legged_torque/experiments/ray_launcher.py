@@ -37,7 +37,8 @@ class RayLauncher:
         if device not in ("auto", "cuda", "cpu"):
             raise UserError(f"on a cluster, --device must be auto, cuda or cpu, not '{device}': Ray chooses the GPUs")
         try:
-            ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
+            if not ray.is_initialized():
+                ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
         except (ConnectionError, RuntimeError, ValueError) as error:
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
             hint = "start one with 'ray start --head'"

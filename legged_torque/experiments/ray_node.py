@@ -144,8 +144,9 @@ def write_files(root: Path, files: Files) -> None:
 def versions_here() -> dict[str, str]:
     """Return what must be the same on all machines: versions of packages, and a digest of this package's code."""
     digest = hashlib.sha256()
-    folder = Path(legged_torque.__file__).parent
-    for file in sorted([*folder.rglob("*.py"), *legged_torque.SCRIPTS_DIR.glob("*.py")]):
+    folder, scripts = Path(legged_torque.__file__).parent, legged_torque.SCRIPTS_DIR
+    package = [file for file in sorted(folder.rglob("*.py")) if scripts not in file.parents]  # a wheel holds both
+    for file in (*package, *sorted(scripts.glob("*.py"))):
         digest.update(file.read_bytes())
     return {**package_versions(), "code of legged_torque": digest.hexdigest()[:12]}
 

@@ -52,6 +52,9 @@ def join(device: str) -> None:
         torch.distributed.init_process_group("nccl" if torch.device(device).type == "cuda" else "gloo")
     except ValueError as error:  # an environment variable that torchrun sets is missing
         raise UserError(f"WORLD_SIZE is {world_size()}, but torchrun has not started this process: {error}") from None
+    except torch.distributed.DistError as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise UserError(f"the {world_size()} processes do not find each other: {reason}") from None
 
 
 def average(tensors: list[Tensor]) -> None:
@@ -85,3 +88,22 @@ def gather(value: Any) -> list[Any]:
     values: list[Any] = [None] * torch.distributed.get_world_size()
     torch.distributed.all_gather_object(values, value)
     return values
+
+
+def from_first(value: Any, device: str) -> Any:
+    """Return the value of the first process in all of them, sent between devices ("cpu", "cuda:N")."""
+    import torch
+
+    values = [value]
+    torch.distributed.broadcast_object_list(values, src=0, device=torch.device(device))
+    return values[0]
+
+
+def check_same(settings: dict[str, Any]) -> None:
+    """Refuse, by UserError, what is not the same in all processes: each machine has its own command line and files."""
+    first, *others = gather(settings)
+    for number, other in enumerate(others, 1):
+        for name in sorted(first.keys() | other.keys()):
+            if repr(first.get(name)) != repr(other.get(name)):
+                values = f"{other.get(name)} in process {number}, but {first.get(name)} in the first one"
+                raise UserError(f"processes that train together must have the same settings: {name} is {values}")

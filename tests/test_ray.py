@@ -1,0 +1,201 @@
+"""Experiments on a Ray cluster of two machines, here two nodes on one, with small stand-ins for the scripts."""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+from settings import error_of
+from test_experiment import SMALL, experiment_here, wait_for, write
+from test_scripts import ROOT, assert_told_in_one_line
+
+ray = pytest.importorskip("ray", reason="needs the extra: pip install -e .[ray]")
+
+import legged_torque
+from legged_torque.experiments import matrix, ray_launcher
+from legged_torque.experiments.ray_node import difference, versions_here, write_files
+
+TRAIN = """
+import os, signal, sys, time, zipfile
+from pathlib import Path
+options = dict(word.lstrip("-").partition("=")[::2] for word in sys.argv[1:])
+cell, here = Path(options["log_root"]) / options["experiment_name"], Path(__file__).parent
+runs = sorted(cell.glob("run_*"))
+done = max(int(file.stem[6:]) for file in runs[-1].glob("model_*")) if "resume" in options else 0
+with open(here / "order", "a") as order:
+    order.write(f"{cell.name} {done} {os.getppid()}\\n")
+run = cell / f"run_{int(runs[-1].name[4:]) + 1 if runs else 0}"
+run.mkdir(parents=True)
+(run / "config.yaml").write_text("{task: t, env: {}, train: {}, max_iterations: 4, versions: {}}")
+stopped = []
+signal.signal(signal.SIGTERM, lambda *_: stopped.append(1))
+while done < 4 and not stopped:
+    print(f"Learning iteration {done}/4", flush=True)
+    done += 1
+    if done == 3:
+        zipfile.ZipFile(run / "model_2.pt", "w").close()
+    while done == 3 and (here / "wait").exists() and not stopped:
+        time.sleep(0.02)
+zipfile.ZipFile(run / f"model_{done}.pt", "w").close()
+"""
+
+EVALUATE = """
+import json, sys
+from pathlib import Path
+options = dict(word.lstrip("-").partition("=")[::2] for word in sys.argv[1:])
+Path(options["json"]).write_text(json.dumps({"of": options["experiment_name"], "in": options["perturbation"]}))
+"""
+FAST = {
+    "health_check_initial_delay_ms": 0,
+    "health_check_period_ms": 200,
+    "health_check_timeout_ms": 1000,
+    "health_check_failure_threshold": 2,
+}
+"""How soon Ray notices that a machine is gone."""
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory):
+    """A copy of the package, which the machines use, and stand-ins for the scripts beside it."""
+    stage = tmp_path_factory.mktemp("stage")
+    shutil.copytree(ROOT / "legged_torque", stage / "legged_torque", ignore=shutil.ignore_patterns("__pycache__"))
+    (stage / "scripts").mkdir()
+    for name, text in {"train.py": TRAIN, "evaluate.py": EVALUATE, "order": ""}.items():
+        (stage / "scripts" / name).write_text(text)
+    return stage
+
+
+@pytest.fixture(scope="module")
+def cluster(stage):
+    """A cluster of two machines with a core each, and a head without one."""
+    from ray.cluster_utils import Cluster
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_AUTH_MODE", "disabled")  # which would write a token into the home folder
+        patch.setenv("PYTHONPATH", str(stage))
+        head = {"num_cpus": 0, "include_dashboard": False, "_system_config": FAST}
+        cluster = Cluster(initialize_head=True, head_node_args=head)
+        for _ in range(2):
+            cluster.add_node(num_cpus=1)
+        yield cluster
+        ray.shutdown()
+        cluster.shutdown()
+
+
+@pytest.fixture
+def here(stage, cluster, monkeypatch, tmp_path):
+    """Run an experiment of two cells on the cluster, with the stand-ins."""
+    monkeypatch.setattr(matrix, "SCRIPTS_DIR", stage / "scripts")
+    monkeypatch.setattr(legged_torque, "SCRIPTS_DIR", stage / "scripts")
+    monkeypatch.setattr(ray_launcher, "SEND_EVERY", 0.0)
+    (stage / "scripts" / "order").write_text("")
+    file = write(tmp_path / "m.yaml", SMALL | {"environments": {"low": ["low"]}})
+    words = [file, f"--out={tmp_path / 'out'}", "--device=cpu", "--launcher=ray", f"--address={cluster.address}"]
+    return lambda *more: experiment_here(*words, *more, tmp_path=tmp_path)
+
+
+def order(stage):
+    """The trainings that were started: cell, iterations before, process that started it."""
+    return [line.split() for line in (stage / "scripts" / "order").read_text().splitlines()]
+
+
+def node_of(cluster, process):
+    """The node that a process, started by one of its own, belongs to."""
+    nodes = {node.all_processes["raylet"][0].process.pid: node for node in cluster.worker_nodes}
+    while process not in nodes:
+        process = int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+    return nodes[process]
+
+
+def during(stage, act):
+    """Do something while both trainings wait in their third iteration, in a thread of its own."""
+    (stage / "scripts" / "wait").touch()
+    thread = threading.Thread(target=act)
+    thread.start()
+    return thread
+
+
+def test_stop(here, stage, tmp_path):
+    """Trainings save, their checkpoints come home, and the next call goes on from there."""
+    out = tmp_path / "out"
+    logs = [out / f"{task}-low-s1" / "train.log" for task in SMALL["tasks"]]
+
+    def stop():
+        """Ask to stop when both are under way."""
+        wait_for(lambda: all(log.is_file() and "iteration 2/4" in log.read_text() for log in logs), 30)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    thread = during(stage, stop)
+    status, output, error = here()
+    thread.join()
+    assert (status, error) == (130, "interrupted\n"), output
+    assert [max(path.name for path in log.parent.glob("run_0/model_*")) for log in logs] == ["model_3.pt"] * 2
+    (stage / "scripts" / "wait").unlink()
+    status, output, error = here()
+    assert (status, error) == (0, "") and output.endswith("2 of 2 cells are done.\n")
+    assert sorted(done for _, done, _ in order(stage)) == ["0", "0", "3", "3"]
+
+
+def test_a_machine_is_killed(here, stage, cluster, tmp_path):
+    """The training that it ran goes on elsewhere from its last checkpoint; nothing else is done again."""
+    out, lost = tmp_path / "out", SMALL["tasks"][0] + "-low-s1"
+
+    def kill():
+        """Kill the machine of the first cell when a checkpoint of its training has come home; let the other go on."""
+        wait_for((out / lost / "run_0" / "model_2.pt").is_file, 30)
+        (process,) = (int(process) for cell, _, process in order(stage) if cell == lost)
+        cluster.remove_node(node_of(cluster, process), allow_graceful=False)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)  # all that runs on a machine goes with it
+        (stage / "scripts" / "wait").unlink()
+
+    thread = during(stage, kill)
+    status, output, error = here()
+    thread.join()
+    assert (status, error) == (0, ""), output + error
+    assert f"{lost}: the machine was lost during training; it will be tried again | " in output
+    trained = [(cell, done) for cell, done, _ in order(stage)]
+    other = SMALL["tasks"][1] + "-low-s1"
+    assert sorted(trained) == [(lost, "0"), (lost, "2"), (other, "0")]
+    for cell in (lost, other):
+        assert json.loads((out / cell / "result_low.json").read_text()) == {"of": cell, "in": "low"}
+        assert (out / cell / ("run_1" if cell == lost else "run_0") / "model_4.pt").is_file()
+        assert json.loads((out / cell / "times.json").read_text())["seconds"]["cpu training"] > 0.0
+    names = {path.name for cell in (lost, other) for path in (out / cell).iterdir()}
+    assert names == {"run_0", "run_1", "lock", "train.log", "evaluate.log", "times.json", "result_low.json"}
+
+
+def test_other_code_is_refused(here, monkeypatch, tmp_path):
+    """A machine with other code than this one's is told by name, and nothing is trained."""
+    monkeypatch.setattr(legged_torque, "SCRIPTS_DIR", ROOT / "scripts")
+    assert_told_in_one_line(here(), "code of legged_torque")
+    assert not list(tmp_path.glob("out/*/run_*"))
+
+
+def test_mistakes(here, tmp_path):
+    """They are told in one line."""
+    assert_told_in_one_line(here("--jobs=2"), "--jobs is for GPUs on a cluster")
+    assert_told_in_one_line(here("--device=cuda:0"), "--device must be auto, cuda or cpu, not 'cuda:0'")
+    assert_told_in_one_line(here("--device=cuda"), "has no GPU")
+    assert_told_in_one_line(here("--launcher=slurm"), "unknown launcher 'slurm'")
+    assert_told_in_one_line(here("--launcher=local"), "--address is that of a Ray cluster")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["../x", "/tmp/x", "a/../../x", "", "a\0b"])
+def test_files_stay_in_their_folder(name, tmp_path):
+    """What a machine sends is written below the folder of the results, or not at all."""
+    folder = tmp_path / "out"
+    assert "would be written to" in error_of(write_files, folder, {"good": b"1", name: b"2"})
+    assert not list(tmp_path.iterdir())
+
+
+def test_versions():
+    """The first difference is told; a file of code that changes is one."""
+    here = versions_here()
+    assert not difference("m", here, dict(here)) and {"torch", "mujoco-warp", "code of legged_torque"} <= here.keys()
+    assert difference("m", here, here | {"torch": "1"}) == f"the machine m has torch 1, this one has {here['torch']}"
