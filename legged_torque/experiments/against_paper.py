@@ -53,7 +53,7 @@ def best_torque(table: Table) -> list[Block]:
     texts = (
         f"**In {reached} of {len(rows)} rows the best torque method is better than the paper's best by {TARGET:.0%} or",
         f"more** ({BETTER}; {WITHIN}: better by less, {WORSE}: not better). Torque methods are all tasks but",
-        f"{', '.join(f'`{task}`' for task in POSITION_TASKS)}; the best of them has the best mean. Positive percentages",
+        f"{', '.join(f'`{task}`' for task in POSITION_TASKS)}; the best has the best mean. Positive percentages",
         "are better, whichever direction that is.",
     )
     header = ["metric", "environment", "paper's best", "our best torque method", "ours", "better by"]
