@@ -39,37 +39,40 @@ def count(table: Table) -> str:
             summary = table.get(column, {}).get(task, {}).get(metric.name)
             signs.append(judge(metric, summary, paper).sign if summary else "")
     better, within, worse, missing = (signs.count(sign) for sign in (BETTER, WITHIN, WORSE, ""))
-    text = (
+    good = (
         f"**{better + within} of {len(signs)} numbers are at least as good as the paper's within one standard error**"
     )
-    return f"{text} of ours: {better} are better, {within} within it, {worse} worse, {missing} missing."
+    return f"{good} of ours: {better} are better, {within} within it, {worse} worse, {missing} missing."
 
 
 def best_torque(table: Table) -> list[Block]:
     """Return the best torque method against the paper's best, by metric and environment of training."""
-    rows, reached = [], 0
-    columns = [name for name in ENVIRONMENTS if name != "doubled"]
-    for metric, column in itertools.product(PAPER_METRICS, columns):
-        papers = paper_column(column, metric.name)
-        model = max(papers, key=lambda task: metric.gain(papers[task], 0.0))
-        row = [metric.label, column, f"{papers[model]:.{metric.digits}f} ({MODELS[model]})"]
-        cells = table.get(column, {})
-        task = best_task(cells, metric)
-        if task is None:
-            rows.append([*row, "no data", "", ""])
-            continue
-        summary = cells[task][metric.name]
-        share = judge(metric, summary, papers[model]).share
-        sign = BETTER if share >= TARGET else WITHIN if share > 0.0 else WORSE
-        reached += sign == BETTER
-        rows.append([*row, f"`{task}`", number_text(metric, summary), f"{sign} {share:+.1%}"])
-    text = (
-        f"**In {reached} of {len(rows)} rows the best torque method is better than the paper's best by {TARGET:.0%} or "
+    trained = [name for name in ENVIRONMENTS if name != "doubled"]
+    rows = [best_row(table.get(name, {}), metric, name) for metric, name in itertools.product(PAPER_METRICS, trained)]
+    reached = sum(row[-1].startswith(BETTER) for row in rows)
+    texts = (
+        f"**In {reached} of {len(rows)} rows the best torque method is better than the paper's best by {TARGET:.0%} or",
+        f"more** ({BETTER}; {WITHIN}: better by less, {WORSE}: not better). Torque methods are all tasks but",
+        f"{', '.join(f'`{task}`' for task in POSITION_TASKS)}; the best has the best mean. Positive percentages",
+        "are better, whichever direction that is.",
     )
-    text += f"more** ({BETTER}; {WITHIN}: better by less, {WORSE}: not better). Torque methods are all tasks but "
-    text += f"{', '.join(f'`{task}`' for task in POSITION_TASKS)}; the best is the one with the best mean. Positive "
     header = ["metric", "environment", "paper's best", "our best torque method", "ours", "better by"]
-    return [Paragraph(text + "percentages are better, whichever direction that is."), Grid(header, rows)]
+    return [Paragraph(" ".join(texts)), Grid(header, rows)]
+
+
+def best_row(cells: Cells, metric: Metric, column: str) -> list[str]:
+    """Return the row of :func:`best_torque` for a metric in a column of the table."""
+    papers = paper_column(column, metric.name)
+    model = max(papers, key=lambda task: metric.gain(papers[task], 0.0))
+    row = [metric.label, column, f"{papers[model]:.{metric.digits}f} ({MODELS[model]})"]
+    found = {task: cell[metric.name] for task, cell in cells.items() if metric.name in cell}
+    torque = [task for task in found if task not in POSITION_TASKS]
+    if not torque:
+        return [*row, "no data", "", ""]
+    task = max(torque, key=lambda task: metric.gain(found[task].mean, 0.0))
+    share = judge(metric, found[task], papers[model]).share
+    sign = BETTER if share >= TARGET else WITHIN if share > 0.0 else WORSE
+    return [*row, f"`{task}`", marked(number_text(metric, found[task]), False, found[task]), f"{sign} {share:+.1%}"]
 
 
 def number_text(metric: Metric, summary: Summary) -> str:
@@ -78,8 +81,7 @@ def number_text(metric: Metric, summary: Summary) -> str:
     return f"{summary.mean:.{metric.digits}f}{error} ({len(summary.values)})"
 
 
-def best_task(cells: Cells, metric: Metric) -> str | None:
-    """Return the torque method with the best mean; None without any."""
-    means = {task: cell[metric.name].mean for task, cell in cells.items() if metric.name in cell}
-    torque = [task for task in means if task not in POSITION_TASKS]
-    return max(torque, key=lambda task: metric.gain(means[task], 0.0), default=None)
+def marked(text: str, is_significant: bool, *summaries: Summary) -> str:
+    """Return an entry of a table: bold if it is significant, with a dagger if what it comes from is not final."""
+    text = f"**{text}**" if is_significant else text
+    return text if all(summary.is_final for summary in summaries) else f"{text} †"

@@ -64,7 +64,7 @@ class Cell:
         return evaluations_file(run_dir, "" if environment == self.environment else environment)
 
     def missing(self) -> list[str]:
-        """Return the perturbations without a readable result that a whole training was not evaluated in either."""
+        """Return the perturbations with neither a readable result nor evaluations during a training that is whole."""
         missing = [name for name in self.evaluated_in if not is_json(self.result_file(name))]
         runs = list(self.folder.glob("*/")) if missing else []
         measured = [name for name in missing if any(self.rows_file(run, name).is_file() for run in runs)]

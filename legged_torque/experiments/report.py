@@ -9,7 +9,7 @@ from pathlib import Path
 
 import yaml
 
-from legged_torque.experiments.against_paper import MEANINGS, best_torque, count, judge, number_text
+from legged_torque.experiments.against_paper import MEANINGS, best_torque, count, judge, marked, number_text
 from legged_torque.experiments.blocks import VIDEO_TYPES, Block, Bullets, Code, Grid, Heading, Paragraph, Picture
 from legged_torque.experiments.curves import MILLION
 from legged_torque.experiments.figures import FIGURES, file_name
@@ -22,7 +22,6 @@ from legged_torque.experiments.results import (
     CellResult,
     Cells,
     Experiment,
-    Summary,
     Table,
     compare,
     is_of_paper,
@@ -101,12 +100,6 @@ def run_problems(run: CellResult, from_step: float) -> list[str]:
         elif not run.is_finished(counted[-1]["steps"]):
             problems.append(f"evaluated in {name} after {counted[-1]['steps'] / MILLION:.4g} of {total}")
     return problems
-
-
-def marked(text: str, is_significant: bool, *summaries: Summary) -> str:
-    """Return an entry of a table: bold if it is significant, with a dagger if what it comes from is not final."""
-    text = f"**{text}**" if is_significant else text
-    return text if all(summary.is_final for summary in summaries) else f"{text} †"
 
 
 def number(cells: Cells, task: str, metric: Metric, paper: float | None) -> str:
