@@ -53,8 +53,8 @@ def main() -> None:
 def make_launcher(args: argparse.Namespace) -> Launcher:
     """Return what starts the runs."""
     if args.launcher == "ray":
-        from legged_torque.experiments.ray_launcher import RayLauncher
-
+        with importing():
+            from legged_torque.experiments.ray_launcher import RayLauncher
         return RayLauncher(args.address or "auto", args.device, args.jobs)
     if args.launcher != "local":
         raise unknown_name("launcher", args.launcher, ["local", "ray"])

@@ -183,6 +183,8 @@ def test_mistakes(here, tmp_path):
     assert_told_in_one_line(here("--device=cuda"), "has no GPU")
     assert_told_in_one_line(here("--launcher=slurm"), "unknown launcher 'slurm'")
     assert_told_in_one_line(here("--launcher=local"), "--address is that of a Ray cluster")
+    assert_told_in_one_line(here("--address=nowhere"), "--address must be auto or HOST:PORT, not 'nowhere'")
+    assert_told_in_one_line(here("--address=127.0.0.1:1"), "there is no Ray cluster at address '127.0.0.1:1'")
     assert not (tmp_path / "out").exists()
 
 
