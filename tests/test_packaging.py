@@ -96,6 +96,6 @@ def test_scripts_from_another_directory(installed, tmp_path):
     assert str(installed / "legged_torque" / "resources" / "robots") in walking
     assert "cost_of_transport" in finish(playing)
     finish(experiment)
-    (result,) = (tmp_path / "logs" / "experiments" / "tiny").glob("*/*.json")
+    (result,) = (tmp_path / "logs" / "experiments" / "tiny").glob("*/result_*.json")
     assert result.is_file()
     assert {path.name for path in tmp_path.iterdir()} <= {"tiny.yaml", "logs", "walk.mp4"}
