@@ -74,6 +74,7 @@ def cluster(stage):
     """A cluster of two machines with a core each, and a head without one."""
     from ray.cluster_utils import Cluster
 
+    handler = signal.getsignal(signal.SIGTERM)  # which Ray replaces
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_AUTH_MODE", "disabled")  # which would write a token into the home folder
         patch.setenv("PYTHONPATH", str(stage))
@@ -84,6 +85,7 @@ def cluster(stage):
         yield cluster
         ray.shutdown()
         cluster.shutdown()
+        signal.signal(signal.SIGTERM, handler)
 
 
 @pytest.fixture
