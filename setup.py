@@ -11,7 +11,6 @@ EXPORT = ["onnx>=1.16,<2", "onnxruntime>=1.18,<2", "jsonschema>=4.18,<5"]
 PLOTS = ["matplotlib", "scipy>=1.10,<2"]
 VIDEO = ["imageio", "imageio-ffmpeg", "pillow>=10.1"]
 TRITON = "triton>=3.2; sys_platform == 'linux'"  # torch for a GPU brings its own
-RAY = ["ray>=2.40,<3"]
 TEST = ["pytest", TRITON, "pytest-xdist>=3.6,<4", "setuptools>=77", *PLOTS, *VIDEO, *EXPORT]
 
 setup(
@@ -49,7 +48,7 @@ setup(
         "plots": PLOTS,
         "viewer": ["viser>=1.1,<2", "trimesh>=4.8,<6", "pillow"],
         "wandb": ["wandb"],
-        "ray": RAY,
+        "ray": ["ray>=2.52,<3"],
         "export": EXPORT,
         "test": TEST,
         "dev": ["ruff>=0.17,<0.18", "mypy>=2.4,<2.5", "pre-commit>=4.2,<5", "types-PyYAML"],

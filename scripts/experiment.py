@@ -61,10 +61,10 @@ def main() -> None:
 def make_launcher(args: argparse.Namespace) -> Launcher:
     """Return what starts the runs."""
     if args.launcher == "ray":
-        from legged_torque.experiments.ray_launcher import RayLauncher
-
         if args.mps:
             raise UserError("--mps is for this machine; on a cluster, start the service on each node")
+        with importing():
+            from legged_torque.experiments.ray_launcher import RayLauncher
         return RayLauncher(args.address or "auto", args.device, args.jobs)
     if args.launcher != "local":
         raise unknown_name("launcher", args.launcher, ["local", "ray"])

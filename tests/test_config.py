@@ -108,7 +108,7 @@ def test_set_by_path():
     [
         (["--max_iterations=0"], "--max_iterations must be at least 1, not 0"),
         (["--max_iterations=-1"], "--max_iterations must be at least 1, not -1"),
-        (["--preset=papr"], "unknown preset 'papr'; did you mean 'paper'? allowed: paper, parallel"),
+        (["--preset=papr"], "unknown preset 'papr'; did you mean 'paper'? allowed: paper, parallel, thorough"),
         (["--device=cup"], "unknown device 'cup'; did you mean 'cpu'?"),
         (["--device=cuda:99"], "there is no device 'cuda:99'; available: cpu"),
         (["--num_env=4"], "unknown option '--num_env=4'; did you mean '--num_envs'?"),
@@ -195,6 +195,15 @@ def test_parallel_preset_is_the_default(task):
     }
     assert env_cfg.env.num_envs == 4096
     assert {path: get(train_cfg, path) for path in expected} == expected
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_thorough_preset(task):
+    """Three times the steps, and nothing else."""
+    (env_cfg, train_cfg), thorough = get_cfgs(task=task), get_cfgs("--preset=thorough", task=task)
+    assert thorough[1].runner.total_steps == 3 * train_cfg.runner.total_steps
+    train_cfg.runner.total_steps *= 3
+    assert [to_dict(cfg) for cfg in (env_cfg, train_cfg)] == [to_dict(cfg) for cfg in thorough]
 
 
 LAYERS = [

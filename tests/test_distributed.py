@@ -320,11 +320,16 @@ def test_two_machines_without_shared_files(script, tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    master = ("--nnodes=2", "--nproc_per_node=1", "--master_addr=127.0.0.1", f"--master_port={port}")
+    page = (ROOT / "docs" / "howto" / "cluster.md").read_text()
+    ours = {"--nproc_per_node": 1, "--master_addr": "127.0.0.1", "--master_port": port}
+    launches = []
+    for line in re.findall(r"^torchrun (.+) scripts/train.py", page, flags=re.MULTILINE):  # as they stand there
+        options = dict(word.split("=") for word in line.split())
+        assert ours.keys() < options.keys()
+        launches.append([f"{name}={value}" for name, value in (options | ours).items()])
     words = [ROOT / "scripts" / "train.py", *SCRIPT, f"--max_iterations={checkpoint_number(checkpoint)}", "--resume"]
     both = [
-        torchrun(*words, f"--log_root={tmp_path / str(node)}", launch=(*master, f"--node_rank={node}"))
-        for node in range(2)
+        torchrun(*words, f"--log_root={tmp_path / str(node)}", launch=launch) for node, launch in enumerate(launches)
     ]
     outputs = [process.communicate(timeout=120)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], outputs

@@ -175,10 +175,12 @@ def test_whole_updates_are_those_of_rsl_rl():
 
 
 def test_learning_rate_follows_the_divergence():
-    """As without fused kernels: after the policy has moved far, it falls by 1.5, and its bounds hold."""
-    algorithms = pair(schedule="adaptive", learning_rate=1e-2, desired_kl=0.01)
+    """As without fused kernels: after the policy has moved far, it falls by 1.5, its bounds hold, and it is annealed."""
+    algorithms = pair(schedule="adaptive", learning_rate=1e-2, desired_kl=0.01, annealing_start=0.5)
     for round_number in range(3):
         choose(algorithms, round_number)
+        for alg in algorithms:
+            alg.anneal(0.3 + 0.3 * round_number)
         algorithms[0]._update_minibatch()
         algorithms[1]._update_minibatch()
         assert float(algorithms[1].learning_rate) == pytest.approx(float(algorithms[0].learning_rate), rel=1e-6)

@@ -141,6 +141,31 @@ def test_highest_learning_rate():
         assert float(alg.learning_rate) == pytest.approx(new_rate, rel=1e-6)
 
 
+@pytest.mark.parametrize(("progress", "left"), [(0.0, 1.0), (0.5, 1.0), (0.75, 0.5), (0.9, 0.2)])
+def test_annealing(progress, left):
+    """After half of a training a fixed rate, or the wanted divergence, falls linearly, and so does the entropy's weight."""
+    fixed, adaptive = (make_ppo(schedule=name, annealing_start=0.5, entropy_coef=0.1) for name in ("fixed", "adaptive"))
+    for alg in (fixed, adaptive):
+        record_rollout(alg)
+        full, (_, _, entropy, _) = alg.loss()
+        alg.anneal(progress)
+        assert float(full - alg.loss()[0]) == pytest.approx(-0.1 * (1.0 - left) * float(entropy), abs=1e-5)
+    assert float(fixed.learning_rate) == pytest.approx(left * 1e-3)
+    assert float(fixed.optimizer.param_groups[0]["lr"]) == float(fixed.learning_rate)
+    assert float(adaptive.learning_rate) == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize(("share", "factor"), [(1.0, 1.0), (1 / 3, 1 / 1.5)])
+def test_adaptive_rate_follows_annealing(share, factor):
+    """A divergence that is wanted is too large when a third of it is left to be wanted."""
+    alg = make_ppo(num_mini_batches=1, schedule="adaptive", desired_kl=0.01, annealing_start=0.5, learning_rate=1e-3)
+    record_rollout(alg)
+    shift_policy(alg, 0.05)
+    alg.anneal(1.0 - 0.5 * share * kl_by_hand(alg) / 0.01)
+    alg.update()
+    assert float(alg.learning_rate) == pytest.approx(1e-3 * factor, rel=1e-6)
+
+
 def test_learning_rate_adapts_on_after_loading():
     """A loaded algorithm changes its learning rate, and steps with it, just as the one that was saved."""
     saved, loaded = make_ppo(schedule="adaptive"), make_ppo(schedule="adaptive", seed=9)

@@ -74,6 +74,7 @@ def cluster(stage):
     """A cluster of two machines with a core each, and a head without one."""
     from ray.cluster_utils import Cluster
 
+    handler = signal.getsignal(signal.SIGTERM)  # which Ray replaces
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_AUTH_MODE", "disabled")  # which would write a token into the home folder
         patch.setenv("PYTHONPATH", str(stage))
@@ -84,6 +85,7 @@ def cluster(stage):
         yield cluster
         ray.shutdown()
         cluster.shutdown()
+        signal.signal(signal.SIGTERM, handler)
 
 
 @pytest.fixture
@@ -183,6 +185,8 @@ def test_mistakes(here, tmp_path):
     assert_told_in_one_line(here("--device=cuda"), "has no GPU")
     assert_told_in_one_line(here("--launcher=slurm"), "unknown launcher 'slurm'")
     assert_told_in_one_line(here("--launcher=local"), "--address is that of a Ray cluster")
+    assert_told_in_one_line(here("--address=nowhere"), "--address must be auto or HOST:PORT, not 'nowhere'")
+    assert_told_in_one_line(here("--address=127.0.0.1:1"), "there is no Ray cluster at address '127.0.0.1:1'")
     assert not (tmp_path / "out").exists()
 
 

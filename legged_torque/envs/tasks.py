@@ -24,10 +24,6 @@ class A1TorqueCfgPPO(torque.TorqueCfgPPO, A1CfgPPO):
     """Its training."""
 
 
-class A1TorqueGravityCfg(torque.TorqueCfg, A1Cfg):
-    """A1 whose actions are torques and whose policy stands from the start."""
-
-
 class A1TorqueGravityCfgPPO(torque_gravity.TorqueGravityCfgPPO, A1CfgPPO):
     """Training of torque control from a policy that stands."""
 
@@ -100,7 +96,7 @@ _TWO_RATES = "legged_torque.envs.approaches.multi_head:MultiHeadTwoRatesRobot"
 for name, robot, env_cfg, train_cfg in (
     ("a1_position", _ROBOT, A1Cfg, A1CfgPPO),
     ("a1_torque", _TORQUE, A1TorqueCfg, A1TorqueCfgPPO),
-    ("a1_torque_gravity", _TORQUE, A1TorqueGravityCfg, A1TorqueGravityCfgPPO),
+    ("a1_torque_gravity", _TORQUE, A1TorqueCfg, A1TorqueGravityCfgPPO),
     ("a1_torque_curriculum", _CURRICULUM, A1TorqueCurriculumCfg, A1TorqueCurriculumCfgPPO),
     ("a1_torque_multihead", _MULTI_HEAD, A1TorqueMultiHeadCfg, A1MultiHeadCfgPPO),
     ("a1_multihead", _MULTI_HEAD, A1MultiHeadCfg, A1MultiHeadCfgPPO),

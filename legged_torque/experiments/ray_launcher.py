@@ -6,6 +6,7 @@ import dataclasses
 import logging
 import os
 import signal
+import socket
 import time
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -21,6 +22,7 @@ from legged_torque.utils.runs import CONFIG_FILE
 
 LOOK_EVERY = 5.0  # seconds between looks at what the cluster has
 SEND_EVERY = 60.0  # seconds between checkpoints that are brought home while a training goes on
+ANSWER = 10.0  # seconds within which a cluster must answer
 WAIT = 1.0  # seconds for which a machine waits before it says that nothing has ended
 
 
@@ -29,20 +31,10 @@ class RayLauncher:
 
     def __init__(self, address: str, device: str, jobs: int | None) -> None:
         """Join the cluster at an address; a UserError if Ray is not installed, or there is no cluster."""
-        try:
-            import ray
-        except ImportError:
-            raise UserError("--launcher ray needs the extra: pip install -e .[ray]") from None
         check_jobs(jobs)
         if device not in ("auto", "cuda", "cpu"):
             raise UserError(f"on a cluster, --device must be auto, cuda or cpu, not '{device}': Ray chooses the GPUs")
-        try:
-            if not ray.is_initialized():
-                ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-            hint = "start one with 'ray start --head'"
-            raise UserError(f"there is no Ray cluster at address '{address}' ({hint}): {reason}") from None
+        ray = join_cluster(address)
         self._versions = versions_here()
         on_gpus = device == "cuda" or (device == "auto" and ray.cluster_resources().get("GPU", 0.0) > 0)
         if not on_gpus and jobs is not None:
@@ -87,6 +79,27 @@ class RayLauncher:
             cores = int(resources.get("CPU", 0.0))
             count += min(cores, round(resources.get("GPU", 0.0) / self._share)) if self._share else cores
         return count
+
+
+def join_cluster(address: str) -> Any:
+    """Join the cluster at an address, "auto" or HOST:PORT, and return the package ray; see :class:`RayLauncher`."""
+    try:
+        import ray
+    except ImportError:
+        raise UserError("--launcher ray needs the extra: pip install -e .[ray]") from None
+    host, _, port = address.rpartition(":")
+    if address != "auto" and not (host and port.isdecimal()):
+        raise UserError(f"--address must be auto or HOST:PORT, not '{address}'")
+    try:
+        if host:  # Ray itself tries for many minutes
+            socket.create_connection((host, int(port)), timeout=ANSWER).close()
+        if not ray.is_initialized():
+            ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
+    except (OSError, OverflowError, RuntimeError, ValueError) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        hint = "start one with 'ray start --head'"
+        raise UserError(f"there is no Ray cluster at address '{address}' ({hint}): {reason}") from None
+    return ray
 
 
 class RayProcess:

@@ -52,14 +52,9 @@ class OnDevicePPO(PPO):
         optimizer: str = "adam",
         max_learning_rate: float = 1e-2,
         annealing_start: float = 1.0,
-        advantage_epsilon: float = 1e-8,
         **kwargs,
     ) -> None:
-        """Create the algorithm.
-
-        Arguments are rsl_rl's, an upper bound of the adaptive learning rate, that of :meth:`anneal`, and what is added
-        to the standard deviation of advantages before they are divided by it.
-        """
+        """Create the algorithm; arguments are rsl_rl's, a bound of the adaptive learning rate, and :meth:`anneal`'s."""
         if optimizer not in ("adam", "adamw"):  # of these torch can skip a step on the device
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
         if kwargs.get("rnd_cfg"):
@@ -79,7 +74,6 @@ class OnDevicePPO(PPO):
         self.learning_rates = (MIN_LEARNING_RATE, max_learning_rate)
         self.learning_rate = torch.tensor(learning_rate, device=self.device)
         self.annealing_start, self._first_rate = annealing_start, learning_rate
-        self.advantage_epsilon = advantage_epsilon
         self.kl_target = torch.tensor(self.desired_kl or 0.0, device=self.device)  # of the adaptive learning rate
         self.entropy_weight = torch.tensor(self.entropy_coef, device=self.device)
         self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
@@ -129,13 +123,7 @@ class OnDevicePPO(PPO):
         else:
             advantages = self.storage.advantages
             super().compute_returns(obs)
-            self.storage.advantages = advantages.copy_(self.storage.returns - self.storage.values)
-            if not self.normalize_advantage_per_mini_batch:
-                self.normalize(advantages)
-
-    def normalize(self, advantages: Tensor) -> None:
-        """Give advantages the mean 0 and nearly the standard deviation 1, in place; small ones stay small."""
-        advantages.copy_((advantages - advantages.mean()) / (advantages.std() + self.advantage_epsilon))
+            self.storage.advantages = advantages.copy_(self.storage.advantages)
 
     def update(self) -> dict[str, float]:
         """Learn from the rollout in random order, epoch by epoch; return :data:`LOSS_NAMES` over all processes."""
@@ -270,7 +258,7 @@ class OnDevicePPO(PPO):
 
         advantages = pick(storage.advantages)
         if self.normalize_advantage_per_mini_batch:
-            self.normalize(advantages)
+            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         return RolloutStorage.Batch(
             observations=TensorDict({key: pick(value) for key, value in storage.observations.items()}, [len(indices)]),
             actions=pick(storage.actions),

@@ -115,7 +115,8 @@ class FusedLearner:
             storage.rewards, storage.dones, storage.values, last_values, storage.returns, storage.advantages,
             storage.num_transitions_per_env, storage.num_envs, alg.gamma, alg.lam, WORLDS=GAE_WORLDS, num_warps=2,
         )  # fmt: skip
-        alg.normalize(storage.advantages)
+        advantages = storage.advantages
+        advantages.copy_((advantages - advantages.mean()) / (advantages.std() + 1e-8))
 
     def action_std(self) -> Tensor:
         """Return the standard deviations of actions when they were last sampled. Shape: (num_actions,)."""
