@@ -71,7 +71,7 @@ def test_off_by_default(make_task):
         notes = watch(task)
         sent = send(task, 5)
         assert task.cfg.domain_rand.action_delay == [0, 0]
-        assert np.array_equal(torques_of(notes), 4.0 * np.repeat(sent, 4, axis=0))
+        assert np.array_equal(torques_of(notes), 8.0 * np.repeat(sent, 4, axis=0))
         seen.append(np.concatenate([*map(np.ravel, notes[-1]), task.get_observations()["critic"].numpy().ravel()]))
     assert np.array_equal(seen[0], seen[1]) and np.array_equal(seen[0], seen[2])
 
@@ -81,11 +81,11 @@ def test_off_by_default(make_task):
     [*((4, delay) for delay in range(10)), (2, 1), (2, 2), (2, 3), (2, 9), (3, 1), (3, 4), (3, 9), (1, 3)],
 )
 def test_physics_steps(make_task, decimation, delay):
-    """The torque at physics step t is 4 N m times the action of physics step t - delay."""
+    """The torque at physics step t is 8 N m times the action of physics step t - delay."""
     task = make_task("a1_torque", 3, **delayed(delay, delay, decimation=decimation))
     notes = watch(task)
     sent = send(task, 10)
-    assert np.array_equal(torques_of(notes), 4.0 * arrived(sent, decimation, delay))
+    assert np.array_equal(torques_of(notes), 8.0 * arrived(sent, decimation, delay))
 
 
 @pytest.mark.parametrize("refresh", [True, False])
@@ -96,7 +96,7 @@ def test_control_steps(make_task, decimation, delay, refresh):
     task = make_task("a1_torque", 3, **settings)
     notes = watch(task)
     sent = send(task, 6)
-    assert np.array_equal(torques_of(notes), 4.0 * arrived(sent, decimation, decimation * delay))
+    assert np.array_equal(torques_of(notes), 8.0 * arrived(sent, decimation, decimation * delay))
 
 
 @pytest.mark.parametrize(
@@ -160,13 +160,13 @@ def test_reset_forgets(make_task, how, delay):
     last = np.nan_to_num(last)  # what is not finite is taken for 0
     anew = np.concatenate([arrived(np.concatenate([first, last]), 4, delay), arrived(then, 4, delay)])
     on = arrived(np.concatenate([first, last, then]), 4, delay)
-    assert np.array_equal(torques_of(notes)[:, 0], 4.0 * anew[:, 0])
-    assert np.array_equal(torques_of(notes)[:, 1], 4.0 * (anew if how == "all at once" else on)[:, 1])
+    assert np.array_equal(torques_of(notes)[:, 0], 8.0 * anew[:, 0])
+    assert np.array_equal(torques_of(notes)[:, 1], 8.0 * (anew if how == "all at once" else on)[:, 1])
 
 
 def delays_of(torques, sent):
     """The delay in physics steps of each world: the only one that explains all its torques."""
-    fits = np.stack([(torques == 4.0 * arrived(sent, 4, k)).all(axis=(0, 2)) for k in range(len(torques))])
+    fits = np.stack([(torques == 8.0 * arrived(sent, 4, k)).all(axis=(0, 2)) for k in range(len(torques))])
     assert (fits.sum(axis=0) == 1).all()
     return fits.argmax(axis=0)
 

@@ -304,7 +304,7 @@ def test_half_of_the_worlds_may_diverge(make_runner, tmp_path):
 
 def test_stops_when_all_updates_are_skipped(make_runner, tmp_path):
     """Nothing was learned, nothing was spoiled, and the learning rate is told."""
-    runner, _ = make_runner(tmp_path, **{"runner.logger": "none"})
+    runner, _ = make_runner(tmp_path, **{"runner.logger": "none", "algorithm.schedule": "adaptive"})
     before = [parameter.detach().clone() for parameter in runner.alg.actor.parameters()]
     runner.alg.learning_rate.fill_(math.nan)
     why = stops(runner)

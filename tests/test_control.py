@@ -53,10 +53,10 @@ def test_position_torques(make_task, kp, kd, scale):
 
 @pytest.mark.parametrize("name", TORQUE_TASKS)
 def test_torque_torques(make_task, name):
-    """Torque control is 4 N m per unit of action, whatever the state."""
-    task = make_task(name, 3)
+    """Torque control is 8 N m per unit of action, 4 N m in the curriculum, whatever the state."""
+    task, torque_scale = make_task(name, 3), 4.0 if name == "a1_torque_curriculum" else 8.0
     _, _, action = random_state(task)
-    np.testing.assert_allclose(task._compute_torques(torch.tensor(action).float()), 4.0 * action, rtol=1e-5)
+    np.testing.assert_allclose(task._compute_torques(torch.tensor(action).float()), torque_scale * action, rtol=1e-5)
 
 
 @pytest.mark.parametrize("total_steps", [0, 25_000_000, 50_000_000, 60_000_000])
@@ -135,7 +135,7 @@ def test_actions_are_clipped(make_task):
     expected = np.tile([2.0, -2.0, 1.5], (2, 4))
     np.testing.assert_array_equal(task.actions, expected)
     np.testing.assert_array_equal(obs["policy"][:, -12:], expected)
-    np.testing.assert_allclose(task.torques, 4.0 * expected)
+    np.testing.assert_allclose(task.torques, 8.0 * expected)
 
 
 @pytest.mark.parametrize(("name", "refresh"), [("a1_position", True), ("a1_position", False), ("a1_multihead", True)])

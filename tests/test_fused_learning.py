@@ -175,7 +175,7 @@ def test_whole_updates_are_those_of_rsl_rl():
 
 
 def test_learning_rate_follows_the_divergence():
-    """As without fused kernels: after the policy has moved far, it falls by 1.5, its bounds hold, and it is annealed."""
+    """As without fused kernels: after the policy has moved far, it falls by 1.5, annealed too, and its bounds hold."""
     algorithms = pair(schedule="adaptive", learning_rate=1e-2, desired_kl=0.01, annealing_start=0.5)
     for round_number in range(3):
         choose(algorithms, round_number)

@@ -37,7 +37,7 @@ SMALL = ["--device=cpu", "--num_envs=16"]
 FEW = {"num_rounds": 2, "num_epochs": 3, "batch_size": 16}
 CONFIGURATIONS, STEPS = 41, 6
 WEIGHT = 12.453 * 9.81
-TORQUE_SCALE, TORQUE_LIMIT = 4.0, 33.5
+TORQUE_SCALE, TORQUE_LIMIT = 8.0, 33.5
 STD = "distribution.log_std_param"
 LAST_ACTION = slice(33, 45)
 """Where the last action is in what the policy sees, after 9 numbers of the trunk, 12 angles and 12 velocities."""
@@ -165,7 +165,7 @@ def test_histogram():
 
 @pytest.mark.parametrize("who", ["controller", "policy"])
 def test_pairs_are_what_the_controller_does(task, controller, who):
-    """Whoever acts, actions are the controller's torques over 4 N m in exactly the states that the policy sees there.
+    """Whoever acts, actions are the controller's torques over 8 N m in exactly the states that the policy sees there.
 
     There are more configurations than worlds, and not a multiple of them.
     """
@@ -351,7 +351,7 @@ def test_supervision(task):
     errors = supervise(task, actor, collection, settings_of(num_epochs=20, batch_size=50))
     assert {name: len(values) for name, values in errors.items()} == {"training": 20, "held_out": 20}
     assert errors["training"][-1] < 0.5 * errors["training"][0]
-    assert errors["held_out"][-1] < 0.6 * TORQUE_SCALE  # without learning: 4 N m, since actions are standard normal
+    assert errors["held_out"][-1] < 0.6 * TORQUE_SCALE  # without learning: 8 N m, since actions are standard normal
     assert errors["held_out"][-1] > errors["training"][-1]
     with torch.no_grad():
         mirrored = held_out.observations[:, OTHER_SIDE_SEEN] * SEEN_SIGNS

@@ -143,7 +143,7 @@ def test_highest_learning_rate():
 
 @pytest.mark.parametrize(("progress", "left"), [(0.0, 1.0), (0.5, 1.0), (0.75, 0.5), (0.9, 0.2)])
 def test_annealing(progress, left):
-    """After half of a training a fixed rate, or the wanted divergence, falls linearly, and so does the entropy's weight."""
+    """After half of a training a fixed rate and the weight of the entropy fall linearly; an adaptive rate does not."""
     fixed, adaptive = (make_ppo(schedule=name, annealing_start=0.5, entropy_coef=0.1) for name in ("fixed", "adaptive"))
     for alg in (fixed, adaptive):
         record_rollout(alg)

@@ -170,7 +170,7 @@ def test_what_goes_together(make_task):
     assert (friction == friction[:, :1]).all()
     kinds = torch.tensor(model.geom_friction[0] / model.geom_friction[0, 0], dtype=torch.float32)
     torch.testing.assert_close(friction[:, 0], friction[:, 0, :1] * kinds)
-    torch.testing.assert_close(task.torque_scale / 4.0, task.action_scale / 0.25)
+    torch.testing.assert_close(task.torque_scale / task.cfg.control.torque_scale, task.action_scale / 0.25)
     feet = [model.geom(name).id for name in task.foot_names]
     for values in (task.motor_strength, task.p_gains, task.d_gains, task.sim.field("geom_size")[:, feet, 0]):
         assert (values == values[:, :1]).all() and values[:, 0].unique().numel() == 50

@@ -53,7 +53,7 @@ def test_who_stands(made, tmp_path):
     assert [row[:3] for row in rows] == [("controller", "200", "3"), ("controller", "50", "5"), ("policy", "50", "5")]
     for *_, share, torque in rows[:2]:
         assert 80.0 < float(share) <= 100.0 and 1.0 < float(torque) < 8.0
-    assert rows[2][3:] == ("0.0", "2.00")
+    assert rows[2][3:] == ("0.0", "4.00")
 
 
 def test_standing_of_a_missing_policy(tmp_path):
@@ -68,7 +68,7 @@ def test_standing_of_a_missing_policy(tmp_path):
 def test_standing_of_a_policy_that_does_not_fit(made):
     """It is refused, as in training."""
     result = run_here("check_standing.py", *SMALL, "--set=control.torque_scale=5", root=made[0])
-    assert_told_in_one_line(result, "its control.torque_scale is 4.0, here it is 5.0")
+    assert_told_in_one_line(result, "its control.torque_scale is 8.0, here it is 5.0")
 
 
 # ---------------------------------------------------------------------------------------------- plot_pretraining.py

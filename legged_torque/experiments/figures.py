@@ -5,6 +5,7 @@ A task has the same colour, line style and hatch in all figures, so that they ca
 
 from __future__ import annotations
 
+import io
 import math
 import textwrap
 from collections.abc import Sequence
@@ -64,6 +65,7 @@ METRICS_BY_NAME = {metric.name: metric for metric in CURVE_METRICS}
 UNFINISHED_ALPHA = 0.45
 CUT_AT = 3.0  # largest height of a panel of bars, in medians of the values that it shows
 PAPER_MARKER: dict[str, Any] = {"marker": "D", "color": "none", "markerfacecolor": "white", "markeredgecolor": "black"}
+COLOURS = 96  # of a PNG
 SETTINGS = {"font.size": 10, "hatch.linewidth": 0.6, "axes.axisbelow": True, "savefig.dpi": 150}
 
 Style = tuple[str, Any, str]  # colour, line style and hatch
@@ -90,10 +92,19 @@ def draw_all(experiment: Experiment, table: Table, out: Path) -> list[str]:
         for title in FIGURES:
             figure = draw_curves(experiment, title) if title in CURVES else draw_bars(experiment, table, title)
             if figure is not None:
-                figure.savefig(out / file_name(title))
+                save_small(figure, out / file_name(title))
                 pyplot.close(figure)
                 drawn.append(title)
     return drawn
+
+
+def save_small(figure: Figure, file: Path) -> None:
+    """Write a figure as a PNG of few colours, a third of the usual size."""
+    from PIL import Image  # matplotlib needs it too
+
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    Image.open(stream).convert("RGB").quantize(COLOURS).save(file, optimize=True)
 
 
 def style(tasks: Sequence[str], task: str) -> Style:

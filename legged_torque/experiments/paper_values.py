@@ -29,8 +29,13 @@ MODELS = {
     "a1_torque_curriculum": "Torque curriculum",
     "a1_torque_multihead": "Torque multi-head",
     "a1_multihead": "Multi-head",
+    "a1_torque_curriculum_multihead": "Curriculum, torque multi-head",
+    "a1_torque_gravity_curriculum": "Gravity, curriculum",
+    "a1_torque_gravity_multihead": "Gravity, torque multi-head",
+    "a1_torque_curriculum_high": "Curriculum, higher pose",
+    "a1_multihead_two_rates": "Multi-head, two rates",
 }
-"""The paper's names of our tasks. Default torque occurs only in its Figures 3 and 5."""
+"""Names of our tasks: the paper's, and of its future work. Default torque occurs only in its Figures 3 and 5."""
 TABLE_I = {
     ("track_percentage", "a1_position"): (0.7642, 0.7518, 0.7163, 0.6765),
     ("track_percentage", "a1_torque_multihead"): (0.7624, 0.7534, 0.7159, 0.6699),

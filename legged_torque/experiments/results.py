@@ -218,14 +218,13 @@ def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
         found = table[column][task].get(name)
         numbers = [found.mean, found.standard_error, len(found.values)] if found else [None, None, 0]
         summaries.append([task, column, name, *numbers, paper_value(task, column, name)])
-    of_rows = ["steps", "seconds", *names]
-    evaluations: list[list[Any]] = [["task", "environment", "seed", *of_rows]]
+    evaluations: list[list[Any]] = [["task", "environment", "seed", "steps", "seconds", *names]]
     runs = sorted(experiment.runs, key=lambda run: run.cell.name)
     for cell, evaluated, rows in ((run.cell, *entry) for run in runs for entry in run.rows_in.items()):
         column = column_name(cell.environment, evaluated)
         for row in rows:
-            values = [row[name] if math.isfinite(row[name]) else None for name in of_rows]
-            evaluations.append([cell.task, column, cell.seed, *values])
+            values = [f"{row[name]:.4g}" if math.isfinite(row[name]) else None for name in ("seconds", *names)]
+            evaluations.append([cell.task, column, cell.seed, row["steps"], *values])
     (out / TABLE_FILE).write_bytes(csv_bytes(summaries))
     (out / EVALUATIONS_FILE).write_bytes(gzip.compress(csv_bytes(evaluations), mtime=0))  # the same bytes every time
 

@@ -56,6 +56,7 @@ def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device:
     Of trainings that start at the same time one makes it, and the others wait.
     """
     if not file.exists():
+        check_output(file)
         with held(file.with_name(f"{file.name}.lock")):
             if not file.exists():
                 print(f"There is no pre-trained policy '{file}' yet; making it.", flush=True)
