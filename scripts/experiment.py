@@ -70,7 +70,10 @@ def make_launcher(args: argparse.Namespace) -> Launcher:
         raise unknown_name("launcher", args.launcher, ["local", "ray"])
     if args.address:
         raise UserError("--address is that of a Ray cluster: give --launcher ray as well")
-    return LocalLauncher(args.device, MPS_JOBS if args.mps and args.jobs is None else args.jobs)
+    launcher = LocalLauncher(args.device, MPS_JOBS if args.mps and args.jobs is None else args.jobs)
+    if args.mps and any(worker.device == "cpu" for worker in launcher.workers()):
+        raise UserError("--mps is for GPUs, and this experiment would run on the CPU")
+    return launcher
 
 
 if __name__ == "__main__":

@@ -1,0 +1,49 @@
+"""NVIDIA's Multi-Process Service around an experiment, with a stand-in for its program: this machine has no GPU."""
+
+import os
+
+import pytest
+
+from legged_torque.experiments.mps import FOLDERS, PROGRAM, multi_process_service
+from legged_torque.utils.errors import UserError
+
+
+@pytest.fixture
+def program(tmp_path, monkeypatch):
+    """A program that notes its arguments, its input and its folder, and may refuse; returns where it notes them."""
+    notes, file = tmp_path / "notes", tmp_path / PROGRAM
+    file.write_text(
+        f'#!/bin/sh\necho "$*|$([ "$1" ] || cat)|$CUDA_MPS_PIPE_DIRECTORY" >> {notes}\n[ ! -e {notes}.no ]\n'
+    )
+    file.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    return notes
+
+
+def test_service(program, monkeypatch):
+    """It runs with a folder of its own while the context is open, also when that ends by an error, and no longer."""
+    monkeypatch.setenv(FOLDERS[0], "/mine")
+    monkeypatch.delenv(FOLDERS[1], raising=False)
+    with pytest.raises(KeyError), multi_process_service():
+        folder = os.environ[FOLDERS[0]]
+        assert os.path.isdir(folder) and os.environ[FOLDERS[1]] == folder != "/mine"
+        assert program.read_text() == f"-d||{folder}\n"
+        raise KeyError
+    assert program.read_text().splitlines()[1:] == [f"|quit|{folder}"]
+    assert os.environ[FOLDERS[0]] == "/mine" and FOLDERS[1] not in os.environ and not os.path.exists(folder)
+
+
+def test_service_that_refuses(program, monkeypatch):
+    """Nothing is started, and the variables are as they were."""
+    program.with_name("notes.no").touch()
+    before = dict(os.environ)
+    with pytest.raises(UserError, match=f"{PROGRAM} says"), multi_process_service():
+        raise AssertionError("the service has not started")
+    assert dict(os.environ) == before
+
+
+def test_without_the_program(tmp_path, monkeypatch):
+    """The program that is missing is named."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match=f"--mps needs the program {PROGRAM}"), multi_process_service():
+        raise AssertionError("there is no service")
