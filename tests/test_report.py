@@ -279,7 +279,7 @@ def test_evaluations(report):
     assert len(evaluations) == 4 * 5 + 5
     row = next(row for row in evaluations if row["environment"] == "high_frequency" and row["seed"] == "2")
     cells = ("task", "steps", "seconds", "track_percentage", "height")
-    assert [row[name] for name in cells] == ["a1_position", "10000000", "10.5", "0.1", "1.0"]
+    assert [row[name] for name in cells] == ["a1_position", "10000000", "10.5", "0.1", "1"]
 
 
 def test_same_bytes_again(report, folder, tmp_path):
