@@ -21,28 +21,32 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("experiment", type=Path, help="folder of results that experiment.py has made")
     parser.add_argument("--out", type=Path, required=True, help="folder for the report, its tables and figures")
-    help_text = "step from which evaluations count; default: %(default).0f, where the paper's Table I begins to average"
-    parser.add_argument("--from_step", type=float, default=90e6, help=help_text)
+    help_text = (
+        "step from which evaluations count; default: the last 18%% of a training: from 90 of 110 million, as in Table I"
+    )
+    parser.add_argument("--from_step", type=float, help=help_text)
     help_text = "folder with videos <task>.mp4, .webm or .gif, which the page is to hold"
     parser.add_argument("--videos", type=Path, help=help_text)
     args = parser.parse_args()
-    check_at_least(args, 0, "from_step")
+    if args.from_step is not None:
+        check_at_least(args, 0, "from_step")
     file, page = args.out / "report.md", args.out / "report.html"
     check_output(file)
     check_output(page)
     experiment = read_experiment(args.experiment)
     videos = find_videos(args.videos, experiment.plan.tasks) if args.videos else {}
-    table = summarize(experiment, args.from_step)
+    from_step = experiment.last_part() if args.from_step is None else args.from_step
+    table = summarize(experiment, from_step)
     args.out.mkdir(parents=True, exist_ok=True)
     figures = draw_all(experiment, table, args.out)
     blocks, title = (
-        report(experiment, table, args.from_step, figures, args.out, videos),
+        report(experiment, table, from_step, figures, args.out, videos),
         f"Results of {experiment.folder.resolve().name}",
     )
     file.write_text(to_markdown(title, blocks), encoding="utf-8")
     page.write_text(to_html(title, blocks), encoding="utf-8")
     write_tables(experiment, table, args.out)
-    missing = len(missing_lines(experiment, args.from_step))
+    missing = len(missing_lines(experiment, from_step))
     print(f"{file}, {page.name}, {len(figures)} figures; missing or not finished: {missing} lines")
 
 

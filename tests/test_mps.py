@@ -10,11 +10,10 @@ from legged_torque.utils.errors import UserError
 
 @pytest.fixture
 def program(tmp_path, monkeypatch):
-    """A program that notes its arguments, its input and its folder, and may refuse; returns where it notes them."""
+    """A program that notes arguments, input, folder and devices, and may refuse; returns where it notes them."""
     notes, file = tmp_path / "notes", tmp_path / PROGRAM
-    file.write_text(
-        f'#!/bin/sh\necho "$*|$([ "$1" ] || cat)|$CUDA_MPS_PIPE_DIRECTORY" >> {notes}\n[ ! -e {notes}.no ]\n'
-    )
+    noted = '$*|$([ "$1" ] || cat)|$CUDA_MPS_PIPE_DIRECTORY|$CUDA_VISIBLE_DEVICES'
+    file.write_text(f'#!/bin/sh\necho "{noted}" >> {notes}\n[ ! -e {notes}.no ]\n')
     file.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     return notes
@@ -23,13 +22,14 @@ def program(tmp_path, monkeypatch):
 def test_service(program, monkeypatch):
     """It runs with a folder of its own while the context is open, also when that ends by an error, and no longer."""
     monkeypatch.setenv(FOLDERS[0], "/mine")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,3")  # would be 0, 1 to programs that use the service
     monkeypatch.delenv(FOLDERS[1], raising=False)
     with pytest.raises(KeyError), multi_process_service():
         folder = os.environ[FOLDERS[0]]
         assert os.path.isdir(folder) and os.environ[FOLDERS[1]] == folder != "/mine"
-        assert program.read_text() == f"-d||{folder}\n"
+        assert program.read_text() == f"-d||{folder}|\n"
         raise KeyError
-    assert program.read_text().splitlines()[1:] == [f"|quit|{folder}"]
+    assert program.read_text().splitlines()[1:] == [f"|quit|{folder}|"]
     assert os.environ[FOLDERS[0]] == "/mine" and FOLDERS[1] not in os.environ and not os.path.exists(folder)
 
 

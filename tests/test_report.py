@@ -14,10 +14,10 @@ import yaml
 
 from legged_torque.experiments import figures
 from legged_torque.experiments.curves import CURVE_METRICS, read_rows
-from legged_torque.experiments.matrix import Cell
+from legged_torque.experiments.matrix import Cell, Matrix
 from legged_torque.experiments.paper_values import ENVIRONMENTS, PAPER_METRICS, TABLE_I, paper_value
 from legged_torque.experiments.report import run_problems
-from legged_torque.experiments.results import CellResult, compare, holm, read_experiment, summarize, welch
+from legged_torque.experiments.results import CellResult, Experiment, compare, holm, read_experiment, summarize, welch
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "report.py"
 HEADER = (
@@ -190,6 +190,13 @@ def test_finished_runs():
     run.configs.append(SETTINGS | {"max_iterations": 108, "processes": 2})
     assert run.total_steps == 216_000_000
     assert not CellResult(CELL).is_finished(0)
+
+
+@pytest.mark.parametrize(("iterations", "start"), [(110, 90e6), (330, 271e6), (1, 1e6)])
+def test_last_part(iterations, start):
+    """Evaluations count in the last 18%, in whole millions of steps: from 90 of 110 million on, as in Table I."""
+    runs = [CellResult(CELL, configs=[SETTINGS | {"max_iterations": number}]) for number in (1, iterations)]
+    assert Experiment(Path(), Matrix([], {}, []), runs, []).last_part() == start
 
 
 def test_broken_files_are_told(folder, tmp_path):

@@ -67,7 +67,7 @@ class Cell:
         """Return the perturbations with neither a readable result nor evaluations during a training that is whole."""
         missing = [name for name in self.evaluated_in if not is_json(self.result_file(name))]
         runs = list(self.folder.glob("*/")) if missing else []
-        measured = [name for name in missing if any(self.rows_file(run, name).is_file() for run in runs)]
+        measured = [name for name in missing if any(has_rows(self.rows_file(run, name)) for run in runs)]
         return [name for name in missing if name not in measured] if measured and is_trained(self) else missing
 
 
@@ -218,9 +218,9 @@ def cell_state(cell: Cell) -> CellState:
 
 
 def last_checkpoint(cell: Cell) -> Path | None:
-    """Return the file of a cell's last checkpoint that is not damaged, or None."""
+    """Return the file of a cell's last checkpoint that is not damaged, or None; clocks of machines may differ."""
     runs = sorted(cell.folder.glob("*/"), reverse=True)
-    return next(filter(None, map(newest_checkpoint, runs)), None)
+    return max(filter(None, map(newest_checkpoint, runs)), key=checkpoint_number, default=None)
 
 
 def is_trained(cell: Cell) -> bool:
@@ -231,6 +231,11 @@ def is_trained(cell: Cell) -> bool:
     except UserError:
         return False
     return newest is not None and type(total) is int and checkpoint_number(newest) >= total
+
+
+def has_rows(file: Path) -> bool:
+    """Return whether a CSV file exists and has a whole line after its header."""
+    return file.is_file() and file.read_bytes().count(b"\n") > 1
 
 
 def is_json(file: Path) -> bool:

@@ -36,8 +36,9 @@ def multi_process_service() -> Iterator[None]:
 
 def control(arguments: list[str], commands: str = "") -> None:
     """Call NVIDIA's program; a UserError if it is missing or refuses."""
+    variables = {name: value for name, value in os.environ.items() if name != "CUDA_VISIBLE_DEVICES"}  # else renumbered
     try:
-        subprocess.run([PROGRAM, *arguments], input=commands, text=True, capture_output=True, check=True)
+        subprocess.run([PROGRAM, *arguments], input=commands, text=True, capture_output=True, check=True, env=variables)
     except FileNotFoundError:
         raise UserError(f"--mps needs the program {PROGRAM}, which comes with NVIDIA's driver") from None
     except subprocess.CalledProcessError as error:

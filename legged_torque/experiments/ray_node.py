@@ -7,6 +7,7 @@ the name of a script of this package with its arguments.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import shutil
 import socket
@@ -59,9 +60,10 @@ class NodeStep:
         self._refusal = difference(f"{name} ({socket.gethostname()})", versions, versions_here())
         if self._refusal:
             return
-        temporary = Path(tempfile.gettempdir())
+        temporary = Path(tempfile.gettempdir(), f"legged_torque_{os.getuid()}")
+        temporary.mkdir(mode=0o700, exist_ok=True)
         remove_stale_parts(temporary)
-        self._root = part_of(temporary / f"legged_torque_{ray.get_runtime_context().get_actor_id()}")
+        self._root = part_of(temporary / ray.get_runtime_context().get_actor_id())
         self._root.mkdir(mode=0o700)
         write_files(self._root, files)
         self._sent, self._sent_at, self._read = stamps(self._root), time.monotonic(), 0

@@ -81,6 +81,11 @@ class Experiment:
         """Return the trainings of a task in an environment that have begun."""
         return [run for run in self.runs if (run.cell.task, run.cell.environment) == (task, environment)]
 
+    def last_part(self) -> float:
+        """Return the step at which the last :data:`LAST_SHARE` of the longest training begins, in whole millions."""
+        steps = (1.0 - LAST_SHARE) * max((run.total_steps for run in self.runs), default=PAPER_STEPS)
+        return round(steps, -6) or steps
+
     def columns(self) -> dict[str, tuple[str, str]]:
         """Return the environments of training and evaluation by column, those of Table I first."""
         pairs = [(trained, name) for trained, names in self.plan.environments.items() for name in [trained, *names]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import subprocess
@@ -73,7 +74,8 @@ class ExperimentRun:
         finally:
             self._ask_to_stop()  # after an exception too no process is left running
             for job in self._jobs():
-                job.process.wait()
+                with contextlib.suppress(UserError):  # what one has to tell must not keep others from coming home
+                    job.process.wait()
         spent = describe(add_up(read_times(cell.folder) for cell in self.matrix.cells(self.out)))
         if spent:
             print(spent)

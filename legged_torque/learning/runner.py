@@ -80,6 +80,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train, and leave a checkpoint; Ctrl-C ends training after the current iteration, a second one at once.
 
+        A call is one training: it is at its end that ``algorithm.annealing_start`` lets steps be small.
         All processes that train together end after the same iteration, whichever of them is asked to stop. If episodes
         start at random lengths, they do not all end at once; those of a checkpoint go on as they are. A TrainingError,
         after the checkpoint, if nothing can be learned any more.

@@ -47,16 +47,13 @@ def write_whole(file: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def held(lock: Path) -> Iterator[None]:
-    """Hold a lock file, which exists meanwhile, when others have let it go; a UserError if it cannot be written."""
+    """Hold a lock file when others have let it go; a UserError if it cannot be written. It stays: others may wait."""
     with told_by_name(lock):
         lock.parent.mkdir(parents=True, exist_ok=True)
         stream = lock.open("ab")
     with stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)
+        yield
 
 
 def remove_stale_parts(folder: Path) -> None:
