@@ -52,7 +52,7 @@ while done < 4 and not stopped and not (behaviour == "early" and done == 2):
 zipfile.ZipFile(run / f"model_{done}.pt", "w").close()
 if behaviour.startswith("measure"):
     for name in behaviour.split()[1:]:
-        (run / name).touch()
+        (run / name).write_text("steps\\n8\\n")
 """
 
 STAND_IN_EVALUATE = """
@@ -301,7 +301,7 @@ def test_what_a_training_has_measured_is_not_evaluated_again(stage, tmp_path):
     assert not list(out.glob("*/result*")) and "'--set=evaluation.also=[\"high\"]'" in (
         next(out.glob("*/train.log")).read_text()
     )
-    next(out.glob("*/*/evaluations_high.csv")).unlink()
+    next(out.glob("*/*/evaluations_high.csv")).write_text("steps\n")  # the disk was full
     assert experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1] == "a1_torque-low-s1: evaluate in high\n"
     (checkpoint,) = out.glob("*/*/model_4.pt")
     checkpoint.rename(checkpoint.with_name("model_3.pt"))  # a training that is not whole has measured nothing for good
