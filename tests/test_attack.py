@@ -18,14 +18,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_a_part_of_the_attack(tmp_path):
-    """Forty cases drawn at random: what must be refused is, and none leaves files or a traceback."""
+    """Cases drawn at random: what must be refused is, and none leaves files or a traceback."""
     file = tmp_path / "results.json"
-    command = [sys.executable, str(ROOT / "scripts" / "attack.py"), "--limit=40", "--seed=3", f"--json={file}"]
+    command = [sys.executable, str(ROOT / "scripts" / "attack.py"), "--limit=24", "--seed=3", f"--json={file}"]
     done = subprocess.run(command, cwd=tmp_path, text=True, capture_output=True, timeout=600)
     cases = json.loads(file.read_text())["cases"]
     assert [case for case in cases if not case["is_good"]] == []
-    assert (done.returncode, done.stderr) == (0, "") and len(cases) == 40
-    assert sum(case["outcome"] == REFUSED for case in cases) > 20
+    assert (done.returncode, done.stderr) == (0, "") and len(cases) == 24
+    assert sum(case["outcome"] == REFUSED for case in cases) > 12
     assert list(tmp_path.iterdir()) == [file]
 
 

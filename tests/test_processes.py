@@ -1,0 +1,76 @@
+"""What one process does that torchrun has started, or should have, without the others."""
+
+import pytest
+import torch
+from settings import error_of, parse
+
+from legged_torque.envs import task_registry
+from legged_torque.utils import distributed
+from legged_torque.utils.devices import resolve_device
+from legged_torque.utils.task_registry import num_iterations, set_seed
+
+
+@pytest.fixture
+def second_of_two(monkeypatch):
+    """The environment in which torchrun starts the second of two processes."""
+    for key, value in {"WORLD_SIZE": 2, "RANK": 1, "LOCAL_RANK": 1, "LOCAL_WORLD_SIZE": 2}.items():
+        monkeypatch.setenv(key, str(value))
+    return monkeypatch
+
+
+def test_every_process_has_its_gpu(second_of_two):
+    """It is the one with the process's number; too few GPUs, or one for all, are refused."""
+    second_of_two.setattr(torch.cuda, "device_count", lambda: 2)
+    assert [resolve_device(name) for name in (None, "auto", "cuda", "cpu")] == ["cuda:1", "cuda:1", "cuda:1", "cpu"]
+    assert error_of(resolve_device, "cuda:0").startswith("with torchrun each process takes a GPU of its own: leave out")
+    second_of_two.setattr(torch.cuda, "device_count", lambda: 1)
+    line = error_of(resolve_device, "auto")
+    assert line == "torchrun has started 2 processes on a machine with 1 GPU(s)"
+    second_of_two.setattr(torch.cuda, "device_count", lambda: 0)
+    assert resolve_device("auto") == "cpu"
+
+
+def test_length_of_a_training(second_of_two):
+    """The steps of a whole training are those of all processes; each has its own random numbers."""
+    args = parse("--task=a1_position", "--num_envs=100", "--set=runner.total_steps=9601")
+    _, train_cfg = task_registry.get_cfgs("a1_position", args)
+    env = type("Task", (), {"num_envs": 100})
+    assert num_iterations(env, train_cfg) == 3  # 9601 / (2 * 100 * 24)
+    set_seed(5)
+    drawn = torch.rand(3)
+    torch.manual_seed(6)
+    assert torch.equal(torch.rand(3), drawn)
+
+
+def test_processes_that_torchrun_has_not_started(second_of_two):
+    """A stray WORLD_SIZE is told in one line."""
+    second_of_two.delenv("MASTER_ADDR", raising=False)
+    assert error_of(distributed.join, "cpu").startswith("WORLD_SIZE is 2, but torchrun has not started this process")
+
+
+def test_processes_that_do_not_meet(second_of_two):
+    """Where the first process should be nobody answers: one line, no traceback."""
+    second_of_two.setenv("MASTER_ADDR", "127.0.0.1")
+    second_of_two.setenv("MASTER_PORT", "1")
+
+    def give_up(*_args, **_kwargs):
+        raise torch.distributed.DistNetworkError("The client socket has timed out\nwith a trace")
+
+    second_of_two.setattr(torch.distributed, "init_process_group", give_up)  # minutes later
+    line = error_of(distributed.join, "cpu")
+    assert line == "the 2 processes do not find each other: The client socket has timed out"
+
+
+def test_processes_with_other_settings(second_of_two):
+    """The first setting that differs is told."""
+    second_of_two.setattr(distributed, "gather", lambda mine: [mine, {**mine, "env.env.num_envs": 3}])
+    line = error_of(distributed.check_same, {"task": "t", "env.env.num_envs": 2})
+    assert line.endswith("must have the same settings: env.env.num_envs is 3 in process 1, but 2 in the first one")
+    second_of_two.setattr(distributed, "gather", lambda mine: [mine, dict(mine)])
+    distributed.check_same({"task": "t", "weight": float("nan")})
+
+
+def test_one_process_asks_nobody():
+    """Without other processes, a condition is what it is."""
+    assert distributed.any_process(True, "cpu") and not distributed.any_process(False, "cpu")
+    assert (distributed.world_size(), distributed.rank(), distributed.local_rank()) == (1, 0, 0)
