@@ -1,6 +1,7 @@
 """NVIDIA's Multi-Process Service around an experiment, with a stand-in for its program: this machine has no GPU."""
 
 import os
+import signal
 
 import pytest
 
@@ -13,10 +14,12 @@ def program(tmp_path, monkeypatch):
     """A program that notes arguments, input, folder and devices, and may refuse; returns where it notes them."""
     notes, file = tmp_path / "notes", tmp_path / PROGRAM
     noted = '$*|$([ "$1" ] || cat)|$CUDA_MPS_PIPE_DIRECTORY|$CUDA_VISIBLE_DEVICES'
-    file.write_text(f'#!/bin/sh\necho "{noted}" >> {notes}\n[ ! -e {notes}.no ]\n')
+    stays = f'[ "$1" ] && {{ sleep 60 & echo $! > {notes}.pid; }}'  # with its output open, as a service does
+    file.write_text(f'#!/bin/sh\necho "{noted}" >> {notes}\n{stays}\necho "it is $1"\n[ ! -e {notes}.no ]\n')
     file.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    return notes
+    yield notes
+    os.kill(int(notes.with_name("notes.pid").read_text()), signal.SIGKILL)  # fails if it was waited for
 
 
 def test_service(program, monkeypatch):
@@ -37,7 +40,7 @@ def test_service_that_refuses(program, monkeypatch):
     """Nothing is started, and the variables are as they were."""
     program.with_name("notes.no").touch()
     before = dict(os.environ)
-    with pytest.raises(UserError, match=f"{PROGRAM} says"), multi_process_service():
+    with pytest.raises(UserError, match=f"--mps: {PROGRAM} says: it is -d"), multi_process_service():
         raise AssertionError("the service has not started")
     assert dict(os.environ) == before
 

@@ -20,7 +20,7 @@ def multi_process_service() -> Iterator[None]:
 
     A UserError if this machine has none.
     """
-    with tempfile.TemporaryDirectory(prefix="mps-") as folder:
+    with tempfile.TemporaryDirectory(prefix="mps-", ignore_cleanup_errors=True) as folder:
         before = {name: os.environ.get(name) for name in FOLDERS}
         os.environ |= dict.fromkeys(FOLDERS, folder)
         try:
@@ -37,9 +37,19 @@ def multi_process_service() -> Iterator[None]:
 def control(arguments: list[str], commands: str = "") -> None:
     """Call NVIDIA's program; a UserError if it is missing or refuses."""
     variables = {name: value for name, value in os.environ.items() if name != "CUDA_VISIBLE_DEVICES"}  # else renumbered
-    try:
-        subprocess.run([PROGRAM, *arguments], input=commands, text=True, capture_output=True, check=True, env=variables)
-    except FileNotFoundError:
-        raise UserError(f"--mps needs the program {PROGRAM}, which comes with NVIDIA's driver") from None
-    except subprocess.CalledProcessError as error:
-        raise UserError(f"--mps: {PROGRAM} says: {(error.stderr or error.stdout).strip()}") from None
+    with tempfile.TemporaryFile("w+") as said:  # no pipe: the service would hold it open
+        try:
+            ended = subprocess.run(
+                [PROGRAM, *arguments],
+                input=commands,
+                text=True,
+                stdout=said,
+                stderr=subprocess.STDOUT,
+                env=variables,
+                start_new_session=True,  # Ctrl-C does not reach the service
+            )
+        except FileNotFoundError:
+            raise UserError(f"--mps needs the program {PROGRAM}, which comes with NVIDIA's driver") from None
+        if ended.returncode:
+            said.seek(0)
+            raise UserError(f"--mps: {PROGRAM} says: {' '.join(said.read().split())}")
