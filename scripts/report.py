@@ -39,10 +39,8 @@ def main() -> None:
     table = summarize(experiment, from_step)
     args.out.mkdir(parents=True, exist_ok=True)
     figures = draw_all(experiment, table, args.out)
-    blocks, title = (
-        report(experiment, table, from_step, figures, args.out, videos),
-        f"Results of {experiment.folder.resolve().name}",
-    )
+    blocks = report(experiment, table, from_step, figures, args.out, videos)
+    title = f"Results of {experiment.folder.resolve().name}"
     file.write_text(to_markdown(title, blocks), encoding="utf-8")
     page.write_text(to_html(title, blocks), encoding="utf-8")
     write_tables(experiment, table, args.out)

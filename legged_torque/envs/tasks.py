@@ -14,7 +14,7 @@ from legged_torque.utils.task_registry import task_registry
 
 
 class A1TorqueCfg(torque.TorqueCfg, A1Cfg):
-    """A1 whose actions are torques, at first large enough to lift it by chance."""
+    """A1 whose actions are torques; their scale lets the noise of the start lift it, so that it finds walking."""
 
     class control:
         torque_scale = 8.0

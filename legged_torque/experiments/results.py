@@ -215,7 +215,7 @@ def holm(p_values: list[float | None]) -> list[float | None]:
 
 
 def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
-    """Write all summaries as CSV, and every evaluation during training as compressed CSV, with names of columns."""
+    """Write all summaries as CSV, and every evaluation during training as compressed CSV, with four digits."""
     names = [metric.name for metric in CURVE_METRICS]
     summaries: list[list[Any]] = [["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean"]]
     keys = [(task, column, name) for column, cells in table.items() for task in cells for name in names]
