@@ -49,15 +49,15 @@ class MultiHeadTwoRatesCfg(MultiHeadCfg):
     """
 
     class commands:
-        resampling_probability = LeggedRobotCfg.commands.resampling_probability / STEPS
+        resampling_probability = 0.0005  # per control step: about every 10 s at 200 Hz
 
     class control:
         decimation = 1  # control steps are physics steps
-        position_interval: Count = STEPS  # control steps for which position actions are held
+        position_interval: Count = 4  # control steps for which position actions are held
 
     class domain_rand:
-        resampling_probability = LeggedRobotCfg.domain_rand.resampling_probability / STEPS
-        push_probability = LeggedRobotCfg.domain_rand.push_probability / STEPS
+        resampling_probability = 0.0005
+        push_probability = 0.0005
 
     def perturbations(self) -> dict[str, dict]:
         """Return those of 50 Hz, with as many pushes per second."""
@@ -83,11 +83,11 @@ class MultiHeadTwoRatesCfgPPO(MultiHeadCfgPPO):
         num_steps_per_env = 48
 
     class evaluation:
-        num_samples = STEPS * LeggedRobotCfgPPO.evaluation.num_samples  # world steps: as much time as at 50 Hz
+        num_samples = 128_000  # world steps of one evaluation: as much time as at 50 Hz
 
     class algorithm:
         num_mini_batches = 8  # of as many samples as at 50 Hz
-        gamma, lam = (LeggedRobotCfgPPO.algorithm.gamma ** (1 / STEPS), LeggedRobotCfgPPO.algorithm.lam ** (1 / STEPS))
+        gamma, lam = 0.98**0.25, 0.95**0.25
 
     def presets(self) -> dict[str, dict[str, Any]]:
         """Return those of 50 Hz, with the same discounts per second."""
