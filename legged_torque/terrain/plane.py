@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import torch
 from torch import Tensor
 
@@ -10,6 +11,9 @@ from legged_torque.terrain.terrain import Terrain
 
 class Plane(Terrain):
     """A plane at z = 0, on which every world starts at the origin."""
+
+    def add_to(self, spec: mujoco.MjSpec, floor: str) -> None:
+        """Leave the robot's own plane."""
 
     def height(self, points: Tensor) -> Tensor:
         """Return 0 for each point."""

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
+import mujoco
 from torch import Tensor
 
 
 class Terrain(ABC):
     """The ground under all worlds."""
+
+    @classmethod
+    def build(cls, settings: Any, num_envs: int, device: str) -> Terrain:
+        """Return the ground for a section ``terrain`` of settings, which :class:`Plane` does not need."""
+        return cls()
+
+    @abstractmethod
+    def add_to(self, spec: mujoco.MjSpec, floor: str) -> None:
+        """Put this ground into a robot's MJCF in place of its plane, the geom ``floor`` of the world."""
 
     @abstractmethod
     def height(self, points: Tensor) -> Tensor:

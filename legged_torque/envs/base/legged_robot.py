@@ -242,7 +242,8 @@ class LeggedRobot(BaseTask):
     def _create_sim(self) -> None:
         """Load robot, ground and motors, and build the simulator and its views."""
         cfg, sim = self.cfg, self.cfg.sim
-        self.asset = load_asset(cfg)
+        self.terrain = make_terrain(cfg.terrain, self.num_envs, self.device)
+        self.asset = load_asset(cfg, self.terrain)
         model = self.asset.mj_model
         per_world = MODEL_FIELDS if cfg.domain_rand.randomize_parameters else ()
         limits = (sim.solver_iterations, sim.ls_iterations)
@@ -251,7 +252,6 @@ class LeggedRobot(BaseTask):
         self.num_dof = len(self.dof_names)
         axes = self.asset.dof_axes().tolist()
         self.symmetry = RobotSymmetry(cfg.asset.mirrored_legs, self.dof_names, axes, self.foot_names)
-        self.terrain = make_terrain(cfg.terrain.mesh_type)
         self.motors = make_motors(cfg.motors.model, self.num_envs, self._tensor(model.actuator_forcerange.T))
         self.torque_limits, self.motor_strength = self.motors.limits, self.motors.strength
         self.base_pos, self.base_quat = self.sim.qpos[:, :3], self.sim.qpos[:, 3:7]

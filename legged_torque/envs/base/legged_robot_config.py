@@ -24,6 +24,7 @@ from legged_torque.utils.limits import (
 )
 
 Place = Annotated[list[float], Limits(-1e3, 1e3, length=3)]
+Scan = Annotated[list[float], Limits(-10, 10, nonempty=True)]
 Gains = Annotated[float | dict[str, float], Limits(lowest=0)]
 
 
@@ -61,7 +62,31 @@ class LeggedRobotCfg(BaseConfig):
         ls_iterations: Annotated[int, Limits(1, 1000)] = 20  # line search, at most
 
     class terrain:  # the ground
-        mesh_type: str = "plane"  # the only one so far
+        mesh_type: str = "plane"  # or heightfield: a map of tiles, to which all that follows belongs
+        seed: Number = 1  # of the map
+        num_rows: Annotated[int, Limits(1, 100)] = 10  # levels: rows of tiles along x, the first is the easiest
+        num_cols: Annotated[int, Limits(1, 100)] = 20  # tiles of each level, along y; a column is of one kind
+        terrain_proportions: dict[str, Share] = {
+            "flat": 0.0,
+            "smooth_slope_up": 0.05,
+            "smooth_slope_down": 0.05,
+            "rough_slope": 0.1,
+            "stairs_up": 0.35,
+            "stairs_down": 0.25,
+            "discrete_obstacles": 0.2,
+            "waves": 0.0,
+            "stepping_stones": 0.0,
+            "gaps": 0.0,
+            "pits": 0.0,
+        }  # share of the columns of each kind; they sum to 1
+        difficulty_range: Annotated[list[float], Limits(0, 1, ordered=True)] = [0.0, 1.0]  # rows divide it evenly
+        tile_size: Annotated[float, Limits(6, 100)] = 8.0  # [m] side of a tile
+        border_size: Annotated[float, Limits(0, 100)] = 25.0  # [m] level ground around all tiles
+        horizontal_scale: Annotated[float, Limits(0.01, 0.5)] = 0.05  # [m] from sample to sample
+        curriculum: bool = True  # whether robots change levels; if not, they are spread evenly over all
+        max_init_terrain_level: Number = 5  # with the curriculum, highest level on which robots start
+        measured_points_x: Scan = [x / 10 for x in range(-8, 9)]  # [m] where the height scan measures: ahead
+        measured_points_y: Scan = [y / 10 for y in range(-5, 6)]  # [m] and to the left
 
     class motors:  # what joints get of the torques that actions ask for
         model: str = "ideal"  # any torque within the limits, at once
