@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from legged_torque.terrain.tiles import START_SIZE, TILES, Grid
+from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 
 MAX_SAMPLES = 2**27
@@ -36,7 +37,8 @@ class Layout:
     @classmethod
     def of(cls, settings: Any) -> Layout:
         """Return the layout that the section ``terrain`` of a task's settings asks for; errors of :meth:`check`."""
-        layout = cls(**{field.name: getattr(settings, field.name) for field in dataclasses.fields(cls)})
+        values = to_dict(settings)
+        layout = cls(**{field.name: values[field.name] for field in dataclasses.fields(cls)})
         layout.check()
         return layout
 
@@ -93,9 +95,11 @@ class Layout:
 
     def tile(self, row: int, col: int) -> np.ndarray:
         """Return the heights of one tile [m]; its random numbers are its own. Shape: as of a TileFunction."""
-        function = TILES[self.kinds()[col]]
-        grid = Grid(self._tile, self.horizontal_scale)
-        return function(self.difficulty(row), np.random.default_rng([self.seed, row, col]), grid)
+        kind, grid = self.kinds()[col], Grid(self._tile, self.horizontal_scale)
+        heights = TILES[kind](self.difficulty(row), np.random.default_rng([self.seed, row, col]), grid)
+        if heights.shape != grid.flat().shape or not np.isfinite(heights).all():
+            raise UserError(f"the kind of tile '{kind}' must return finite heights of shape {grid.flat().shape}")
+        return heights
 
     def heights(self) -> np.ndarray:
         """Return the heights of the whole map [m]. Where two tiles meet, the later one has the line of samples.

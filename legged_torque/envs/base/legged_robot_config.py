@@ -66,19 +66,6 @@ class LeggedRobotCfg(BaseConfig):
         seed: Number = 1  # of the map
         num_rows: Annotated[int, Limits(1, 100)] = 10  # levels: rows of tiles along x, the first is the easiest
         num_cols: Annotated[int, Limits(1, 100)] = 20  # tiles of each level, along y; a column is of one kind
-        terrain_proportions: dict[str, Share] = {
-            "flat": 0.0,
-            "smooth_slope_up": 0.05,
-            "smooth_slope_down": 0.05,
-            "rough_slope": 0.1,
-            "stairs_up": 0.35,
-            "stairs_down": 0.25,
-            "discrete_obstacles": 0.2,
-            "waves": 0.0,
-            "stepping_stones": 0.0,
-            "gaps": 0.0,
-            "pits": 0.0,
-        }  # share of the columns of each kind; they sum to 1
         difficulty_range: Annotated[list[float], Limits(0, 1, ordered=True)] = [0.0, 1.0]  # rows divide it evenly
         tile_size: Annotated[float, Limits(6, 100)] = 8.0  # [m] side of a tile
         border_size: Annotated[float, Limits(0, 100)] = 25.0  # [m] level ground around all tiles
@@ -87,6 +74,19 @@ class LeggedRobotCfg(BaseConfig):
         max_init_terrain_level: Number = 5  # with the curriculum, highest level on which robots start
         measured_points_x: Scan = [x / 10 for x in range(-8, 9)]  # [m] where the height scan measures: ahead
         measured_points_y: Scan = [y / 10 for y in range(-5, 6)]  # [m] and to the left
+
+        class terrain_proportions:  # share of the columns of each kind; together 1
+            flat: Share = 0.0  # level
+            smooth_slope_up: Share = 0.05  # up to 0.4
+            smooth_slope_down: Share = 0.05  # likewise
+            rough_slope: Share = 0.1  # the same, and random heights
+            stairs_up: Share = 0.35  # steps of 0.05 to 0.23 m
+            stairs_down: Share = 0.25  # likewise
+            discrete_obstacles: Share = 0.2  # blocks and hollows of up to 0.25 m
+            waves: Share = 0.0  # crests of up to 0.3 m
+            stepping_stones: Share = 0.0  # of 1.58 to 0.08 m, with holes between them
+            gaps: Share = 0.0  # of up to 1 m
+            pits: Share = 0.0  # up to 1 m deep
 
     class motors:  # what joints get of the torques that actions ask for
         model: str = "ideal"  # any torque within the limits, at once
