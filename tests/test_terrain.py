@@ -1,5 +1,6 @@
 """Rough ground: the surface as MuJoCo has it, tiles by legged_gym's formulas, levels by its rule."""
 
+import math
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from settings import error_of
+from settings import error_of, flatten
 
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.envs.robots.a1 import A1Cfg
@@ -17,6 +18,8 @@ from legged_torque.terrain import make_terrain
 from legged_torque.terrain.height_map import HeightMap
 from legged_torque.terrain.hfield import add_hfield
 from legged_torque.terrain.layout import Layout
+from legged_torque.terrain.plane import Plane
+from legged_torque.terrain.rough import RoughGround
 from legged_torque.terrain.tiles import TILES, Grid
 from legged_torque.utils.config import set_by_path, to_dict
 
@@ -265,12 +268,18 @@ def test_levels_move_by_legged_gyms_rule():
     torch.manual_seed(0)
     ground = make_ground(2000, num_rows=4, max_init_terrain_level=3)
     before = ground.levels.clone()
-    mask, distance, commanded = torch.rand(2000) < 0.7, 6.0 * torch.rand(2000), 8.0 * torch.rand(2000)
+    mask, steps, distance = torch.rand(2000) < 0.7, torch.randint(0, 5, (2000,)), 6.0 * torch.rand(2000)
+    commands = torch.rand(2000, 3) - 0.5
+    commanded = 10.0 * commands[:, 0].hypot(commands[:, 1])
+    direction = torch.nn.functional.normalize(torch.randn(2000, 2), dim=1)
+    place = ground.origins + torch.cat([direction * distance.unsqueeze(1), torch.rand(2000, 1)], dim=1)
     kept = ground.levels
-    ground.move_levels(mask, distance, commanded)
+    ground.end_episodes(mask, steps, place, commands, 10.0)
     assert ground.levels is kept, "written in place"
     drawn = []
-    for was, is_over, got, asked, now in zip(before.tolist(), mask, distance, commanded, kept.tolist(), strict=True):
+    for was, is_over, got, asked, now in zip(
+        before.tolist(), mask & (steps > 0), distance, commanded, kept.tolist(), strict=True
+    ):
         change = 0 if not is_over else 1 if got > 3.0 else -1 if got < 0.5 * asked else 0
         if was + change == 4:
             drawn.append(now)
@@ -284,6 +293,62 @@ def test_levels_are_kept_for_a_resume():
     ground = make_ground(7)
     found = world_tensors(SimpleNamespace(num_envs=7, terrain=ground))
     assert set(found) == {"terrain.levels", "terrain.columns"} and found["terrain.levels"] is ground.levels
+
+
+# ---- in a task ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def make_rough_task(make_task, monkeypatch):
+    """Factory of tasks that are told of rough ground, while physics has the robot's own plane."""
+    monkeypatch.setattr(RoughGround, "add_to", Plane.add_to)
+    cfg = flatten({"terrain": to_dict(ground_cfg(terrain_proportions={"rough_slope": 0.0, "stairs_up": 1.0}).terrain)})
+    return lambda num_envs, **changes: make_task("a1_position", num_envs, **(cfg | changes))
+
+
+def test_height_scan(make_rough_task):
+    """Point by point: 17 x 11 heights along the heading, clipped and scaled; the policy sees them by option only."""
+    task = make_rough_task(2)
+    seen = {"terrain.measure_heights": True, "noise.add_noise": True, "noise.noise_scales.height_measurements": 0.02}
+    other = make_rough_task(2, **seen)
+    position = torch.tensor([[2.0, 1.7, 0.9], [-5.2, -3.1, -0.7]])
+    for robots in (task, other):
+        robots.base_pos.copy_(position)
+        yaw, roll = torch.tensor([0.4, -1.1]), torch.tensor([0.3, 0.0])
+        turns = [yaw.cos() * roll.cos(), yaw.cos() * roll.sin(), yaw.sin() * roll.sin(), yaw.sin() * roll.cos()]
+        robots.base_quat.copy_(torch.stack(turns, dim=1))  # half the angles: first about x, then about z
+        robots.compute_observations()
+    expected = torch.empty(2, 17, 11)
+    for world, heading in enumerate((0.8, -2.2)):
+        for i in range(17):
+            for j in range(11):
+                x, y = 0.1 * i - 0.8, 0.1 * j - 0.5
+                point = position[world, 0] + math.cos(heading) * x - math.sin(heading) * y
+                point = torch.stack([point, position[world, 1] + math.sin(heading) * x + math.cos(heading) * y])
+                height = task.terrain.height(point)
+                expected[world, i, j] = 5.0 * (position[world, 2] - 0.5 - height).clamp(-1.0, 1.0)
+    expected = expected.flatten(1)
+    assert (expected == -5.0).any() and expected.max() > 0.0
+    obs, others = task.get_observations(), other.get_observations()
+    assert obs["policy"].shape == (2, 45) and others["policy"].shape == (2, 45 + 187)
+    torch.testing.assert_close(obs["critic"][:, -187:], expected, atol=1e-3, rtol=0.0)
+    errors = (others["policy"][:, 45:] - expected).abs()
+    assert 0.08 < errors.max() < 0.1 + 1e-3
+    mirrored = task.mirror("critic", obs["critic"])[:, -187:].view(2, 17, 11)
+    torch.testing.assert_close(mirrored.flip(2).flatten(1), obs["critic"][:, -187:])
+
+
+def test_levels_and_places_in_episodes(make_rough_task):
+    """Worlds begin on their tiles; when an episode ends far away, the next begins a level higher."""
+    task = make_rough_task(4)
+    torch.testing.assert_close(task.base_pos[:, :2], task.terrain.origins[:, :2])
+    assert task.terrain.levels.tolist() == [0, 1, 0, 1] and task.curriculum_values()["terrain_level"] == 0.5
+    task.base_pos[:, 0] += torch.tensor([3.2, 3.2, 2.8, 2.8])
+    task.commands.copy_(torch.tensor([0.2, 0.0, 0.0]).expand(4, 3))
+    task.episode_length_buf = torch.full((4,), task.max_episode_length - 1)
+    task.step(torch.zeros(4, 12))
+    assert task.reset_buf.all() and task.terrain.levels.tolist() == [1, 2, 0, 1]
+    torch.testing.assert_close(task.base_pos[:, :2], task.terrain.origins[:, :2])
 
 
 # ---- mistakes --------------------------------------------------------------------------------------------------------

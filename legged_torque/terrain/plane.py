@@ -28,6 +28,15 @@ class Plane(Terrain):
     def move_to_origin(self, mask: Tensor, base_pos: Tensor) -> None:
         """Leave trunks where they are."""
 
+    def end_episodes(
+        self, mask: Tensor, steps: Tensor, base_pos: Tensor, commands: Tensor, episode_length_s: float
+    ) -> None:
+        """Stay as it is."""
+
+    def curriculum_values(self) -> dict[str, Tensor]:
+        """Return nothing: a plane is a plane."""
+        return {}
+
     def height_above(self, points: Tensor) -> Tensor:
         """Return z, without a kernel."""
         return points[..., 2]

@@ -24,10 +24,10 @@ class RoughGround(Terrain):
         columns: Column of that tile. Shape: (num_envs,), int64.
     """
 
-    def __init__(self, layout: Layout, num_envs: int, device: str, first_levels: int) -> None:
-        """Make the map, and spread worlds evenly over all columns, and there over the first levels."""
+    def __init__(self, layout: Layout, num_envs: int, device: str, first_levels: int, curriculum: bool) -> None:
+        """Make the map, and spread worlds over all columns and the first levels, which ``curriculum`` changes."""
         heights = layout.heights()
-        self.layout = layout
+        self.layout, self._curriculum = layout, curriculum
         self.map = HeightMap(heights, layout.horizontal_scale, layout.corner, device)
         self._origins = torch.as_tensor(layout.origins(heights), device=device)
         worlds = torch.arange(num_envs, device=device)
@@ -38,7 +38,7 @@ class RoughGround(Terrain):
     def build(cls, settings: Any, num_envs: int, device: str) -> RoughGround:
         """Make the ground of a section ``terrain``; a UserError if it asks for what cannot be."""
         first_levels = settings.max_init_terrain_level + 1 if settings.curriculum else settings.num_rows
-        return cls(Layout.of(settings), num_envs, device, first_levels)
+        return cls(Layout.of(settings), num_envs, device, first_levels, settings.curriculum)
 
     def add_to(self, spec: mujoco.MjSpec, floor: str) -> None:
         """Make the floor a height field."""
@@ -61,15 +61,24 @@ class RoughGround(Terrain):
         """Move trunks to the middles of their tiles."""
         base_pos.add_(torch.where(mask.unsqueeze(1), self.origins, 0.0))
 
-    def move_levels(self, mask: Tensor, distance: Tensor, commanded: Tensor) -> None:
-        """Change the levels of the worlds in ``mask``, whose episodes have ended, by legged_gym's rule.
+    def end_episodes(
+        self, mask: Tensor, steps: Tensor, base_pos: Tensor, commands: Tensor, episode_length_s: float
+    ) -> None:
+        """Change levels by legged_gym's rule, if there is a curriculum.
 
         A robot that got further than half a tile goes a level up, and from the highest to any; else one that got less
-        than half as far as was commanded goes a level down. Shapes: (num_envs,); distances [m], from where they began.
+        than half as far as its last command leads in a whole episode goes a level down.
         """
+        if not self._curriculum:
+            return
+        distance = (base_pos - self.origins)[:, :2].norm(dim=1)
         up = distance > 0.5 * self.layout.tile_size
-        down = ~up & (distance < 0.5 * commanded)
+        down = ~up & (distance < 0.5 * episode_length_s * commands[:, :2].norm(dim=1))
         levels = (self.levels + up.long() - down.long()).clamp(min=0)
         num_rows = self.layout.num_rows
         levels = torch.where(levels < num_rows, levels, torch.randint_like(levels, num_rows))
-        self.levels.copy_(torch.where(mask, levels, self.levels))
+        self.levels.copy_(torch.where(mask & (steps > 0), levels, self.levels))
+
+    def curriculum_values(self) -> dict[str, Tensor]:
+        """Return the mean level of all worlds."""
+        return {"terrain_level": self.levels.float().mean()}

@@ -36,6 +36,21 @@ class Terrain(ABC):
         Of the worlds in ``mask`` (num_envs,), bool, ``base_pos`` is changed in place. Shape: (num_envs, 3).
         """
 
+    @abstractmethod
+    def end_episodes(
+        self, mask: Tensor, steps: Tensor, base_pos: Tensor, commands: Tensor, episode_length_s: float
+    ) -> None:
+        """Learn from the episodes that end in the worlds of ``mask``, before :meth:`move_to_origin` begins the next.
+
+        They have lasted so many ``steps``, 0 where none has begun yet, of ``episode_length_s`` at most. Trunks have got
+        to ``base_pos`` under ``commands``: v_x, v_y [m/s] and yaw rate. Shapes: (num_envs,), bool; (num_envs,), int64;
+        (num_envs, 3) both.
+        """
+
+    @abstractmethod
+    def curriculum_values(self) -> dict[str, Tensor]:
+        """Return the scalars by which one sees how hard the ground is, for logging."""
+
     def height_above(self, points: Tensor) -> Tensor:
         """Return how high points are above the ground under them [m]. Shapes: (..., 3), (...,)."""
         return points[..., 2] - self.height(points)

@@ -106,10 +106,11 @@ class LeggedRobot(BaseTask):
         return parameters(self)
 
     def curriculum_values(self) -> dict[str, Tensor]:
-        """Return the scalars that curricula set, for logging: here the weights of reward terms that have one."""
+        """Return the scalars that curricula set, for logging: weights of reward terms that have one, and levels."""
         weights = self.reward_weights() / self.dt
         curricula = section_keys(self.cfg.rewards.curriculum)
-        return {f"weight_{name}": weights[i] for i, name in enumerate(self.reward_names) if name in curricula}
+        values = {f"weight_{name}": weights[i] for i, name in enumerate(self.reward_names) if name in curricula}
+        return values | self.terrain.curriculum_values()
 
     # ---- one control step --------------------------------------------------------------------------------------------
 
@@ -209,6 +210,8 @@ class LeggedRobot(BaseTask):
 
     def _reset_worlds(self) -> None:
         """Put the worlds of ``reset_buf`` where an episode starts; elsewhere draw anew what is due, and push."""
+        seconds, steps = self.cfg.env.episode_length_s, self._episode_length_buf
+        self.terrain.end_episodes(self.reset_buf, steps, self.base_pos, self.commands, seconds)
         self.events.happen(self.reset_buf)
         self.terrain.move_to_origin(self.reset_buf, self.base_pos)
 

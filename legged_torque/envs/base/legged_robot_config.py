@@ -72,6 +72,7 @@ class LeggedRobotCfg(BaseConfig):
         horizontal_scale: Annotated[float, Limits(0.01, 0.5)] = 0.05  # [m] from sample to sample
         curriculum: bool = True  # whether robots change levels; if not, they are spread evenly over all
         max_init_terrain_level: Number = 5  # with the curriculum, highest level on which robots start
+        measure_heights: bool = False  # whether the policy sees the height scan, too; the critic always does
         measured_points_x: Scan = [x / 10 for x in range(-8, 9)]  # [m] where the height scan measures: ahead
         measured_points_y: Scan = [y / 10 for y in range(-5, 6)]  # [m] and to the left
 
@@ -157,6 +158,7 @@ class LeggedRobotCfg(BaseConfig):
             dof_vel: NotNegative = 0.5  # [rad/s]
             ang_vel: NotNegative = 0.1  # [rad/s]
             gravity: NotNegative = 0.05  # of the unit vector
+            height_measurements: NotNegative = 0.1  # [m] of each point of the height scan
 
     class commands:  # commanded velocities, in the trunk's frame
         resampling_probability: Share = 0.002  # per control step: about every 10 s at 50 Hz
@@ -214,6 +216,7 @@ class LeggedRobotCfg(BaseConfig):
             ang_vel: NotNegative = 0.25  # of angular velocities in rad/s, commands included
             dof_pos: NotNegative = 1.0  # of joint angles in rad
             dof_vel: NotNegative = 0.05  # of joint velocities in rad/s
+            height_measurements: NotNegative = 5.0  # of the height scan in m
 
     def perturbations(self) -> dict[str, dict]:
         """Return the named changes that ``--perturbation`` chooses from (paper, IV-A)."""
