@@ -13,6 +13,7 @@ from settings import error_of, flatten
 
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.envs.robots.a1 import A1Cfg
+from legged_torque.learning.evaluator import evaluation_cfg
 from legged_torque.learning.worlds import world_tensors
 from legged_torque.terrain import make_terrain
 from legged_torque.terrain.height_map import HeightMap
@@ -286,6 +287,17 @@ def test_levels_move_by_legged_gyms_rule():
         else:
             assert now == max(was + change, 0)
     assert set(drawn) == {0, 1, 2, 3} and len(drawn) > 50
+
+
+def test_levels_stay_in_evaluations():
+    """Measured worlds are spread over all levels, wherever they get."""
+    cfg = evaluation_cfg(ground_cfg(), 12)
+    ground = make_terrain(cfg.terrain, 12, "cpu")
+    before = ground.levels.clone()
+    assert set(before.tolist()) == {0, 1, 2}
+    ended = torch.ones(12, dtype=torch.bool)
+    ground.end_episodes(ended, ended.long(), ground.origins + 5.0, torch.ones(12, 3), 20.0)
+    assert torch.equal(ground.levels, before)
 
 
 def test_levels_are_kept_for_a_resume():
