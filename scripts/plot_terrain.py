@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from legged_torque.utils.args import Parser
-from legged_torque.utils.cli import check_output, importing, run_script
+from legged_torque.utils.cli import check_at_least, check_output, importing, run_script
 from legged_torque.utils.errors import UserError
 
 
@@ -16,8 +16,7 @@ def main() -> None:
     args = parser.parse_args()
     if not 0.0 <= args.difficulty <= 1.0:
         raise UserError(f"--difficulty must be from 0 to 1, not {args.difficulty}")
-    if args.seed < 0:
-        raise UserError(f"--seed must be at least 0, not {args.seed}")
+    check_at_least(args, 0, "seed")
     check_output(args.out)
     with importing():
         from legged_torque.terrain.picture import draw_tiles
