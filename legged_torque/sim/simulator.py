@@ -17,6 +17,7 @@ from legged_torque.sim.fused.set_const import DerivedConstants
 from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.fused.tables import FUSED_FIELDS, unread_columns
 from legged_torque.sim.graph import prepare_device
+from legged_torque.sim.height_map import HeightMap
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
 from legged_torque.sim.per_world import check_fields, expand, owner
 from legged_torque.sim.warp_step import WarpStep
@@ -62,6 +63,7 @@ class Simulator:
         ls_iterations: int = 20,
         per_world: Sequence[str] = (),
         applied_forces: bool = False,
+        height_map: HeightMap | None = None,
     ) -> None:
         """Build the worlds on "cpu" or "cuda:N", all in the reference pose of a model with contact sensors.
 
@@ -92,7 +94,7 @@ class Simulator:
         self._constants = DerivedConstants(model, self.model, num_envs) if per_world else None
         self.is_fused = engine == "fused"
         if self.is_fused:
-            self._step: FusedStep | WarpStep = FusedStep(model, self.model, self.data, applied_forces)
+            self._step: FusedStep | WarpStep = FusedStep(model, self.model, self.data, applied_forces, height_map)
         else:
             self._step = WarpStep(self.model, self.data)
         state = (self.data.qpos, self.data.qvel, self.data.qacc_warmstart, self.data.ctrl)
