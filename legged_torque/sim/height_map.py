@@ -1,30 +1,24 @@
-"""Ground that is not a plane, as :class:`~legged_torque.sim.simulator.Simulator` takes it."""
+"""What :class:`~legged_torque.sim.simulator.Simulator` needs of ground that is not a plane."""
 
-from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from legged_torque.utils.errors import UserError
 
+class HeightMap(Protocol):
+    """Heights on a square grid in the world frame, the same for all worlds, and two triangles per cell.
 
-@dataclass(frozen=True)
-class HeightMap:
-    """Heights on a square grid; each cell is two triangles, the diagonal as in MuJoCo's hfield.
-
-    One map for all worlds, in the world frame. A UserError if it is not one of finite numbers with two rows and two
-    columns or more, or its cells have no size.
+    A cell's diagonal runs from sample (i, j) to (i + 1, j + 1), as in MuJoCo's hfield.
     """
 
-    heights: np.ndarray  # [m]; rows along x, columns along y. Shape: (rows, cols)
-    horizontal_scale: float  # side of a cell [m]
-    corner: tuple[float, float]  # x and y of the first height [m]
+    @property
+    def heights(self) -> np.ndarray:
+        """Return the heights [m]: rows along x, columns along y, two or more of each. Shape: (rows, cols)."""
 
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        shape = np.shape(self.heights)
-        if len(shape) != 2 or min(shape) < 2:
-            raise UserError(f"a height map has rows and columns, two or more of each; its shape is {shape}")
-        if not np.isfinite(self.heights).all():
-            raise UserError("a height map has heights that are not finite")
-        if not self.horizontal_scale > 0.0:
-            raise UserError(f"horizontal_scale of a height map is {self.horizontal_scale}: more than 0 is allowed")
+    @property
+    def horizontal_scale(self) -> float:
+        """Return the distance between neighbouring samples [m]."""
+
+    @property
+    def corner(self) -> tuple[float, float]:
+        """Return x and y of sample (0, 0) [m]."""

@@ -69,11 +69,14 @@ class Simulator:
 
         Each has its own rows of the fields ``per_world``, "gravity" among them. Iterations of the constraint solver,
         and of its line search, are the most per physics step. With ``applied_forces``, ``xfrc_applied`` and
-        ``qfrc_applied`` act. A UserError if the engine, one of :data:`ENGINES`, is unknown or cannot simulate this
-        robot, or does not read one of the fields.
+        ``qfrc_applied`` act. The ground of "fused" is a height map instead of the model's plane, if there is one; for
+        "mujoco_warp" the model has it as a hfield. A UserError if the engine, one of :data:`ENGINES`, is unknown or
+        cannot simulate this robot, or does not read one of the fields.
         """
         if engine not in ENGINES:
             raise unknown_name("sim.engine", engine, ENGINES)
+        if height_map is not None and engine != "fused":
+            raise ValueError("only the fused engine takes a height map; the model of others has a hfield")
         self.mj_model, self.num_envs, self.device = model, num_envs, device
         prepare_device(device)
         self._wp_device = wp.get_device(device)

@@ -5,10 +5,12 @@ import warp as wp
 
 from legged_torque.sim.height_map import HeightMap
 
-MAX_REACH = wp.constant(0.1)
+MAX_REACH = wp.constant(0.2)
 """How far around the centre of a sphere that is below the surface the way out is looked for [m]."""
 ALIKE = wp.constant(0.999)
 """Faces whose normals have this cosine, 2.6 degrees, are one face: a sphere never touches both."""
+ON_EDGE = wp.constant(1.0e-5)
+"""A point this share of a triangle's height outside of it is still inside, so that rounding leaves no gaps."""
 MIN_DISTANCE = wp.constant(1.0e-6)
 """A direction over a shorter way [m] is lost in float32."""
 
@@ -63,12 +65,15 @@ class Window:
 
 
 @wp.func
-def triangle_corner(half: int, k: int) -> wp.vec2i:
-    """Return which of a cell's four heights, by row and column, is corner ``k`` of one of its triangles.
+def half_of_cell(x: float, y: float) -> int:
+    """Return in which of a cell's two triangles a place in it is; the diagonal runs from its corner (0, 0) to (1, 1)."""
+    return wp.where(x >= y, 0, 1)
 
-    They go counterclockwise as seen from above; the diagonal runs from (1, 0) to (0, 1), as in MuJoCo's hfield.
-    """
-    return wp.vec2i(wp.where((k == 1) != (half == 1), 1, 0), wp.where((k == 2) != (half == 1), 1, 0))
+
+@wp.func
+def triangle_corner(half: int, k: int) -> wp.vec2i:
+    """Return which corner of its cell, by row and column, is a triangle's ``k``-th, counterclockwise from above."""
+    return wp.vec2i(wp.where(k == 1 or k + half == 2, 1, 0), wp.where(k == 2 or k * half == 1, 1, 0))
 
 
 @wp.func
@@ -96,7 +101,7 @@ def see_triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> Triangle:
     out.dist = -wp.dot(out.normal, a)
     out.nearest = -out.dist * out.normal
     ab, bc, ca = wp.dot(area, wp.cross(a, b)), wp.dot(area, wp.cross(b, c)), wp.dot(area, wp.cross(c, a))
-    out.is_face = wp.min(ab, wp.min(bc, ca)) >= -1.0e-6 * wp.dot(area, area)
+    out.is_face = wp.min(ab, wp.min(bc, ca)) >= -ON_EDGE * wp.dot(area, area)
     if not out.is_face:
         out.nearest = nearest_on_edge(a, b)
         other = nearest_on_edge(b, c)
@@ -140,7 +145,7 @@ def height_above(surface: Surface, centre: wp.vec3) -> float:
     """Return how high a point is above the surface under it [m]."""
     window = make_window(surface, centre, 0.0)
     i, j = window.first[0], window.first[1]
-    half = wp.where(-window.start[0] - window.start[1] > surface.scale, 1, 0)
+    half = half_of_cell(-window.start[0], -window.start[1])
     triangle = cell_triangle(surface, i, j, half, window)
     return triangle.dist / triangle.normal[2]
 
@@ -160,17 +165,18 @@ def nearest_triangle(surface: Surface, window: Window, reach: float) -> Triangle
     One without a normal if all are further away than ``reach``.
     """
     best = Triangle()
-    best_sq = reach * reach * (1.0 + 1.0e-5)
+    best_sq = reach * reach * (1.0 + ON_EDGE)
     for i in range(window.first[0], window.last[0] + 1):
         for j in range(window.first[1], window.last[1] + 1):
             if top_of_cell(surface, i, j, window) > -reach:
                 for half in range(2):
                     other = cell_triangle(surface, i, j, half, window)
                     other_sq = wp.length_sq(other.nearest)
-                    bonus = wp.where(other.is_face and not best.is_face, 1.0 + 1.0e-5, 1.0)
-                    if other_sq < bonus * best_sq:
+                    if other.is_face != best.is_face:
+                        other_sq *= wp.where(other.is_face, 1.0 - ON_EDGE, 1.0 + ON_EDGE)
+                    if other_sq < best_sq:
                         best = other
-                        best_sq = other_sq
+                        best_sq = wp.length_sq(other.nearest)
     return best
 
 
