@@ -55,7 +55,9 @@ def sense_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch: Any
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
         address = contacts.found[k].sensor
         if address >= 0:
-            force = contact_force(contacts.found[k], contact_normal(contacts, k), contacts.residual[k], contacts.pushing[k])
+            force = contact_force(
+                contacts.found[k], contact_normal(contacts, k), contacts.residual[k], contacts.pushing[k]
+            )
             worlds.sensordata[world, address] = worlds.sensordata[world, address] + 1.0
             for r in range(3):
                 worlds.sensordata[world, address + 1 + r] = worlds.sensordata[world, address + 1 + r] + force[r]

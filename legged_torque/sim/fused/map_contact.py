@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from legged_torque.sim.fused.contact import BOX, MAX_CORNERS, Contact, contact_normal, half_size, make_contact
-from legged_torque.sim.fused.surface import Surface, make_surface, touch_map
+from legged_torque.sim.fused.contact import Contact, contact_normal, half_size, make_contact
 from legged_torque.sim.fused.math import quat_to_matrix
 from legged_torque.sim.fused.smooth import Poses
+from legged_torque.sim.fused.surface import Surface, make_surface, touch_map
 from legged_torque.sim.fused.tables import Tables, of_world
 from legged_torque.sim.fused.types import vec4
 from legged_torque.sim.height_map import HeightMap
@@ -55,8 +55,8 @@ def map_contacts(
     return MapContacts(found, residual, pushing, change, ground)
 
 
-@wp.func
-def contact_normal(contacts: MapContacts, k: int) -> wp.vec3:  # type: ignore[no-redef]  # noqa: F811: an overload
+@wp.func  # an overload
+def contact_normal(contacts: MapContacts, k: int) -> wp.vec3:  # type: ignore[no-redef]  # noqa: F811
     """Return the unit normal of the ground at a contact; the solver takes this or the plane's by its contacts' type."""
     return contacts.ground.normals[k]
 
@@ -67,12 +67,11 @@ def find_map_contacts(
 ) -> int:
     """Write the contacts of a branch with the height map from index ``first`` on and return how many there are.
 
-    A box touches as on a plane: with at most four corners, those below its centre.
+    Of a box all corners touch: without those above its centre, which MuJoCo leaves out on a plane, rough ground would
+    hold a box that is more than half in it.
     """
     surface = contacts.ground.surface
     count = int(0)
-    last_geom = int(-1)
-    in_geom = int(0)
     point = int(0)
     while point < tables.point_count[b]:
         geom = tables.point_geom[b, point]
@@ -87,12 +86,6 @@ def find_map_contacts(
         arm = turn * wp.cw_mul(tables.point_offset[b, point], half)
         centre = middle + arm
         touch = touch_map(surface, origin + centre, radius)
-        if geom != last_geom:
-            last_geom = geom
-            in_geom = 0
-        if tables.geom_type[geom] == BOX and (wp.dot(arm, touch.first) > 0.0 or in_geom == MAX_CORNERS):
-            touch.count = 0
-        in_geom += wp.min(touch.count, 1)
         for i in range(touch.count):
             normal = wp.where(i == 0, touch.first, touch.second)
             dist = wp.where(i == 0, touch.dist[0], touch.dist[1])

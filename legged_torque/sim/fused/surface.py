@@ -66,7 +66,7 @@ class Window:
 
 @wp.func
 def half_of_cell(x: float, y: float) -> int:
-    """Return in which of a cell's two triangles a place in it is; the diagonal runs from its corner (0, 0) to (1, 1)."""
+    """Return in which of a cell's two triangles a place in it is; the diagonal runs from corner (0, 0) to (1, 1)."""
     return wp.where(x >= y, 0, 1)
 
 
@@ -126,9 +126,12 @@ def cell_triangle(surface: Surface, i: int, j: int, half: int, window: Window) -
 
 @wp.func
 def make_window(surface: Surface, centre: wp.vec3, reach: float) -> Window:
-    """Return the cells within a distance along x and y of a point."""
+    """Return the cells within a distance along x and y of a point.
+
+    Outside of the map all is flat outwards: a place further out is like one near the border.
+    """
     window = Window()
-    margin = reach + 2.0 * surface.scale  # outside of the map all is flat outwards: a place further out is like this one
+    margin = reach + 2.0 * surface.scale
     for k in range(2):
         place = wp.clamp(
             centre[k] - surface.corner[k], -margin, float(surface.heights.shape[k] - 1) * surface.scale + margin
