@@ -1,10 +1,14 @@
 """The surface of a height map, two triangles per cell, and where a sphere touches it."""
 
+import math
+
 import numpy as np
 import warp as wp
 
 from legged_torque.sim.height_map import HeightMap
 
+USUAL_RADIUS = 0.05
+"""Spheres up to this size [m] that are high enough above the ground are known to be so from one number."""
 MAX_REACH = wp.constant(0.2)
 """How far around the centre of a sphere that is below the surface the way out is looked for [m]."""
 ALIKE = wp.constant(0.999)
@@ -23,15 +27,22 @@ class Surface:
     scale: wp.float32  # side of a cell [m]
     corner: wp.vec2  # x and y of the first height [m]
     top: wp.float32  # the greatest height [m]
+    ceiling: wp.array2d(dtype=wp.float32)  # the greatest height near each cell [m]. Shape: (rows - 1, cols - 1)
+    near: wp.float32  # how far around a cell that is [m]
 
 
 def make_surface(height_map: HeightMap) -> Surface:
     """Return a height map on the current device."""
+    heights, scale = np.asarray(height_map.heights, np.float32), height_map.horizontal_scale
+    cells = math.ceil(USUAL_RADIUS / scale)
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(heights, cells, "edge"), (2 * cells + 2,) * 2)
     surface = Surface()
-    surface.heights = wp.array(np.asarray(height_map.heights), dtype=wp.float32)
-    surface.scale = height_map.horizontal_scale
+    surface.heights = wp.array(heights, dtype=wp.float32)
+    surface.scale = scale
     surface.corner = wp.vec2(*height_map.corner)
-    surface.top = float(np.max(height_map.heights))
+    surface.top = float(heights.max())
+    surface.ceiling = wp.array(windows.max(axis=(2, 3)), dtype=wp.float32)
+    surface.near = cells * scale
     return surface
 
 
@@ -144,34 +155,44 @@ def make_window(surface: Surface, centre: wp.vec3, reach: float) -> Window:
 
 
 @wp.func
-def height_above(surface: Surface, centre: wp.vec3) -> float:
-    """Return how high a point is above the surface under it [m]."""
+def triangle_under(surface: Surface, centre: wp.vec3) -> Triangle:
+    """Return the triangle that is vertically under, or above, a point."""
     window = make_window(surface, centre, 0.0)
-    i, j = window.first[0], window.first[1]
     half = half_of_cell(-window.start[0], -window.start[1])
-    triangle = cell_triangle(surface, i, j, half, window)
-    return triangle.dist / triangle.normal[2]
+    return cell_triangle(surface, window.first[0], window.first[1], half, window)
 
 
 @wp.func
-def top_of_cell(surface: Surface, i: int, j: int, window: Window) -> float:
-    """Return the greatest height of a cell, from the centre of the window's sphere [m]."""
-    near = wp.max(height_point(surface, i, j, window)[2], height_point(surface, i + 1, j, window)[2])
+def distance_sq_to_cell(surface: Surface, i: int, j: int, window: Window) -> float:
+    """Return the squared distance from the centre of the window's sphere to a cell, filled up to its highest corner."""
+    corner = height_point(surface, i, j, window)
+    top = wp.max(corner[2], height_point(surface, i + 1, j, window)[2])
     far = wp.max(height_point(surface, i, j + 1, window)[2], height_point(surface, i + 1, j + 1, window)[2])
-    return wp.max(near, far)
+    x, y = wp.max(corner[0], -corner[0] - surface.scale), wp.max(corner[1], -corner[1] - surface.scale)
+    away = wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(-wp.max(top, far), 0.0))
+    return wp.length_sq(away)
 
 
 @wp.func
-def nearest_triangle(surface: Surface, window: Window, reach: float) -> Triangle:
-    """Return the triangle that is nearest to the centre of the window's sphere; among equals, one with its face.
+def is_clear(surface: Surface, centre: wp.vec3, radius: float) -> bool:
+    """Return whether a sphere is above all that is near, which is all that most spheres need to know."""
+    i = int(wp.clamp((centre[0] - surface.corner[0]) / surface.scale, 0.0, float(surface.ceiling.shape[0] - 1)))
+    j = int(wp.clamp((centre[1] - surface.corner[1]) / surface.scale, 0.0, float(surface.ceiling.shape[1] - 1)))
+    return radius <= surface.near and centre[2] - radius > surface.ceiling[i, j]
 
-    One without a normal if all are further away than ``reach``.
+
+@wp.func
+def nearest_triangle(surface: Surface, window: Window, reach: float, under: Triangle) -> Triangle:
+    """Return which triangle is nearest to the centre of the window's sphere; among equals, one with its face.
+
+    The one under the centre is where the search starts; others count within ``reach``.
     """
-    best = Triangle()
-    best_sq = reach * reach * (1.0 + ON_EDGE)
+    best = under
+    best_sq = wp.length_sq(best.nearest)
     for i in range(window.first[0], window.last[0] + 1):
         for j in range(window.first[1], window.last[1] + 1):
-            if top_of_cell(surface, i, j, window) > -reach:
+            most = (1.0 + ON_EDGE) * wp.min(best_sq, reach * reach)
+            if distance_sq_to_cell(surface, i, j, window) < most:
                 for half in range(2):
                     other = cell_triangle(surface, i, j, half, window)
                     other_sq = wp.length_sq(other.nearest)
@@ -187,13 +208,13 @@ def nearest_triangle(surface: Surface, window: Window, reach: float) -> Triangle
 def second_face(surface: Surface, window: Window, radius: float, point: wp.vec3, normal: wp.vec3) -> Triangle:
     """Return the deepest other face that a sphere touches at a concave edge, given where it touches the surface.
 
-    Both points are in front of the other's face. One without a normal if there is none.
+    Both points are in front of the other's face. One at the distance of the radius if there is none.
     """
     best = Triangle()
     best.dist = radius
     for i in range(window.first[0], window.last[0] + 1):
         for j in range(window.first[1], window.last[1] + 1):
-            if top_of_cell(surface, i, j, window) > -radius:
+            if distance_sq_to_cell(surface, i, j, window) < radius * radius:
                 for half in range(2):
                     other = cell_triangle(surface, i, j, half, window)
                     way = other.nearest - point
@@ -212,15 +233,13 @@ def touch_map(surface: Surface, centre: wp.vec3, radius: float) -> Touch:
     triangles of one plane are never felt. Of a sphere whose centre is below the surface it is the shortest way out.
     """
     out = Touch()
-    above = height_above(surface, centre)
-    reach = radius
-    if above < 0.0:
-        reach = wp.max(radius, wp.min(-above, MAX_REACH))
-    window = make_window(surface, centre, reach)
-    search = wp.max(reach, -above)
-    nearest = nearest_triangle(surface, window, search)
-    if wp.length_sq(nearest.normal) == 0.0:
+    if is_clear(surface, centre, radius):
         return out
+    under = triangle_under(surface, centre)
+    above = under.dist / under.normal[2]
+    reach = wp.max(radius, wp.min(-above, MAX_REACH))
+    window = make_window(surface, centre, reach)
+    nearest = nearest_triangle(surface, window, reach, under)
     away = wp.length(nearest.nearest)
     out.first = nearest.normal
     out.dist[0] = nearest.dist - radius
