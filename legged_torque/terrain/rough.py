@@ -28,7 +28,7 @@ class RoughGround(Terrain):
         """Make the map, and spread worlds over all columns and the first levels, which ``curriculum`` changes."""
         heights = layout.heights()
         self.layout, self._curriculum = layout, curriculum
-        self.map = HeightMap(heights, layout.horizontal_scale, layout.corner, device)
+        self.map: HeightMap = HeightMap(heights, layout.horizontal_scale, layout.corner, device)
         self._origins = torch.as_tensor(layout.origins(heights), device=device)
         worlds = torch.arange(num_envs, device=device)
         self.columns = worlds * layout.num_cols // num_envs

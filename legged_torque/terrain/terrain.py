@@ -8,9 +8,14 @@ from typing import Any
 import mujoco
 from torch import Tensor
 
+from legged_torque.terrain.height_map import HeightMap
+
 
 class Terrain(ABC):
     """The ground under all worlds."""
+
+    map: HeightMap | None = None
+    """Its surface, unless it is a plane."""
 
     @classmethod
     def build(cls, settings: Any, num_envs: int, device: str) -> Terrain:

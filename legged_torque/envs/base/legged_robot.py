@@ -246,11 +246,12 @@ class LeggedRobot(BaseTask):
         """Load robot, ground and motors, and build the simulator and its views."""
         cfg, sim = self.cfg, self.cfg.sim
         self.terrain = make_terrain(cfg.terrain, self.num_envs, self.device)
-        self.asset = load_asset(cfg, self.terrain)
+        height_map = self.terrain.map if sim.engine == "fused" else None  # others find it in their model
+        self.asset = load_asset(cfg, None if height_map else self.terrain)
         model = self.asset.mj_model
         per_world = MODEL_FIELDS if cfg.domain_rand.randomize_parameters else ()
         limits = (sim.solver_iterations, sim.ls_iterations)
-        self.sim = Simulator(model, self.num_envs, self.device, sim.engine, *limits, per_world)
+        self.sim = Simulator(model, self.num_envs, self.device, sim.engine, *limits, per_world, False, height_map)
         self.dof_names, self.foot_names = self.asset.dof_names, self.asset.foot_names
         self.num_dof = len(self.dof_names)
         axes = self.asset.dof_axes().tolist()
