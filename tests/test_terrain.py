@@ -19,11 +19,10 @@ from legged_torque.terrain import make_terrain
 from legged_torque.terrain.height_map import HeightMap
 from legged_torque.terrain.hfield import add_hfield
 from legged_torque.terrain.layout import Layout
-from legged_torque.terrain.plane import Plane
-from legged_torque.terrain.rough import RoughGround
 from legged_torque.terrain.tiles import TILES, Grid
 from legged_torque.utils.config import set_by_path, to_dict
 
+NEAR = np.array([[0, 0, 0], [0.02, 0, 0], [-0.02, 0, 0], [0, 0.02, 0], [0, -0.02, 0]])  # [m] where steps touch feet
 GRID = Grid(160, 0.05)
 MIDDLE = 80
 FLOOR = """<mujoco><worldbody><geom name="wall" type="box" size="1 1 1" pos="0 0 -90"/>
@@ -311,9 +310,8 @@ def test_levels_are_kept_for_a_resume():
 
 
 @pytest.fixture
-def make_rough_task(make_task, monkeypatch):
-    """Factory of tasks that are told of rough ground, while physics has the robot's own plane."""
-    monkeypatch.setattr(RoughGround, "add_to", Plane.add_to)
+def make_rough_task(make_task):
+    """Factory of tasks on stairs."""
     cfg = flatten({"terrain": to_dict(ground_cfg(terrain_proportions={"rough_slope": 0.0, "stairs_up": 1.0}).terrain)})
     return lambda num_envs, **changes: make_task("a1_position", num_envs, **(cfg | changes))
 
@@ -361,6 +359,23 @@ def test_levels_and_places_in_episodes(make_rough_task):
     task.step(torch.zeros(4, 12))
     assert task.reset_buf.all() and task.terrain.levels.tolist() == [1, 2, 0, 1]
     torch.testing.assert_close(task.base_pos[:, :2], task.terrain.origins[:, :2])
+
+
+def test_robots_stand_on_their_tiles(make_rough_task):
+    """After a second of position control, robots stand with all feet where the ground is, on steps as in the middle."""
+    task = make_rough_task(4, **{"asset.terminate_after_contacts_on": [], "domain_rand.init_yaw": [0.5, 0.5]})
+    task.base_pos[:2, 0] += 1.3  # half on the first steps
+    for _ in range(50):
+        task.step(torch.zeros(4, 12))
+    data = mujoco.MjData(task.sim.mj_model)
+    for world in range(4):
+        data.qpos[:] = task.sim.qpos[world]
+        mujoco.mj_kinematics(task.sim.mj_model, data)
+        for foot in task.foot_names:
+            place, radius = data.geom(foot).xpos, task.sim.mj_model.geom(foot).size[0]
+            highest = task.terrain.height(torch.tensor(place + NEAR)).max()
+            assert -0.005 < place[2] - float(highest) - radius < 0.05, (world, foot)
+    assert task.feet_contact[2:].all()
 
 
 # ---- mistakes --------------------------------------------------------------------------------------------------------
