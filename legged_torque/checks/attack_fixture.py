@@ -50,6 +50,7 @@ WORDS = {
     "plot_curves.py": (CURVE, "--out=out.png"),
     "plot_pretraining.py": (REPORT, "--out=out.png"),
     "plot_randomization.py": (*_SMALL, "--out=out.png"),
+    "plot_terrain.py": ("--out=out.png",),
     "benchmark.py": ("--task=a1_position", *_SMALL, "--rounds=1"),
     "check_capture.py": ("--task=a1_position", *_SMALL),
     "check_standing.py": _SMALL,

@@ -60,8 +60,13 @@ def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = FLOO
 
 
 def max_contacts(model: mujoco.MjModel) -> int:
-    """Return the most contacts that one world can have: one per sphere, two per capsule, eight per other geom."""
+    """Return the most contacts that one world can have: one per sphere, two per capsule, eight per other geom.
+
+    On a height field, every geom has four at most: those that MuJoCo Warp keeps.
+    """
     per_type = {int(mujoco.mjtGeom.mjGEOM_SPHERE): 1, int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2}
+    if mujoco.mjtGeom.mjGEOM_HFIELD in model.geom_type:
+        per_type = dict.fromkeys(map(int, model.geom_type), 4)
     touches = (model.geom_contype[:, None] & model.geom_conaffinity) != 0
     pairs = np.argwhere(np.triu(touches | touches.T, k=1))
     return sum(min(per_type.get(int(kind), 8) for kind in model.geom_type[pair]) for pair in pairs)

@@ -17,6 +17,7 @@ from legged_torque.sim.fused.set_const import DerivedConstants
 from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.fused.tables import FUSED_FIELDS, unread_columns
 from legged_torque.sim.graph import prepare_device
+from legged_torque.sim.height_map import HeightMap
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
 from legged_torque.sim.per_world import check_fields, expand, owner
 from legged_torque.sim.warp_step import WarpStep
@@ -62,16 +63,20 @@ class Simulator:
         ls_iterations: int = 20,
         per_world: Sequence[str] = (),
         applied_forces: bool = False,
+        height_map: HeightMap | None = None,
     ) -> None:
         """Build the worlds on "cpu" or "cuda:N", all in the reference pose of a model with contact sensors.
 
         Each has its own rows of the fields ``per_world``, "gravity" among them. Iterations of the constraint solver,
         and of its line search, are the most per physics step. With ``applied_forces``, ``xfrc_applied`` and
-        ``qfrc_applied`` act. A UserError if the engine, one of :data:`ENGINES`, is unknown or cannot simulate this
-        robot, or does not read one of the fields.
+        ``qfrc_applied`` act. The ground of "fused" is a height map instead of the model's plane, if there is one; for
+        "mujoco_warp" the model has it as a hfield. A UserError if the engine, one of :data:`ENGINES`, is unknown or
+        cannot simulate this robot, or does not read one of the fields.
         """
         if engine not in ENGINES:
             raise unknown_name("sim.engine", engine, ENGINES)
+        if height_map is not None and engine != "fused":
+            raise ValueError("only the fused engine takes a height map; the model of others has a hfield")
         self.mj_model, self.num_envs, self.device = model, num_envs, device
         prepare_device(device)
         self._wp_device = wp.get_device(device)
@@ -92,7 +97,7 @@ class Simulator:
         self._constants = DerivedConstants(model, self.model, num_envs) if per_world else None
         self.is_fused = engine == "fused"
         if self.is_fused:
-            self._step: FusedStep | WarpStep = FusedStep(model, self.model, self.data, applied_forces)
+            self._step: FusedStep | WarpStep = FusedStep(model, self.model, self.data, applied_forces, height_map)
         else:
             self._step = WarpStep(self.model, self.data)
         state = (self.data.qpos, self.data.qvel, self.data.qacc_warmstart, self.data.ctrl)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import torch
 from torch import Tensor
 
@@ -10,6 +11,9 @@ from legged_torque.terrain.terrain import Terrain
 
 class Plane(Terrain):
     """A plane at z = 0, on which every world starts at the origin."""
+
+    def add_to(self, spec: mujoco.MjSpec, floor: str) -> None:
+        """Leave the robot's own plane."""
 
     def height(self, points: Tensor) -> Tensor:
         """Return 0 for each point."""
@@ -23,6 +27,15 @@ class Plane(Terrain):
 
     def move_to_origin(self, mask: Tensor, base_pos: Tensor) -> None:
         """Leave trunks where they are."""
+
+    def end_episodes(
+        self, mask: Tensor, steps: Tensor, base_pos: Tensor, commands: Tensor, episode_length_s: float
+    ) -> None:
+        """Stay as it is."""
+
+    def curriculum_values(self) -> dict[str, Tensor]:
+        """Return nothing: a plane is a plane."""
+        return {}
 
     def height_above(self, points: Tensor) -> Tensor:
         """Return z, without a kernel."""

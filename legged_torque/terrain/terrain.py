@@ -3,12 +3,28 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
+import mujoco
 from torch import Tensor
+
+from legged_torque.terrain.height_map import HeightMap
 
 
 class Terrain(ABC):
     """The ground under all worlds."""
+
+    map: HeightMap | None = None
+    """Its surface, unless it is a plane."""
+
+    @classmethod
+    def build(cls, settings: Any, num_envs: int, device: str) -> Terrain:
+        """Return the ground for a section ``terrain`` of settings, which :class:`Plane` does not need."""
+        return cls()
+
+    @abstractmethod
+    def add_to(self, spec: mujoco.MjSpec, floor: str) -> None:
+        """Put this ground into a robot's MJCF in place of its plane, the geom ``floor`` of the world."""
 
     @abstractmethod
     def height(self, points: Tensor) -> Tensor:
@@ -24,6 +40,21 @@ class Terrain(ABC):
 
         Of the worlds in ``mask`` (num_envs,), bool, ``base_pos`` is changed in place. Shape: (num_envs, 3).
         """
+
+    @abstractmethod
+    def end_episodes(
+        self, mask: Tensor, steps: Tensor, base_pos: Tensor, commands: Tensor, episode_length_s: float
+    ) -> None:
+        """Learn from the episodes that end in the worlds of ``mask``, before :meth:`move_to_origin` begins the next.
+
+        They have lasted so many ``steps``, 0 where none has begun yet, of ``episode_length_s`` at most. Trunks have got
+        to ``base_pos`` under ``commands``: v_x, v_y [m/s] and yaw rate. Shapes: (num_envs,), bool; (num_envs,), int64;
+        (num_envs, 3) both.
+        """
+
+    @abstractmethod
+    def curriculum_values(self) -> dict[str, Tensor]:
+        """Return the scalars by which one sees how hard the ground is, for logging."""
 
     def height_above(self, points: Tensor) -> Tensor:
         """Return how high points are above the ground under them [m]. Shapes: (..., 3), (...,)."""

@@ -14,3 +14,12 @@ def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     w, xyz = quat[..., :1], quat[..., 1:]
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec - w * t + torch.linalg.cross(xyz, t)
+
+
+def quat_rotate_yaw(quat: Tensor, vec: Tensor) -> Tensor:
+    """Turn vectors (..., 3) about the world's z axis as far as unit quaternions (..., 4) do; axes are broadcast."""
+    w, z = quat[..., 0], quat[..., 3]
+    norm = (w.square() + z.square()).clamp(min=1e-12)  # 0 upside down, where there is no heading
+    cos, sin = (w.square() - z.square()) / norm, 2.0 * w * z / norm
+    x, y, height = vec.unbind(dim=-1)
+    return torch.stack(torch.broadcast_tensors(cos * x - sin * y, sin * x + cos * y, height), dim=-1)

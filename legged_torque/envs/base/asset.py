@@ -11,6 +11,7 @@ import numpy as np
 from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching, read_spec
+from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.mjcf import loading
 
@@ -36,8 +37,8 @@ class Asset:
         return self.mj_model.jnt_axis[1:]
 
 
-def load_asset(cfg: LeggedRobotCfg) -> Asset:
-    """Load the robot of ``cfg.asset``, to be simulated in steps of ``cfg.sim.dt``.
+def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
+    """Load the robot of ``cfg.asset``, to be simulated in steps of ``cfg.sim.dt``, on the file's plane or a terrain.
 
     A UserError if the file cannot be read, a name in the settings matches nothing, or motors are in another order.
     """
@@ -48,6 +49,8 @@ def load_asset(cfg: LeggedRobotCfg) -> Asset:
     feet = indices_matching(geoms, [settings.foot_name])
     penalized = indices_matching(geoms, settings.penalize_contacts_on)
     terminating = indices_matching(geoms, settings.terminate_after_contacts_on)
+    if terrain:
+        terrain.add_to(spec, FLOOR)
     with loading(resource_path(settings.file)):
         model = build_model(spec, geoms)
     if not np.isfinite([*model.body_mass, *model.body_inertia.flat]).all():

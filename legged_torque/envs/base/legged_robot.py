@@ -106,10 +106,11 @@ class LeggedRobot(BaseTask):
         return parameters(self)
 
     def curriculum_values(self) -> dict[str, Tensor]:
-        """Return the scalars that curricula set, for logging: here the weights of reward terms that have one."""
+        """Return the scalars that curricula set, for logging: weights of reward terms that have one, and levels."""
         weights = self.reward_weights() / self.dt
         curricula = section_keys(self.cfg.rewards.curriculum)
-        return {f"weight_{name}": weights[i] for i, name in enumerate(self.reward_names) if name in curricula}
+        values = {f"weight_{name}": weights[i] for i, name in enumerate(self.reward_names) if name in curricula}
+        return values | self.terrain.curriculum_values()
 
     # ---- one control step --------------------------------------------------------------------------------------------
 
@@ -209,6 +210,8 @@ class LeggedRobot(BaseTask):
 
     def _reset_worlds(self) -> None:
         """Put the worlds of ``reset_buf`` where an episode starts; elsewhere draw anew what is due, and push."""
+        seconds, steps = self.cfg.env.episode_length_s, self._episode_length_buf
+        self.terrain.end_episodes(self.reset_buf, steps, self.base_pos, self.commands, seconds)
         self.events.happen(self.reset_buf)
         self.terrain.move_to_origin(self.reset_buf, self.base_pos)
 
@@ -242,16 +245,17 @@ class LeggedRobot(BaseTask):
     def _create_sim(self) -> None:
         """Load robot, ground and motors, and build the simulator and its views."""
         cfg, sim = self.cfg, self.cfg.sim
-        self.asset = load_asset(cfg)
+        self.terrain = make_terrain(cfg.terrain, self.num_envs, self.device)
+        height_map = self.terrain.map if sim.engine == "fused" else None  # others find it in their model
+        self.asset = load_asset(cfg, None if height_map else self.terrain)
         model = self.asset.mj_model
         per_world = MODEL_FIELDS if cfg.domain_rand.randomize_parameters else ()
         limits = (sim.solver_iterations, sim.ls_iterations)
-        self.sim = Simulator(model, self.num_envs, self.device, sim.engine, *limits, per_world)
+        self.sim = Simulator(model, self.num_envs, self.device, sim.engine, *limits, per_world, False, height_map)
         self.dof_names, self.foot_names = self.asset.dof_names, self.asset.foot_names
         self.num_dof = len(self.dof_names)
         axes = self.asset.dof_axes().tolist()
         self.symmetry = RobotSymmetry(cfg.asset.mirrored_legs, self.dof_names, axes, self.foot_names)
-        self.terrain = make_terrain(cfg.terrain.mesh_type)
         self.motors = make_motors(cfg.motors.model, self.num_envs, self._tensor(model.actuator_forcerange.T))
         self.torque_limits, self.motor_strength = self.motors.limits, self.motors.strength
         self.base_pos, self.base_quat = self.sim.qpos[:, :3], self.sim.qpos[:, 3:7]

@@ -24,6 +24,7 @@ from legged_torque.utils.limits import (
 )
 
 Place = Annotated[list[float], Limits(-1e3, 1e3, length=3)]
+Scan = Annotated[list[float], Limits(-10, 10, nonempty=True)]
 Gains = Annotated[float | dict[str, float], Limits(lowest=0)]
 
 
@@ -61,7 +62,32 @@ class LeggedRobotCfg(BaseConfig):
         ls_iterations: Annotated[int, Limits(1, 1000)] = 20  # line search, at most
 
     class terrain:  # the ground
-        mesh_type: str = "plane"  # the only one so far
+        mesh_type: str = "plane"  # or heightfield: a map of tiles, to which all that follows belongs
+        seed: Number = 1  # of the map
+        num_rows: Annotated[int, Limits(1, 100)] = 10  # levels: rows of tiles along x, the first is the easiest
+        num_cols: Annotated[int, Limits(1, 100)] = 20  # tiles of each level, along y; a column is of one kind
+        difficulty_range: Annotated[list[float], Limits(0, 1, ordered=True)] = [0.0, 1.0]  # rows divide it evenly
+        tile_size: Annotated[float, Limits(6, 100)] = 8.0  # [m] side of a tile
+        border_size: Annotated[float, Limits(0, 100)] = 25.0  # [m] level ground around all tiles
+        horizontal_scale: Annotated[float, Limits(0.01, 0.5)] = 0.05  # [m] from sample to sample
+        curriculum: bool = True  # whether robots change levels; if not, they are spread evenly over all
+        max_init_terrain_level: Number = 5  # with the curriculum, highest level on which robots start
+        measure_heights: bool = False  # whether the policy sees the height scan, too; the critic always does
+        measured_points_x: Scan = [x / 10 for x in range(-8, 9)]  # [m] where the height scan measures: ahead
+        measured_points_y: Scan = [y / 10 for y in range(-5, 6)]  # [m] and to the left
+
+        class terrain_proportions:  # share of the columns of each kind; together 1
+            flat: Share = 0.0  # level
+            smooth_slope_up: Share = 0.05  # up to 0.4
+            smooth_slope_down: Share = 0.05  # likewise
+            rough_slope: Share = 0.1  # the same, and random heights
+            stairs_up: Share = 0.35  # steps of 0.05 to 0.23 m
+            stairs_down: Share = 0.25  # likewise
+            discrete_obstacles: Share = 0.2  # blocks and hollows of up to 0.25 m
+            waves: Share = 0.0  # crests of up to 0.3 m
+            stepping_stones: Share = 0.0  # of 1.58 to 0.08 m, with holes between them
+            gaps: Share = 0.0  # of up to 1 m
+            pits: Share = 0.0  # up to 1 m deep
 
     class motors:  # what joints get of the torques that actions ask for
         model: str = "ideal"  # any torque within the limits, at once
@@ -132,6 +158,7 @@ class LeggedRobotCfg(BaseConfig):
             dof_vel: NotNegative = 0.5  # [rad/s]
             ang_vel: NotNegative = 0.1  # [rad/s]
             gravity: NotNegative = 0.05  # of the unit vector
+            height_measurements: NotNegative = 0.1  # [m] of each point of the height scan
 
     class commands:  # commanded velocities, in the trunk's frame
         resampling_probability: Share = 0.002  # per control step: about every 10 s at 50 Hz
@@ -189,6 +216,7 @@ class LeggedRobotCfg(BaseConfig):
             ang_vel: NotNegative = 0.25  # of angular velocities in rad/s, commands included
             dof_pos: NotNegative = 1.0  # of joint angles in rad
             dof_vel: NotNegative = 0.05  # of joint velocities in rad/s
+            height_measurements: NotNegative = 5.0  # of the height scan in m
 
     def perturbations(self) -> dict[str, dict]:
         """Return the named changes that ``--perturbation`` chooses from (paper, IV-A)."""

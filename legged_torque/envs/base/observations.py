@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.envs.base.height_scan import CLIP, OFFSET, HeightScan
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import AXIAL_VECTOR, PLANAR_VELOCITY, SCALAR, VECTOR, Mirroring
 
@@ -41,6 +42,7 @@ _DESCRIPTIONS = {
     "joint_position": ("rad", "joint", "q - nominal_pose"),
     "joint_velocity": ("rad/s", "joint", "qd"),
     "last_action": ("", "none", "clipped actions of the step before, 0 at the start"),
+    "height_scan": ("m", "trunk", f"trunk's height - {OFFSET} - ground's, +-{CLIP}; points level, along the heading"),
     "random_parameters": ("", "none", "drawn parameters as shares of their ranges, -1 to 1"),
 }
 """Unit, frame and meaning of the standard terms."""
@@ -63,7 +65,7 @@ def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
     ) -> ObservationTerm:
         return ObservationTerm(name, value, mirror, scale, error, privileged, *_DESCRIPTIONS.get(name, ()))
 
-    return [
+    terms = [
         term("projected_gravity", lambda: task.projected_gravity, VECTOR, error=noise.gravity),
         term("angular_velocity", lambda: task.base_ang_vel, AXIAL_VECTOR, scales.ang_vel, noise.ang_vel),
         term("command", lambda: task.commands, PLANAR_VELOCITY, command_scales),
@@ -75,6 +77,11 @@ def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
         term("feet_contact", lambda: task.feet_contact, feet, privileged=True),
         term("random_parameters", lambda: task.randomization.values, parameter_mirror, privileged=True),
     ]
+    if task.cfg.terrain.mesh_type == "heightfield":
+        scan, is_hidden = HeightScan(task), not task.cfg.terrain.measure_heights
+        scan_settings = (scales.height_measurements, noise.height_measurements, is_hidden)
+        terms.append(term("height_scan", scan, scan.mirror, *scan_settings))
+    return terms
 
 
 class Observations:

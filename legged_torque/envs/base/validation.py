@@ -19,6 +19,8 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
         raise UserError("rewards.scales.symmetry needs asset.mirrored_legs: which legs are right and left of a pair")
     if cfg.rewards.scales.base_height and not cfg.rewards.base_height_target > 0.0:
         raise UserError(f"rewards.base_height_target must be greater than 0, not {cfg.rewards.base_height_target}")
+    if cfg.terrain.mesh_type == "heightfield":
+        _check_map(cfg)
     rand = cfg.domain_rand
     for name in rand.keep_fixed:
         if name not in cfg.random_ranges():
@@ -28,6 +30,22 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
             "domain_rand.action_delay_unit must be control_steps, since control.refresh_torques is off: torques are "
             "computed once per control step"
         )
+
+
+def _check_map(cfg: LeggedRobotCfg) -> None:
+    """Refuse a map that cannot be, levels that it does not have, and a scan that leaves it."""
+    from legged_torque.terrain.layout import Layout  # it imports torch, which other grounds need not wait for
+
+    settings = cfg.terrain
+    Layout.of(settings)
+    if settings.curriculum and settings.max_init_terrain_level >= settings.num_rows:
+        most = f"at most {settings.num_rows - 1}, since terrain.num_rows is {settings.num_rows}"
+        raise UserError(f"terrain.max_init_terrain_level must be {most}, not {settings.max_init_terrain_level}")
+    for name in ("measured_points_x", "measured_points_y"):
+        farthest = max(abs(place) for place in getattr(settings, name))
+        if farthest > settings.border_size:
+            most = f"at most terrain.border_size, {settings.border_size}, either way"
+            raise UserError(f"terrain.{name} must be {most}, not {farthest}")
 
 
 def _check_changes(section: Section, path: str = "") -> None:

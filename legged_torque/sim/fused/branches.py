@@ -13,14 +13,15 @@ import warp as wp
 from legged_torque.sim.fused import solver
 from legged_torque.sim.fused.applied import apply_to_branch
 from legged_torque.sim.fused.constraint import make_joint_rows
-from legged_torque.sim.fused.contact import Contacts, find_contacts
+from legged_torque.sim.fused.contact import find_contacts
 from legged_torque.sim.fused.integrate import integrate_branch, sense_branch
+from legged_torque.sim.fused.map_contact import MAX_TOUCHES, find_map_contacts
 from legged_torque.sim.fused.math import group_sum, group_sum3
 from legged_torque.sim.fused.smooth import Pose, add_bodies, links_maker, make_equations
 from legged_torque.sim.fused.tables import Tables, Worlds, dof, qadr
 from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
-from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types
+from legged_torque.sim.fused.types import AnyBranch, AnyContacts, Body, Trunk, branch_types
 
 LINE_SEARCH_TOLERANCE = wp.constant(0.1)
 FIRST_TOLERANCE = wp.constant(5.0)
@@ -35,12 +36,14 @@ class Layout(NamedTuple):
     depth: int  # joints per branch
     points: int  # most contacts of a branch with the floor
     lanes: int  # threads per world, a power of two; 1 on a CPU
+    on_map: bool  # whether the ground is a height map, not a plane
 
     @classmethod
-    def of(cls, tree: Tree, on_gpu: bool) -> "Layout":
+    def of(cls, tree: Tree, on_gpu: bool, on_map: bool) -> "Layout":
         """Return a robot's layout: on a GPU a thread per branch, rounded up to a power of two, else one per world."""
         branches, depth = tree.joints.shape
-        return cls(branches, depth, tree.most_points, 1 << (branches - 1).bit_length() if on_gpu else 1)
+        points = tree.most_points * (MAX_TOUCHES if on_map else 1)
+        return cls(branches, depth, points, 1 << (branches - 1).bit_length() if on_gpu else 1, on_map)
 
     @property
     def per_lane(self) -> int:
@@ -81,8 +84,9 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
 
     ``applied_forces`` says whether there are forces that a user applies, ``law`` what computes torques, if anything.
     """
-    branches, depth, points, lanes = layout
+    branches, depth, points, lanes, on_map = layout
     per_lane, place = layout.per_lane, places(layout)
+    find = find_map_contacts if on_map else find_contacts
     Branch, make_links = branch_types(depth).Branch, links_maker(depth)
     Kept = wp.array(dtype=Branch)
 
@@ -102,7 +106,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
                             worlds.ctrl[world, motor] = law(reads, world, motor, step, pos, vel)
 
     @wp.func
-    def make_branch(tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, contacts: Contacts) -> Branch:
+    def make_branch(tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, contacts: AnyContacts) -> Branch:
         """Return a branch with its equations of motion, constraints and the accelerations to start from."""
         poses = wp.zeros(shape=wp.static(depth + 1), dtype=Pose)
         branch, links = make_links(tables, worlds, world, b, trunk, poses)
@@ -111,7 +115,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
         branch = make_equations(branch, links, tables, world, b, trunk.rot)
         branch.rows = make_joint_rows(branch.rows, tables, worlds, world, b)
         branch.first_contact = (world * wp.static(branches) + b) * wp.static(points)
-        branch.num_contacts = find_contacts(tables, world, b, trunk.pos, poses, contacts, branch.first_contact)
+        branch.num_contacts = find(tables, world, b, trunk.pos, poses, contacts, branch.first_contact)
         for j in range(wp.static(depth)):
             branch.acc[j] = worlds.qacc_warmstart[world, dof(tables.branch_joint[b, j])]
         return branch
@@ -124,7 +128,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
         lane: int,
         trunk: Trunk,
         acc: TrunkMotion,
-        contacts: Contacts,
+        contacts: AnyContacts,
         kept: Kept,
     ):
         """Build the branches; return (the last of) them and the sum of their inertias and wrenches."""
@@ -160,7 +164,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
         branch: Branch,
         kept: Kept,
         damped: TrunkMotion,
-        contacts: Contacts,
+        contacts: AnyContacts,
         sense: bool,
     ):
         """Write the branches' state after the step, and their contact sensors."""
@@ -184,7 +188,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
 
     @wp.func
     def assemble_all(
-        world: int, lane: int, branch: Branch, kept: Kept, rot: wp.mat33, acc: TrunkMotion, contacts: Contacts
+        world: int, lane: int, branch: Branch, kept: Kept, rot: wp.mat33, acc: TrunkMotion, contacts: AnyContacts
     ):
         """Assemble and eliminate the branches' Newton equations; return also what is left for the trunk."""
         system = TrunkSystem()
@@ -198,7 +202,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
 
     @wp.func
     def turn_all(
-        world: int, lane: int, branch: Branch, kept: Kept, rot: wp.mat33, step: TrunkMotion, contacts: Contacts
+        world: int, lane: int, branch: Branch, kept: Kept, rot: wp.mat33, step: TrunkMotion, contacts: AnyContacts
     ):
         """Find the branches' parts of the step; return also their slopes of the cost along it."""
         slopes = wp.vec3(0.0)
@@ -218,7 +222,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
         branch: Branch,
         kept: Kept,
         at_start: wp.vec3,
-        contacts: Contacts,
+        contacts: AnyContacts,
     ) -> float:
         """Return the share of the step at which the cost is least: Newton's method, kept between bounds."""
         alpha = float(1.0)
@@ -243,7 +247,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
         return alpha
 
     @wp.func
-    def move_all(world: int, branch: Branch, kept: Kept, contacts: Contacts, alpha: float):
+    def move_all(world: int, branch: Branch, kept: Kept, contacts: AnyContacts, alpha: float):
         """Move the branches along the step; return also how many rows of the world changed their state."""
         flips = float(0.0)
         for i in range(wp.static(per_lane)):

@@ -4,7 +4,7 @@ import warp as wp
 
 from legged_torque.sim.fused.constraint import MIN_VALUE, constraint_mass, reference_dynamics
 from legged_torque.sim.fused.math import quat_to_matrix
-from legged_torque.sim.fused.smooth import Poses
+from legged_torque.sim.fused.smooth import Pose, Poses
 from legged_torque.sim.fused.tables import Tables, of_world
 from legged_torque.sim.fused.types import vec4
 
@@ -51,10 +51,30 @@ class Contacts:
 
 
 @wp.func
+def contact_normal(contacts: Contacts, k: int) -> wp.vec3:
+    """Return the unit normal of the ground at a contact: the floor's; see ``map_contact`` for a height map's."""
+    return contacts.normal
+
+
+@wp.func
 def floor_normal(tables: Tables, world: int) -> wp.vec3:
     """Return the unit normal of the floor."""
     rot = quat_to_matrix(of_world(tables.geom_quat, world, tables.floor))
     return wp.vec3(rot[0, 2], rot[1, 2], rot[2, 2])
+
+
+@wp.func
+def plane_contacts(
+    tables: Tables,
+    world: int,
+    ground: int,
+    found: wp.array(dtype=Contact),
+    residual: wp.array(dtype=vec4),
+    pushing: wp.array(dtype=vec4),
+    change: wp.array(dtype=vec4),
+) -> Contacts:
+    """Return where a kernel keeps the contacts with the model's floor, all that there is to the ``ground``."""
+    return Contacts(found, residual, pushing, change, floor_normal(tables, world))
 
 
 @wp.func
@@ -178,6 +198,40 @@ def contact_stiffness(contact: Contact, normal: wp.vec3, pushing: vec4) -> wp.ma
 
 
 @wp.func
+def make_contact(
+    tables: Tables,
+    world: int,
+    geom: int,
+    depth: int,
+    pose: Pose,
+    turn: wp.mat33,
+    centre: wp.vec3,
+    radius: float,
+    dist: float,
+    normal: wp.vec3,
+) -> Contact:
+    """Return the contact of a sphere of a geom, at a distance from the ground that is negative."""
+    contact = Contact()
+    contact.pos = centre - (radius + 0.5 * dist) * normal
+    contact.depth = depth
+    contact.sensor = tables.geom_sensor[geom]
+    is_capsule = tables.geom_type[geom] == CAPSULE
+    contact.tangent = contact_tangent(normal, wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2]), is_capsule)
+    velocity = pose.lin_vel + wp.cross(pose.ang_vel, contact.pos)
+    return set_contact_rows(tables, world, geom, dist, velocity, normal, contact)
+
+
+@wp.func
+def half_size(tables: Tables, world: int, geom: int) -> wp.vec3:
+    """Return the half sizes of a geom, in units of which its points stand."""
+    size = of_world(tables.geom_size, world, geom)
+    half = size
+    if tables.geom_type[geom] == CAPSULE:
+        half = wp.vec3(0.0, 0.0, size[1])
+    return half
+
+
+@wp.func
 def find_contacts(
     tables: Tables, world: int, b: int, origin: wp.vec3, poses: Poses, contacts: Contacts, first: int
 ) -> int:
@@ -191,12 +245,8 @@ def find_contacts(
     while point < tables.point_count[b]:
         geom = tables.point_geom[b, point]
         depth = tables.point_depth[b, point]
-        size = of_world(tables.geom_size, world, geom)
-        is_capsule = tables.geom_type[geom] == CAPSULE
-        half = size
-        if is_capsule:
-            half = wp.vec3(0.0, 0.0, size[1])
-        radius = tables.point_radius[b, point] * size[0]
+        half = half_size(tables, world, geom)
+        radius = tables.point_radius[b, point] * of_world(tables.geom_size, world, geom)[0]
         middle = poses[depth].pos + poses[depth].rot * of_world(tables.geom_pos, world, geom)
         if wp.dot(height + middle, normal) > wp.length(half) + radius:  # nothing of the geom reaches the floor
             point = tables.point_next[b, point]
@@ -212,13 +262,9 @@ def find_contacts(
             dist = 0.0
         if dist < 0.0:
             in_geom += 1
-            contact = Contact()
-            contact.pos = centre - (radius + 0.5 * dist) * normal
-            contact.depth = depth
-            contact.sensor = tables.geom_sensor[geom]
-            contact.tangent = contact_tangent(normal, wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2]), is_capsule)
-            velocity = poses[depth].lin_vel + wp.cross(poses[depth].ang_vel, contact.pos)
-            contacts.found[first + count] = set_contact_rows(tables, world, geom, dist, velocity, normal, contact)
+            contacts.found[first + count] = make_contact(
+                tables, world, geom, depth, poses[depth], turn, centre, radius, dist, normal
+            )
             count += 1
         point += 1
     return count

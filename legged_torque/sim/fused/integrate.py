@@ -2,12 +2,12 @@
 
 import warp as wp
 
-from legged_torque.sim.fused.contact import Contacts, contact_force
+from legged_torque.sim.fused.contact import contact_force, contact_normal
 from legged_torque.sim.fused.math import quat_multiply, quat_rotation
 from legged_torque.sim.fused.solver import branch_step
 from legged_torque.sim.fused.tables import Tables, Worlds, dof, qadr
 from legged_torque.sim.fused.trunk import TrunkMotion
-from legged_torque.sim.fused.types import AnyBranch, Trunk
+from legged_torque.sim.fused.types import AnyBranch, AnyContacts, Trunk
 
 
 @wp.func
@@ -45,7 +45,7 @@ def integrate_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch:
 
 
 @wp.func
-def sense_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch: AnyBranch, contacts: Contacts):
+def sense_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch: AnyBranch, contacts: AnyContacts):
     """Write the contact sensors of a branch's geoms: number of contacts, and the sum of their forces."""
     for k in range(tables.point_count[b]):
         address = tables.geom_sensor[tables.point_geom[b, k]]
@@ -55,7 +55,9 @@ def sense_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch: Any
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
         address = contacts.found[k].sensor
         if address >= 0:
-            force = contact_force(contacts.found[k], contacts.normal, contacts.residual[k], contacts.pushing[k])
+            force = contact_force(
+                contacts.found[k], contact_normal(contacts, k), contacts.residual[k], contacts.pushing[k]
+            )
             worlds.sensordata[world, address] = worlds.sensordata[world, address] + 1.0
             for r in range(3):
                 worlds.sensordata[world, address + 1 + r] = worlds.sensordata[world, address + 1 + r] + force[r]

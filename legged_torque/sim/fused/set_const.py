@@ -38,7 +38,7 @@ class DerivedConstants:
         self._device = model.qpos0.device
         for name in ("body_invweight0", "dof_invweight0"):
             expand(model, name, num_envs)
-        self._layout = layout = Layout.of(tree, self._device.is_cuda)
+        self._layout = layout = Layout.of(tree, self._device.is_cuda, on_map=False)
         self._measure, self._derive = make_measure(layout.depth), make_derive(layout)
         self._dim = (num_envs, (layout.depth + 1) * KINDS * layout.lanes)
         rotation = np.zeros(9)
@@ -197,7 +197,7 @@ def make_derive(layout: Layout) -> wp.Kernel:
     threads per body of a branch and kind of weight, which all factorize its equations and then take their own rows.
     All of them run the same loop, which is short, since code that runs once must first be fetched.
     """
-    branches, depth, _, lanes = layout
+    branches, depth, _, lanes, _ = layout
     per_lane, (Branch, _, Smooth) = layout.per_lane, branch_types(depth)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})

@@ -12,8 +12,8 @@ import warp as wp
 from legged_torque.sim.fused.constraint import friction_force, friction_state, row_force
 from legged_torque.sim.fused.contact import (
     Contact,
-    Contacts,
     contact_force,
+    contact_normal,
     contact_stiffness,
     expected_rows,
     pushing_rows,
@@ -21,7 +21,7 @@ from legged_torque.sim.fused.contact import (
 )
 from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, forward_solve, with_column
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
-from legged_torque.sim.fused.types import AnyBranch, AnyColumns, AnyMatrix, AnyVector, vec4
+from legged_torque.sim.fused.types import AnyBranch, AnyColumns, AnyContacts, AnyMatrix, AnyVector, vec4
 
 
 @wp.func
@@ -48,7 +48,7 @@ def contact_rows_times(
 
 
 @wp.func
-def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: Contacts):
+def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: AnyContacts):
     """Return a branch with the residuals of the accelerations that it starts from.
 
     Contacts push with the rows that are expected to, whatever these accelerations are. It is a better start than those
@@ -59,14 +59,14 @@ def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: Co
     branch.residuals.limit = branch.residuals.limit - branch.rows.limit_reference
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
         contact = contacts.found[k]
-        motion = contact_rows_times(branch, rot, trunk_acc, branch.acc, contacts.normal, contact)
+        motion = contact_rows_times(branch, rot, trunk_acc, branch.acc, contact_normal(contacts, k), contact)
         contacts.residual[k] = motion - contact.reference
         contacts.pushing[k] = expected_rows(contact)
     return branch
 
 
 @wp.func
-def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: Contacts):
+def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: AnyContacts):
     """Return a branch with gradient and Hessian of the cost, and what its contacts add for the trunk."""
     add = TrunkSystem()
     hessian = 1.0 * branch.smooth.mass
@@ -94,11 +94,11 @@ def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts:
                 motion = column(branch.smooth.lever, j) + wp.cross(column(branch.smooth.axis, j), contact.pos)
                 jacobian = with_column(jacobian, j, motion)
         pushing = contacts.pushing[k]
-        force = contact_force(contact, contacts.normal, contacts.residual[k], pushing)
+        force = contact_force(contact, contact_normal(contacts, k), contacts.residual[k], pushing)
         gradient -= wp.transpose(jacobian) * force
         gradient_lin -= force
         gradient_ang -= wp.transpose(lever) * force
-        stiffness = contact_stiffness(contact, contacts.normal, pushing)
+        stiffness = contact_stiffness(contact, contact_normal(contacts, k), pushing)
         pushed = stiffness * jacobian
         hessian += wp.transpose(jacobian) * pushed
         coupling_lin += pushed
@@ -161,7 +161,7 @@ def branch_step(branch: AnyBranch, trunk_step: TrunkMotion):
 
 
 @wp.func
-def turn_to(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts: Contacts):
+def turn_to(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts: AnyContacts):
     """Return a branch with its part of the Newton step and the changes of its residuals along it.
 
     Return also the slope of its rows' cost along the step.
@@ -177,14 +177,14 @@ def turn_to(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts:
         slope -= row_force(branch.rows.limit_mass[j], branch.residuals.limit[j]) * branch.change.limit[j]
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
         contact = contacts.found[k]
-        change = contact_rows_times(branch, rot, trunk_step, branch.step, contacts.normal, contact)
+        change = contact_rows_times(branch, rot, trunk_step, branch.step, contact_normal(contacts, k), contact)
         slope += contact.mass * wp.dot(wp.cw_mul(contacts.pushing[k], contacts.residual[k]), change)
         contacts.change[k] = change
     return branch, slope
 
 
 @wp.func
-def row_slopes(branch: AnyBranch, contacts: Contacts, alpha: float) -> wp.vec2:
+def row_slopes(branch: AnyBranch, contacts: AnyContacts, alpha: float) -> wp.vec2:
     """Return first and second derivative of the rows' cost along the step, at a share ``alpha`` of it."""
     slope = float(0.0)
     curvature = float(0.0)
@@ -222,7 +222,7 @@ def slopes_at_start(branch: AnyBranch, trunk_step: TrunkMotion, of_rows: float) 
 
 
 @wp.func
-def move(branch: AnyBranch, contacts: Contacts, alpha: float):
+def move(branch: AnyBranch, contacts: AnyContacts, alpha: float):
     """Return a branch moved by a share of the step, and how many rows changed their state on the way."""
     flips = float(0.0)
     branch.acc = branch.acc + alpha * branch.step

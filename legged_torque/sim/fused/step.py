@@ -16,13 +16,15 @@ import warp as wp
 
 from legged_torque.sim.fused.applied import apply_to_trunk
 from legged_torque.sim.fused.branches import FIRST_TOLERANCE, LINE_SEARCH_TOLERANCE, Layout, around_solver, in_solver
-from legged_torque.sim.fused.contact import Contact, Contacts, floor_normal
+from legged_torque.sim.fused.contact import Contact, plane_contacts
 from legged_torque.sim.fused.integrate import integrate_trunk
+from legged_torque.sim.fused.map_contact import Ground, make_ground, map_contacts
 from legged_torque.sim.fused.smooth import make_trunk, trunk_pose
 from legged_torque.sim.fused.tables import Tables, Worlds, make_tables
-from legged_torque.sim.fused.tree import read_tree
+from legged_torque.sim.fused.tree import check_map, read_tree
 from legged_torque.sim.fused.trunk import TrunkMotion, solve_trunk, trunk_residual, trunk_slopes, whole_body
 from legged_torque.sim.fused.types import branch_types, vec4
+from legged_torque.sim.height_map import HeightMap
 from legged_torque.sim.parallel import launch_worlds
 
 BLOCK_DIM = 128  # threads per block: of 32, 64 and 128 the fastest in many worlds, in 4096 within 3% of it
@@ -40,24 +42,32 @@ class FusedStep:
     carried: tuple[()] = ()
 
     def __init__(
-        self, mj_model: mujoco.MjModel, model: mjw.Model, data: mjw.Data, applied_forces: bool = False
+        self,
+        mj_model: mujoco.MjModel,
+        model: mjw.Model,
+        data: mjw.Data,
+        applied_forces: bool = False,
+        height_map: HeightMap | None = None,
     ) -> None:
         """Read the robot's structure; the kernels compile at the first step that needs them.
 
         Parameters that change in ``model``, the one on the device, act at once; ``xfrc_applied`` and ``qfrc_applied``
-        of ``data`` act with ``applied_forces``. A UserError if the robot has something that this step does not
-        simulate.
+        of ``data`` act with ``applied_forces``. The ground is the model's plane, or a height map, of which that plane
+        says how it feels. A UserError if the robot has something that this step does not simulate.
         """
         tree = read_tree(mj_model)
         self._device = data.qpos.device
-        layout = Layout.of(tree, self._device.is_cuda)
+        if height_map is not None:
+            check_map(mj_model)
+        layout = Layout.of(tree, self._device.is_cuda, height_map is not None)
         room = data.nworld * layout.branches
         with wp.ScopedDevice(self._device):
             tables = make_tables(mj_model, model, tree)
             self._scratch = [wp.empty(room * layout.points, dtype=dtype) for dtype in (Contact, vec4, vec4, vec4)]
             waiting = room if layout.per_lane > 1 else 1  # a GPU's threads have one branch each
             self._scratch.append(wp.empty(waiting, dtype=branch_types(layout.depth).Branch))
-        self._model = [tables, mj_model.opt.iterations, mj_model.opt.ls_iterations]
+            ground = make_ground(height_map, room * layout.points) if height_map is not None else 0
+        self._model = [tables, ground, mj_model.opt.iterations, mj_model.opt.ls_iterations]
         self._data = [data.ctrl, data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, data.solver_niter]
         self._data += [data.xfrc_applied, data.qfrc_applied]
         self._kernel_for = layout, applied_forces
@@ -90,12 +100,15 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
     around, solver, lanes = around_solver(layout, applied_forces, law), in_solver(layout), layout.lanes
     Reads = next(iter(law.input_types.values())) if law else wp.int32  # what the law reads: its first argument
     Branch = branch_types(layout.depth).Branch
+    GroundType = Ground if layout.on_map else wp.int32  # a plane is in the tables
+    gather = map_contacts if layout.on_map else plane_contacts
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def fused_step(
         first_world: int,
         # Model:
         tables: Tables,
+        ground: GroundType,
         iterations: int,
         ls_iterations: int,
         # In:
@@ -125,7 +138,7 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
         place, lane = wp.tid()
         world = first_world + place
         worlds = Worlds(ctrl, qpos, qvel, qacc_warmstart, sensordata, xfrc_applied, qfrc_applied)
-        contacts = Contacts(found, residuals, pushing, changes, floor_normal(tables, world))
+        contacts = gather(tables, world, ground, found, residuals, pushing, changes)
         for i in range(first_step, end_step):
             trunk = make_trunk(tables, worlds, world)
             if wp.static(applied_forces):

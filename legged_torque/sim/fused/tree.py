@@ -64,6 +64,13 @@ def read_tree(model: mujoco.MjModel) -> Tree:
     return Tree(np.array([[model.body_jntadr[body] for body in chain] for chain in chains]), points)
 
 
+def check_map(model: mujoco.MjModel) -> None:
+    """Raise a UserError if the floor of an accepted robot cannot become a height map, whose heights are the world's."""
+    floor = int(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)[0])
+    posed = model.geom_pos[floor].any() or not np.array_equal(model.geom_quat[floor], (1.0, 0.0, 0.0, 0.0))
+    _require(not posed, "its floor is not at the origin, where a height map needs it")
+
+
 def _require(holds: bool, reason: str) -> None:
     """Raise a UserError with the reason if something does not hold."""
     if not holds:

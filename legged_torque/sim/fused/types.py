@@ -18,6 +18,8 @@ AnyVector = AnyMatrix = AnyColumns = Any
 """A number per joint of a branch; a square matrix; a vector in space per joint."""
 AnyBranch = AnyLinks = AnyRows = Any
 """``Branch``, ``Links`` and ``JointRows`` of :func:`branch_types`."""
+AnyContacts = Any
+"""``Contacts`` with a plane, ``MapContacts`` with a height map."""
 
 
 @wp.struct

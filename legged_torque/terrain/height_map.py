@@ -1,0 +1,74 @@
+"""The surface of rough ground: heights on a grid, and the triangles between them.
+
+All that knows rough ground takes one :class:`HeightMap`: rewards, the height scan, contacts, MuJoCo's ``hfield``,
+viewers. A cell between four samples is two triangles, which meet in the diagonal from sample (i, j) to (i + 1, j + 1).
+That is how MuJoCo divides the cells of an ``hfield``, for contacts and for rays, and how MuJoCo Warp does.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+class HeightMap:
+    """Ground whose height is given on a grid in x and y of the world.
+
+    Outside of the grid, the ground goes on as it is at the nearest place of the grid's edge.
+
+    Attributes:
+        heights: Heights of the samples [m], along x and y. Shape: (rows, cols), float32.
+        horizontal_scale: Distance between neighbouring samples [m].
+        corner: x and y of sample (0, 0) [m].
+        samples: The heights on the device. It has one axis, so that it is never taken for a row per world.
+            Shape: (rows * cols,).
+    """
+
+    def __init__(self, heights: np.ndarray, horizontal_scale: float, corner: tuple[float, float], device: str) -> None:
+        """Keep heights of shape (rows, cols), at least two of each, here and on the device."""
+        self.heights = np.ascontiguousarray(heights, dtype=np.float32)
+        self.horizontal_scale, self.corner = horizontal_scale, corner
+        self.samples = torch.as_tensor(self.heights, device=device).flatten()
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Extent of the grid along x and y [m]."""
+        rows, cols = self.heights.shape
+        return (rows - 1) * self.horizontal_scale, (cols - 1) * self.horizontal_scale
+
+    def height(self, points: Tensor) -> Tensor:
+        """Return the height of the surface at x and y of points [m]. Shapes: (..., 2 or more) to (...,).
+
+        Points whose x or y is not a number have the height of some sample, not an error.
+        """
+        low, slope_x, slope_y, x, y = self._triangle(points)
+        return low + slope_x * x + slope_y * y
+
+    def normal(self, points: Tensor) -> Tensor:
+        """Return the upward unit normal of the triangle at x and y of points. Shapes: (..., 2 or more) to (..., 3)."""
+        _, slope_x, slope_y, _, _ = self._triangle(points)
+        upwards = torch.full_like(slope_x, self.horizontal_scale)
+        return torch.nn.functional.normalize(torch.stack([-slope_x, -slope_y, upwards], dim=-1), dim=-1)
+
+    def _triangle(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Return height at a cell's corner, rises of its triangle in x and y per cell [m], and x, y in cells."""
+        rows, cols = self.heights.shape
+        row, x = self._along(points[..., 0], self.corner[0], rows)
+        col, y = self._along(points[..., 1], self.corner[1], cols)
+        corner = row * cols + col
+        is_along_x = x >= y  # the triangle below the diagonal, whose third corner is the next sample along x
+        low = self._sample(corner, points)
+        third = self._sample(corner + torch.where(is_along_x, cols, 1), points)
+        first, second = third - low, self._sample(corner + (cols + 1), points) - third
+        return low, torch.where(is_along_x, first, second), torch.where(is_along_x, second, first), x, y
+
+    def _along(self, place: Tensor, start: float, count: int) -> tuple[Tensor, Tensor]:
+        """Return in which cell of an axis places are, and where in it, from 0 to 1."""
+        cells = ((place.nan_to_num() - start) / self.horizontal_scale).clamp(0.0, count - 1.0)
+        cell = cells.floor().clamp(max=count - 2.0)
+        return cell.long(), cells - cell
+
+    def _sample(self, index: Tensor, points: Tensor) -> Tensor:
+        """Return samples with the precision of points."""
+        return self.samples[index].to(points.dtype)

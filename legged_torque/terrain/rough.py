@@ -1,0 +1,84 @@
+"""Rough ground in tiles, and the levels on which worlds train."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import torch
+from torch import Tensor
+
+from legged_torque.terrain.height_map import HeightMap
+from legged_torque.terrain.hfield import add_hfield
+from legged_torque.terrain.layout import Layout
+from legged_torque.terrain.terrain import Terrain
+
+
+class RoughGround(Terrain):
+    """A map of tiles that all worlds share. Each world has a column for good and a row that changes: its level.
+
+    Attributes:
+        layout: Where the tiles lie.
+        map: The surface.
+        levels: Row of the tile on which each world starts its episodes. Shape: (num_envs,), int64.
+        columns: Column of that tile. Shape: (num_envs,), int64.
+    """
+
+    def __init__(self, layout: Layout, num_envs: int, device: str, first_levels: int, curriculum: bool) -> None:
+        """Make the map, and spread worlds over all columns and the first levels, which ``curriculum`` changes."""
+        heights = layout.heights()
+        self.layout, self._curriculum = layout, curriculum
+        self.map: HeightMap = HeightMap(heights, layout.horizontal_scale, layout.corner, device)
+        self._origins = torch.as_tensor(layout.origins(heights), device=device)
+        worlds = torch.arange(num_envs, device=device)
+        self.columns = worlds * layout.num_cols // num_envs
+        self.levels = worlds % first_levels
+
+    @classmethod
+    def build(cls, settings: Any, num_envs: int, device: str) -> RoughGround:
+        """Make the ground of a section ``terrain``; a UserError if it asks for what cannot be."""
+        first_levels = settings.max_init_terrain_level + 1 if settings.curriculum else settings.num_rows
+        return cls(Layout.of(settings), num_envs, device, first_levels, settings.curriculum)
+
+    def add_to(self, spec: mujoco.MjSpec, floor: str) -> None:
+        """Make the floor a height field."""
+        add_hfield(spec, self.map, floor)
+
+    def height(self, points: Tensor) -> Tensor:
+        """Return the height of the surface."""
+        return self.map.height(points)
+
+    def normal(self, points: Tensor) -> Tensor:
+        """Return the normal of the surface's triangle."""
+        return self.map.normal(points)
+
+    @property
+    def origins(self) -> Tensor:
+        """Middle of the tile of each world [m]. Shape: (num_envs, 3)."""
+        return self._origins[self.levels, self.columns]
+
+    def move_to_origin(self, mask: Tensor, base_pos: Tensor) -> None:
+        """Move trunks to the middles of their tiles."""
+        base_pos.add_(torch.where(mask.unsqueeze(1), self.origins, 0.0))
+
+    def end_episodes(
+        self, mask: Tensor, steps: Tensor, base_pos: Tensor, commands: Tensor, episode_length_s: float
+    ) -> None:
+        """Change levels by legged_gym's rule, if there is a curriculum.
+
+        A robot that got further than half a tile goes a level up, and from the highest to any; else one that got less
+        than half as far as its last command leads in a whole episode goes a level down.
+        """
+        if not self._curriculum:
+            return
+        distance = (base_pos - self.origins)[:, :2].norm(dim=1)
+        up = distance > 0.5 * self.layout.tile_size
+        down = ~up & (distance < 0.5 * episode_length_s * commands[:, :2].norm(dim=1))
+        levels = (self.levels + up.long() - down.long()).clamp(min=0)
+        num_rows = self.layout.num_rows
+        levels = torch.where(levels < num_rows, levels, torch.randint_like(levels, num_rows))
+        self.levels.copy_(torch.where(mask & (steps > 0), levels, self.levels))
+
+    def curriculum_values(self) -> dict[str, Tensor]:
+        """Return the mean level of all worlds."""
+        return {"terrain_level": self.levels.float().mean()}
