@@ -10,6 +10,7 @@ import warp as wp
 
 from legged_torque.sim.fused.surface import Surface, Touch, make_surface, touch_map
 from legged_torque.sim.simulator import Simulator
+from legged_torque.utils.errors import UserError
 from tests.test_fused import ROBOTS, assert_alike, compiled, draw_states, invariants, make_a1, put, step_mujoco
 
 BALL = """<mujoco><compiler angle="radian" autolimits="true"/>
@@ -349,3 +350,34 @@ def test_nothing_falls_through(kind, size, ground):
     above = np.array(points)[..., 2] - heights_under(height_map, np.array(points))
     assert above.min() > (-0.02 if kind == "box" else 0.0)  # under a riser's edge: 5 mm from its face
     assert np.mean(above.min(axis=1) < 0.1) > 0.9
+
+
+def test_beyond_the_border():
+    """Outside of the map the ground goes on as high as its border."""
+    height_map = make_map(lambda x, y: np.where(x > 0.0, 0.2, 0.0) + 0.0 * y, cells=20)
+    sim = simulate(ball(0.5), height_map, [[3.0, 0.1, 0.5], [-3.0, 40.0, 0.5], [0.2, -0.5, 0.5]], steps=300)
+    np.testing.assert_allclose(sim.qpos[:, 2], [0.3, 0.1, 0.3], rtol=0, atol=0.01)
+    assert (sim.contact_found == 1.0).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e30])
+def test_bad_numbers_stay_in_their_world(value):
+    """A world with a place that is none, or absurd, leaves the others bitwise alone."""
+    places = np.random.default_rng(6).uniform(-1.0, 1.0, (6, 3))
+    sims = [simulate(ball(0.5), make_map(rough), places) for _ in range(2)]
+    for axis in range(3):
+        sims[1].qpos[axis, axis] = value
+    for sim in sims:
+        for _ in range(50):
+            sim.step()
+    assert torch.equal(sims[0].qpos[3:], sims[1].qpos[3:]) and torch.isfinite(sims[0].qpos).all()
+
+
+def test_refused():
+    """Heights are the world's, so a floor that is elsewhere cannot become a map; other engines have their own way."""
+    spec, height_map = make_a1(), make_map(rough)
+    with pytest.raises(ValueError, match="hfield"):
+        Simulator(compiled(spec), 1, "cpu", "mujoco_warp", height_map=height_map)
+    spec.geom("floor").pos = [0.0, 0.0, 0.1]
+    with pytest.raises(UserError, match="its floor is not at the origin"):
+        Simulator(compiled(spec), 1, "cpu", height_map=height_map)

@@ -24,7 +24,7 @@ from legged_torque.sim.warp_step import WarpStep
 from legged_torque.utils.errors import UserError, unknown_name
 
 ENGINES = ("fused", "mujoco_warp")
-"""What may step the worlds: one kernel per step for legged robots on a plane, or MuJoCo Warp for any robot."""
+"""What may step the worlds: one kernel per step for legged robots, or MuJoCo Warp for any robot."""
 
 _BUFFERS = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CONTACT_MATCH")
 

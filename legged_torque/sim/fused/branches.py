@@ -39,7 +39,7 @@ class Layout(NamedTuple):
     on_map: bool  # whether the ground is a height map, not a plane
 
     @classmethod
-    def of(cls, tree: Tree, on_gpu: bool, on_map: bool) -> "Layout":
+    def of(cls, tree: Tree, on_gpu: bool, on_map: bool = False) -> "Layout":
         """Return a robot's layout: on a GPU a thread per branch, rounded up to a power of two, else one per world."""
         branches, depth = tree.joints.shape
         points = tree.most_points * (MAX_TOUCHES if on_map else 1)

@@ -1,7 +1,7 @@
 """Physics steps as one kernel: a group of threads per world, one thread per branch.
 
-MuJoCo Warp runs a step as some hundred small kernels, which wait for each other and for memory. A legged robot on a
-plane is small: a trunk and a few branches of hinge joints that meet only there. Here a thread holds a branch in
+MuJoCo Warp runs a step as some hundred small kernels, which wait for each other and for memory. A legged robot on
+the ground is small: a trunk and a few branches of hinge joints that meet only there. Here a thread holds a branch in
 registers from kinematics to integration, and the threads of a world add up what concerns the trunk.
 
 A launch may do several steps, each under torques that a Warp function computes from the state of the joints.

@@ -15,7 +15,7 @@ _GEOM_POINTS = {
     mujoco.mjtGeom.mjGEOM_CAPSULE: (_CAPSULE_ENDS, 1.0),
     mujoco.mjtGeom.mjGEOM_BOX: (_BOX_CORNERS, 0.0),
 }
-"""Where a geom can touch a plane: points in units of its half sizes, and how many radii it is thick around them."""
+"""Where a geom can touch the ground: points in units of its half sizes, and how many radii it is thick around them."""
 
 
 @dataclass
