@@ -38,7 +38,7 @@ def main() -> None:
     if args.resumes >= args.iterations:
         raise UserError(f"--resumes must be less than --iterations, which is {args.iterations}, not {args.resumes}")
     with importing():
-        check_env_cfg(task_registry.get_cfgs(args.task, options_of(args))[0])  # mistakes are told before anything is trained
+        check_env_cfg(task_registry.get_cfgs(args.task, options_of(args))[0])  # mistakes are told first
     with tempfile.TemporaryDirectory() as folder:
         sys.exit(0 if check(args, Path(folder)) else 1)
 

@@ -97,7 +97,7 @@ def warm_up(runner: OnPolicyRunner) -> None:
 
 
 def _state(runner: OnPolicyRunner) -> list[Tensor]:
-    """Return the tensors that training carries from one iteration to the next: networks, optimizer, counters, worlds."""
+    """Return the tensors that training carries between iterations: networks, optimizer, counters, worlds."""
     alg = runner.alg
     networks = [*alg.actor.state_dict().values(), *alg.critic.state_dict().values()]
     moments = [tensor for entry in alg.optimizer.state.values() for tensor in entry.values()]
