@@ -8,8 +8,10 @@ import pytest
 import torch
 import warp as wp
 
+from legged_torque.envs import task_registry
 from legged_torque.sim.fused.surface import Surface, Touch, make_surface, touch_map
 from legged_torque.sim.simulator import Simulator
+from legged_torque.terrain.rough import RoughGround
 from legged_torque.utils.errors import UserError
 from tests.test_fused import assert_alike, compiled, draw_states, invariants, make_a1, put, step_mujoco
 
@@ -391,3 +393,11 @@ def test_refused():
     spec.geom("floor").pos = [0.0, 0.0, 0.1]
     with pytest.raises(UserError, match="its floor is not at the origin"):
         Simulator(compiled(spec), 1, "cpu", height_map=height_map)
+
+
+def test_a_gpu_without_room(monkeypatch):
+    """A map that does not fit a GPU's memory is refused before it is made: three times 2601 x 4201 float32 here."""
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (2**20, 2**30))
+    settings, _ = task_registry.get_cfgs("a1_position")
+    with pytest.raises(UserError, match="needs 125 MiB, and cuda:0 has 1 left: raise terrain.horizontal_scale"):
+        RoughGround.build(settings.terrain, 1, "cuda:0")

@@ -35,13 +35,16 @@ def make_surface(height_map: HeightMap) -> Surface:
     """Return a height map on the current device."""
     heights, scale = np.asarray(height_map.heights, np.float32), height_map.horizontal_scale
     cells = math.ceil(USUAL_RADIUS / scale)
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(heights, cells, "edge"), (2 * cells + 2,) * 2)
+    ceiling = np.pad(heights, cells, "edge")
+    for _ in range(2):  # along one axis after the other: a cell's greatest height of so many cells on either side
+        ends = range(len(ceiling) - 2 * cells - 1, len(ceiling) + 1)
+        ceiling = np.maximum.reduce([ceiling[first:end] for first, end in enumerate(ends)]).T
     surface = Surface()
     surface.heights = wp.array(heights, dtype=wp.float32)
     surface.scale = scale
     surface.corner = wp.vec2(*height_map.corner)
     surface.top = float(heights.max())
-    surface.ceiling = wp.array(windows.max(axis=(2, 3)), dtype=wp.float32)
+    surface.ceiling = wp.array(ceiling, dtype=wp.float32)
     surface.near = cells * scale
     return surface
 
