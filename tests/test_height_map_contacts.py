@@ -21,6 +21,7 @@ BALL = """<mujoco><compiler angle="radian" autolimits="true"/>
  <geom name="ball" type="{kind}" size="{size}" mass="2" contype="1" conaffinity="15" condim="3" friction="1e-5"/>{fill}
  <body><joint axis="1 0 0" range="-9 9" damping="0.01"/><inertial pos="0 0 0" mass="0.01" diaginertia="1e-3 1e-3 1e-3"/>
  </body></body></worldbody></mujoco>"""
+# Tiny spheres in the middle make up for the points of other kinds, so that one kernel simulates all of them:
 POINTS = {"sphere": 1, "capsule": 2, "box": 8}
 FILL = '<geom size="1e-3" mass="0" contype="1" conaffinity="15" condim="3"/>'
 FLAT = '<geom name="floor" type="plane" size="0 0 1" contype="15" conaffinity="1" friction="{friction}"/>'
@@ -49,10 +50,7 @@ def tilted(slope, yaw):
 
 
 def ball(friction=1e-5, kind="sphere", size="0.1", planes=()):
-    """A ball with a needless leg on a flat floor, or on planes posed by quaternions through the origin.
-
-    Tiny spheres in its middle make up for the points of other kinds, so that one kernel simulates all of them.
-    """
+    """A ball with a needless leg on a flat floor, or on planes posed by quaternions through the origin."""
     posed = "".join(
         f'<geom type="plane" size="0 0 1" quat="{" ".join(map(str, quat))}" contype="15" conaffinity="1" '
         f'friction="{friction}"/>'
@@ -398,6 +396,5 @@ def test_refused():
 def test_a_gpu_without_room(monkeypatch):
     """A map that does not fit a GPU's memory is refused before it is made: three times 2601 x 4201 float32 here."""
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (2**20, 2**30))
-    settings, _ = task_registry.get_cfgs("a1_position")
-    with pytest.raises(UserError, match="needs 125 MiB, and cuda:0 has 1 left: raise terrain.horizontal_scale"):
-        RoughGround.build(settings.terrain, 1, "cuda:0")
+    with pytest.raises(UserError, match="needs 125 MiB, and cuda:0 has 1 left"):
+        RoughGround.build(task_registry.get_cfgs("a1_position")[0].terrain, 1, "cuda:0")
