@@ -42,6 +42,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=500, help=hint)
     parser.add_argument("--video", type=Path, help="mp4 to write; default: in the run's folder")
     parser.add_argument("--grid", type=int, help="number of robots in the video: 1, 4, 9, 16 or 25; default: 1")
+    add_terrain_args(parser)
     hint = """none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's
         window; default: %(default)s"""
     parser.add_argument("--viewer", choices=NUM_ENVS, default="none", help=hint)
@@ -59,6 +60,7 @@ def main() -> None:
     with importing():
         run = task_registry.load_run(options)
         from legged_torque.viewer.session import Session
+    choose_ground(run.env_cfg.terrain, args)
     set_seed(args.seed)
     if args.viewer == "none":
         roll_out(args, *task_registry.make_loaded(run, options), run.checkpoint)
@@ -79,6 +81,13 @@ def choose_worlds(args: argparse.Namespace) -> None:
         args.num_envs = max(NUM_ENVS[args.viewer], args.grid)
     elif 1 <= args.num_envs < args.grid:
         raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
+
+
+def choose_ground(settings: Any, args: argparse.Namespace) -> None:
+    """Let robots stay on their tiles, of the kinds and the difficulty that were asked for."""
+    settings.curriculum = False
+    if args.terrain or args.level is not None:
+        select_tiles(settings, args.terrain, args.level)
 
 
 def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:

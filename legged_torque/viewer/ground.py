@@ -17,10 +17,11 @@ from legged_torque.terrain.layout import Layout
 from legged_torque.utils.mjcf import loading
 
 if TYPE_CHECKING:
+    from legged_torque.envs.base.legged_robot import LeggedRobot
     from legged_torque.terrain.height_map import HeightMap
 
 RESOLUTION, MOST_PIXELS = 32.0, 4096  # of the picture: pixels per metre, but no more than so many along a side
-PLAIN, LINE, EDGE = 1.0, 0.94, 0.85  # brightness of a tile, of lines that are 1 m apart, and of its edges
+SHADES = (1.0, 0.94, 0.85)  # brightness of a tile, of lines on it that are 1 m apart, and of its edges
 STRAIGHT = 1e-6  # [m] how far a line may bend from sample to sample
 CLEARANCE = 0.3  # [m] how far above the ground a camera and its line of sight stay
 SMOOTHING, JUMP = 0.1, 0.6  # share of a change by which heights of cameras follow in a frame, and what they jump to [m]
@@ -62,12 +63,11 @@ class Ground:
         places = [(np.arange(count) + 0.5) / per_metre - layout.border_size for count in pixels]
         tiles = [np.floor(place / layout.tile_size).astype(int) for place in places]
         shade_x, shade_y = (_shade(place, layout.tile_size, 1.0 / per_metre) for place in places)
-        colors = np.array([*(color_of(kind) for kind in layout.kinds()), NEUTRAL], float)
+        colors = np.array([*(color_of(kind) for kind in layout.kinds()), NEUTRAL])
         is_row, is_col = (np.isin(tile, range(n)) for tile, n in zip(tiles, (layout.num_rows, layout.num_cols)))
-        column = np.where(is_row[:, None] & is_col, tiles[1], layout.num_cols)
-        shade = np.minimum(shade_x[:, None], shade_y)
-        image = (colors[column] * shade[..., None]).astype(np.uint8)
-        return image.transpose(1, 0, 2)[::-1]
+        column = np.where(is_row & is_col[:, None], tiles[1][:, None], layout.num_cols)
+        shades = (colors[:, None] * np.array(SHADES)[:, None]).astype(np.uint8)
+        return shades[column, np.maximum(shade_x, shade_y[:, None])][::-1]
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Return the height of the sample nearest to x and y of points [m]. Shapes: (..., 2 or more) to (...,)."""
@@ -96,6 +96,13 @@ class Ground:
         floor = next(geom for geom in spec.worldbody.geoms if geom.name == FLOOR)
         floor.type, floor.meshname, floor.material = mujoco.mjtGeom.mjGEOM_MESH, "ground", "ground"
         floor.pos, floor.quat, floor.contype, floor.conaffinity = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], 0, 0
+
+
+def ground_of(task: LeggedRobot) -> Ground | None:
+    """Return the ground of a task; None if it is a plane."""
+    from legged_torque.terrain.rough import RoughGround
+
+    return Ground(task.terrain.layout, task.terrain.map) if isinstance(task.terrain, RoughGround) else None
 
 
 def drawn_model(robot: Path, ground: Ground | None) -> mujoco.MjModel:
@@ -151,6 +158,6 @@ def patches(heights: np.ndarray) -> np.ndarray:
 
 
 def _shade(places: np.ndarray, tile_size: float, pixel: float) -> np.ndarray:
-    """Return how bright lines across an axis make places on it, by their distance from the first tile [m]."""
-    is_edge, is_line = (np.abs((places + 0.5 * step) % step - 0.5 * step) < 0.6 * pixel for step in (tile_size, 1.0))
-    return np.where(is_edge, EDGE, np.where(is_line, LINE, PLAIN))
+    """Return which of :data:`SHADES` places along an axis have, by their distance from the first tile [m]."""
+    is_line, is_edge = (np.abs((places + 0.5 * step) % step - 0.5 * step) < 0.6 * pixel for step in (1.0, tile_size))
+    return np.where(is_edge, 2, is_line.astype(int))
