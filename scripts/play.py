@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 
 from legged_torque import resource_path
 from legged_torque.envs import task_registry
+from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
 from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, check_at_least, check_output, importing, run_script
+from legged_torque.utils.cli import Parser, check_at_least, check_output, finite, importing, run_script
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
@@ -54,13 +55,18 @@ def main() -> None:
     if not 1 <= args.port <= 65535:
         raise UserError(f"--port must be from 1 to 65535, not {args.port}")
     choose_worlds(args)
+    kinds, levels = named_kinds(args.terrain), rising_levels(args.level)
+    if levels and not kinds:
+        raise UserError("--level needs --terrain: the kinds of rough ground")
     if args.video:
         check_output(args.video)
     options = options_of(args)
     with importing():
         run = task_registry.load_run(options)
         from legged_torque.viewer.session import Session
-    choose_ground(run.env_cfg.terrain, args)
+    run.env_cfg.terrain.curriculum = False  # robots stay on their tiles
+    if kinds:
+        select_tiles(run.env_cfg.terrain, kinds, levels, 1)
     set_seed(args.seed)
     if args.viewer == "none":
         roll_out(args, *task_registry.make_loaded(run, options), run.checkpoint)
@@ -83,11 +89,12 @@ def choose_worlds(args: argparse.Namespace) -> None:
         raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
 
 
-def choose_ground(settings: Any, args: argparse.Namespace) -> None:
-    """Let robots stay on their tiles, of the kinds and the difficulty that were asked for."""
-    settings.curriculum = False
-    if args.terrain or args.level is not None:
-        select_tiles(settings, args.terrain, args.level)
+def add_terrain_args(parser: Parser) -> None:
+    """Add what chooses the ground."""
+    hint = "kinds of rough ground, or all: a column of tiles of each; default: the ground of the training"
+    parser.add_argument("--terrain", nargs="+", metavar="KIND", default=[], help=hint)
+    hint = "difficulties of rough ground, 0 to 1: a row of tiles of each; default: those of the training"
+    parser.add_argument("--level", nargs="+", type=finite, default=[], help=hint)
 
 
 def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:

@@ -13,16 +13,16 @@ import numpy as np
 
 from legged_torque.sim.model import FLOOR
 from legged_torque.terrain.colors import NEUTRAL, color_of
+from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.mjcf import loading
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
-    from legged_torque.terrain.height_map import HeightMap
 
 RESOLUTION, MOST_PIXELS = 32.0, 4096  # of the picture: pixels per metre, but no more than so many along a side
 SHADES = (1.0, 0.94, 0.85)  # brightness of a tile, of lines on it that are 1 m apart, and of its edges
-STRAIGHT = 1e-6  # [m] how far a line may bend from sample to sample
+STRAIGHT, LARGEST = 1e-6, 20  # [m] how far lines of a rectangle may bend from sample to sample; cells of its sides
 CLEARANCE = 0.3  # [m] how far above the ground a camera and its line of sight stay
 SMOOTHING, JUMP = 0.1, 0.6  # share of a change by which heights of cameras follow in a frame, and what they jump to [m]
 
@@ -37,11 +37,11 @@ class Ground:
         faces: The triangles, counterclockwise as seen from above. Shape: (triangles, 3), int32.
     """
 
-    def __init__(self, layout: Layout, height_map: HeightMap) -> None:
-        """Find the triangles of a map with this layout."""
+    def __init__(self, layout: Layout, grid: HeightGrid) -> None:
+        """Find the triangles of a grid with this layout."""
         self.layout = layout
-        self._heights, self._scale = height_map.heights, height_map.horizontal_scale
-        self._corner, size = np.array(height_map.corner), np.array(height_map.size)
+        self._heights, self._scale = grid.heights, grid.horizontal_scale
+        self._corner, size = np.array(grid.corner), np.array(grid.size)
         first_x, last_x, first_y, last_y = patches(self._heights).T
         rows, cols = np.stack([first_x, last_x, last_x, first_x]), np.stack([first_y, first_y, last_y, last_y])
         samples, corners = np.unique(rows * self._heights.shape[1] + cols, return_inverse=True)
@@ -52,10 +52,7 @@ class Ground:
         self.faces = np.ascontiguousarray(triangles.T, np.int32).reshape(-1, 3)
 
     def picture(self) -> np.ndarray:
-        """Return the map from above in the colors of its kinds, from its last to its first y. Shape: (y, x, 3), uint8.
-
-        What lies around the tiles is neutral.
-        """
+        """Return the map from above, tiles in the colors of their kinds. Shape: (y, x of the world, 3), uint8."""
         layout = self.layout
         size = np.array(self._heights.shape) - 1
         per_metre = min(RESOLUTION, MOST_PIXELS / (size.max() * self._scale))
@@ -64,10 +61,16 @@ class Ground:
         tiles = [np.floor(place / layout.tile_size).astype(int) for place in places]
         shade_x, shade_y = (_shade(place, layout.tile_size, 1.0 / per_metre) for place in places)
         colors = np.array([*(color_of(kind) for kind in layout.kinds()), NEUTRAL])
-        is_row, is_col = (np.isin(tile, range(n)) for tile, n in zip(tiles, (layout.num_rows, layout.num_cols)))
+        is_row = (tiles[0] >= 0) & (tiles[0] < layout.num_rows)
+        is_col = (tiles[1] >= 0) & (tiles[1] < layout.num_cols)
         column = np.where(is_row & is_col[:, None], tiles[1][:, None], layout.num_cols)
         shades = (colors[:, None] * np.array(SHADES)[:, None]).astype(np.uint8)
-        return shades[column, np.maximum(shade_x, shade_y[:, None])][::-1]
+        return shades[column, np.maximum(shade_x, shade_y[:, None])]
+
+    def tile_text(self, row: int, column: int) -> str:
+        """Return what a tile is, in words."""
+        layout = self.layout
+        return f"{layout.kinds()[column]}, level {row} (difficulty {layout.difficulty(row):.2f})"
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Return the height of the sample nearest to x and y of points [m]. Shapes: (..., 2 or more) to (...,)."""
@@ -89,10 +92,15 @@ class Ground:
         texture.width, texture.height, texture.data = width, height, picture.tobytes()
         textures = [""] * mujoco.mjtTextureRole.mjNTEXROLE
         textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ground"
-        spec.add_material(name="ground", textures=textures, specular=0.05)
+        spec.add_material(name="ground", textures=textures, specular=0.05, rgba=[0.72, 0.72, 0.72, 1.0])
         mesh = spec.add_mesh(name="ground", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-        mesh.uservert, mesh.userface = self.vertices.ravel(), self.faces.ravel()
-        mesh.usertexcoord, mesh.userfacetexcoord = self.uv.ravel(), self.faces.ravel()
+        p0, p1, p2, _, _, p3 = self.faces.reshape(-1, 6).T
+        corners = self.vertices[[p0, p1, p2, p3]].transpose(1, 0, 2)
+        normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+        mesh.uservert, mesh.usernormal = corners.ravel(), np.repeat(normals, 4, axis=0).ravel()  # so edges stay sharp
+        mesh.usertexcoord = self.uv[[p0, p1, p2, p3]].transpose(1, 0, 2).ravel()
+        starts = 4 * np.arange(len(p0), dtype=np.int32)[:, None]
+        mesh.userface = (starts + np.array([0, 1, 2, 0, 2, 3], np.int32)).ravel()
         floor = next(geom for geom in spec.worldbody.geoms if geom.name == FLOOR)
         floor.type, floor.meshname, floor.material = mujoco.mjtGeom.mjGEOM_MESH, "ground", "ground"
         floor.pos, floor.quat, floor.contype, floor.conaffinity = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], 0, 0
@@ -144,6 +152,9 @@ def patches(heights: np.ndarray) -> np.ndarray:
     bends_y = np.abs(np.diff(heights, 2, axis=1)) > STRAIGHT
     is_end = np.ones((heights.shape[0] - 1, heights.shape[1]), bool)
     is_end[:, 1:-1] = bends_y[:-1] | bends_y[1:]
+    is_end[:, ::LARGEST] = True
+    starts = np.arange(0, len(is_end), LARGEST)
+    is_end = np.logical_or.reduceat(is_end, starts).repeat(np.diff(starts, append=len(is_end)), axis=0)
     strip, col = np.nonzero(is_end)
     is_run = strip[:-1] == strip[1:]
     strip, first, last = strip[:-1][is_run], col[:-1][is_run], col[1:][is_run]
@@ -152,7 +163,7 @@ def patches(heights: np.ndarray) -> np.ndarray:
     rise_first, rise_last = (heights[strip + 1, col] - heights[strip, col] for col in (first, last))
     is_plane = np.abs(rise_first - rise_last) < STRAIGHT
     goes_on = (np.diff(first) == 0) & (np.diff(last) == 0) & (np.diff(strip) == 1) & is_plane[1:] & is_plane[:-1]
-    goes_on &= np.abs(np.diff(rise_first)) < STRAIGHT
+    goes_on &= (np.abs(np.diff(rise_first)) < STRAIGHT) & (strip[1:] % LARGEST != 0)
     begins, ends = np.append(True, ~goes_on), np.append(~goes_on, True)
     return np.stack([strip[begins], strip[ends] + 1, first[begins], last[begins]], axis=1)
 

@@ -167,9 +167,7 @@ class Camera:
         return camera
 
 
-def _draw(
-    renderer: mujoco.Renderer, data: mujoco.MjData, trunk: int, moment: Moment, camera: Camera
-) -> np.ndarray:
+def _draw(renderer: mujoco.Renderer, data: mujoco.MjData, trunk: int, moment: Moment, camera: Camera) -> np.ndarray:
     """Return the image of a robot and the arrows of its velocities. Shape: (height, width, 3)."""
     data.qpos[:] = moment.qpos
     mujoco.mj_forward(renderer.model, data)
