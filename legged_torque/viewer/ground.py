@@ -80,9 +80,9 @@ class Ground:
 
     def lowest_view(self, target: np.ndarray, camera: np.ndarray) -> float:
         """Return how high a camera must be, above where it is, to see a target over the ground between them [m]."""
-        share = np.linspace(0.2, 1.0, 33)
-        ground = self.height(target + share[:, None] * (camera - target)) + CLEARANCE
-        return float((target[2] + (ground - target[2]) / share).max())
+        share = np.linspace(0.25, 1.0, 31)
+        ground = self.height(target + share[:, None] * (camera - target))
+        return float((target[2] + (ground - target[2]) / share).max()) + CLEARANCE
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Draw this surface in place of the floor of a robot, which will collide with nothing."""

@@ -16,6 +16,7 @@ from legged_torque.viewer.reading import Reading
 
 COMMAND_COLOR, VELOCITY_COLOR, SCAN_COLOR = (10, 150, 50), (20, 90, 230), (214, 51, 108)
 VISUAL_GROUPS = (0, 1, 2)  # groups of visual geoms; the others only collide
+GROUND_FACTOR = (0.6, 0.6, 0.6, 1.0)  # of the colors of rough ground: the light is bright
 SPACING = 2.0  # distance between neighbouring worlds [m]
 LIFTING = 0.2  # share of the way to where it sees the robot by which a camera moves up in a frame
 ARROW_LENGTH = 0.5  # length of the arrow of a velocity of 1 m/s [m]
@@ -71,7 +72,7 @@ class Scene:
                 handle.batched_wxyzs = quats[shown, body]
             if self._scan:
                 self._scan.visible = self.shows_scan and world == reading.world
-                self._scan.points = (reading.scan + self._offset).astype(np.float32)
+                self._scan.points = (reading.scan + self._offset + [0.0, 0.0, 0.01]).astype(np.float32)
             velocities = (reading.commands[world], reading.velocities[world])
             for handle, vector, height in zip(self._arrows, velocities, (0.22, 0.17), strict=True):
                 start = trunk + np.array([0.0, 0.0, height])
@@ -95,9 +96,9 @@ class Scene:
         assert self.ground
         for client in self._server.get_clients().values():
             camera = client.camera
-            if camera.update_timestamp == 0.0:
-                continue  # nothing is known of it yet
             place, target = np.array(camera.position), np.array(camera.look_at)
+            if not target.any():
+                continue  # the browser has not taken the page's camera yet
             lowest = self.ground.lowest_view(target - self._offset, place - self._offset) + self._offset[2]
             if place[2] < lowest - 0.01:
                 place[2] += LIFTING * (lowest - place[2])
@@ -132,7 +133,7 @@ class Scene:
         """Add rough ground and the points of the height scan, and return the ground."""
         scene = self._server.scene
         self._scan = scene.add_point_cloud(
-            "/scan", np.zeros((1, 3)), SCAN_COLOR, point_size=0.012, point_shape="circle", precision="float32"
+            "/scan", np.zeros((1, 3)), SCAN_COLOR, point_size=0.009, point_shape="circle", precision="float32"
         )
         return scene.add_glb("/ground", ground_glb(ground), cast_shadow=False, receive_shadow=True)
 
@@ -149,7 +150,9 @@ def places(num_envs: int) -> np.ndarray:
 def ground_glb(ground: Ground) -> bytes:
     """Return rough ground as a binary glTF. It has no normals: browsers draw its triangles flat, with sharp edges."""
     picture = Image.fromarray(ground.picture()[::-1])
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=0.95)
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=picture, baseColorFactor=GROUND_FACTOR, metallicFactor=0.0, roughnessFactor=0.95
+    )
     visual = trimesh.visual.TextureVisuals(ground.uv, material=material)
     mesh = trimesh.Trimesh(ground.vertices, ground.faces, visual=visual, process=False)
     return trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=False)
