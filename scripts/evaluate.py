@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from legged_torque.envs.base.legged_robot import LeggedRobot
     from legged_torque.envs.base.metrics import CommandBreakdown
-    from legged_torque.learning.crossing import Grounds, Result
+    from legged_torque.learning.crossing import Grounds
 
 STEPS = 2000  # control steps, where robots do not cross tiles
 
