@@ -1,23 +1,17 @@
 """Crossing tiles of rough ground: where robots start, when a tile is crossed, and what is counted."""
 
-import json
 import math
 
-import numpy as np
 import pytest
 import torch
-import yaml
 from settings import error_of
-from test_report import rows_of, run_script, whole_run, write_part
 from test_terrain import ground_cfg
 
-from legged_torque.envs.robots.a1 import A1Cfg
-from legged_torque.experiments.matrix import read_matrix
-from legged_torque.learning.crossing import SLOWNESS, SPEED, Grounds, cross
+from legged_torque.learning.crossing import Grounds, cross
 from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.tiles import TILES
-from legged_torque.utils.task_registry import task_registry
 from legged_torque.utils.options import Options
+from legged_torque.utils.task_registry import task_registry
 
 FAST = [2.0, 0.0, 0.0]  # a command under which a trial lasts 2 * 4 m / 2 m/s = 4 s
 
@@ -95,7 +89,7 @@ def test_who_stands_does_not_cross():
 
 
 def test_a_trial_by_default():
-    """Robots have twice as long as 4 m take at 0.6 m/s; all kinds stand for themselves, and kinds and levels are sets."""
+    """Robots have twice as long as 4 m take at 0.6 m/s; kinds and levels are sets."""
     grounds = Grounds.of(["flat", "all"], [0.3, 0.1, 0.3])
     assert (grounds.kinds, grounds.levels, grounds.command) == (list(TILES), [0.1, 0.3], (0.6, 0.0))
     assert grounds.time_limit(8.0) == pytest.approx(2 * 4.0 / 0.6)

@@ -10,7 +10,6 @@ import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from legged_torque.experiments.curves import CURVE_METRICS, LEVEL, MILLION, LearningCurve, Row
-from legged_torque.experiments.grounds import against_level, kinds_of
+from legged_torque.experiments.grounds import by_level, kinds_of
 from legged_torque.experiments.matrix import Matrix
 from legged_torque.experiments.paper_values import (
     ENVIRONMENTS,
@@ -235,45 +234,52 @@ def draw_curve(axis: Axes, seeds: list[Curve], label: str, styles: Style) -> Non
 
 
 def draw_success(experiment: Experiment, environment: str) -> Figure | None:
-    """Draw the share of robots that cross tiles over difficulty, a panel per kind; return None without data."""
+    """Draw the share of robots that cross tiles over difficulty, for each kind and all; return None without data."""
     plan = experiment.plan
-    by_task = {task: [run.crossings for run in experiment.runs_of(task, environment)] for task in plan.tasks}
-    by_task = {task: [each for each in seeds if each] for task, seeds in by_task.items() if any(seeds)}
+    approaches = list(dict.fromkeys(map(task_on_plane, plan.tasks)))
+    by_task = {}
+    for task in sorted(plan.tasks, key=lambda name: approaches.index(task_on_plane(name))):
+        by_task[task] = [run.crossings for run in experiment.runs_of(task, environment) if run.crossings]
     kinds = kinds_of([each for seeds in by_task.values() for each in seeds])
     if not kinds:
         return None
-    columns = min(4, len(kinds))
-    rows = math.ceil(len(kinds) / columns)
-    grid = {"figsize": (3.1 * columns, 2.3 * rows + 1.6), "sharex": True, "sharey": True, "squeeze": False}
+    columns = min(4, len(kinds) + 1)
+    rows = math.ceil((len(kinds) + 1) / columns)
+    grid = {"figsize": (3.1 * columns, 2.3 * rows + 1.2), "sharex": True, "sharey": True, "squeeze": False}
     figure, axes = load_pyplot().subplots(rows, columns, layout="constrained", **grid)
-    for axis, kind in zip_longest(axes.flat, kinds):
-        if kind is None:
-            axis.set_axis_off()
-            continue
+    for axis, kind in zip(axes.flat, [*kinds, None], strict=False):
         for task, seeds in by_task.items():
-            draw_success_line(axis, plan, task, [against_level(each, "crossed", kind) for each in seeds])
-        axis.set(title=kind.replace("_", " "), ylim=(-0.04, 1.04))
+            look = {"marker": MARKERS[approaches.index(task_on_plane(task)) % len(MARKERS)], "markersize": 3.5}
+            draw_success_line(axis, plan, task, [by_level(each, "crossed", kind) for each in seeds], look)
+        axis.set(title=kind.replace("_", " ") if kind else "mean of all kinds", ylim=(-0.04, 1.04))
         axis.grid(alpha=0.3)
-    figure.supxlabel("difficulty", fontsize=10)
-    figure.supylabel("share of robots that cross a tile in time", fontsize=10)
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(4, columns), handlelength=4, frameon=False)
-    title = f"{ENVIRONMENTS.get(environment, environment)}: mean over seeds, with a band from the lowest to the highest"
-    figure.suptitle(title, fontsize=11)
+    for axis in axes.flat[len(kinds) + 1 :]:
+        axis.set_axis_off()
+    for axis in axes[-1]:
+        axis.set_xlabel("difficulty")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("share that crosses")
+    shown = axes.flat[0].get_legend_handles_labels()
+    figure.legend(*shown, loc="outside lower center", ncols=columns, handlelength=4, frameon=False)
+    text = "robots that cross a tile in time, mean over seeds with a band from the lowest to the highest"
+    figure.suptitle(textwrap.fill(f"{ENVIRONMENTS.get(environment, environment)}: {text}", 40 * columns), fontsize=11)
     return figure
 
 
-def draw_success_line(axis: Axes, plan: Matrix, task: str, seeds: list[dict[float, float]]) -> None:
-    """Draw the success of a task on one kind of tiles, given by difficulty for each seed."""
+def draw_success_line(
+    axis: Axes, plan: Matrix, task: str, seeds: list[dict[float, float]], look: dict[str, Any]
+) -> None:
+    """Draw the success of a task, given by difficulty for each seed; nothing without seeds."""
+    levels = sorted(set[float]().union(*seeds))
+    if not levels:
+        return
     color, line, _ = style(plan.tasks, task)
-    approaches = list(dict.fromkeys(map(task_on_plane, plan.tasks)))
-    marker = MARKERS[approaches.index(task_on_plane(task)) % len(MARKERS)]
-    levels = sorted(set.intersection(*(set(seed) for seed in seeds)))
-    values = np.array([[seed[level] for level in levels] for seed in seeds])
+    values = np.array([[seed.get(level, math.nan) for level in levels] for seed in seeds])
     note = "" if len(seeds) == len(plan.seeds) else f" ({len(seeds)} of {len(plan.seeds)} seeds)"
-    look = {"color": color, "linestyle": line, "marker": marker, "markersize": 3.5, "linewidth": 1.5}
-    axis.plot(levels, values.mean(axis=0), label=f"{MODELS.get(task, task)}{note}", **look)
-    axis.fill_between(levels, values.min(axis=0), values.max(axis=0), color=color, alpha=0.15, linewidth=0)
+    look = look | {"color": color, "linestyle": line, "markerfacecolor": "white" if line == "--" else color}
+    label = f"{MODELS.get(task, task)}{note}"
+    axis.plot(levels, values.mean(axis=0), label=label, linewidth=1.5, **look)
+    axis.fill_between(levels, values.min(axis=0), values.max(axis=0), color=color, alpha=0.12, linewidth=0)
 
 
 def draw_bars(experiment: Experiment, table: Table, title: str) -> Figure | None:

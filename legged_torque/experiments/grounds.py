@@ -8,10 +8,10 @@ from pathlib import Path
 from statistics import fmean
 
 MEASURES = {
-    "crossed": ("share of robots that crossed their tile in time", 2),
-    "fell": ("share of robots that fell", 2),
-    "track_percentage": ("tracking", 2),
-    "cost_of_transport": ("cost of transport", 2),
+    "crossed": ("Share of robots that crossed their tile in time", 2),
+    "fell": ("Share of robots that fell", 2),
+    "track_percentage": ("Tracking", 2),
+    "cost_of_transport": ("Cost of transport", 2),
 }
 """What is shown of a tile: its meaning, and decimals in tables."""
 
@@ -38,16 +38,24 @@ def kinds_of(crossings: list[Crossings]) -> list[str]:
     return list(dict.fromkeys(kind for each in crossings for kind, _ in each))
 
 
+def by_level(crossings: Crossings, measure: str, kind: str | None = None) -> dict[float, float]:
+    """Return the mean of a measure by difficulty, over the tiles of a kind or all kinds; NaN without numbers."""
+    values: dict[float, list[float]] = {}
+    for (name, level), tile in sorted(crossings.items()):
+        if kind in (None, name):
+            values.setdefault(level, []).append(tile[measure])
+    return {level: finite_mean(numbers) for level, numbers in values.items()}
+
+
 def over_levels(crossings: Crossings, measure: str, kind: str | None = None) -> float:
     """Return the mean of a measure over the tiles of a kind, or of all; NaN without numbers."""
-    values = [tile[measure] for (name, _), tile in crossings.items() if kind in (None, name)]
+    return finite_mean([tile[measure] for (name, _), tile in crossings.items() if kind in (None, name)])
+
+
+def finite_mean(values: list[float]) -> float:
+    """Return the mean of what is finite; NaN if nothing is."""
     finite = [value for value in values if math.isfinite(value)]
     return fmean(finite) if finite else math.nan
-
-
-def against_level(crossings: Crossings, measure: str, kind: str) -> dict[float, float]:
-    """Return a measure by difficulty on tiles of a kind."""
-    return {level: tile[measure] for (name, level), tile in sorted(crossings.items()) if name == kind}
 
 
 def _numbers(entry: dict) -> dict[str, float]:

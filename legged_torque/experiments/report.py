@@ -13,8 +13,8 @@ from legged_torque.experiments.against_paper import MEANINGS, best_torque, count
 from legged_torque.experiments.blocks import VIDEO_TYPES, Block, Bullets, Code, Grid, Heading, Paragraph, Picture
 from legged_torque.experiments.curves import MILLION
 from legged_torque.experiments.figures import FIGURES, file_name, rough_figures
-from legged_torque.experiments.grounds import MEASURES, Crossings, kinds_of, over_levels
-from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE
+from legged_torque.experiments.grounds import MEASURES, kinds_of, over_levels
+from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE, Matrix
 from legged_torque.experiments.paper_values import MODELS, PAPER_METRICS, PAPER_TASKS, paper_value
 from legged_torque.experiments.results import (
     EVALUATIONS_FILE,
@@ -192,8 +192,8 @@ def rough_blocks(experiment: Experiment, figures: list[str], out: Path) -> list[
     text = (
         f"On each kind and difficulty, {plan.grounds['num_envs']} robots start in the middle of a tile, are told to "
         "walk straight on, and cross it if the trunk gets over its edge in time, see docs/terrain.md. In tables are "
-        "means over all difficulties, ± standard errors over seeds (number of seeds). All tiles are in "
-        f"`{GROUNDS_FILE}`."
+        "means over all difficulties, ± standard errors over seeds, in brackets how many if not all. All tiles "
+        f"are in `{GROUNDS_FILE}`."
     )
     titles = [title for title in rough_figures(plan) if title in figures]
     blocks: list[Block] = [Paragraph(text), *(Picture(title, out / file_name(title)) for title in titles)]
@@ -202,18 +202,18 @@ def rough_blocks(experiment: Experiment, figures: list[str], out: Path) -> list[
         kinds = kinds_of([each for some in seeds.values() for each in some])
         blocks.append(Heading(environment, 3))
         for measure, (meaning, digits) in MEASURES.items() if kinds else []:
-            rows = [
-                [MODELS.get(task, f"`{task}`"), *(over_seeds(some, measure, kind, digits) for kind in [*kinds, None])]
-                for task, some in seeds.items()
-            ]
-            blocks += [Paragraph(f"{meaning[0].upper()}{meaning[1:]}:"), Grid(["task", *kinds, "all"], rows)]
+            rows = []
+            for task, some in seeds.items():
+                means = [[over_levels(each, measure, kind) for each in some] for kind in [*kinds, None]]
+                rows.append([MODELS.get(task, f"`{task}`"), *(mean_text(part, digits, plan) for part in means)])
+            blocks += [Paragraph(f"{meaning}:"), Grid(["task", *kinds, "all"], rows)]
     return blocks
 
 
-def over_seeds(seeds: list[Crossings], measure: str, kind: str | None, digits: int) -> str:
-    """Return a measure's mean over difficulties and seeds, on tiles of a kind or all, with its standard error."""
-    values = [value for each in seeds if math.isfinite(value := over_levels(each, measure, kind))]
-    return number_text(Summary(values), digits) if values else "–"
+def mean_text(values: list[float], digits: int, plan: Matrix) -> str:
+    """Return mean and standard error of the finite values of seeds, and how many they are if not all."""
+    finite = [value for value in values if math.isfinite(value)]
+    return number_text(Summary(finite), digits).removesuffix(f" ({len(plan.seeds)})") if finite else "–"
 
 
 def other_table(table: Table) -> list[Block]:
