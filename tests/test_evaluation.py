@@ -323,6 +323,16 @@ def test_fixed_command_with_one_world(root, tmp_path, noted, monkeypatch):
     assert "model_3.pt, after 24 steps of training, 1 worlds x 9 steps:" in output
 
 
+def test_mean_level_is_noted(make_runner):
+    """On rough ground a row says how far training has come; four worlds start on levels 0 to 3."""
+    ground = {"terrain.mesh_type": "heightfield", "terrain.border_size": 1.0}
+    runner = make_runner(env=ground, **{"evaluation.interval": 16})
+    runner.learn(1)
+    header, row = (Path(runner.log_dir) / "evaluations.csv").read_text().splitlines()
+    assert header == f"{COLUMNS},terrain_level" and row.endswith(",1.5")
+    assert runner.env.terrain.levels.tolist() == [0, 1, 2, 3]
+
+
 def test_crossing_tiles_after_training_on_a_plane(root, tmp_path):
     """The policy sees what it saw; there is a row per kind and level; a seed fixes every number."""
     words = ["--terrain", "stairs_up", "flat", "--level", "0.5", "0", "--num_envs=2", "--command", "2", "0", "0"]
