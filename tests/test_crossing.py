@@ -5,9 +5,11 @@ import math
 import pytest
 import torch
 from settings import error_of
-from test_terrain import ground_cfg
+from test_terrain import ground_cfg, make_ground
 
+from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.learning.crossing import Grounds, cross
+from legged_torque.terrain import make_terrain
 from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.tiles import TILES
 from legged_torque.utils.options import Options
@@ -103,3 +105,13 @@ def test_difficulties_of_rows():
     assert [layout.difficulty(row) for row in range(3)] == [0.7, 0.1, 1.0]
     told = "terrain.difficulties must be empty or one number for each row, not 2: terrain.num_rows is 3"
     assert error_of(Layout.of, ground_cfg(difficulties=[0.7, 0.1]).terrain) == told
+
+
+def test_random_tiles_differ():
+    """Worlds on one kind and level stand on four tiles, which are not those of the training."""
+    grounds = Grounds.of(["discrete_obstacles"], [0.5])
+    ground = make_terrain(grounds.cfg(A1Cfg(), 8).terrain, 8, "cpu")
+    training = make_ground(terrain_proportions={"discrete_obstacles": 1.0}, difficulty_range=[0.5, 0.5], tile_size=8.0)
+    places = torch.cartesian_prod(torch.arange(-3.5, 4.0, 0.5), torch.arange(-3.5, 4.0, 0.5), torch.zeros(1))
+    tiles = {tuple(of.height(origin + places).tolist()) for of in (ground, training) for origin in of.origins}
+    assert len(tiles) == 4 + len({*zip(training.levels.tolist(), training.columns.tolist(), strict=True)})
