@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.envs import task_registry
+from legged_torque.experiments.matrix import GROUNDS
 from legged_torque.utils.args import Parser, add_task_args, options_of
 from legged_torque.utils.cli import (
     add_command_arg,
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
     from legged_torque.envs.base.legged_robot import LeggedRobot
     from legged_torque.envs.base.metrics import CommandBreakdown
-    from legged_torque.learning.crossing import Grounds, Result
+    from legged_torque.learning.crossing import Grounds
 
 STEPS = 2000  # control steps, where robots do not cross tiles
 
@@ -82,7 +83,8 @@ def parse_args() -> argparse.Namespace:
     parser.set_defaults(num_envs=16, seed=1)
     parser.add_argument("--steps", type=int, help=f"control steps; default: {STEPS}")
     add_command_arg(parser)
-    hint = "kinds of rough ground to cross, or all; then --num_envs is for each kind and level"
+    hint = """kinds of rough ground to cross, or all; then --num_envs is for each kind and level, and --command a speed
+        straight on, 0.6 0 0 unless it is given"""
     parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
     hint = "difficulties of rough ground, 0 to 1; default: the ten of training, 0 to 0.9"
     parser.add_argument("--level", nargs="+", type=finite, help=hint)
@@ -93,7 +95,7 @@ def parse_args() -> argparse.Namespace:
     if args.level and not args.terrain:
         raise UserError("--level needs --terrain: the kinds of rough ground")
     args.steps = STEPS if args.steps is None else args.steps
-    args.level = args.level or [level / 10 for level in range(10)]
+    args.level = args.level or GROUNDS["levels"]
     check_at_least(args, 1, "steps")
     return args
 

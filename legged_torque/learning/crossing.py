@@ -6,10 +6,10 @@ crosses the tile if its trunk gets over the tile's edge before it falls, and bef
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -58,16 +58,14 @@ class Grounds:
         chosen, rising = named_kinds(kinds), rising_levels(levels)
         v_x, v_y, yaw_rate = command or (SPEED, 0.0, 0.0)
         if math.hypot(v_x, v_y) < MIN_SPEED or yaw_rate:
-            raise UserError(
-                f"robots that shall cross tiles walk straight on: the command must have a speed of at least {MIN_SPEED} "
-                f"and a yaw rate of 0, not {v_x:g} {v_y:g} {yaw_rate:g}"
-            )
+            needed = f"a speed of {MIN_SPEED} m/s or more and a yaw rate of 0, not {v_x:g} {v_y:g} {yaw_rate:g}"
+            raise UserError(f"robots cross tiles straight on: the command must have {needed}")
         return cls(chosen, rising, (v_x, v_y))
 
     def cfg(self, cfg: Any, worlds_per_tile: int) -> Any:
-        """Return settings of a task with so many worlds on each kind and level; those of its training, a plane's even.
+        """Return settings of a task for trials of so many worlds on each kind and level.
 
-        The task's critic may see other things than in training, its policy does not.
+        What the policy sees is as in the settings given, whichever ground they are for; what the critic sees may not.
         """
         cfg = evaluation_cfg(cfg, worlds_per_tile * len(self.kinds) * len(self.levels))
         terrain, ranges = cfg.terrain, cfg.commands.ranges
@@ -142,11 +140,10 @@ def _results(
     """Return what came out, in each group of worlds."""
     kinds = ground.layout.kinds()
     of_kind = [kinds[column] for column in ground.columns.tolist()]
-    groups: dict[tuple[str, float], list[int]] = {
-        (kind, level): [] for kind in grounds.kinds for level in grounds.levels
-    }
-    for world, (kind, row) in enumerate(zip(of_kind, ground.levels.tolist(), strict=True)):
-        groups[kind, grounds.levels[row]].append(world)
+    of_level = [grounds.levels[row] for row in ground.levels.tolist()]
+    groups: dict[tuple[str, float], list[int]] = {group: [] for group in product(grounds.kinds, grounds.levels)}
+    for world, group in enumerate(zip(of_kind, of_level, strict=True)):
+        groups[group].append(world)
     shares = {name: ended.double().cpu().numpy() for name, ended in {"crossed": crossed, "fell": fell}.items()}
     ratios = {name: [part.double().cpu().numpy() for part in parts] for name, parts in walking.ratios().items()}
     results = []
