@@ -52,6 +52,9 @@ def parse_args() -> argparse.Namespace:
         "--push_probability", type=finite, help="probability of a push per control step; default: 0.002"
     )
     parser.add_argument("--seed", type=int, default=1, help="random seed; default: %(default)s")
+    hint = "kinds of rough ground, a tile of which each robot gets; default: those of training"
+    parser.add_argument("--terrain", nargs="+", metavar="KIND", default=(), help=hint)
+    parser.add_argument("--level", type=finite, help="difficulty of all tiles, 0 to 1; default: those of training")
     parser.add_argument("--video", type=Path, help="mp4 of the first robot")
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
@@ -75,6 +78,7 @@ def main() -> None:
     with importing():
         import numpy as np
 
+        from legged_torque.deploy.ground import select_ground
         from legged_torque.deploy.policy import Policy
         from legged_torque.deploy.robot import MujocoRobot
         from legged_torque.deploy.simulation import Events, Simulation
@@ -82,6 +86,8 @@ def main() -> None:
         from legged_torque.viewer.native import simulation_window
         from legged_torque.viewer.video import SimulationRecorder
     policy = Policy(args.policy)
+    if args.terrain or args.level is not None:
+        select_ground(policy.description, args.terrain, args.level)
     xml = args.xml or resource_path(policy.description["robot"]["file"])
     robot = MujocoRobot(xml, policy.description)
     events = Events(args.command, args.push_velocity, args.push_probability)
