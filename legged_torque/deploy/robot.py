@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from legged_torque.deploy import ghosts
+from legged_torque.deploy import hfield_contacts
 from legged_torque.deploy.ground import ground_heights, place_ground
 from legged_torque.deploy.policy import State
 from legged_torque.utils.errors import UserError, unknown_name
@@ -78,7 +78,7 @@ class MujocoRobot:
         if self._hfield is None:
             mujoco.mj_step(self.model, self.data)
         else:
-            ghosts.step(self.model, self.data, self._hfield)
+            hfield_contacts.step(self.model, self.data, self._hfield)
 
     def planar_velocity(self) -> np.ndarray:
         """Return v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame, as commands are. Shape: (3,)."""
