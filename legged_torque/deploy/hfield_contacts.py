@@ -1,4 +1,4 @@
-"""Steps of plain MuJoCo on a height field, with the contacts that its surface has.
+"""Steps of plain MuJoCo, with the contacts of height fields that their surfaces have.
 
 MuJoCo lets a geom touch every triangle of a height field that it overlaps, each as if it were a column that stands
 alone. Feet that sink into level ground by a centimetre also touch edges of the columns around them, with normals that
@@ -17,10 +17,10 @@ ALIKE = math.cos(math.radians(2.6))  # cosine of the angle up to which two norma
 _ABOVE = 10.0  # [m] from how far above a place one looks down on it
 
 
-def step(model: mujoco.MjModel, data: mujoco.MjData, hfield: int) -> None:
-    """Do what ``mj_step`` does, with corrected contacts of the geom ``hfield``."""
+def step(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Do what ``mj_step`` does, with corrected contacts of height fields."""
     mujoco.mj_step1(model, data)
-    if correct_contacts(model, data, hfield):
+    if correct_contacts(model, data):
         mujoco.mj_makeConstraint(model, data)
         mujoco.mj_island(model, data)
         mujoco.mj_projectConstraint(model, data)
@@ -28,13 +28,14 @@ def step(model: mujoco.MjModel, data: mujoco.MjData, hfield: int) -> None:
     mujoco.mj_step2(model, data)
 
 
-def correct_contacts(model: mujoco.MjModel, data: mujoco.MjData, hfield: int) -> bool:
-    """Correct the contacts of the geom ``hfield`` in place, and return whether it has any."""
-    by_geom: dict[int, list[mujoco.MjContact]] = {}
-    for contact in data.contact:
-        if contact.geom[0] == hfield:  # geoms are in the order of their types
-            by_geom.setdefault(int(contact.geom[1]), []).append(contact)
-    for geom, contacts in by_geom.items():
+def correct_contacts(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
+    """Correct the contacts of height fields in place, and return whether there are any."""
+    by_geoms: dict[tuple[int, int], list[mujoco.MjContact]] = {}
+    for contact in data.contact if model.nhfield else ():
+        hfield, geom = contact.geom.tolist()  # in the order of their types
+        if model.geom_type[hfield] == mujoco.mjtGeom.mjGEOM_HFIELD:
+            by_geoms.setdefault((hfield, geom), []).append(contact)
+    for (hfield, geom), contacts in by_geoms.items():
         contacts.sort(key=lambda contact: contact.dist)
         spheres = _spheres(model, data, geom)
         under = [_surface(model, data, hfield, centre) for centre in spheres]
@@ -42,7 +43,7 @@ def correct_contacts(model: mujoco.MjModel, data: mujoco.MjData, hfield: int) ->
             _push_out(contacts, spheres, under, model.geom_size[geom, 0])
         else:
             _drop_ghosts(model, data, hfield, contacts)
-    return bool(by_geom)
+    return bool(by_geoms)
 
 
 def _push_out(

@@ -75,10 +75,7 @@ class MujocoRobot:
     def step(self, torques: np.ndarray) -> None:
         """Advance by one physics step with torques of shape (joints,) [N m]."""
         self.data.ctrl[self._motors] = torques / self._torque_per_ctrl
-        if self._hfield is None:
-            mujoco.mj_step(self.model, self.data)
-        else:
-            hfield_contacts.step(self.model, self.data, self._hfield)
+        hfield_contacts.step(self.model, self.data)
 
     def planar_velocity(self) -> np.ndarray:
         """Return v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame, as commands are. Shape: (3,)."""
@@ -200,8 +197,6 @@ class MujocoRobot:
         """Find the ground, and the geoms whose contact with it ends an episode: by name, or those of the trunk."""
         model = self.model
         self._is_ground = model.body_weldid[model.geom_bodyid] == 0
-        (hfields,) = np.nonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)
-        self._hfield: int | None = int(hfields[0]) if len(hfields) else None
         (self._grounds,) = np.nonzero(self._is_ground & (model.geom_contype | model.geom_conaffinity != 0))
         names = [model.geom(i).name or model.body(model.geom_bodyid[i]).name for i in range(model.ngeom)]
         is_ending = np.array([any(part in name for part in ends_on_contact_of) for name in names]) & ~self._is_ground
