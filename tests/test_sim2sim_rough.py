@@ -137,7 +137,7 @@ def test_motion_is_the_task_s(exported, policy, robot):
 
 
 def test_level_map_is_a_plane(policy):
-    """A robot that falls onto a level map, feet sinking in deep, moves as on a plane, which it does not without help."""
+    """A robot that falls onto a level map, feet sinking in deep, moves as on a plane; MuJoCo alone differs."""
     description = copy.deepcopy(policy.description)
     select_ground(description, ["flat"], 0.0)
     on_map, untouched = MujocoRobot(XML, description), MujocoRobot(XML, description)
