@@ -24,6 +24,7 @@ from legged_torque.deploy.ground import select_ground
 from legged_torque.deploy.policy import Policy, State
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Events, Simulation, quaternion
+from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.height_map import HeightMap
 from legged_torque.terrain.hfield import add_hfield
@@ -139,7 +140,7 @@ def test_motion_is_the_task_s(exported, policy, robot):
 def test_level_map_is_a_plane(policy):
     """A robot that falls onto a level map, feet sinking in deep, moves as on a plane; MuJoCo alone differs."""
     description = copy.deepcopy(policy.description)
-    select_ground(description, ["flat"], 0.0)
+    select_ground(description, A1Cfg().terrain, ["flat"], [0.0])
     on_map, untouched = MujocoRobot(XML, description), MujocoRobot(XML, description)
     del description["terrain"]
     on_plane, depths = MujocoRobot(XML, description), [0.0]
@@ -210,15 +211,14 @@ def test_height_is_above_the_ground(policy, robot):
 
 
 def test_chosen_kinds(policy):
-    """Tiles of other kinds at one difficulty take the place of those of the training."""
+    """Tiles of other kinds at other difficulties take the place of those of the training, and of a plane."""
     description = copy.deepcopy(policy.description)
-    select_ground(description, ["pits", "flat"], 0.6)
-    robot = MujocoRobot(XML, description)
-    np.testing.assert_allclose(np.unique(robot.origins[:, 2]), [-0.6, 0.0], atol=1e-6)
-    select_ground(description, [], 0.25)
-    np.testing.assert_allclose(np.unique(MujocoRobot(XML, description).origins[:, 2]), [-0.25, 0.0], atol=1e-6)
-    del description["terrain"]
-    assert "this one has a plane" in error_of(select_ground, description, ["flat"])
+    for trained in (description["terrain"], None):
+        select_ground(description, A1Cfg().terrain, ["pits", "flat"], [0.6, 0.25])
+        depths, counts = np.unique(MujocoRobot(XML, description).origins[:, 2].astype(float).round(6), return_counts=True)
+        assert depths.tolist() == [-0.6, -0.25, 0.0] and counts.tolist() == [4, 4, 8]
+        assert Layout(**description["terrain"]).tile_size == (6.0 if trained else 8.0)
+        del description["terrain"]
 
 
 def test_ground_of_the_mjcf(policy, tmp_path):
@@ -280,5 +280,7 @@ def test_script(exported, tmp_path):
     status, output, error = run_here("sim2sim.py", *words, "--terrain", "pits", "--level=0.5", root=tmp_path)
     assert (status, error) == (0, "") and "note" not in output and "height" in output
     result = run_here("sim2sim.py", *words, "--terrain", "stair_up", root=tmp_path)
-    assert_told_in_one_line(result, "unknown kind of --terrain 'stair_up'; did you mean 'stairs_up'?")
-    assert_told_in_one_line(run_here("sim2sim.py", *words, "--level=1.5", root=tmp_path), "--level must be from 0 to 1")
+    assert_told_in_one_line(result, "unknown kind of terrain 'stair_up'; did you mean 'stairs_up'?")
+    result = run_here("sim2sim.py", *words, "--terrain", "pits", "--level", "0.5", "1.5", root=tmp_path)
+    assert_told_in_one_line(result, "a level must be from 0 to 1, not 1.5")
+    assert_told_in_one_line(run_here("sim2sim.py", *words, "--level=0.5", root=tmp_path), "--level needs --terrain")

@@ -46,7 +46,7 @@ def use_standing_trials(cfg: LeggedRobotCfg, decimation: int = 1) -> None:
     quiet = {"randomize_parameters": False, "push_robots": False}
     update_from_dict(cfg, {"domain_rand": quiet, "noise": {"add_noise": False}, "control": {"decimation": decimation}})
     if cfg.terrain.mesh_type == "heightfield":  # still a map, since policies may see it
-        select_tiles(cfg.terrain, ["flat"], 0.0)
+        select_tiles(cfg.terrain, ["flat"], [0.0], 1)
 
 
 def place_on_ground(

@@ -12,17 +12,20 @@ import numpy as np
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.hfield import add_hfield
 from legged_torque.terrain.layout import Layout
-from legged_torque.terrain.selection import select_tiles
-from legged_torque.utils.config import Section
+from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
+from legged_torque.utils.config import update_from_dict
 
+COLUMNS = 4  # tiles of each chosen kind and level
 _ABOVE = 100.0  # [m] height from which one looks down on the ground
 
 
-def select_ground(description: dict[str, Any], kinds: Sequence[str] = (), difficulty: float | None = None) -> None:
-    """Change the ground of ``policy.yaml`` to tiles of some kinds at one difficulty, by :func:`select_tiles`."""
-    mesh_type = "heightfield" if "terrain" in description else "plane"
-    settings = _section({"mesh_type": mesh_type, **description.get("terrain", {})})
-    select_tiles(settings, kinds, difficulty)
+def select_ground(description: dict[str, Any], settings: Any, kinds: Sequence[str], levels: Sequence[float]) -> None:
+    """Change the ground of ``policy.yaml`` to tiles of some kinds at some difficulties, those of training without any.
+
+    Of ``settings``, a section ``terrain``, a policy of a plane takes the size of tiles and all else; they are changed.
+    """
+    update_from_dict(settings, {**description.get("terrain", {}), "terrain_proportions": {}})
+    select_tiles(settings, named_kinds(kinds), rising_levels(levels), COLUMNS)
     description["terrain"] = dataclasses.asdict(Layout.of(settings))
 
 
@@ -62,14 +65,6 @@ def ground_heights(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray
             if depth >= 0.0:
                 heights[i] = max(heights[i], _ABOVE - depth)
     return heights
-
-
-def _section(values: dict[str, Any]) -> Section:
-    """Return nested dictionaries as settings."""
-    section = Section()
-    for name, value in values.items():
-        setattr(section, name, _section(value) if isinstance(value, dict) else value)
-    return section
 
 
 def _depth(model: mujoco.MjModel, data: mujoco.MjData, geom: int, point: np.ndarray) -> float:

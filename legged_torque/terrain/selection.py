@@ -6,34 +6,39 @@ from collections.abc import Sequence
 from typing import Any
 
 from legged_torque.terrain.tiles import TILES
-from legged_torque.utils.config import to_dict
+from legged_torque.utils.config import section_keys
 from legged_torque.utils.errors import UserError, unknown_name
 
+ALL = "all"
+"""Stands for all kinds."""
 
-def select_tiles(settings: Any, kinds: Sequence[str] = (), difficulty: float | None = None) -> None:
-    """Change the section ``terrain`` of a task with rough ground to tiles of some kinds at one difficulty.
 
-    Args:
-        settings: The section. Robots will stay on the levels on which they start.
-        kinds: They get the same number of columns each, and no fewer in all than there are; none keeps all as they are.
-        difficulty: Of all tiles, in a single row; None keeps the rows.
+def named_kinds(names: Sequence[str]) -> list[str]:
+    """Return the kinds that a user has named, each once; a UserError if there is no such kind."""
+    for name in names:
+        if name not in (ALL, *TILES):
+            raise unknown_name("kind of terrain", str(name), [ALL, *TILES])
+    return list(TILES) if ALL in names else list(dict.fromkeys(names))
 
-    Raises:
-        UserError: If the ground is a plane, a kind is unknown, or the difficulty is not from 0 to 1.
+
+def rising_levels(levels: Sequence[float]) -> list[float]:
+    """Return difficulties in rising order, each once; a UserError if one is not from 0 to 1."""
+    for level in levels:
+        if not 0.0 <= level <= 1.0:
+            raise UserError(f"a level must be from 0 to 1, not {level}")
+    return sorted(set(levels))
+
+
+def select_tiles(settings: Any, kinds: Sequence[str], levels: Sequence[float], columns: int) -> None:
+    """Let a section ``terrain`` be rough ground, a plane's as well: rows of these levels, so many columns of each kind.
+
+    Robots are to stay on their tiles. Without ``levels``, rows are as before.
     """
-    if settings.mesh_type == "plane":
-        raise UserError("--terrain and --level are for tasks on rough ground; this one has a plane")
-    settings.curriculum = False
-    kinds = list(dict.fromkeys(kinds))
-    if kinds:
-        shares = settings.terrain_proportions
-        for name in kinds:
-            if name not in TILES:
-                raise unknown_name("kind of --terrain", name, TILES)
-        for name in {*to_dict(shares), *kinds}:
-            setattr(shares, name, 1.0 / len(kinds) if name in kinds else 0.0)
-        settings.num_cols = -(-settings.num_cols // len(kinds)) * len(kinds)
-    if difficulty is not None:
-        if not 0.0 <= difficulty <= 1.0:  # NaN is neither
-            raise UserError(f"--level must be from 0 to 1, not {difficulty}")
-        settings.difficulty_range, settings.num_rows = [difficulty, difficulty], 1
+    settings.mesh_type, settings.curriculum = "heightfield", False
+    settings.num_cols = columns * len(kinds)
+    if levels:
+        settings.num_rows, settings.difficulties = len(levels), list(levels)
+    for kind in section_keys(settings.terrain_proportions):
+        setattr(settings.terrain_proportions, kind, 0.0)
+    for kind in kinds:
+        setattr(settings.terrain_proportions, kind, 1.0 / len(kinds))
