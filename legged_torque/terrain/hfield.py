@@ -29,4 +29,4 @@ def add_hfield(spec: mujoco.MjSpec, grid: HeightGrid, floor: str) -> None:
     geom = next(geom for geom in spec.worldbody.geoms if geom.name == floor)
     geom.type, geom.hfieldname = mujoco.mjtGeom.mjGEOM_HFIELD, floor
     geom.pos = [grid.corner[0] + x, grid.corner[1] + y, lowest]
-    geom.quat = [1.0, 0.0, 0.0, 0.0]
+    geom.quat, geom.alt.type = [1.0, 0.0, 0.0, 0.0], mujoco.mjtOrientation.mjORIENTATION_QUAT

@@ -164,7 +164,7 @@ class TaskRegistry:
         """
         env, _ = self.make_env(options.task, options, env_cfg or run.env_cfg)
         runner, _ = self.make_alg_runner(env, options.task, train_cfg=run.train_cfg, log_root=None)
-        runner.load(str(run.checkpoint), {"actor": True})
+        runner.load(str(run.checkpoint), {"actor": True, "iteration": True})
         return env, runner
 
     def _copies(self, name: str) -> tuple[Any, Any]:
