@@ -67,6 +67,7 @@ class LeggedRobotCfg(BaseConfig):
         num_rows: Annotated[int, Limits(1, 100)] = 10  # levels: rows of tiles along x, the first is the easiest
         num_cols: Annotated[int, Limits(1, 100)] = 20  # tiles of each level, along y; a column is of one kind
         difficulty_range: Annotated[list[float], Limits(0, 1, ordered=True)] = [0.0, 1.0]  # rows divide it evenly
+        difficulties: Annotated[list[float], Limits(0, 1)] = []  # of each row, in place of difficulty_range
         tile_size: Annotated[float, Limits(6, 100)] = 8.0  # [m] side of a tile
         border_size: Annotated[float, Limits(0, 100)] = 25.0  # [m] level ground around all tiles
         horizontal_scale: Annotated[float, Limits(0.01, 0.5)] = 0.05  # [m] from sample to sample
