@@ -1,9 +1,7 @@
 """Which ground a policy masters: whether robots cross tiles of all kinds and levels in time, in one batch of worlds.
 
-A trial is one episode: a robot starts in the middle of its tile, heads along x or y, is told to walk straight on and to
-keep its heading, and crosses the tile if its trunk gets over the tile's edge before it falls, and before the trial is
-over. Metrics compare with the straight command: a yaw rate that corrects the heading is often near 0, and errors of
-tracking are relative.
+A trial is one episode: a robot starts in the middle of its tile, heads along x or y, is told to walk on in that
+direction, and crosses the tile if its trunk gets over the tile's edge before it falls, and before the trial is over.
 """
 
 from __future__ import annotations
@@ -34,8 +32,6 @@ SLOWNESS = 2.0
 """A trial lasts this many times as long as the commanded speed needs: as in the curriculum, half of it is enough."""
 MIN_SPEED = 0.1
 """Least commanded speed [m/s]; one that is slower would need minutes."""
-HEADING_GAIN = 0.5
-"""Commanded yaw rate per error of the heading [1/s], as in legged_gym; up to 1 rad/s."""
 COLUMNS = 4
 """Of each kind: where tiles are random, these differ."""
 SEED = 10_000
@@ -78,7 +74,7 @@ class Grounds:
         cfg.env.episode_length_s = self.time_limit(terrain.tile_size) + 1.0  # no trial ends with the episode
         cfg.commands.resampling_probability = 0.0
         ranges.lin_vel_x, ranges.lin_vel_y = ([speed, speed] for speed in self.command)
-        ranges.ang_vel_yaw = [0.0, 0.0]
+        cfg.commands.heading_command = True
         cfg.domain_rand.init_yaw = [0.0, 0.0]
         return cfg
 
@@ -109,48 +105,32 @@ def cross(task: LeggedRobot, policy: Callable[[TensorDict], Tensor], grounds: Gr
     assert isinstance(ground, RoughGround), "tiles are those of rough ground"
     half = 0.5 * ground.layout.tile_size
     walking = WalkingMetrics(task)
-    headings = _headings(task, ground, grounds.command)
-    obs = _start(task, ground, headings)
-    starts, straight = task.base_pos[:, :2].clone(), task.commands.clone()
+    obs = _start(task, ground, grounds.command)
+    starts = task.base_pos[:, :2].clone()
     crossed, fell = (torch.zeros_like(task.reset_buf) for _ in range(2))
     with torch.inference_mode():
         for _ in range(math.ceil(grounds.time_limit(ground.layout.tile_size) / task.dt)):
-            is_trying = ~(crossed | fell)
+            commands, is_trying = task.commands.clone(), ~(crossed | fell)
             obs = task.step(policy(obs))[0]
-            walking.add_step(straight, is_trying)
-            task.commands[:, 2] = (HEADING_GAIN * _wrapped(headings - _yaw(task.base_quat))).clamp(-1.0, 1.0)
+            walking.add_step(commands, is_trying)
             distance = (task.base_pos[:, :2] - starts).abs().amax(dim=1)
             fell |= is_trying & task.reset_buf
             crossed |= is_trying & ~task.reset_buf & (distance > half)
     return _results(ground, grounds, walking, crossed, fell)
 
 
-def _headings(task: LeggedRobot, ground: RoughGround, command: tuple[float, float]) -> Tensor:
-    """Return headings with which the commanded velocity is along x, y, -x and -y in turns [rad]. Shape: (num_envs,)."""
-    turns = torch.arange(task.num_envs, device=task.device) // ground.layout.num_rows % 4
-    return 0.5 * math.pi * turns - math.atan2(command[1], command[0])
-
-
-def _yaw(quat: Tensor) -> Tensor:
-    """Return the heading of trunks [rad]. Shapes: (num_envs, 4) to (num_envs,)."""
-    w, x, y, z = quat.unbind(dim=1)
-    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-
-
-def _wrapped(angle: Tensor) -> Tensor:
-    """Return the same angles from -pi to pi [rad]."""
-    return torch.atan2(angle.sin(), angle.cos())
-
-
-def _start(task: LeggedRobot, ground: RoughGround, headings: Tensor) -> TensorDict:
-    """Begin an episode in the middle of each tile with headings [rad], and return the observations."""
+def _start(task: LeggedRobot, ground: RoughGround, command: tuple[float, float]) -> TensorDict:
+    """Begin an episode in the middle of each tile, in turns along x, y, -x and -y, and return the observations."""
     task.reset()
     qpos, qvel = task.sim.qpos.clone(), task.sim.qvel.clone()
-    cos, sin = (0.5 * headings).cos(), (0.5 * headings).sin()
+    turns = torch.arange(task.num_envs, device=task.device) // ground.layout.num_rows % 4
+    angles = 0.5 * math.pi * turns - math.atan2(command[1], command[0])
+    cos, sin = (0.5 * angles).cos(), (0.5 * angles).sin()
     w, x, y, z = qpos[:, 3:7].unbind(dim=1)  # without a yaw
     qpos[:, :2] = ground.origins[:, :2]
     qpos[:, 3:7] = torch.stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w], dim=1)
     qvel[:, :3] = quat_rotate_yaw(qpos[:, 3:7], qvel[:, :3])
+    task.command_generator.headings.copy_(angles)
     task.set_state(qpos, qvel)
     return task.get_observations()
 
