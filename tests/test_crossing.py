@@ -66,7 +66,8 @@ def test_who_crosses():
     torch.testing.assert_close(headings[0], quarters * 0.5 * math.pi, atol=0.06, rtol=0.0)  # rolled and pitched, too
     assert sorted((quarters % 4).tolist()) == [0.0] * 4 + [1.0] * 4 + [2.0] * 4 + [3.0] * 4
     for commands in told:
-        torch.testing.assert_close(commands, torch.tensor(FAST).expand(16, 3), atol=0.02, rtol=0.0)
+        whole = commands[falls_at == 1000]  # in new episodes headings are others
+        torch.testing.assert_close(whole, torch.tensor(FAST).expand(12, 3), atol=0.02, rtol=0.0)
     fallen = {5, 7}
     arrived = {world for world in range(16) if speeds[world] > 1.0} - fallen
     flat = iter([0.2, 0.8] * 4)
@@ -106,7 +107,7 @@ def test_headings_are_kept():
         return torch.zeros(4, 12)
 
     cross(task, turn, grounds)
-    assert told[0].tolist() == [FAST] * 4
+    torch.testing.assert_close(told[0], torch.tensor(FAST).expand(4, 3), atol=0.01, rtol=0.0)
     torch.testing.assert_close(told[5][:, 2], torch.tensor([0.0, -0.15, 0.4, -1.0]), atol=0.01, rtol=0.0)
     assert (told[5][:, :2] == torch.tensor(FAST[:2])).all()
 
