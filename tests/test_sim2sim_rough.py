@@ -215,9 +215,8 @@ def test_chosen_kinds(policy):
     description = copy.deepcopy(policy.description)
     for trained in (description["terrain"], None):
         select_ground(description, A1Cfg().terrain, ["pits", "flat"], [0.6, 0.25])
-        depths, counts = np.unique(
-            MujocoRobot(XML, description).origins[:, 2].astype(float).round(6), return_counts=True
-        )
+        heights = MujocoRobot(XML, description).origins[:, 2].astype(float)
+        depths, counts = np.unique(heights.round(6), return_counts=True)
         assert depths.tolist() == [-0.6, -0.25, 0.0] and counts.tolist() == [4, 4, 8]
         assert Layout(**description["terrain"]).tile_size == (6.0 if trained else 8.0)
         del description["terrain"]
