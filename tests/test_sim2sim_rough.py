@@ -223,7 +223,7 @@ def test_chosen_kinds(policy):
 
 
 def test_ground_of_the_mjcf(policy, tmp_path):
-    """A plane without a name gives way to the tiles; boxes stay, and are seen by the scan."""
+    """A plane without a name gives way to the tiles; boxes stay, and are seen by the scan, on a plane without end."""
 
     def edit(root):
         (floor,) = root.findall("worldbody/geom")
@@ -233,13 +233,15 @@ def test_ground_of_the_mjcf(policy, tmp_path):
 
     def add_step(root):
         edit(root)
+        root.find("worldbody/geom").set("size", "2 2 0.05")
         box = {"type": "box", "size": "0.5 1 0.1", "pos": "1 0 0.02"}
         root.find("worldbody").append(root.makeelement("geom", box))
 
     robot = MujocoRobot(changed_xml(tmp_path, add_step), policy.description)
     assert robot.notes[0].startswith("the MJCF has ground of its own, on which the robot starts at the origin")
     robot.reset([0.0, 0.0, 0.4], quaternion(0, 0, 0), policy.nominal_pose, STILL)
-    np.testing.assert_allclose(robot.ground_heights(np.array([[0.49, 0.0], [0.51, 0.9], [1.0, 1.1]])), [0.0, 0.12, 0.0])
+    places = np.array([[0.49, 0.0], [0.51, 0.9], [1.0, 1.1], [9.0, 9.0]])
+    np.testing.assert_allclose(robot.ground_heights(places), [0.0, 0.12, 0.0, 0.0], atol=1e-12)
     assert robot.origins.tolist() == [[0.0, 0.0, 0.0]]
 
 
