@@ -13,6 +13,7 @@ from dataclasses import astuple
 from typing import TYPE_CHECKING
 
 from legged_torque.envs import task_registry
+from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.args import Parser, add_build_args, options_of
 from legged_torque.utils.cli import check_at_least, importing, run_script
 from legged_torque.utils.devices import device_name, resolve_device
@@ -36,7 +37,7 @@ def main() -> None:
     check_at_least(args, 0, "tolerance")
     options = options_of(args)
     with importing():
-        task_registry.get_cfgs(options.task, options)  # mistakes are told before anything is built
+        check_env_cfg(task_registry.get_cfgs(options.task, options)[0])  # mistakes are told before anything is built
         device = resolve_device(args.device)
         from legged_torque.checks.capture import KERNEL_TOLERANCE, compare_capture, compare_kernels
     print(f"{args.task} on {device_name(device)}: with CUDA graphs against without")

@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 
 from legged_torque.envs import task_registry
+from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.args import Parser, add_build_args, options_of
 from legged_torque.utils.cli import check_at_least, importing, run_script
 from legged_torque.utils.errors import UserError
@@ -37,7 +38,7 @@ def main() -> None:
     if args.resumes >= args.iterations:
         raise UserError(f"--resumes must be less than --iterations, which is {args.iterations}, not {args.resumes}")
     with importing():
-        task_registry.get_cfgs(args.task, options_of(args))  # mistakes are told before anything is trained
+        check_env_cfg(task_registry.get_cfgs(args.task, options_of(args))[0])  # mistakes are told first
     with tempfile.TemporaryDirectory() as folder:
         sys.exit(0 if check(args, Path(folder)) else 1)
 

@@ -1,6 +1,8 @@
 """Compare a physics step with converged mj_step in ten kinds of states: ``python scripts/physics_accuracy.py``.
 
-The states are made from those of a robot that walks under a trained policy.
+The states are made from those of a robot that walks under a trained policy. On rough ground they are five kinds, and
+compared are those in which only feet are near the ground, and where it is a plane near each: plain MuJoCo has such a
+plane for each foot.
 """
 
 from legged_torque.utils.interrupt import end_on_interrupt
@@ -9,6 +11,7 @@ from legged_torque.utils.rendering import without_renderer
 end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
+from legged_torque import resource_path
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import Parser, add_task_args, options_of
 from legged_torque.utils.cli import check_at_least, importing, run_script
@@ -34,6 +37,7 @@ def main() -> None:
 
         from legged_torque.checks.accuracy import (
             KINDS,
+            ON_ANY_GROUND,
             TOLERANCE,
             PhysicsState,
             copy_state,
@@ -42,6 +46,9 @@ def main() -> None:
             open_motors,
             reference_step,
         )
+        from legged_torque.checks.planes import PlanePerFoot
+        from legged_torque.envs.base.asset import load_asset
+        from legged_torque.sim.model import read_spec
         from legged_torque.sim.simulator import ENGINES, Simulator
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options)
@@ -53,16 +60,22 @@ def main() -> None:
             obs = env.step(policy(obs))[0]
             kept.append(copy_state(env.sim))
     walking = {name: torch.cat([state[name] for state in kept]) for name in kept[0]}
-    model, settings = open_motors(env.sim.mj_model), env.cfg.sim
-    limits = (settings.solver_iterations, settings.ls_iterations)
-    sims = {engine: Simulator(model, args.worlds, env.device, engine, *limits) for engine in ENGINES}
+    limits, ground, sims, pose = (env.cfg.sim.solver_iterations, env.cfg.sim.ls_iterations), env.terrain.map, {}, None
+    for engine in ENGINES:
+        height_map = ground if engine == "fused" else None
+        model = open_motors(load_asset(env.cfg, None if height_map else env.terrain).mj_model)
+        sims[engine] = Simulator(model, args.worlds, env.device, engine, *limits, height_map=height_map)
+    if ground:
+        planes = PlanePerFoot(read_spec(resource_path(env.cfg.asset.file)), env.foot_names, ground)
+        model, pose = open_motors(planes.model), planes.pose
+        model.opt.timestep = env.cfg.sim.dt
     print(f"{args.task} on {device_name(env.device)}: errors of the velocities after one step [m/s, rad/s]")
     print(f"of {args.worlds} worlds each; {limits[0]} iterations of the solver, {limits[1]} of its line search")
     titles = ("kind", "engine", "median", "99.9%", "max", f"> {TOLERANCE:g}", "left out", "iterations")
     print("{:<21} | {:<11} | {:>7} | {:>7} | {:>7} | {:>7} | {:>8} | {:>10}".format(*titles))
-    for kind in KINDS:
+    for kind in ON_ANY_GROUND if ground else KINDS:
         states = make_states(kind, model, walking, args.worlds, args.seed)
-        expected = reference_step(model, states)
+        expected = reference_step(model, states, pose)
         for engine, sim in sims.items():
             row = measure_accuracy(sim, states, *expected)
             errors = " | ".join(f"{value:7.1e}" for value in (row.median, row.p999, row.max))

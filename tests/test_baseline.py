@@ -42,10 +42,14 @@ def test_ratios_by_hand(tmp_path):
     assert baseline.notes == ["it has no 16384 worlds x 24 steps"]
 
 
-def test_other_machine(tmp_path):
-    """Another device and other software are told, not refused."""
-    file = write(tmp_path, device="NVIDIA H100", versions={"torch": "2.10", "warp-lang": "1.19"})
+def test_other_settings_and_machine(tmp_path):
+    """Another task, other settings, another device and other software are told, not refused."""
+    changes = {"task": "a1_torque", "set": [], "perturbation": "low"}
+    file = write(tmp_path, device="NVIDIA H100", versions={"torch": "2.10", "warp-lang": "1.19"}, **changes)
     assert Baseline(file, RESULT, [(4096, 24)]).notes == [
+        "its task was 'a1_torque', is 'a1_position'",
+        "its perturbation was 'low', is 'none'",
+        "its set was [], is ['seed=3']",
         "its device was 'NVIDIA H100', is 'NVIDIA H200'",
         "its torch was '2.10', is '2.11'",
         "its warp-lang was '1.19', is None",
@@ -56,9 +60,6 @@ def test_other_machine(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"task": "a1_torque"}, "has task 'a1_torque', not 'a1_position'"),
-        ({"set": []}, "has set [], not ['seed=3']"),
-        ({"perturbation": "low"}, "has perturbation 'low', not 'none'"),
         ({"rows": [OLD_ROW | {"num_envs": 1024}]}, "has 1024 worlds x 24 steps, not 4096 worlds x 24 steps"),
         ({"rows": [OLD_ROW | {"num_steps_per_env": 32}]}, "has 4096 worlds x 32 steps, not 4096 worlds x 24 steps"),
         ({"rows": []}, "has no sizes, not 4096 worlds x 24 steps"),

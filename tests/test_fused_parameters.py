@@ -1,5 +1,6 @@
 """Parameters of the fused step, one after another, against plain MuJoCo."""
 
+import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import pytest
@@ -8,6 +9,10 @@ import warp as wp
 from test_fused import FIELDS, assert_alike, compiled, draw_states, make_a1, random, step_fused, step_mujoco
 
 from legged_torque.sim.fused.step import FusedStep
+from legged_torque.sim.simulator import Simulator
+from legged_torque.terrain.height_map import HeightMap
+from legged_torque.terrain.hfield import add_hfield
+from legged_torque.utils.errors import UserError
 
 
 def edited_a1(edit):
@@ -141,3 +146,20 @@ def test_parameters_per_world():
         assert np.abs(np.diff(data.qvel.numpy(), axis=0)).max(axis=1).min() > 0.1
         tables["dof_damping"] *= 0.5
         wp.to_torch(warp_model.dof_damping).mul_(0.5)
+
+
+def test_derived_constants_on_a_hfield():
+    """With MuJoCo Warp a hfield is a floor like any other: inverse weights follow the masses, as by mj_setConst."""
+    spec = make_a1()
+    add_hfield(spec, HeightMap(np.random.default_rng(0).uniform(size=(4, 5)), 1.0, (-2.0, -2.0), "cpu"), "floor")
+    model = compiled(spec)
+    sim = Simulator(model, 2, "cpu", "mujoco_warp", per_world=["body_mass"])
+    sim.field("body_mass")[1, 1] *= 1.7
+    sim.update_constants(torch.tensor([False, True]))
+    before = model.body_invweight0.copy()
+    model.body_mass[1] *= 1.7
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    for found, exact in zip(sim.field("body_invweight0"), (before, model.body_invweight0), strict=True):
+        np.testing.assert_allclose(found, exact, rtol=2e-5)
+    with pytest.raises(UserError, match="it needs one plane"):
+        Simulator(model, 1, "cpu")

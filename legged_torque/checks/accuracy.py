@@ -20,6 +20,8 @@ _FAR = 100.0  # [m] from the floor, at most
 Arrays = dict[str, np.ndarray]
 PhysicsState = dict[str, torch.Tensor]
 """A batch of states: "qpos", "qvel", "qacc_warmstart", "ctrl", each (worlds, size)."""
+Pose = Callable[[mujoco.MjModel, mujoco.MjData], bool]
+"""Makes a model fit a state, and says whether it does, as :meth:`~legged_torque.checks.planes.PlanePerFoot.pose`."""
 
 
 def copy_state(sim: Simulator) -> PhysicsState:
@@ -130,6 +132,10 @@ KINDS: dict[str, Callable[[mujoco.MjModel, Arrays, np.random.Generator], None]] 
     "flight, at the limits": flight,
 }
 """What is changed in walking states, by name."""
+ON_ANY_GROUND = [
+    name for name, change in KINDS.items() if change in (walking, sliding, fast_joints, impact, large_torques)
+]
+"""Those that do not need a level floor."""
 
 
 def make_states(kind: str, model: mujoco.MjModel, walking_states: PhysicsState, count: int, seed: int) -> PhysicsState:
@@ -141,13 +147,16 @@ def make_states(kind: str, model: mujoco.MjModel, walking_states: PhysicsState, 
     return {name: torch.tensor(values, dtype=torch.float32) for name, values in state.items()}
 
 
-def reference_step(model: mujoco.MjModel, state: PhysicsState) -> tuple[np.ndarray, np.ndarray]:
-    """Take one converged ``mj_step`` in float64 per state.
+def reference_step(
+    model: mujoco.MjModel, state: PhysicsState, pose: Pose | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Take one converged ``mj_step`` in float64 per state, for which the model may be posed.
 
     Returns:
         The velocities (worlds, nv), and which worlds are comparable (worlds,), bool. Those are not in which a contact
         only just touches: raising or lowering the trunk by half of float32's spacing at its height changes the number
-        of contacts. There ``mj_step`` jumps, since a contact acts with all its damping as soon as it touches.
+        of contacts. There ``mj_step`` jumps, since a contact acts with all its damping as soon as it touches. Nor are
+        those that cannot be posed.
     """
     model = copy.copy(model)
     model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
@@ -156,13 +165,14 @@ def reference_step(model: mujoco.MjModel, state: PhysicsState) -> tuple[np.ndarr
     for world, height in enumerate(arrays["qpos"][:, 2].astype(np.float32)):
         for name, values in arrays.items():
             getattr(data, name)[:] = values[world]
+        is_posed = pose is None or pose(model, data)
         contacts = []
         for change in (-0.5, 0.5, 0.0):
             data.qpos[2] = height + change * float(np.spacing(np.abs(height)))
             mujoco.mj_fwdPosition(model, data)
             contacts.append(data.ncon)
         mujoco.mj_step(model, data)
-        velocities[world], comparable[world] = data.qvel, len(set(contacts)) == 1
+        velocities[world], comparable[world] = data.qvel, is_posed and len(set(contacts)) == 1
     return velocities, comparable
 
 

@@ -9,8 +9,8 @@ from typing import Any
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.plotting import read_data
 
-SETTINGS = ("task", "preset", "perturbation", "ranges", "set")
-"""What must be the same in both."""
+TOLD = ("task", "preset", "perturbation", "ranges", "set", "device")
+"""What is told where it is different, beside the versions of software."""
 
 LARGEST = 1e30  # number in a row; a stranger's file may hold integers that are no floats
 Row = dict[str, Any]
@@ -22,18 +22,15 @@ class Baseline:
     """The rows of an earlier benchmark that have a size in common with a new one.
 
     Attributes:
-        notes: What is different: device, software, and sizes that the baseline lacks.
+        notes: What is different: settings, device, software, and sizes that the baseline lacks.
     """
 
     def __init__(self, file: Path, result: Row, sizes: list[Size]) -> None:
-        """Read a file; a UserError if it is not a benchmark's, of other :data:`SETTINGS`, or of other sizes only.
+        """Read a file; a UserError if it is not a benchmark's, or of other sizes only.
 
         ``result`` is what the new benchmark writes, without its rows; ``sizes`` are those that it measures.
         """
-        data = read_data(file, {*SETTINGS, "device", "versions", "rows"}, "benchmark.py --json")
-        for name in SETTINGS:
-            if data[name] != result[name]:
-                raise UserError(f"--baseline '{file}' has {name} {data[name]!r}, not {result[name]!r}")
+        data = read_data(file, {*TOLD, "versions", "rows"}, "benchmark.py --json")
         try:
             self._rows: dict[Size, Row] = {
                 (row["num_envs"], row["num_steps_per_env"]): row for row in data["rows"] if "error" not in row
@@ -45,8 +42,8 @@ class Baseline:
         if len(missing) == len(sizes):
             raise UserError(f"--baseline '{file}' has {_texts(self._rows) or 'no sizes'}, not {_texts(sizes)}")
         self.notes = [f"it has no {_texts(missing)}"] if missing else []
-        was = {"device": data["device"], **versions}
-        now = {"device": result["device"], **result["versions"]}
+        was = {name: data[name] for name in TOLD} | versions
+        now = {name: result[name] for name in TOLD} | result["versions"]
         changed = [name for name in {**was, **now} if was.get(name) != now.get(name)]
         self.notes += [f"its {name} was {was.get(name)!r}, is {now.get(name)!r}" for name in changed]
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.utils import parameters_to_vector
 
 from legged_torque.learning.runner import OnPolicyRunner
+from legged_torque.learning.worlds import world_tensors
 from legged_torque.utils.task_registry import set_seed
 
 WARM_UP_ITERATIONS = 2  # iterations before everything is replayed: the first runs as it is, the second captures
@@ -41,8 +42,8 @@ class Difference:
 def compare_capture(plain: OnPolicyRunner, captured: OnPolicyRunner, seed: int) -> dict[str, Difference]:
     """Run the same iteration with both runners, and with ``plain`` twice.
 
-    All three start from the networks and counters of ``plain``, with new episodes and the same random numbers. They
-    learn from the rollout of ``plain``, so that differences between rollouts do not hide those of the update. The
+    All three start from the networks, counters and worlds of ``plain``, with new episodes and the same random numbers.
+    They learn from the rollout of ``plain``, so that differences between rollouts do not hide those of the update. The
     runners, with ``runner.capture`` off and on, come from :func:`warm_up`.
 
     Returns:
@@ -96,11 +97,12 @@ def warm_up(runner: OnPolicyRunner) -> None:
 
 
 def _state(runner: OnPolicyRunner) -> list[Tensor]:
-    """Return the tensors that training carries from one iteration to the next: networks, optimizer, counters."""
+    """Return the tensors that training carries between iterations: networks, optimizer, counters, worlds."""
     alg = runner.alg
     networks = [*alg.actor.state_dict().values(), *alg.critic.state_dict().values()]
     moments = [tensor for entry in alg.optimizer.state.values() for tensor in entry.values()]
-    return [*networks, *moments, alg.learning_rate, runner.env.total_steps]
+    worlds = [tensor for _, tensor in sorted(world_tensors(runner.env).items())]
+    return [*networks, *moments, alg.learning_rate, runner.env.total_steps, *worlds]
 
 
 def _iterate(

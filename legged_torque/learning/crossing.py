@@ -21,14 +21,11 @@ from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import WalkingMetrics
 from legged_torque.learning.evaluator import evaluation_cfg
 from legged_torque.terrain.rough import RoughGround
-from legged_torque.terrain.tiles import TILES
-from legged_torque.utils.config import section_keys
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.math import quat_rotate_yaw
 from legged_torque.utils.metrics import Estimate, estimate, estimates
 
-ALL = "all"
-"""Stands for all kinds."""
 SPEED = 0.6
 """What robots are told to walk forwards, unless something else is asked for [m/s]."""
 SLOWNESS = 2.0
@@ -58,18 +55,12 @@ class Grounds:
     @classmethod
     def of(cls, kinds: Sequence[str], levels: Sequence[float], command: Sequence[float] | None = None) -> Grounds:
         """Return grounds as users name them; a UserError if a kind, a level or a command of three makes no sense."""
-        for kind in kinds:
-            if kind not in (ALL, *TILES):
-                raise unknown_name("kind of terrain", str(kind), [ALL, *TILES])
-        for level in levels:
-            if not 0.0 <= level <= 1.0:
-                raise UserError(f"a level must be from 0 to 1, not {level}")
+        chosen, rising = named_kinds(kinds), rising_levels(levels)
         v_x, v_y, yaw_rate = command or (SPEED, 0.0, 0.0)
         if math.hypot(v_x, v_y) < MIN_SPEED or yaw_rate:
             needed = f"a speed of {MIN_SPEED} m/s or more and a yaw rate of 0, not {v_x:g} {v_y:g} {yaw_rate:g}"
             raise UserError(f"robots cross tiles straight on: the command must have {needed}")
-        chosen = list(TILES) if ALL in kinds else list(dict.fromkeys(kinds))
-        return cls(chosen, sorted(set(levels)), (v_x, v_y))
+        return cls(chosen, rising, (v_x, v_y))
 
     def cfg(self, cfg: Any, worlds_per_tile: int) -> Any:
         """Return settings of a task for trials of so many worlds on each kind and level.
@@ -78,13 +69,8 @@ class Grounds:
         """
         cfg = evaluation_cfg(cfg, worlds_per_tile * len(self.kinds) * len(self.levels))
         terrain, ranges = cfg.terrain, cfg.commands.ranges
-        terrain.mesh_type, terrain.seed = "heightfield", terrain.seed + SEED
-        terrain.num_rows, terrain.num_cols = len(self.levels), COLUMNS * len(self.kinds)
-        terrain.difficulties = list(self.levels)
-        for kind in section_keys(terrain.terrain_proportions):
-            setattr(terrain.terrain_proportions, kind, 0.0)
-        for kind in self.kinds:
-            setattr(terrain.terrain_proportions, kind, 1.0 / len(self.kinds))
+        select_tiles(terrain, self.kinds, self.levels, COLUMNS)
+        terrain.seed += SEED
         cfg.env.episode_length_s = self.time_limit(terrain.tile_size) + 1.0  # no trial ends with the episode
         cfg.commands.resampling_probability = 0.0
         ranges.lin_vel_x, ranges.lin_vel_y = ([speed, speed] for speed in self.command)

@@ -16,6 +16,7 @@ from legged_torque.sim import kernels
 from legged_torque.sim.fused.set_const import DerivedConstants
 from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.fused.tables import FUSED_FIELDS, unread_columns
+from legged_torque.sim.fused.tree import find_floor
 from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.height_map import HeightMap
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
@@ -96,6 +97,7 @@ class Simulator:
             self._reference_pose: wp.array = wp.array(model.qpos0, dtype=wp.float32)
         self._constants = DerivedConstants(model, self.model, num_envs) if per_world else None
         self.is_fused = engine == "fused"
+        self._is_on_map = height_map is not None
         if self.is_fused:
             self._step: FusedStep | WarpStep = FusedStep(model, self.model, self.data, applied_forces, height_map)
         else:
@@ -118,11 +120,15 @@ class Simulator:
     def check_columns(self, name: str, columns: Sequence[int]) -> None:
         """Refuse numbers of a world's part of a field, all entries behind each other, that the engine never reads.
 
-        A UserError for those of the trunk's free joint with "fused".
+        A UserError for those of the trunk's free joint with "fused", and for the place of a floor that is a height map.
         """
-        unread = unread_columns(name) * self.field(name)[0, 0].numel() if self.is_fused else 0
+        width = self.field(name)[0, 0].numel()
+        unread = unread_columns(name) * width if self.is_fused else 0
         if any(column < unread for column in columns):
             raise UserError(f"sim.engine 'fused' does not read '{name}' of the trunk's free joint")
+        is_place = self._is_on_map and name in ("geom_pos", "geom_quat")
+        if is_place and find_floor(self.mj_model) in [column // width for column in columns]:
+            raise UserError(f"sim.engine 'fused' does not read '{name}' of the floor: heights of a map are the world's")
 
     def vary_legs(self) -> None:
         """Also recompute per-leg constants, see :func:`~legged_torque.sim.randomization.changes_legs`.

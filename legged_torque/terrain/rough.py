@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import mujoco
@@ -12,6 +13,10 @@ from legged_torque.terrain.height_map import HeightMap
 from legged_torque.terrain.hfield import add_hfield
 from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.terrain import Terrain
+from legged_torque.utils.errors import UserError
+
+COPIES, BYTES = 3, 4
+"""Of a map on the device: for rewards and scans, for contacts, and what is greatest near each cell; in float32."""
 
 
 class RoughGround(Terrain):
@@ -37,8 +42,10 @@ class RoughGround(Terrain):
     @classmethod
     def build(cls, settings: Any, num_envs: int, device: str) -> RoughGround:
         """Make the ground of a section ``terrain``; a UserError if it asks for what cannot be."""
+        layout = Layout.of(settings)
+        _check_memory(layout, device)
         first_levels = settings.max_init_terrain_level + 1 if settings.curriculum else settings.num_rows
-        return cls(Layout.of(settings), num_envs, device, first_levels, settings.curriculum)
+        return cls(layout, num_envs, device, first_levels, settings.curriculum)
 
     def add_to(self, spec: mujoco.MjSpec, floor: str) -> None:
         """Make the floor a height field."""
@@ -82,3 +89,15 @@ class RoughGround(Terrain):
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the mean level of all worlds."""
         return {"terrain_level": self.levels.float().mean()}
+
+
+def _check_memory(layout: Layout, device: str) -> None:
+    """Refuse a map for which a GPU has no room."""
+    if torch.device(device).type != "cuda":
+        return
+    needed, (free, _) = COPIES * BYTES * math.prod(layout.shape), torch.cuda.mem_get_info(device)
+    if needed > free:
+        raise UserError(
+            f"the map of terrain.num_rows x terrain.num_cols tiles needs {needed / 2**20:.0f} MiB, and {device} has "
+            f"{free / 2**20:.0f} left: raise terrain.horizontal_scale, or make the map smaller"
+        )

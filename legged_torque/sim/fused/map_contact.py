@@ -73,26 +73,26 @@ def find_map_contacts(
     surface = contacts.ground.surface
     count = int(0)
     point = int(0)
-    while point < tables.point_count[b]:
+    while point < tables.point_count[b]:  # geom by geom
         geom = tables.point_geom[b, point]
         depth = tables.point_depth[b, point]
         half = half_size(tables, world, geom)
         radius = tables.point_radius[b, point] * of_world(tables.geom_size, world, geom)[0]
         middle = poses[depth].pos + poses[depth].rot * of_world(tables.geom_pos, world, geom)
-        if origin[2] + middle[2] > surface.top + wp.length(half) + radius:  # the geom is above all of the map
-            point = tables.point_next[b, point]
-            continue
+        end = tables.point_next[b, point]
+        if origin[2] + middle[2] > surface.top + wp.length(half) + radius:
+            point = end  # the geom is above all of the map
         turn = poses[depth].rot * quat_to_matrix(of_world(tables.geom_quat, world, geom))
-        arm = turn * wp.cw_mul(tables.point_offset[b, point], half)
-        centre = middle + arm
-        touch = touch_map(surface, origin + centre, radius)
-        for i in range(touch.count):
-            normal = wp.where(i == 0, touch.first, touch.second)
-            dist = wp.where(i == 0, touch.dist[0], touch.dist[1])
-            contacts.ground.normals[first + count] = normal
-            contacts.found[first + count] = make_contact(
-                tables, world, geom, depth, poses[depth], turn, centre, radius, dist, normal
-            )
-            count += 1
-        point += 1
+        while point < end:
+            centre = middle + turn * wp.cw_mul(tables.point_offset[b, point], half)
+            touch = touch_map(surface, origin + centre, radius)
+            for i in range(touch.count):
+                normal = wp.where(i == 0, touch.first, touch.second)
+                dist = wp.where(i == 0, touch.dist[0], touch.dist[1])
+                contacts.ground.normals[first + count] = normal
+                contacts.found[first + count] = make_contact(
+                    tables, world, geom, depth, poses[depth], turn, centre, radius, dist, normal
+                )
+                count += 1
+            point += 1
     return count

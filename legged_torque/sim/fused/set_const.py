@@ -12,7 +12,7 @@ from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, forwa
 from legged_torque.sim.fused.smooth import Pose, add_bodies, body_dynamics, links_maker, make_equations, make_trunk
 from legged_torque.sim.fused.solver import assemble_damping, eliminate
 from legged_torque.sim.fused.tables import Tables, Worlds, dof, make_tables, of_world, row
-from legged_torque.sim.fused.tree import read_tree
+from legged_torque.sim.fused.tree import FLOORS, read_tree
 from legged_torque.sim.fused.trunk import TrunkSystem, trunk_matrix, whole_inertia
 from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types, mat66, vec6
 from legged_torque.sim.per_world import expand
@@ -34,7 +34,7 @@ class DerivedConstants:
 
         A UserError if the robot's structure is not a trunk with branches.
         """
-        tree = read_tree(mj_model)
+        tree = read_tree(mj_model, FLOORS)
         self._device = model.qpos0.device
         for name in ("body_invweight0", "dof_invweight0"):
             expand(model, name, num_envs)

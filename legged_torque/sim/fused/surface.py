@@ -35,13 +35,16 @@ def make_surface(height_map: HeightMap) -> Surface:
     """Return a height map on the current device."""
     heights, scale = np.asarray(height_map.heights, np.float32), height_map.horizontal_scale
     cells = math.ceil(USUAL_RADIUS / scale)
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(heights, cells, "edge"), (2 * cells + 2,) * 2)
+    ceiling = np.pad(heights, cells, "edge")
+    for _ in range(2):  # along one axis after the other: a cell's greatest height of so many cells on either side
+        ends = range(len(ceiling) - 2 * cells - 1, len(ceiling) + 1)
+        ceiling = np.maximum.reduce([ceiling[first:end] for first, end in enumerate(ends)]).T
     surface = Surface()
     surface.heights = wp.array(heights, dtype=wp.float32)
     surface.scale = scale
     surface.corner = wp.vec2(*height_map.corner)
     surface.top = float(heights.max())
-    surface.ceiling = wp.array(windows.max(axis=(2, 3)), dtype=wp.float32)
+    surface.ceiling = wp.array(ceiling, dtype=wp.float32)
     surface.near = cells * scale
     return surface
 
@@ -60,10 +63,20 @@ class Touch:
 class Triangle:
     """A triangle as seen from the centre of a sphere."""
 
-    nearest: wp.vec3  # its point that is nearest to the centre
+    nearest: wp.vec3  # the point of its plane that is nearest to the centre; once known, that of the triangle
     is_face: wp.bool  # whether that is inside of it, not on its edges or at a vertex
     normal: wp.vec3  # upwards
     dist: wp.float32  # of the centre above its plane [m]
+
+
+@wp.struct
+class Cell:
+    """The corners of a cell as seen from the centre of a sphere."""
+
+    low: wp.vec3
+    next_row: wp.vec3
+    next_col: wp.vec3
+    high: wp.vec3
 
 
 @wp.struct
@@ -82,18 +95,34 @@ def half_of_cell(x: float, y: float) -> int:
 
 
 @wp.func
-def triangle_corner(half: int, k: int) -> wp.vec2i:
-    """Return which corner of its cell, by row and column, is a triangle's ``k``-th, counterclockwise from above."""
-    return wp.vec2i(wp.where(k == 1 or k + half == 2, 1, 0), wp.where(k == 2 or k * half == 1, 1, 0))
+def see_cell(surface: Surface, i: int, j: int, window: Window) -> Cell:
+    """Return a cell as seen from the centre of the window's sphere."""
+    rows, cols = surface.heights.shape[0], surface.heights.shape[1]
+    row, next_row = wp.clamp(i, 0, rows - 1), wp.clamp(i + 1, 0, rows - 1)
+    col, next_col = wp.clamp(j, 0, cols - 1), wp.clamp(j + 1, 0, cols - 1)
+    x, y = surface.scale * float(i - window.first[0]), surface.scale * float(j - window.first[1])
+    next_x, next_y = surface.scale * float(i + 1 - window.first[0]), surface.scale * float(j + 1 - window.first[1])
+    cell = Cell()
+    cell.low = window.start + wp.vec3(x, y, surface.heights[row, col])
+    cell.next_row = window.start + wp.vec3(next_x, y, surface.heights[next_row, col])
+    cell.next_col = window.start + wp.vec3(x, next_y, surface.heights[row, next_col])
+    cell.high = window.start + wp.vec3(next_x, next_y, surface.heights[next_row, next_col])
+    return cell
 
 
 @wp.func
-def height_point(surface: Surface, i: int, j: int, window: Window) -> wp.vec3:
-    """Return a point of the grid, from the centre of the window's sphere."""
-    rows, cols = surface.heights.shape[0], surface.heights.shape[1]
-    height = surface.heights[wp.clamp(i, 0, rows - 1), wp.clamp(j, 0, cols - 1)]
-    from_first = wp.vec3(float(i - window.first[0]), float(j - window.first[1]), 0.0)
-    return window.start + surface.scale * from_first + wp.vec3(0.0, 0.0, height)
+def see_triangle(cell: Cell, half: int) -> Triangle:
+    """Return one of the two triangles of a cell; where it is nearest, if not with its face, is not known yet."""
+    b, c = wp.where(half == 0, cell.next_row, cell.high), wp.where(half == 0, cell.high, cell.next_col)
+    a = cell.low
+    out = Triangle()
+    area = wp.cross(b - a, c - a)
+    out.normal = wp.normalize(area)
+    out.dist = -wp.dot(out.normal, a)
+    out.nearest = -out.dist * out.normal
+    ab, bc, ca = wp.dot(area, wp.cross(a, b)), wp.dot(area, wp.cross(b, c)), wp.dot(area, wp.cross(c, a))
+    out.is_face = wp.min(ab, wp.min(bc, ca)) >= -ON_EDGE * wp.dot(area, area)
+    return out
 
 
 @wp.func
@@ -104,35 +133,17 @@ def nearest_on_edge(a: wp.vec3, b: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def see_triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> Triangle:
-    """Return a triangle, with corners counterclockwise, as seen from the origin."""
-    out = Triangle()
-    area = wp.cross(b - a, c - a)
-    out.normal = wp.normalize(area)
-    out.dist = -wp.dot(out.normal, a)
-    out.nearest = -out.dist * out.normal
-    ab, bc, ca = wp.dot(area, wp.cross(a, b)), wp.dot(area, wp.cross(b, c)), wp.dot(area, wp.cross(c, a))
-    out.is_face = wp.min(ab, wp.min(bc, ca)) >= -ON_EDGE * wp.dot(area, area)
-    if not out.is_face:
-        out.nearest = nearest_on_edge(a, b)
-        other = nearest_on_edge(b, c)
-        if wp.length_sq(other) < wp.length_sq(out.nearest):
-            out.nearest = other
-        other = nearest_on_edge(c, a)
-        if wp.length_sq(other) < wp.length_sq(out.nearest):
-            out.nearest = other
-    return out
-
-
-@wp.func
-def cell_triangle(surface: Surface, i: int, j: int, half: int, window: Window) -> Triangle:
-    """Return one of the two triangles of a cell as seen from the centre of the window's sphere."""
-    a, b, c = triangle_corner(half, 0), triangle_corner(half, 1), triangle_corner(half, 2)
-    return see_triangle(
-        height_point(surface, i + a[0], j + a[1], window),
-        height_point(surface, i + b[0], j + b[1], window),
-        height_point(surface, i + c[0], j + c[1], window),
-    )
+def nearest_on_edges(cell: Cell, half: int) -> wp.vec3:
+    """Return the point of a triangle's edges that is nearest to the centre."""
+    b, c = wp.where(half == 0, cell.next_row, cell.high), wp.where(half == 0, cell.high, cell.next_col)
+    nearest = nearest_on_edge(cell.low, b)
+    other = nearest_on_edge(b, c)
+    if wp.length_sq(other) < wp.length_sq(nearest):
+        nearest = other
+    other = nearest_on_edge(c, cell.low)
+    if wp.length_sq(other) < wp.length_sq(nearest):
+        nearest = other
+    return nearest
 
 
 @wp.func
@@ -159,17 +170,19 @@ def triangle_under(surface: Surface, centre: wp.vec3) -> Triangle:
     """Return the triangle that is vertically under, or above, a point."""
     window = make_window(surface, centre, 0.0)
     half = half_of_cell(-window.start[0], -window.start[1])
-    return cell_triangle(surface, window.first[0], window.first[1], half, window)
+    cell = see_cell(surface, window.first[0], window.first[1], window)
+    out = see_triangle(cell, half)
+    if not out.is_face:
+        out.nearest = nearest_on_edges(cell, half)
+    return out
 
 
 @wp.func
-def distance_sq_to_cell(surface: Surface, i: int, j: int, window: Window) -> float:
-    """Return the squared distance from the centre of the window's sphere to a cell, filled up to its highest corner."""
-    corner = height_point(surface, i, j, window)
-    top = wp.max(corner[2], height_point(surface, i + 1, j, window)[2])
-    far = wp.max(height_point(surface, i, j + 1, window)[2], height_point(surface, i + 1, j + 1, window)[2])
-    x, y = wp.max(corner[0], -corner[0] - surface.scale), wp.max(corner[1], -corner[1] - surface.scale)
-    away = wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(-wp.max(top, far), 0.0))
+def distance_sq_to_cell(cell: Cell) -> float:
+    """Return the squared distance from the centre to a cell, filled up to its highest corner."""
+    top = wp.max(wp.max(cell.low[2], cell.next_row[2]), wp.max(cell.next_col[2], cell.high[2]))
+    x, y = wp.max(cell.low[0], -cell.high[0]), wp.max(cell.low[1], -cell.high[1])
+    away = wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(-top, 0.0))
     return wp.length_sq(away)
 
 
@@ -191,16 +204,20 @@ def nearest_triangle(surface: Surface, window: Window, reach: float, under: Tria
     best_sq = wp.length_sq(best.nearest)
     for i in range(window.first[0], window.last[0] + 1):
         for j in range(window.first[1], window.last[1] + 1):
-            most = (1.0 + ON_EDGE) * wp.min(best_sq, reach * reach)
-            if distance_sq_to_cell(surface, i, j, window) < most:
+            cell = see_cell(surface, i, j, window)
+            if distance_sq_to_cell(cell) < (1.0 + ON_EDGE) * wp.min(best_sq, reach * reach):
                 for half in range(2):
-                    other = cell_triangle(surface, i, j, half, window)
-                    other_sq = wp.length_sq(other.nearest)
+                    other = see_triangle(cell, half)
+                    weight = float(1.0)
                     if other.is_face != best.is_face:
-                        other_sq *= wp.where(other.is_face, 1.0 - ON_EDGE, 1.0 + ON_EDGE)
-                    if other_sq < best_sq:
-                        best = other
-                        best_sq = wp.length_sq(other.nearest)
+                        weight = wp.where(other.is_face, 1.0 - ON_EDGE, 1.0 + ON_EDGE)
+                    if weight * other.dist * other.dist < best_sq:  # its plane is near enough
+                        if not other.is_face:
+                            other.nearest = nearest_on_edges(cell, half)
+                        other_sq = wp.length_sq(other.nearest)
+                        if weight * other_sq < best_sq:
+                            best = other
+                            best_sq = other_sq
     return best
 
 
@@ -214,14 +231,14 @@ def second_face(surface: Surface, window: Window, radius: float, point: wp.vec3,
     best.dist = radius
     for i in range(window.first[0], window.last[0] + 1):
         for j in range(window.first[1], window.last[1] + 1):
-            if distance_sq_to_cell(surface, i, j, window) < radius * radius:
+            cell = see_cell(surface, i, j, window)
+            if distance_sq_to_cell(cell) < radius * radius:
                 for half in range(2):
-                    other = cell_triangle(surface, i, j, half, window)
-                    way = other.nearest - point
-                    is_concave = wp.min(wp.dot(way, normal), -wp.dot(way, other.normal)) > 10.0 * MIN_DISTANCE
-                    is_other = other.is_face and wp.dot(normal, other.normal) < ALIKE and is_concave
-                    if is_other and other.dist < best.dist:
-                        best = other
+                    other = see_triangle(cell, half)
+                    if other.is_face and other.dist < best.dist and wp.dot(normal, other.normal) < ALIKE:
+                        way = other.nearest - point
+                        if wp.min(wp.dot(way, normal), -wp.dot(way, other.normal)) > 10.0 * MIN_DISTANCE:
+                            best = other
     return best
 
 

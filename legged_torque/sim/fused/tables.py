@@ -7,7 +7,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from legged_torque.sim.fused.tree import Tree
+from legged_torque.sim.fused.tree import Tree, find_floor
 from legged_torque.sim.fused.types import vec5
 
 MIN_TOLERANCE = 1e-9
@@ -131,8 +131,7 @@ def make_tables(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Tab
         if hasattr(warp_model, name):
             setattr(tables, name, getattr(warp_model, name))
     tables.gravity = warp_model.opt.gravity
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    tables.floor = int(np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & collides)[0])
+    tables.floor = find_floor(model)
     tables.timestep = model.opt.timestep
     tables.impratio = model.opt.impratio
     tables.cost_scale = 1.0 / (model.stat.meaninertia * model.nv)

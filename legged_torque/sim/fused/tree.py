@@ -1,5 +1,6 @@
 """The structure of a robot, if it is one that the fused step can simulate."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -16,6 +17,10 @@ _GEOM_POINTS = {
     mujoco.mjtGeom.mjGEOM_BOX: (_BOX_CORNERS, 0.0),
 }
 """Where a geom can touch the ground: points in units of its half sizes, and how many radii it is thick around them."""
+
+
+FLOORS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+"""What robots stand on; the fused step knows planes only, its height maps are none of the model's geoms."""
 
 
 @dataclass
@@ -35,9 +40,12 @@ class Tree:
         return max(1, *(len(points) for points in self.points))
 
 
-def read_tree(model: mujoco.MjModel) -> Tree:
-    """Return the structure of a robot; a UserError if it has something that the fused step does not simulate."""
-    _check(model)
+def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:1]) -> Tree:
+    """Return the structure of a robot on a floor of one of some types.
+
+    A UserError if it has something that the fused step does not simulate.
+    """
+    _check(model, floors)
     children = [[c for c in range(2, model.nbody) if model.body_parentid[c] == b] for b in range(model.nbody)]
     chains = []
     for body in children[1]:
@@ -64,9 +72,15 @@ def read_tree(model: mujoco.MjModel) -> Tree:
     return Tree(np.array([[model.body_jntadr[body] for body in chain] for chain in chains]), points)
 
 
+def find_floor(model: mujoco.MjModel) -> int:
+    """Return the geom that an accepted robot stands on."""
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    return int(np.flatnonzero(np.isin(model.geom_type, FLOORS) & collides)[0])
+
+
 def check_map(model: mujoco.MjModel) -> None:
     """Raise a UserError if the floor of an accepted robot cannot become a height map, whose heights are the world's."""
-    floor = int(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)[0])
+    floor = find_floor(model)
     posed = model.geom_pos[floor].any() or not np.array_equal(model.geom_quat[floor], (1.0, 0.0, 0.0, 0.0))
     _require(not posed, "its floor is not at the origin, where a height map needs it")
 
@@ -78,10 +92,10 @@ def _require(holds: bool, reason: str) -> None:
         raise UserError(f"sim.engine 'fused' cannot simulate this robot: {reason}; {advice}")
 
 
-def _check(model: mujoco.MjModel) -> None:
+def _check(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> None:
     """Raise a UserError for whatever the fused step does not simulate."""
     _check_bodies(model)
-    _check_contacts(model)
+    _check_contacts(model, floors)
     _check_motors(model)
     option = model.opt
     _require(option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL, "the friction cone must be pyramidal")
@@ -112,10 +126,10 @@ def _check_bodies(model: mujoco.MjModel) -> None:
     _require(not nonlinear, "springs or dampers are not linear")
 
 
-def _check_contacts(model: mujoco.MjModel) -> None:
+def _check_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> None:
     """Check the floor and what collides with it."""
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    floor = np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & collides)
+    floor = np.flatnonzero(np.isin(model.geom_type, floors) & collides)
     robot = collides & (model.geom_bodyid > 0)
     _require(bool(len(floor) == 1 and (collides & ~robot).sum() == 1), "it needs one plane and no other obstacle")
     types, affinities, bodies = model.geom_contype[robot], model.geom_conaffinity[robot], model.geom_bodyid[robot]
