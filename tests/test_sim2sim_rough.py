@@ -257,6 +257,7 @@ def test_ground_of_the_mjcf(policy, tmp_path):
         ("observations.terms.6.scan.limit", 0.0, "observations.terms.6.scan.limit"),
         ("terrain.difficulty_range", [0.0, 1.5], "terrain.difficulty_range.1"),
         ("terrain.rows", 3, "'rows' was unexpected"),
+        ("terrain.tile_size", 1.0, "terrain.tile_size: 1.0 is less than the minimum of 6"),
     ],
 )
 def test_damaged_descriptions(policy, path, value, message):

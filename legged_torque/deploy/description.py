@@ -122,7 +122,10 @@ def _check_schema(description: Any, where: str) -> None:
         import jsonschema
     except ImportError:
         raise missing_extra("jsonschema") from None
-    error = jsonschema.exceptions.best_match(jsonschema.Draft202012Validator(_schema()).iter_errors(description))
+    draft = jsonschema.Draft202012Validator  # for which 4.0 is an integer, but it cannot count anything here
+    types = draft.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
+    validator = jsonschema.validators.extend(draft, type_checker=types)(_schema())
+    error = jsonschema.exceptions.best_match(validator.iter_errors(description))
     if error is not None:
         path = ".".join(str(key) for key in error.absolute_path) or "the file"
         message = " ".join(error.message.split())
