@@ -1,4 +1,7 @@
-"""Measure a checkpoint: ``python scripts/evaluate.py --task=a1_position --perturbation=high``."""
+"""Measure a checkpoint: ``python scripts/evaluate.py --task=a1_position --perturbation=high``.
+
+With ``--terrain`` and ``--level``, robots try to cross tiles of rough ground, once in each world: see docs/terrain.md.
+"""
 
 from __future__ import annotations
 
@@ -8,69 +11,108 @@ from legged_torque.utils.rendering import without_renderer
 end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
+import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from legged_torque.envs import task_registry
+from legged_torque.experiments.matrix import GROUNDS
 from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import add_command_arg, check_at_least, check_output, importing, run_script, write_json
+from legged_torque.utils.cli import (
+    add_command_arg,
+    check_at_least,
+    check_output,
+    finite,
+    importing,
+    run_script,
+    write_json,
+)
 from legged_torque.utils.devices import device_name
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.paths import portable_path
 from legged_torque.utils.runs import package_versions
-from legged_torque.utils.task_registry import set_seed
+from legged_torque.utils.task_registry import LoadedRun, set_seed
 
 if TYPE_CHECKING:
+    from rsl_rl.runners import OnPolicyRunner
+
+    from legged_torque.envs.base.legged_robot import LeggedRobot
     from legged_torque.envs.base.metrics import CommandBreakdown
+    from legged_torque.learning.crossing import Grounds
+
+STEPS = 2000  # control steps, where robots do not cross tiles
 
 
 def main() -> None:
     """Roll out a checkpoint with mean actions, print the metrics, write them as JSON."""
-    parser = Parser(__doc__)
-    add_task_args(parser)
-    parser.set_defaults(num_envs=16, seed=1)
-    parser.add_argument("--steps", type=int, default=2000, help="control steps; default: %(default)s")
-    add_command_arg(parser)
-    parser.add_argument("--json", type=Path, help="file to write")
-    args = parser.parse_args()
-    check_at_least(args, 1, "steps")
+    args = parse_args()
     if args.json:
         check_output(args.json)
     options = options_of(args)
+    grounds = None
     with importing():
+        if args.terrain:
+            from legged_torque.learning.crossing import Grounds
+
+            grounds = Grounds.of(args.terrain, args.level, args.command)
         run = task_registry.load_run(options)
         import torch
 
-        from legged_torque.envs.base.metrics import COMMANDS, CommandBreakdown, measure
+        from legged_torque.envs.base.metrics import COMMANDS
         from legged_torque.learning.evaluator import evaluation_cfg
-    env_cfg = evaluation_cfg(run.env_cfg, run.env_cfg.env.num_envs)
-    for name, value in zip(COMMANDS, args.command or (), strict=False):
-        setattr(env_cfg.commands.ranges, name, [value, value])
+    if grounds:
+        env_cfg = grounds.cfg(run.env_cfg, run.env_cfg.env.num_envs)
+    else:
+        env_cfg = evaluation_cfg(run.env_cfg, run.env_cfg.env.num_envs)
+        for name, value in zip(COMMANDS, args.command or (), strict=False):
+            setattr(env_cfg.commands.ranges, name, [value, value])
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options, env_cfg)
-    breakdown = CommandBreakdown(env)
     torch.manual_seed(args.seed)  # building and loading have drawn numbers too
-    metrics = measure(env, runner.get_inference_policy(env.device), args.steps, breakdown.add_step)
+    measured = cross_tiles(run, env, runner, grounds) if grounds else walk(run, env, runner, args.steps)
+    if args.json:
+        write_json(args.json, circumstances(args, run, env, runner) | measured)
+
+
+def parse_args() -> argparse.Namespace:
+    """Return the command line; a UserError if it makes no sense."""
+    parser = Parser(__doc__)
+    add_task_args(parser)
+    parser.set_defaults(num_envs=16, seed=1)
+    parser.add_argument("--steps", type=int, help=f"control steps; default: {STEPS}")
+    add_command_arg(parser)
+    hint = """kinds of rough ground to cross, or all; then --num_envs is for each kind and level, and --command a speed
+        straight on, 0.6 0 0 unless it is given"""
+    parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
+    hint = "difficulties of rough ground, 0 to 1; default: the ten of training, 0 to 0.9"
+    parser.add_argument("--level", nargs="+", type=finite, help=hint)
+    parser.add_argument("--json", type=Path, help="file to write")
+    args = parser.parse_args()
+    if args.terrain and args.steps is not None:
+        raise UserError("--steps is not for --terrain: how long robots may try follows from the command")
+    if args.level and not args.terrain:
+        raise UserError("--level needs --terrain: the kinds of rough ground")
+    args.steps = STEPS if args.steps is None else args.steps
+    args.level = args.level or GROUNDS["levels"]
+    check_at_least(args, 1, "steps")
+    return args
+
+
+def walk(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, num_steps: int) -> dict[str, Any]:
+    """Roll a policy out, print its metrics, and return them."""
+    from legged_torque.envs.base.metrics import CommandBreakdown, measure
+
+    breakdown = CommandBreakdown(env)
+    metrics = measure(env, runner.get_inference_policy(env.device), num_steps, breakdown.add_step).estimates()
     trained = runner.logger.tot_timesteps
-    print(f"{run.checkpoint}, after {trained:,} steps of training, {env.num_envs} worlds x {args.steps} steps:")
-    for name, estimate in metrics.estimates().items():
+    print(f"{run.checkpoint}, after {trained:,} steps of training, {env.num_envs} worlds x {num_steps} steps:")
+    for name, estimate in metrics.items():
         print(f"  {name:<18} {estimate.mean:10.4f} +- {estimate.standard_error:.4f} {UNITS[name]}")
     print_breakdown(breakdown)
-    if args.json:
-        kept = "as in training"
-        result = {
-            "task": args.task,
-            "run": portable_path(run.folder),
-            "checkpoint": run.checkpoint.name,
-            "steps": trained,
-        }
-        result |= {"perturbation": args.perturbation or kept, "ranges": args.ranges or kept, "command": args.command}
-        result |= {"num_envs": env.num_envs, "num_steps": args.steps, "seed": args.seed}
-        result |= {"device": device_name(env.device), "versions": package_versions()}
-        result["metrics"] = {name: asdict(estimate) for name, estimate in metrics.estimates().items()}
-        result["by_command"] = breakdown.table()
-        write_json(args.json, result)
+    shown = {name: asdict(estimate) for name, estimate in metrics.items()}
+    return {"num_steps": num_steps, "metrics": shown, "by_command": breakdown.table()}
 
 
 def print_breakdown(breakdown: CommandBreakdown) -> None:
@@ -80,6 +122,33 @@ def print_breakdown(breakdown: CommandBreakdown) -> None:
         for part in parts:
             line = "  {:<12} {from:>6.2f} {to:>6.2f} {share:>6.2f} {track_percentage:>9.3f} {error:>7.3f}"
             print(line.format(name, **part))
+
+
+def cross_tiles(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, grounds: Grounds) -> dict[str, Any]:
+    """Let a policy try to cross tiles, print what came out, and return it."""
+    from legged_torque.learning.crossing import cross
+
+    results = cross(env, runner.get_inference_policy(env.device), grounds)
+    time_limit, trained = grounds.time_limit(env.cfg.terrain.tile_size), runner.logger.tot_timesteps
+    told = "told to walk {:g} {:g} m/s for {:.1f} s at most".format(*grounds.command, time_limit)
+    print(f"{run.checkpoint}, after {trained:,} steps of training, {env.num_envs} worlds, {told}:")
+    print(f"  {'kind':<18} {'level':>6} {'worlds':>6} {'crossed':>16} {'fell':>16} {'tracking':>9} {'cost':>6}")
+    for result in results:
+        shares = [f"{share.mean:.3f} +- {share.standard_error:.3f}" for share in (result.crossed, result.fell)]
+        tracking, cost = (result.metrics[name].mean for name in ("track_percentage", "cost_of_transport"))
+        place = f"  {result.kind:<18} {result.level:>6g} {result.worlds:>6}"
+        print(f"{place} {shares[0]:>16} {shares[1]:>16} {tracking:>9.3f} {cost:>6.2f}")
+    return {"time_limit": time_limit, "grounds": [asdict(result) for result in results]}
+
+
+def circumstances(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner) -> dict[str, Any]:
+    """Return what was measured, and how."""
+    kept = "as in training"
+    result = {"task": args.task, "run": portable_path(run.folder), "checkpoint": run.checkpoint.name}
+    result |= {"steps": runner.logger.tot_timesteps, "perturbation": args.perturbation or kept}
+    result |= {"ranges": args.ranges or kept, "command": args.command}
+    result |= {"num_envs": env.num_envs, "seed": args.seed}
+    return result | {"device": device_name(env.device), "versions": package_versions()}
 
 
 if __name__ == "__main__":

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 
 from legged_torque import resource_path
 from legged_torque.envs import task_registry
+from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
 from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, check_at_least, check_output, importing, run_script
+from legged_torque.utils.cli import Parser, check_at_least, check_output, finite, importing, run_script
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
@@ -42,6 +43,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=500, help=hint)
     parser.add_argument("--video", type=Path, help="mp4 to write; default: in the run's folder")
     parser.add_argument("--grid", type=int, help="number of robots in the video: 1, 4, 9, 16 or 25; default: 1")
+    add_terrain_args(parser)
     hint = """none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's
         window; default: %(default)s"""
     parser.add_argument("--viewer", choices=NUM_ENVS, default="none", help=hint)
@@ -53,12 +55,18 @@ def main() -> None:
     if not 1 <= args.port <= 65535:
         raise UserError(f"--port must be from 1 to 65535, not {args.port}")
     choose_worlds(args)
+    kinds, levels = named_kinds(args.terrain), rising_levels(args.level)
+    if levels and not kinds:
+        raise UserError("--level needs --terrain: the kinds of rough ground")
     if args.video:
         check_output(args.video)
     options = options_of(args)
     with importing():
         run = task_registry.load_run(options)
         from legged_torque.viewer.session import Session
+    run.env_cfg.terrain.curriculum = False  # robots stay on their tiles
+    if kinds:
+        select_tiles(run.env_cfg.terrain, kinds, levels, 1)
     set_seed(args.seed)
     if args.viewer == "none":
         roll_out(args, *task_registry.make_loaded(run, options), run.checkpoint)
@@ -79,6 +87,14 @@ def choose_worlds(args: argparse.Namespace) -> None:
         args.num_envs = max(NUM_ENVS[args.viewer], args.grid)
     elif 1 <= args.num_envs < args.grid:
         raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
+
+
+def add_terrain_args(parser: Parser) -> None:
+    """Add what chooses the ground."""
+    hint = "kinds of rough ground, or all: a column of tiles of each; default: the ground of the training"
+    parser.add_argument("--terrain", nargs="+", metavar="KIND", default=[], help=hint)
+    hint = "difficulties of rough ground, 0 to 1: a row of tiles of each; default: those of the training"
+    parser.add_argument("--level", nargs="+", type=finite, default=[], help=hint)
 
 
 def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:

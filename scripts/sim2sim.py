@@ -52,12 +52,18 @@ def parse_args() -> argparse.Namespace:
         "--push_probability", type=finite, help="probability of a push per control step; default: 0.002"
     )
     parser.add_argument("--seed", type=int, default=1, help="random seed; default: %(default)s")
+    hint = "kinds of rough ground, or all; each robot starts on one of their tiles; default: the ground of training"
+    parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
+    hint = "difficulties of rough ground, 0 to 1; default: those of training"
+    parser.add_argument("--level", nargs="+", type=finite, default=(), help=hint)
     parser.add_argument("--video", type=Path, help="mp4 of the first robot")
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
     args = parser.parse_args()
     check_at_least(args, 1, "steps", "robots")
     check_at_least(args, 0, "seed", "push_velocity")
+    if args.level and not args.terrain:
+        raise UserError("--level needs --terrain: the kinds of rough ground")
     if args.push_probability is not None and not args.push_velocity:
         raise UserError("--push_probability needs --push_velocity")
     if args.push_probability is None:
@@ -75,13 +81,17 @@ def main() -> None:
     with importing():
         import numpy as np
 
+        from legged_torque.deploy.ground import select_ground
         from legged_torque.deploy.policy import Policy
         from legged_torque.deploy.robot import MujocoRobot
         from legged_torque.deploy.simulation import Events, Simulation
+        from legged_torque.envs import LeggedRobotCfg
         from legged_torque.utils.metrics import UNITS, estimates, ratios
         from legged_torque.viewer.native import simulation_window
         from legged_torque.viewer.video import SimulationRecorder
     policy = Policy(args.policy)
+    if args.terrain:
+        select_ground(policy.description, LeggedRobotCfg().terrain, args.terrain, args.level)
     xml = args.xml or resource_path(policy.description["robot"]["file"])
     robot = MujocoRobot(xml, policy.description)
     events = Events(args.command, args.push_velocity, args.push_probability)

@@ -323,7 +323,45 @@ def test_fixed_command_with_one_world(root, tmp_path, noted, monkeypatch):
     assert "model_3.pt, after 24 steps of training, 1 worlds x 9 steps:" in output
 
 
+def test_mean_level_is_noted(make_runner):
+    """On rough ground a row says how far training has come; four worlds start on levels 0 to 3."""
+    ground = {"terrain.mesh_type": "heightfield", "terrain.border_size": 1.0}
+    runner = make_runner(env=ground, **{"evaluation.interval": 16})
+    runner.learn(1)
+    header, row = (Path(runner.log_dir) / "evaluations.csv").read_text().splitlines()
+    assert header == f"{COLUMNS},terrain_level" and row.endswith(",1.5")
+    assert runner.env.terrain.levels.tolist() == [0, 1, 2, 3]
+
+
+def test_crossing_tiles_after_training_on_a_plane(root, tmp_path):
+    """The policy sees what it saw; there is a row per kind and level; a seed fixes every number."""
+    words = ["--terrain", "stairs_up", "flat", "--level", "0.5", "0", "--num_envs=2", "--command", "2", "0", "0"]
+    output, result = evaluate(root, tmp_path / "a.json", *words)
+    evaluate(root, tmp_path / "b.json", *words)
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+    tiles = [(row["kind"], row["level"], row["worlds"]) for row in result["grounds"]]
+    assert tiles == [("stairs_up", 0.0, 2), ("stairs_up", 0.5, 2), ("flat", 0.0, 2), ("flat", 0.5, 2)]
+    assert (result["num_envs"], result["time_limit"], result["steps"]) == (8, 4.0, 24) and "num_steps" not in result
+    for row in result["grounds"]:
+        assert row["crossed"] == {"mean": 0.0, "standard_error": 0.0}  # it cannot walk yet
+        assert list(row["metrics"]) == list(UNITS)
+        cost = row["metrics"]["cost_of_transport"]["mean"]
+        place = rf"{row['kind']} +{row['level']:g} +2 +0.000 \+- 0.000 +{row['fell']['mean']:.3f} "
+        assert re.search(rf"(?m)^  {place}.* {cost:.2f}$", output), row
+    assert "8 worlds, told to walk 2 0 m/s for 4.0 s at most:" in output
+
+
 MISTAKES = {
+    "--terrain stairs_pu": "unknown kind of terrain 'stairs_pu'; did you mean 'stairs_up'?",
+    "--terrain flat --level 0.5 1.01": "a level must be from 0 to 1, not 1.01",
+    "--terrain flat --level -0.1": "a level must be from 0 to 1, not -0.1",
+    "--terrain flat --level nan": "argument --level: it must be finite, not nan",
+    "--terrain flat --level": "argument --level: expected at least one argument",
+    "--terrain flat --command 0 0 0": "the command must have a speed of 0.1 m/s or more and a yaw rate of 0, not 0 0 0",
+    "--terrain flat --command 1 0 0.5": "a yaw rate of 0, not 1 0 0.5",
+    "--terrain flat --steps=5": "--steps is not for --terrain",
+    "--level 0.5": "--level needs --terrain",
+    "--terrain flat --level 0 --set terrain.measure_heights=true": "does not fit this task",
     "--perturbation=hihg": "unknown perturbation 'hihg'; did you mean 'high'?",
     "--checkpoint=7": "unknown checkpoint '7'; allowed: 1, 2, 3",
     "--steps=0": "--steps must be at least 1, not 0",

@@ -183,6 +183,13 @@ def test_dry_run(name, tmp_path):
         ({"train": {"seed": 3}}, "train.seed cannot be set: it comes from seeds"),
         ({"train": {"evaluation.also": ["low"]}}, "train.evaluation.also cannot be set: it comes from environments"),
         ({"evaluation": {"num_env": 3}}, "unknown evaluation key 'num_env'; did you mean 'num_envs'?"),
+        ({"grounds": {"level": [0.5]}}, "unknown grounds key 'level'; did you mean 'levels'?"),
+        ({"grounds": {"levels": [0, 1.5]}}, "a level must be from 0 to 1, not 1.5"),
+        ({"grounds": {"levels": []}}, "grounds.levels must hold something, not []"),
+        ({"grounds": {"kinds": "flat"}}, "config key 'grounds.kinds' takes a value like ['all'], not 'flat'"),
+        ({"grounds": {"kinds": ["falt"]}}, "unknown kind of terrain 'falt'; did you mean 'flat'?"),
+        ({"grounds": {"num_envs": -1}}, "grounds.num_envs must hold something, not -1"),
+        ({"grounds": ["flat"]}, "experiment key 'grounds' must hold entries 'name: value'"),
         ({"evaluation": {"num_steps": 0}}, "evaluation.num_steps must be a whole number of at least 1, not 0"),
     ],
 )

@@ -309,6 +309,29 @@ def test_what_a_training_has_measured_is_not_evaluated_again(stage, tmp_path):
     assert listed == "a1_torque-low-s1: resume after 3 of 4 iterations, evaluate in low, high\n"
 
 
+def test_tiles_are_crossed_after_training(stage, tmp_path):
+    """That is a step of its own, which is done again alone, and is not possible with other tiles in the same folder."""
+    values = SMALL | {"tasks": ["a1_torque"], "grounds": {"kinds": ["flat", "pits"], "levels": [0, 0.5]}}
+    file, out = write(tmp_path / "m.yaml", values), tmp_path / "out"
+    words = [file, f"--out={out}", "--device=cpu"]
+    (stage / "behaviour").write_text("measure evaluations.csv evaluations_high.csv")
+    listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1]
+    assert listed == "a1_torque-low-s1: train, evaluate in low, high, rough ground\n"
+    assert experiment_here(*words, tmp_path=tmp_path)[0] == 0
+    cell = out / "a1_torque-low-s1"
+    log, result = (cell / "evaluate.log").read_text(), cell / "grounds.json"
+    assert " --num_envs=40 --terrain flat pits --level 0.0 0.5 " in log and "--perturbation" not in log
+    assert json.loads(result.read_text())["experiment_name"] == cell.name and not list(cell.glob("*.part"))
+    result.unlink()
+    listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1]
+    assert listed == "a1_torque-low-s1: evaluate in rough ground\n"
+    assert experiment_here(*words, tmp_path=tmp_path)[0] == 0
+    assert result.is_file() and len(order(stage)) == 1
+    write(file, values | {"grounds": {"kinds": ["flat"], "levels": [0, 0.5]}})
+    told = "grounds.kinds is ['flat'], was ['flat', 'pits']; give another --out"
+    assert_told_in_one_line(experiment_here(*words, tmp_path=tmp_path), told)
+
+
 def test_results_of_another_training_are_not_kept(stage, tmp_path):
     """If the runs are gone and a result is missing, all results come from the new training."""
     file, out = write(tmp_path / "m.yaml", SMALL | {"tasks": ["a1_torque"]}), tmp_path / "out"

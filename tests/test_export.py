@@ -291,10 +291,13 @@ def test_unknown_terms_are_refused(make_task, tmp_path, monkeypatch):
     """A term that a robot could not compute is refused by name with those that it could, and nothing is written."""
     robot = task_registry.get_task_class("a1_position")
     own_terms = robot.observation_terms
-    height = ObservationTerm("height_scan", lambda: torch.zeros(3, 7), None)
+    depth = ObservationTerm("depth_image", lambda: torch.zeros(3, 7), None)
     changes = {
-        "observation term 'height_scan'; it has projected_gravity, angular_velocity, command, joint_position, "
-        "joint_velocity, last_action, position_phase": ("observation_terms", lambda task: [*own_terms(task), height]),
+        "observation term 'depth_image'; it has projected_gravity, angular_velocity, command, joint_position, "
+        "joint_velocity, last_action, position_phase, height_scan": (
+            "observation_terms",
+            lambda task: [*own_terms(task), depth],
+        ),
         "action term 'impedance'; it has position_residual, torque": (
             "action_terms",
             lambda task: [ActionTerm("impedance", task.action_scale, "rad", "")],

@@ -30,6 +30,7 @@ from legged_torque.control.standing import use_standing_trials
 from legged_torque.control.whole_body import WholeBodyController, WholeBodySettings
 from legged_torque.envs import task_registry
 from legged_torque.learning.pretrained import read_pretrained
+from legged_torque.terrain.layout import Layout
 from legged_torque.utils.config import to_dict
 
 TASK = "a1_torque_gravity"
@@ -231,6 +232,17 @@ def test_gains_of_the_imitated_controller(monkeypatch):
     _, report = pretrain(TASK, *get_cfgs(*words, task=TASK), "cpu")
     assert report["histograms"]["mean_torque"]["counts"] == [12.0, *[0.0] * 49]
     assert report["pairs"] == 12 and report["settings"]["controller"]["joint_damping"] == 0.0
+
+
+def test_on_rough_ground():
+    """Trials on rough ground start on level tiles at z = 0, which a policy that sees the ground sees, too."""
+    env_cfg, _ = get_cfgs("--set=terrain.mesh_type=heightfield", "--set=terrain.measure_heights=True", task=TASK)
+    use_standing_trials(env_cfg, 4)
+    assert env_cfg.terrain.mesh_type == "heightfield" and env_cfg.terrain.measure_heights
+    assert not env_cfg.terrain.curriculum and not Layout.of(env_cfg.terrain).heights().any()
+    plane_cfg, _ = get_cfgs(task=TASK)
+    use_standing_trials(plane_cfg, 4)
+    assert plane_cfg.terrain.mesh_type == "plane"
 
 
 def test_falls(task, controller):

@@ -412,3 +412,45 @@ def test_mistakes(tmp_path, capsys, plan, words, message):
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and message in error
     assert not (tmp_path / "out").exists()
+
+
+def write_grounds(cell, crossed):
+    """Write what evaluate.py has measured on tiles: shares of robots by kind and level; tracking is a tenth of it."""
+    cell.mkdir(parents=True, exist_ok=True)
+    estimates = {tile: {"mean": share, "standard_error": 0.1} for tile, share in crossed.items()}
+    tenth = {tile: {"mean": share / 10} for tile, share in crossed.items()}
+    entries = [
+        {"kind": tile[0], "level": tile[1], "crossed": share, "fell": {"mean": 0.25}}
+        | {"metrics": {"track_percentage": tenth[tile], "cost_of_transport": {"mean": None}}}
+        for tile, share in estimates.items()
+    ]
+    (cell / "grounds.json").write_text(json.dumps({"grounds": entries}))
+
+
+def test_rough_ground(tmp_path):
+    """Means over levels, then over seeds; a file with all tiles, a figure; what is missing or broken is told."""
+    folder, tasks = tmp_path / "rough", ["a1_rough_position", "a1_rough_torque_scan"]
+    write_experiment(folder, {"low": ["low"]}, tasks=tasks)
+    plan = yaml.safe_load((folder / "experiment.yaml").read_text()) | {"grounds": {"num_envs": 7}}
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(plan))
+    for task, seed in ((task, seed) for task in tasks for seed in (1, 2)):
+        write_part(folder / f"{task}-low-s{seed}" / "2026-01-01_00-00-00", whole_run(0.7))
+    write_grounds(folder / f"{tasks[0]}-low-s1", {("pits", 0.0): 1.0, ("pits", 0.5): 0.5, ("gaps", 0.5): 0.0})
+    write_grounds(folder / f"{tasks[0]}-low-s2", {("pits", 0.0): 0.5, ("pits", 0.5): 0.25, ("gaps", 0.5): 0.0})
+    write_grounds(folder / f"{tasks[1]}-low-s1", {("pits", 0.0): 0.75, ("pits", 0.5): 0.25, ("gaps", 0.5): 1.0})
+    (folder / f"{tasks[1]}-low-s2" / "grounds.json").write_text('{"grounds": [{}]}')
+    assert run_script(folder, "--out", tmp_path / "out") == 0
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "Table I" not in text and "## While training" in text and "![Success in low](successinlow.png)" in text
+    rows = [line for line in text.splitlines() if line.startswith(("| PD, blind |", "| Default torque, scan |"))]
+    assert rows[:2] == [  # 0.75 and 0.375; 0; 0.5 and 0.25
+        "| PD, blind | 0.56 ± 0.19 | 0.00 ± 0.00 | 0.38 ± 0.12 |",
+        "| Default torque, scan | 0.50 (1) | 1.00 (1) | 0.67 (1) |",
+    ]
+    assert rows[2] == "| PD, blind | 0.25 ± 0.00 | 0.25 ± 0.00 | 0.25 ± 0.00 |" and rows[6].endswith(" – | – | – |")
+    assert "`a1_rough_torque_scan` in low, seed 2: 'a1_rough_torque_scan-low-s2/grounds.json' cannot be read; " in text
+    assert (tmp_path / "out" / "successinlow.png").read_bytes().startswith(b"\x89PNG")
+    tiles = rows_of((tmp_path / "out" / "grounds.csv").read_bytes())
+    assert len(tiles) == 9 and {row["task"] for row in tiles} == set(tasks)
+    numbers = [tiles[1][key] for key in ("seed", "kind", "level", "crossed", "track_percentage")]
+    assert numbers == ["1", "pits", "0.5", "0.5", "0.05"]

@@ -78,7 +78,7 @@ def random_state(seed, height=0.3):
 
 def test_imports_neither_torch_nor_warp():
     """What runs on a robot needs none of the packages of training."""
-    modules = [*(f"deploy.{name}" for name in ("description", "policy", "robot", "simulation"))]
+    modules = [*(f"deploy.{name}" for name in ("description", "ground", "policy", "robot", "simulation"))]
     modules += ["utils.cli", "utils.metrics", "viewer.native", "viewer.video"]
     code = "import sys\n" + "".join(f"import legged_torque.{name}\n" for name in modules)
     code += "print([name for name in sys.modules if name.split('.')[0] in ('torch', 'warp', 'mujoco_warp', 'rsl_rl')"

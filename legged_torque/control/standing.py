@@ -13,6 +13,7 @@ from legged_torque.control.dynamics import RobotDynamics
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.terrain.selection import select_tiles
 from legged_torque.utils.config import update_from_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import apply_perturbation
@@ -38,12 +39,14 @@ class StandingResult:
 def use_standing_trials(cfg: LeggedRobotCfg, decimation: int = 1) -> None:
     """Change a task's settings such that episodes start from the random states of ``--perturbation low``.
 
-    Parameters are not random, nobody pushes and sensors have no noise. A control step has as many physics steps as
-    ``decimation`` says: 1 for a controller at 200 Hz, 4 for a policy at 50 Hz.
+    Parameters are not random, nobody pushes, sensors have no noise, and rough ground is level. A control step has as
+    many physics steps as ``decimation`` says: 1 for a controller at 200 Hz, 4 for a policy at 50 Hz.
     """
     apply_perturbation(cfg, "low")
     quiet = {"randomize_parameters": False, "push_robots": False}
     update_from_dict(cfg, {"domain_rand": quiet, "noise": {"add_noise": False}, "control": {"decimation": decimation}})
+    if cfg.terrain.mesh_type == "heightfield":  # still a map, since policies may see it
+        select_tiles(cfg.terrain, ["flat"], [0.0], 1)
 
 
 def place_on_ground(

@@ -27,7 +27,8 @@ COMMENTS = {
     "nominal_pose": "[rad]",
     "nominal_trunk_height": "[m] above the ground",
     "observations": "terms in order, each clip(scale * value); with history_length > 1 the newest step comes first,\n"
-    "and an episode starts with copies of its first step",
+    "and an episode starts with copies of its first step; scan: height of the trunk's origin above the ground at each\n"
+    "y of points_y for each x of points_x [m], level, along the heading; less offset, then clipped to +-limit",
     "actions": "terms in order; actions are clipped first. Torque: the sum over terms of mixing_weight times\n"
     "position_residual: stiffness * (nominal_pose + scale * action - q) - damping * qd\n"
     "torque: scale * action\n"
@@ -41,6 +42,7 @@ COMMENTS = {
     "initial_state": "of an episode in training, drawn uniformly: [m], [rad], [m/s], [rad/s];\n"
     "joint positions are nominal_pose times joint_position_scale, then inside the joint limits",
     "episode": "length [s]; parts of names of geoms whose contact with the ground ends an episode",
+    "terrain": "ground of the training, from which its map follows",
 }
 """Comment above each section of the file."""
 
@@ -155,7 +157,11 @@ def _check_terms(description: dict[str, Any], where: str) -> None:
     for section, default in ((observations, 3), (actions, num_joints)):
         names = [term["name"] for term in section["terms"]]
         for term in section["terms"]:
-            name, size = term["name"], sizes.get(term["name"], default)
+            name, size, scan = term["name"], sizes.get(term["name"], default), term.get("scan")
+            if (name == "height_scan") != (scan is not None):
+                raise UserError(f"{where}: the term 'height_scan' must have an entry scan, and no other term")
+            if scan:
+                size = len(scan["points_x"]) * len(scan["points_y"])
             if names.count(name) > 1:
                 raise UserError(f"{where}: the term '{name}' occurs more than once")
             if term["size"] != size:

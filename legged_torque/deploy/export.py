@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib.util
 import os
@@ -29,7 +30,9 @@ from legged_torque.deploy.description import (
     to_yaml,
 )
 from legged_torque.deploy.policy import Policy, State
+from legged_torque.envs.base.height_scan import CLIP, OFFSET
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.terrain.layout import Layout
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import package_versions
 
@@ -44,6 +47,7 @@ INITIAL_STATE = {
 }
 """Which of the task's settings each entry of ``initial_state`` is."""
 TOLERANCE = 1e-5  # largest difference between an exported number and the task's; relative for numbers larger than 1
+SCAN_TOLERANCE = 1e-3  # the same for the height scan: at a wall, rounding of a place is a hundred times as large
 
 
 def nominal_cfg(cfg: Any) -> Any:
@@ -134,6 +138,7 @@ def write_networks(model: MLPModel, folder: Path, meaning: dict[str, str]) -> No
 def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str, Any]:
     """Return the contents of ``policy.yaml`` but for the network's checksum; arguments as of :func:`export_policy`."""
     cfg, asset, ranges = task.cfg, task.cfg.asset, task.cfg.commands.ranges
+    is_rough = cfg.terrain.mesh_type == "heightfield"
     clip = float(cfg.normalization.clip_actions)
     file = Path(asset.file)
     if file.is_absolute() and file.is_relative_to(RESOURCES_DIR):
@@ -164,12 +169,15 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
         "initial_state": {"trunk_position": list(cfg.init_state.pos)}
         | {name: list(getattr(cfg.domain_rand, setting)) for name, setting in INITIAL_STATE.items()},
         "episode": {"length": cfg.env.episode_length_s, "ends_on_contact_of": list(asset.terminate_after_contacts_on)},
+        **({"terrain": dataclasses.asdict(Layout.of(cfg.terrain))} if is_rough else {}),
     }
 
 
 def _observation_terms(task: LeggedRobot) -> list[dict[str, Any]]:
     """Return the terms of the policy's observations in their order."""
     clip, sizes = float(task.cfg.normalization.clip_observations), task.observations.sizes
+    points = {f"points_{axis}": list(getattr(task.cfg.terrain, f"measured_points_{axis}")) for axis in "xy"}
+    scan = points | {"offset": OFFSET, "limit": CLIP}
     return [
         {
             "name": term.name,
@@ -177,6 +185,7 @@ def _observation_terms(task: LeggedRobot) -> list[dict[str, Any]]:
             "scale": list(term.scale) if isinstance(term.scale, Sequence) else term.scale,
             **{key: getattr(term, key) for key in ("frame", "unit", "meaning")},
             "clip": [-clip, clip],
+            **({"scan": scan} if term.name == "height_scan" else {}),
         }
         for term in task.observations.policy_terms()
     ]
@@ -226,23 +235,38 @@ def check_task(task: LeggedRobot, policy: Policy) -> None:
     task.set_state(qpos, draw(task.sim.qvel, 3.0))
     task.motors.apply(task._compute_torques(task.actions), task.dof_vel, out=task.torques)
     for world in range(task.num_envs):
-        parts = (task.base_ang_vel, task.dof_pos, task.dof_vel, task.projected_gravity)
-        state = State(*(part[world].cpu().numpy() for part in parts))
-        policy.reset()
-        policy.last_action = actions = task.actions[world].cpu().numpy()
-        obs = policy.observation(state, task.commands[world].cpu().numpy())
-        got = policy.torques(actions, state.joint_positions, state.joint_velocities)
-        pairs = {"observations": (obs, task.obs_buf["policy"][world]), "torques": (got, task.torques[world])}
-        for what, (ours, theirs) in pairs.items():
-            difference = _difference(ours, theirs.cpu().numpy()) if ours.shape == theirs.shape else float("inf")
-            if not difference <= TOLERANCE:
+        for what, difference, tolerance in _differences(task, policy, world):
+            if not difference <= tolerance:
                 why = f"are not what {DESCRIPTION_FILE} can describe: they differ by {difference:.3g}"
                 raise UserError(f"the {what} of {type(task).__name__} {why}")
 
 
+def _differences(task: LeggedRobot, policy: Policy, world: int) -> list[tuple[str, float, float]]:
+    """Return what a policy computes otherwise than a world of the task: its name, how much, and how much it may."""
+    parts = (task.base_ang_vel, task.dof_pos, task.dof_vel, task.projected_gravity, task.base_pos, task.base_quat)
+    *measured, position, quat = (part[world].cpu().numpy() for part in parts)
+    points = np.pad(policy.scan_places(position, quat), [(0, 0), (0, 1)], constant_values=position[2])
+    state, in_world = State(*measured), torch.as_tensor(points, dtype=torch.float32, device=task.device)
+    state.heights = task.terrain.height_above(in_world).cpu().numpy()
+    policy.reset()
+    policy.last_action = actions = task.actions[world].cpu().numpy()
+    obs = policy.observation(state, task.commands[world].cpu().numpy())
+    torques = policy.torques(actions, state.joint_positions, state.joint_velocities)
+    expected = task.obs_buf["policy"][world].cpu().numpy()
+    scan = task.observations.policy_columns("height_scan") if len(policy.scan_points) else []
+    seen = [np.delete(numbers, scan) for numbers in (obs, expected)]
+    return [
+        ("observations", _difference(*seen), TOLERANCE),
+        ("heights of the scan", _difference(obs[scan], expected[scan]), SCAN_TOLERANCE),
+        ("torques", _difference(torques, task.torques[world].cpu().numpy()), TOLERANCE),
+    ]
+
+
 def _difference(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Return the largest difference, relative where numbers are larger than 1."""
-    return float((np.abs(ours - theirs) / np.maximum(np.abs(theirs), 1.0)).max())
+    """Return the largest difference, relative where numbers are larger than 1; infinite for other sizes."""
+    if ours.shape != theirs.shape:
+        return float("inf")
+    return float((np.abs(ours - theirs) / np.maximum(np.abs(theirs), 1.0)).max(initial=0.0))
 
 
 def _move(part: Path, folder: Path) -> None:

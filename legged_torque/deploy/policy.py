@@ -22,6 +22,7 @@ class State:
     joint_velocities: np.ndarray  # [rad/s]; (joints,)
     projected_gravity: np.ndarray | None = None  # unit vector in the trunk's frame; upright it is (0, 0, -1)
     quaternion: np.ndarray | None = None  # the trunk's orientation (w, x, y, z), in place of the gravity vector; (4,)
+    heights: np.ndarray | None = None  # of the trunk's origin above the ground at scan_places of the policy [m]
 
     def gravity(self) -> np.ndarray:
         """Return the unit gravity vector in the trunk's frame. Shape: (3,)."""
@@ -44,6 +45,8 @@ class Policy:
         joint_order: Names of the joints, in the order of all vectors of joints.
         nominal_pose: Shape: (joints,) [rad].
         torque_limits: Lowest and highest torques. Shape: (2, joints) [N m].
+        scan_points: Where the height scan measures: x along the trunk's heading and y to its left, from the trunk's
+            origin; none if the policy does not see the ground. Shape: (points, 2) [m].
         last_action: Actions that acted in the last step, clipped; 0 after a reset. Shape: (actions,).
         session: The network in onnxruntime.
     """
@@ -73,6 +76,10 @@ class Policy:
         sizes = [term["size"] for term in terms]
         self._scale = np.concatenate([np.full(term["size"], term["scale"], dtype) for term in terms])
         self._clip: np.ndarray = np.repeat(np.array([term["clip"] for term in terms], dtype), sizes, axis=0).T
+        scans = [term["scan"] for term in terms if "scan" in term]
+        self._scan: dict[str, Any] | None = scans[0] if scans else None
+        points = [(x, y) for scan in scans for x in scan["points_x"] for y in scan["points_y"]]
+        self.scan_points = np.array(points, float).reshape(-1, 2)
         self.session = load_network(network, self.description)
         self.reset()
 
@@ -96,6 +103,7 @@ class Policy:
             "joint_velocity": self._joints(state.joint_velocities),
             "last_action": self.last_action,
             "position_phase": [self._phase("position_residual")],
+            "height_scan": self._height_scan(state.heights),
         }
         now = np.concatenate([np.asarray(values[name], self.dtype) for name in self._terms])
         if now.shape != self._scale.shape:
@@ -135,6 +143,25 @@ class Policy:
                 torque = self._stiffness * error - self._damping * self._joints(joint_velocities)
             total += self.dtype(term["mixing_weight"]) * torque
         return np.clip(total, *self.torque_limits)
+
+    def scan_places(self, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+        """Return x and y of the points of the height scan in the world, in which the trunk has a pose [m].
+
+        The trunk's position [m] and orientation (w, x, y, z) have shapes (2 or more,), (4,). Shape: (points, 2).
+        """
+        w, _, _, z = quaternion
+        norm = max(w * w + z * z, 1e-12)  # 0 upside down, where there is no heading
+        cos, sin = (w * w - z * z) / norm, 2.0 * w * z / norm
+        return np.asarray(position)[:2] + self.scan_points @ np.array([[cos, sin], [-sin, cos]])
+
+    def _height_scan(self, heights: np.ndarray | None) -> np.ndarray:
+        """Return the height scan for heights above the ground, in the policy's precision. Shapes: (points,) [m]."""
+        if self._scan is None:
+            return np.zeros(0, self.dtype)
+        if heights is None or np.shape(heights) != (len(self.scan_points),):
+            raise ValueError(f"a state needs {len(self.scan_points)} heights above the ground, at scan_places")
+        limit = self._scan["limit"]
+        return np.clip(np.asarray(heights, self.dtype) - self.dtype(self._scan["offset"]), -limit, limit)
 
     def _phase(self, name: str) -> float:
         """Return the share of its interval for which the actions of a term have been held; 0: new ones are due."""

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from legged_torque.deploy import hfield_contacts
+from legged_torque.deploy.ground import ground_heights, place_ground
 from legged_torque.deploy.policy import State
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.mjcf import loading
@@ -29,6 +32,7 @@ class MujocoRobot:
         velocity: The trunk's linear velocity in the world [m/s]. Shape: (3,).
         angular_velocity: The trunk's angular velocity in its own frame [rad/s]. Shape: (3,).
         weight: m g of the whole robot [N].
+        origins: Where episodes may start: the middles of the ground's tiles, or the origin [m]. Shape: (places, 3).
     """
 
     def __init__(self, xml: str | Path, description: dict[str, Any]) -> None:
@@ -37,7 +41,7 @@ class MujocoRobot:
         A UserError if the file cannot be read, or lacks a joint or a motor that the policy needs.
         """
         self.notes: list[str] = []
-        self.model = self._load(Path(xml))
+        self.model, self.origins = self._load(Path(xml), description)
         self.data = mujoco.MjData(self.model)
         old, step = self.model.opt.timestep, 1.0 / description["timing"]["physics_frequency"]
         if not np.isclose(old, step, rtol=1e-6):
@@ -71,7 +75,7 @@ class MujocoRobot:
     def step(self, torques: np.ndarray) -> None:
         """Advance by one physics step with torques of shape (joints,) [N m]."""
         self.data.ctrl[self._motors] = torques / self._torque_per_ctrl
-        mujoco.mj_step(self.model, self.data)
+        hfield_contacts.step(self.model, self.data)
 
     def planar_velocity(self) -> np.ndarray:
         """Return v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame, as commands are. Shape: (3,)."""
@@ -92,12 +96,26 @@ class MujocoRobot:
         self.data.qpos[self._qpos] = np.clip(joint_positions, *self._joint_limits)
         self.velocity[:], self.angular_velocity[:] = velocities[:2]
         self.data.qvel[self._dofs] = velocities[2]
+        mujoco.mj_kinematics(self.model, self.data)  # places the ground
+
+    # ---- the ground --------------------------------------------------------------------------------------------------
+
+    def ground_heights(self, places: np.ndarray) -> np.ndarray:
+        """Return how high the ground is at x and y of places, -inf where there is none. Shapes: (n, 2), (n,) [m]."""
+        return ground_heights(self.model, self.data, self._grounds, places)
+
+    def height(self) -> float:
+        """Return how high the trunk's origin is above the ground under it; infinite where there is none [m]."""
+        return float(self.position[2] - self.ground_heights(self.position[np.newaxis, :2])[0])
 
     # ---- contacts ----------------------------------------------------------------------------------------------------
 
     def has_fallen(self) -> bool:
-        """Return whether a geom that ends an episode touched the ground in the last step, or the state diverged."""
-        if any(self.data.warning[kind].number for kind in _WARNINGS):
+        """Return whether a geom that ends an episode touched the ground in the last step, or the state diverged.
+
+        A robot that has left the ground's edge has fallen, too.
+        """
+        if any(self.data.warning[kind].number for kind in _WARNINGS) or math.isinf(self.height()):
             return True
         return any(self._is_ending[geom] for _, geom, _ in self._ground_contacts())
 
@@ -120,15 +138,12 @@ class MujocoRobot:
 
     # ---- reading the MJCF --------------------------------------------------------------------------------------------
 
-    def _load(self, file: Path) -> mujoco.MjModel:
-        """Compile the file, and add a floor if it has none."""
+    def _load(self, file: Path, description: dict[str, Any]) -> tuple[mujoco.MjModel, np.ndarray]:
+        """Compile the file with the policy's ground, and return it with the places where episodes may start."""
         with loading(file):
             spec = mujoco.MjSpec.from_file(str(file))
-            grounds = [geom for geom in spec.worldbody.geoms if geom.contype or geom.conaffinity]
-            if not grounds:
-                spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05])
-                self.notes.append("the MJCF has no floor: a plane at height 0 is added")
-            return spec.compile()
+            origins = place_ground(spec, description, self.notes)
+            return spec.compile(), origins
 
     def _find_root(self) -> None:
         """Find the free joint of the trunk."""
@@ -182,6 +197,7 @@ class MujocoRobot:
         """Find the ground, and the geoms whose contact with it ends an episode: by name, or those of the trunk."""
         model = self.model
         self._is_ground = model.body_weldid[model.geom_bodyid] == 0
+        (self._grounds,) = np.nonzero(self._is_ground & (model.geom_contype | model.geom_conaffinity != 0))
         names = [model.geom(i).name or model.body(model.geom_bodyid[i]).name for i in range(model.ngeom)]
         is_ending = np.array([any(part in name for part in ends_on_contact_of) for name in names]) & ~self._is_ground
         if ends_on_contact_of and not is_ending.any():

@@ -28,7 +28,10 @@ class Events:
 
 
 class Simulation:
-    """Runs a policy as in evaluation: random initial states and commands, pushes, new episodes."""
+    """Runs a policy as in evaluation: random initial states and commands, pushes, new episodes.
+
+    On rough ground, all episodes of a run start on one tile, which is drawn.
+    """
 
     def __init__(self, policy: Policy, robot: MujocoRobot, events: Events) -> None:
         """Prepare; :meth:`run` starts an episode."""
@@ -56,6 +59,7 @@ class Simulation:
             on_step: Called after every control step, e.g. to record it.
         """
         self._rng = np.random.default_rng(seed)
+        self._origin = self.robot.origins[self._rng.integers(len(self.robot.origins))]
         self._new_episode()
         sums = np.zeros(NUM_SUMS)
         with np.errstate(over="ignore", invalid="ignore"):  # told below, in one line
@@ -71,7 +75,9 @@ class Simulation:
     def _control_step(self) -> None:
         """Observe, act, and apply torques in all physics steps of a control step."""
         policy, robot = self.policy, self.robot
-        actions = policy.act(policy.observation(robot.state(), self.command))
+        state = robot.state()
+        state.heights = robot.position[2] - robot.ground_heights(policy.scan_places(robot.position, robot.quat))
+        actions = policy.act(policy.observation(state, self.command))
         for i in range(self._timing["decimation"]):
             if i == 0 or self._timing["refresh_torques"]:
                 torques = policy.torques(actions, robot.joint_positions(), robot.joint_velocities())
@@ -92,7 +98,7 @@ class Simulation:
         if self._rng.random() < self.events.push_probability:
             self._push()
         velocity = robot.planar_velocity()
-        numbers = (np.linalg.norm(velocity[:2]), force, power, robot.position[2], fell, ended)
+        numbers = (np.linalg.norm(velocity[:2]), force, power, robot.height(), fell, ended)
         return step_sums(np, command[None], velocity[None], *(np.array([number]) for number in numbers))[:, 0]
 
     def _push(self) -> None:
@@ -108,7 +114,7 @@ class Simulation:
         pose = self.policy.nominal_pose * self._draw("joint_position_scale", num_joints)
         sizes = {"trunk_linear_velocity": 3, "trunk_angular_velocity": 3, "joint_velocity": num_joints}
         velocities = tuple(self._draw(name, size) for name, size in sizes.items())
-        self.robot.reset(start["trunk_position"], quaternion(*angles), pose, velocities)
+        self.robot.reset(start["trunk_position"] + self._origin, quaternion(*angles), pose, velocities)
         self.policy.reset()
         self.command = rng.uniform(*self._command_range)
         self._steps = 0

@@ -72,13 +72,14 @@ def best_row(cells: Cells, metric: Metric, column: str) -> list[str]:
     task = max(torque, key=lambda task: metric.gain(found[task].mean, 0.0))
     share = judge(metric, found[task], papers[model]).share
     sign = BETTER if share >= TARGET else WITHIN if share > 0.0 else WORSE
-    return [*row, f"`{task}`", marked(number_text(metric, found[task]), False, found[task]), f"{sign} {share:+.1%}"]
+    ours = marked(number_text(found[task], metric.digits), False, found[task])
+    return [*row, f"`{task}`", ours, f"{sign} {share:+.1%}"]
 
 
-def number_text(metric: Metric, summary: Summary) -> str:
-    """Return mean, standard error and number of seeds."""
-    error = "" if summary.standard_error is None else f" ± {summary.standard_error:.{metric.digits}f}"
-    return f"{summary.mean:.{metric.digits}f}{error} ({len(summary.values)})"
+def number_text(summary: Summary, digits: int) -> str:
+    """Return mean, standard error and number of seeds, with so many decimals."""
+    error = "" if summary.standard_error is None else f" ± {summary.standard_error:.{digits}f}"
+    return f"{summary.mean:.{digits}f}{error} ({len(summary.values)})"
 
 
 def marked(text: str, is_significant: bool, *summaries: Summary) -> str:

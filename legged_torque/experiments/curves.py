@@ -20,9 +20,11 @@ MAX_BYTES = 50_000_000  # of a CSV file; a small compressed one may hold more th
 MILLION = 1e6  # steps in a million, the unit of axes and texts
 CURVE_METRICS = (*METRICS, Metric("critic_gradient_norm", "", "Gradient norm of the critic", None))
 """The metrics of an evaluation during training."""
+LEVEL = Metric("terrain_level", "", "Mean level of robots in training", None)
+"""What such an evaluation notes on rough ground as well."""
 
 Row = dict[str, float]
-"""One evaluation: "steps", "seconds" of training and :data:`CURVE_METRICS`; NaN where nothing was measured."""
+"""One evaluation: "steps", "seconds" of training, :data:`CURVE_METRICS`, :data:`LEVEL`; NaN where there is nothing."""
 
 
 @dataclass
@@ -89,6 +91,6 @@ def read_rows(file: Path, notes: list[str]) -> list[Row]:
 
 def to_row(entry: Mapping[str, Any]) -> Row:
     """Return an evaluation from the cells of a line or the entries of a JSON object; empty ones are NaN."""
-    cells = {name: entry.get(name) for name in ("seconds", *(metric.name for metric in CURVE_METRICS))}
+    cells = {name: entry.get(name) for name in ("seconds", *(metric.name for metric in (*CURVE_METRICS, LEVEL)))}
     values = {name: math.nan if cell in (None, "") else float(cell) for name, cell in cells.items()}
     return {"steps": int(float(entry["steps"])), **values}

@@ -16,9 +16,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from legged_torque.experiments.curves import CURVE_METRICS, MILLION, LearningCurve, Row
+from legged_torque.experiments.curves import CURVE_METRICS, LEVEL, MILLION, LearningCurve, Row
+from legged_torque.experiments.grounds import by_level, kinds_of
 from legged_torque.experiments.matrix import Matrix
-from legged_torque.experiments.paper_values import ENVIRONMENTS, MODELS, PAPER_METRICS, paper_value
+from legged_torque.experiments.paper_values import (
+    ENVIRONMENTS,
+    MODELS,
+    PAPER_METRICS,
+    paper_value,
+    task_on_plane,
+)
 from legged_torque.experiments.results import Cells, Experiment, Summary, Table
 from legged_torque.utils.metrics import Metric
 from legged_torque.utils.plotting import load_pyplot
@@ -53,6 +60,8 @@ CURVES = {
     "Figure 5b": ("critic_gradient_norm", "log", "steps"),
 }
 """Metric, scale of its axis, and what it is drawn over, by title."""
+ROUGH_CURVES = {"Levels": (LEVEL.name, "linear", "steps")}
+"""Those on rough ground."""
 AXES = {
     "steps": (MILLION, "environment steps [millions]", "e6 steps"),
     "seconds": (1.0, "time of training [s]", " s"),
@@ -61,7 +70,8 @@ AXES = {
 BARS = {"Figure 6": ("low", "high"), "Figure 7": ("high_frequency", "doubled")}  # columns of Table I, by title
 FIGURES = (*CURVES, *BARS)
 SINGLE_CURVES = ("track_percentage", "track_xy", "cost_of_transport")  # metrics that are shown of single trainings
-METRICS_BY_NAME = {metric.name: metric for metric in CURVE_METRICS}
+METRICS_BY_NAME = {metric.name: metric for metric in (*CURVE_METRICS, LEVEL)}
+MARKERS = ("o", "s", "^", "D", "v", "P")  # of approaches, where lines are many
 UNFINISHED_ALPHA = 0.45
 CUT_AT = 3.0  # largest height of a panel of bars, in medians of the values that it shows
 PAPER_MARKER: dict[str, Any] = {"marker": "D", "color": "none", "markerfacecolor": "white", "markeredgecolor": "black"}
@@ -89,13 +99,32 @@ def draw_all(experiment: Experiment, table: Table, out: Path) -> list[str]:
     """Draw every figure that there are data for, as PNG, and return their titles; UserError without matplotlib."""
     pyplot, drawn = load_pyplot(), []
     with pyplot.rc_context(SETTINGS):
-        for title in FIGURES:
-            figure = draw_curves(experiment, title) if title in CURVES else draw_bars(experiment, table, title)
+        for title in (*FIGURES, *rough_figures(experiment.plan)):
+            figure = draw(experiment, table, title)
             if figure is not None:
                 save_small(figure, out / file_name(title))
                 pyplot.close(figure)
                 drawn.append(title)
     return drawn
+
+
+def rough_figures(plan: Matrix) -> list[str]:
+    """Return the titles of figures on rough ground: levels, and a figure of success per environment of training."""
+    return [*ROUGH_CURVES, *success_titles(plan)] if plan.grounds else []
+
+
+def success_titles(plan: Matrix) -> dict[str, str]:
+    """Return the environments of training by the titles of their figures of success."""
+    return {f"Success in {name}": name for name in plan.environments}
+
+
+def draw(experiment: Experiment, table: Table, title: str) -> Figure | None:
+    """Draw the figure with a title; return None without data."""
+    if title in BARS:
+        return draw_bars(experiment, table, title)
+    if title in CURVES or title in ROUGH_CURVES:
+        return draw_curves(experiment, title)
+    return draw_success(experiment, success_titles(experiment.plan)[title])
 
 
 def save_small(figure: Figure, file: Path) -> None:
@@ -108,9 +137,13 @@ def save_small(figure: Figure, file: Path) -> None:
 
 
 def style(tasks: Sequence[str], task: str) -> Style:
-    """Return the style of one of the tasks in a figure."""
-    others = [name for name in tasks if name not in STYLES]
-    return STYLES[task] if task in STYLES else OTHER_STYLES[others.index(task) % len(OTHER_STYLES)]
+    """Return the style of one of the tasks in a figure: on rough ground solid, or dashed with the height scan."""
+    plain = task_on_plane(task)
+    others = list(dict.fromkeys(name for name in map(task_on_plane, tasks) if name not in STYLES))
+    color, line, hatch = STYLES[plain] if plain in STYLES else OTHER_STYLES[others.index(plain) % len(OTHER_STYLES)]
+    if task == plain:
+        return color, line, hatch
+    return (color, "--", 2 * hatch) if task.endswith("_scan") else (color, "-", hatch)
 
 
 def draw_single_curves(runs: list[LearningCurve]) -> Figure:
@@ -130,7 +163,7 @@ def draw_single_curves(runs: list[LearningCurve]) -> Figure:
 
 def draw_curves(experiment: Experiment, title: str) -> Figure | None:
     """Draw a metric over steps or time of training, a panel per environment; return None without data."""
-    name, scale, over = CURVES[title]
+    name, scale, over = (CURVES | ROUGH_CURVES)[title]
     unit, label_over, note = AXES[over]
     plan, panels = experiment.plan, {}
     order = [*ENVIRONMENTS, *plan.environments]  # those of Table I first
@@ -198,6 +231,55 @@ def draw_curve(axis: Axes, seeds: list[Curve], label: str, styles: Style) -> Non
         axis.fill_between(places, mean - error, mean + error, color=color, alpha=0.2, linewidth=0)
     ends = np.array([curve.places[-1] for curve in seeds if not curve.is_finished])
     axis.plot(ends, np.interp(ends, places, mean), "x", color=color, markersize=7, markeredgewidth=1.8)
+
+
+def draw_success(experiment: Experiment, environment: str) -> Figure | None:
+    """Draw the share of robots that cross tiles over difficulty, for each kind and all; return None without data."""
+    plan = experiment.plan
+    approaches = list(dict.fromkeys(map(task_on_plane, plan.tasks)))
+    by_task = {}
+    for task in sorted(plan.tasks, key=lambda name: approaches.index(task_on_plane(name))):
+        by_task[task] = [run.crossings for run in experiment.runs_of(task, environment) if run.crossings]
+    kinds = kinds_of([each for seeds in by_task.values() for each in seeds])
+    if not kinds:
+        return None
+    columns = min(4, len(kinds) + 1)
+    rows = math.ceil((len(kinds) + 1) / columns)
+    grid = {"figsize": (3.1 * columns, 2.3 * rows + 1.2), "sharex": True, "sharey": True, "squeeze": False}
+    figure, axes = load_pyplot().subplots(rows, columns, layout="constrained", **grid)
+    for axis, kind in zip(axes.flat, [*kinds, None], strict=False):
+        for task, seeds in by_task.items():
+            look = {"marker": MARKERS[approaches.index(task_on_plane(task)) % len(MARKERS)], "markersize": 3.5}
+            draw_success_line(axis, plan, task, [by_level(each, "crossed", kind) for each in seeds], look)
+        axis.set(title=kind.replace("_", " ") if kind else "mean of all kinds", ylim=(-0.04, 1.04))
+        axis.grid(alpha=0.3)
+    for axis in axes.flat[len(kinds) + 1 :]:
+        axis.set_axis_off()
+    for axis in axes[-1]:
+        axis.set_xlabel("difficulty")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("share that crosses")
+    shown = axes.flat[0].get_legend_handles_labels()
+    figure.legend(*shown, loc="outside lower center", ncols=columns, handlelength=4, frameon=False)
+    text = "robots that cross a tile in time, mean over seeds with a band from the lowest to the highest"
+    figure.suptitle(textwrap.fill(f"{ENVIRONMENTS.get(environment, environment)}: {text}", 40 * columns), fontsize=11)
+    return figure
+
+
+def draw_success_line(
+    axis: Axes, plan: Matrix, task: str, seeds: list[dict[float, float]], look: dict[str, Any]
+) -> None:
+    """Draw the success of a task, given by difficulty for each seed; nothing without seeds."""
+    levels = sorted(set[float]().union(*seeds))
+    if not levels:
+        return
+    color, line, _ = style(plan.tasks, task)
+    values = np.array([[seed.get(level, math.nan) for level in levels] for seed in seeds])
+    note = "" if len(seeds) == len(plan.seeds) else f" ({len(seeds)} of {len(plan.seeds)} seeds)"
+    look = look | {"color": color, "linestyle": line, "markerfacecolor": "white" if line == "--" else color}
+    label = f"{MODELS.get(task, task)}{note}"
+    axis.plot(levels, values.mean(axis=0), label=label, linewidth=1.5, **look)
+    axis.fill_between(levels, values.min(axis=0), values.max(axis=0), color=color, alpha=0.12, linewidth=0)
 
 
 def draw_bars(experiment: Experiment, table: Table, title: str) -> Figure | None:

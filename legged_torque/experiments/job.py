@@ -83,8 +83,8 @@ class Job:
         """
         self.cell, self.lock, self.cell_start, self.state = cell, lock, cell_start, cell_state(cell)
         if self.state.step != "evaluate":  # they would be results of another training
-            for name in cell.evaluated_in:
-                cell.result_file(name).unlink(missing_ok=True)
+            for result in cell.results:
+                result.unlink(missing_ok=True)
         self._times, self._kept = read_times(cell.folder), time.monotonic()
         self._kind = f"{'cpu' if worker.device == 'cpu' else 'gpu'} {self._step_name}"
         self.log = cell.folder / ("evaluate.log" if self.state.step == "evaluate" else "train.log")

@@ -12,7 +12,7 @@ from typing import Any
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.config import parse_yaml
+from legged_torque.utils.config import convert, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
 from legged_torque.utils.runs import (
@@ -34,6 +34,10 @@ CELL_SETTINGS = {
 """Settings that ``train`` must not change, and the keys that they come from."""
 EVALUATION = {"num_envs": 256, "num_steps": 2000}
 """Worlds and control steps of an evaluation, unless the description has others."""
+GROUNDS = {"kinds": ["all"], "levels": [level / 10 for level in range(10)], "num_envs": 40}
+"""Which tiles are crossed after training, and by how many robots each, unless the description has others."""
+ROUGH_GROUND = "rough ground"
+"""Stands for the evaluation on :data:`GROUNDS` where others have the name of an environment, which has no space."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,7 @@ class Cell:
     environment: str  # perturbation during training
     seed: int
     evaluated_in: tuple[str, ...]  # perturbations
+    crosses: bool = False  # whether the last checkpoint is evaluated on rough ground, too
 
     @property
     def name(self) -> str:
@@ -52,20 +57,29 @@ class Cell:
         return self.folder.name
 
     def result_file(self, environment: str) -> Path:
-        """Return the file with the numbers of an evaluation."""
-        return self.folder / f"result_{environment}.json"
+        """Return the file with the numbers of an evaluation, in an environment or on :data:`ROUGH_GROUND`."""
+        return self.folder / ("grounds.json" if environment == ROUGH_GROUND else f"result_{environment}.json")
+
+    @property
+    def results(self) -> list[Path]:
+        """Files with the numbers of evaluations of the last checkpoint."""
+        return [self.result_file(name) for name in (*self.evaluated_in, ROUGH_GROUND)]
 
     def part_file(self, environment: str) -> Path:
         """Return the file that an evaluation writes; it becomes the result when the evaluation is complete."""
-        return self.folder / f"result_{environment}.json.part"
+        return self.result_file(environment).with_suffix(".json.part")
 
     def rows_file(self, run_dir: Path, environment: str) -> Path:
         """Return the file of a run's evaluations in an environment while it trained."""
         return evaluations_file(run_dir, "" if environment == self.environment else environment)
 
     def missing(self) -> list[str]:
-        """Return the perturbations with neither a readable result nor evaluations during a training that is whole."""
-        missing = [name for name in self.evaluated_in if not is_json(self.result_file(name))]
+        """Return the perturbations with neither a readable result nor evaluations during a training that is whole.
+
+        After them comes :data:`ROUGH_GROUND`, if its result is planned and not there.
+        """
+        names = [*self.evaluated_in, *([ROUGH_GROUND] if self.crosses else [])]
+        missing = [name for name in names if not is_json(self.result_file(name))]
         runs = list(self.folder.glob("*/")) if missing else []
         measured = [name for name in missing if any(has_rows(self.rows_file(run, name)) for run in runs)]
         return [name for name in missing if name not in measured] if measured and is_trained(self) else missing
@@ -81,11 +95,13 @@ class Matrix:
     ranges: str = ""  # of random parameters, as --ranges takes them; empty: the tasks' own
     train: dict[str, Any] = field(default_factory=dict)  # changed settings, by dotted path
     evaluation: dict[str, int] = field(default_factory=dict)  # as EVALUATION
+    grounds: dict[str, Any] = field(default_factory=dict)  # as GROUNDS; empty: none
 
     def cells(self, out: Path) -> list[Cell]:
         """Return all cells in a folder, seed by seed, so that tasks can be compared before all seeds are done."""
+        crosses = bool(self.grounds)
         return [
-            Cell(out / f"{task}-{environment}-s{seed}", task, environment, seed, tuple(evaluated_in))
+            Cell(out / f"{task}-{environment}-s{seed}", task, environment, seed, tuple(evaluated_in), crosses)
             for seed in self.seeds
             for environment, evaluated_in in self.environments.items()
             for task in self.tasks
@@ -134,6 +150,10 @@ def read_matrix(file: Path) -> Matrix:
     for key, source in CELL_SETTINGS.items():
         if key in matrix.train:
             raise UserError(f"train.{key} cannot be set: it comes from {source}")
+    if matrix.grounds:
+        from legged_torque.learning.crossing import Grounds
+
+        Grounds.of(matrix.grounds["kinds"], matrix.grounds["levels"])
     ranges, words = str(matrix.ranges) if matrix.ranges else None, matrix.set_words()
     for cell in matrix.cells(Path()):
         options = Options(device="cpu", seed=cell.seed, perturbation=cell.environment, ranges=ranges, set=words)
@@ -161,7 +181,7 @@ def read_plan(file: Path) -> Matrix:
     for key in ("tasks", "environments", "seeds"):
         if key not in values:
             raise UserError(f"'{file}' lacks the key '{key}'")
-    for key in ("environments", "train", "evaluation"):
+    for key in ("environments", "train", "evaluation", "grounds"):
         if not isinstance(values.setdefault(key, {}), dict):
             raise UserError(f"experiment key '{key}' must hold entries 'name: value', not {values[key]!r}")
     for key, value in values["evaluation"].items():
@@ -169,6 +189,13 @@ def read_plan(file: Path) -> Matrix:
             raise unknown_name("evaluation key", str(key), EVALUATION)
         if type(value) is not int or value < 1:
             raise UserError(f"evaluation.{key} must be a whole number of at least 1, not {value!r}")
+    for key, value in values["grounds"].items():
+        if key not in GROUNDS:
+            raise unknown_name("grounds key", str(key), GROUNDS)
+        new = values["grounds"][key] = convert(value, GROUNDS[key], f"grounds.{key}")
+        if not new or (isinstance(new, int) and new < 1):
+            raise UserError(f"grounds.{key} must hold something, not {value!r}")
+    values["grounds"] = values["grounds"] and GROUNDS | values["grounds"]
     matrix = Matrix(**values | {"evaluation": EVALUATION | values["evaluation"]})
     for key, entries in matrix.lists().items():
         kind, example = (int, "[1, 2]") if key == "seeds" else (str, "[a, b]")
@@ -188,7 +215,11 @@ def step_words(matrix: Matrix, cell: Cell, state: CellState, device: str) -> lis
     words.append(f"--device={device}")
     if state.step == "evaluate":
         name, numbers = state.missing[0], matrix.evaluation
-        words += [f"--perturbation={name}", f"--num_envs={numbers['num_envs']}", f"--steps={numbers['num_steps']}"]
+        if name == ROUGH_GROUND:
+            kinds, levels, num_envs = (matrix.grounds[key] for key in GROUNDS)
+            words += [f"--num_envs={num_envs}", "--terrain", *kinds, "--level", *map(str, levels)]
+        else:
+            words += [f"--perturbation={name}", f"--num_envs={numbers['num_envs']}", f"--steps={numbers['num_steps']}"]
         return ["evaluate.py", *words, f"--json={cell.part_file(name)}"]
     if state.step == "resume":
         words.append("--resume")
@@ -251,7 +282,7 @@ def check_same(matrix: Matrix, out: Path) -> None:
     if not (out / SETTINGS_FILE).is_file():
         return
     old, differs = read_plan(out / SETTINGS_FILE), f"'{out}' was made with other settings"
-    for section in ("train", "evaluation"):
+    for section in ("train", "evaluation", "grounds"):
         was, now = getattr(old, section), getattr(matrix, section)
         for key in sorted(was.keys() | now.keys()):
             if was.get(key) != now.get(key):

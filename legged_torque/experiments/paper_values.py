@@ -36,6 +36,11 @@ MODELS = {
     "a1_multihead_two_rates": "Multi-head, two rates",
 }
 """Names of our tasks: the paper's, and of its future work. Default torque occurs only in its Figures 3 and 5."""
+MODELS |= {
+    f"a1_rough_{task.removeprefix('a1_')}{suffix}": f"{name}, {seen}"
+    for task, name in list(MODELS.items())
+    for suffix, seen in (("", "blind"), ("_scan", "scan"))
+}  # those on rough ground
 TABLE_I = {
     ("track_percentage", "a1_position"): (0.7642, 0.7518, 0.7163, 0.6765),
     ("track_percentage", "a1_torque_multihead"): (0.7624, 0.7534, 0.7159, 0.6699),
@@ -62,6 +67,11 @@ TABLE_I = {
 
 PAPER_TASKS = tuple(dict.fromkeys(task for _, task in TABLE_I))
 """The tasks of Table I."""
+
+
+def task_on_plane(task: str) -> str:
+    """Return the name of the task with the same approach on a plane."""
+    return task.replace("_rough_", "_", 1).removesuffix("_scan")
 
 
 def paper_column(environment: str, metric: str) -> dict[str, float]:

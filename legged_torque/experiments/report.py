@@ -12,16 +12,19 @@ import yaml
 from legged_torque.experiments.against_paper import MEANINGS, best_torque, count, judge, marked, number_text
 from legged_torque.experiments.blocks import VIDEO_TYPES, Block, Bullets, Code, Grid, Heading, Paragraph, Picture
 from legged_torque.experiments.curves import MILLION
-from legged_torque.experiments.figures import FIGURES, file_name
-from legged_torque.experiments.matrix import SETTINGS_FILE
-from legged_torque.experiments.paper_values import MODELS, PAPER_METRICS, paper_value
+from legged_torque.experiments.figures import FIGURES, file_name, rough_figures
+from legged_torque.experiments.grounds import MEASURES, kinds_of, over_levels
+from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE, Matrix
+from legged_torque.experiments.paper_values import MODELS, PAPER_METRICS, PAPER_TASKS, paper_value
 from legged_torque.experiments.results import (
     EVALUATIONS_FILE,
+    GROUNDS_FILE,
     LAST_SHARE,
     TABLE_FILE,
     CellResult,
     Cells,
     Experiment,
+    Summary,
     Table,
     compare,
     is_of_paper,
@@ -45,13 +48,18 @@ def report(
     """
     missing = missing_lines(experiment, from_step)
     complete = Paragraph("Nothing: all trainings and evaluations are complete.")
-    sections: dict[str, list[Block]] = {
+    of_paper: dict[str, list[Block]] = {
         "Table I": table_one(experiment, table, from_step),
         "Best torque method against the paper's best": best_torque(table),
+    }
+    walking: dict[str, list[Block]] = {"While training": own_table(table, from_step)}
+    sections: dict[str, list[Block]] = {
+        "Rough ground": rough_blocks(experiment, figures, out),
+        **(of_paper if set(PAPER_TASKS) & set(experiment.plan.tasks) else walking),
         "What is missing": [Bullets(missing) if missing else complete],
         "In other environments than those of training": other_table(table),
         "Differences": differences(table),
-        "Figures": figure_blocks(figures, out),
+        "Figures": figure_blocks([title for title in figures if title in FIGURES], out),
         "Videos": [Picture(MODELS.get(task, task), file) for task, file in videos.items()],
         "How it was made": setup_blocks(experiment, from_step, out),
     }
@@ -99,6 +107,8 @@ def run_problems(run: CellResult, from_step: float) -> list[str]:
             problems.append(f"not evaluated in {name}")
         elif not run.is_finished(counted[-1]["steps"]):
             problems.append(f"evaluated in {name} after {counted[-1]['steps'] / MILLION:.4g} of {total}")
+    if run.cell.crosses and not run.crossings:
+        problems.append(f"not evaluated on {ROUGH_GROUND}")
     return problems
 
 
@@ -107,7 +117,7 @@ def number(cells: Cells, task: str, metric: Metric, paper: float | None) -> str:
     summary = cells[task].get(metric.name)
     if summary is None:
         return "–"
-    text = marked(number_text(metric, summary), is_best(cells, task, metric), summary)
+    text = marked(number_text(summary, metric.digits), is_best(cells, task, metric), summary)
     if paper is None:
         return text
     verdict = judge(metric, summary, paper)
@@ -123,18 +133,18 @@ def is_best(cells: Cells, task: str, metric: Metric) -> bool:
     return means[task] == best and bool(own) and all(p is not None and p < SIGNIFICANT for p in own)
 
 
-def metric_table(table: Table, columns: list[str]) -> Grid:
-    """Return a table with a row per metric and task, and the paper's values beside ours if it has any."""
+def metric_table(table: Table, columns: list[str], beside_paper: bool) -> Grid:
+    """Return a table with a row per metric and task, and if asked for the paper's values beside ours."""
     header = ["metric", "task"]
     for column in columns:
-        header += [column, "paper"] if is_of_paper(column) else [column]
+        header += [column, "paper"] if beside_paper else [column]
     rows = []
     for metric, task in ((metric, task) for metric in PAPER_METRICS for task in table[columns[0]]):
         row = [metric.label, f"`{task}` ({MODELS[task]})" if task in MODELS else f"`{task}`"]
         for column in columns:
             paper = paper_value(task, column, metric.name)
             row.append(number(table[column], task, metric, paper))
-            if is_of_paper(column):
+            if beside_paper:
                 row.append("–" if paper is None else f"{paper:.{metric.digits}f}")
         rows.append(row)
     return Grid(header, rows)
@@ -145,24 +155,72 @@ def table_one(experiment: Experiment, table: Table, from_step: float) -> list[Bl
     texts = (
         count(table),
         f"Mean ± standard error over seeds (number of seeds, of {len(experiment.plan.seeds)} that were planned), and "
-        "by how much it is better than the paper's. Tracking % is better when higher, all else when lower. A seed's "
-        f"number is the mean of its evaluations during training from step {from_step / MILLION:g} million on, or of "
-        f"the last {LAST_SHARE:.0%} if training has not come that far. `doubled` is trained in `high_frequency` and "
-        "evaluated in `doubled` as well while it trains, or else has the number of the last checkpoint. The paper's "
-        "numbers are means of four seeds and of all evaluations after step 90 million; it prints no errors, and no "
-        "numbers of default torque control.",
+        f"by how much it is better than the paper's. {what_counts(from_step)} `doubled` is trained in `high_frequency` "
+        "and evaluated in `doubled` as well while it trains, or else has the number of the last checkpoint. The "
+        "paper's numbers are means of four seeds and of all evaluations after step 90 million; it prints no errors, "
+        "and no numbers of default torque control.",
         "**Bold**: significantly better than every other task of the column (see Differences). †: seeds are missing or "
         "trainings are not finished, so the number will change. With one seed, the standard error counts as 0.",
     )
     legend = Grid(["sign", "meaning"], list(MEANINGS.items()))
-    return [*map(Paragraph, texts), legend, metric_table(table, [name for name in table if is_of_paper(name)])]
+    return [*map(Paragraph, texts), legend, metric_table(table, [name for name in table if is_of_paper(name)], True)]
+
+
+def own_table(table: Table, from_step: float) -> list[Block]:
+    """Return the metrics of tasks that the paper does not have."""
+    text = (
+        f"Mean ± standard error over seeds (number of seeds). {what_counts(from_step)} **Bold**: significantly better "
+        "than every other task of the column. †: seeds are missing or trainings are not finished."
+    )
+    return [Paragraph(text), metric_table(table, [name for name in table if is_of_paper(name)], False)]
+
+
+def what_counts(from_step: float) -> str:
+    """Return in words what the number of a seed is."""
+    return (
+        "Tracking % is better when higher, all else when lower. A seed's number is the mean of its evaluations during "
+        f"training from step {from_step / MILLION:g} million on, or of the last {LAST_SHARE:.0%} if training has not "
+        "come that far."
+    )
+
+
+def rough_blocks(experiment: Experiment, figures: list[str], out: Path) -> list[Block]:
+    """Return what came out on rough ground; nothing if that was not planned."""
+    plan = experiment.plan
+    if not plan.grounds:
+        return []
+    text = (
+        f"On each kind and difficulty, {plan.grounds['num_envs']} robots start in the middle of a tile, are told to "
+        "walk straight on, and cross it if the trunk gets over its edge in time, see docs/terrain.md. In tables are "
+        "means over all difficulties, ± standard errors over seeds, in brackets how many if not all. All tiles "
+        f"are in `{GROUNDS_FILE}`."
+    )
+    titles = [title for title in rough_figures(plan) if title in figures]
+    blocks: list[Block] = [Paragraph(text), *(Picture(title, out / file_name(title)) for title in titles)]
+    for environment in plan.environments:
+        seeds = {task: [run.crossings for run in experiment.runs_of(task, environment)] for task in plan.tasks}
+        kinds = kinds_of([each for some in seeds.values() for each in some])
+        blocks.append(Heading(environment, 3))
+        for measure, (meaning, digits) in MEASURES.items() if kinds else []:
+            rows = []
+            for task, some in seeds.items():
+                means = [[over_levels(each, measure, kind) for each in some] for kind in [*kinds, None]]
+                rows.append([MODELS.get(task, f"`{task}`"), *(mean_text(part, digits, plan) for part in means)])
+            blocks += [Paragraph(f"{meaning}:"), Grid(["task", *kinds, "all"], rows)]
+    return blocks
+
+
+def mean_text(values: list[float], digits: int, plan: Matrix) -> str:
+    """Return mean and standard error of the finite values of seeds, and how many they are if not all."""
+    finite = [value for value in values if math.isfinite(value)]
+    return number_text(Summary(finite), digits).removesuffix(f" ({len(plan.seeds)})") if finite else "–"
 
 
 def other_table(table: Table) -> list[Block]:
     """Return the metrics in environments other than those of training, which the paper does not have."""
     columns = [name for name in table if not is_of_paper(name)]
     text = "Trained -> evaluated, over seeds and evaluations as above. The paper has no such numbers."
-    return [Paragraph(text), metric_table(table, columns)] if columns else [Paragraph("None were planned.")]
+    return [Paragraph(text), metric_table(table, columns, False)] if columns else [Paragraph("None were planned.")]
 
 
 def differences(table: Table) -> list[Block]:

@@ -14,7 +14,8 @@ from statistics import fmean, stdev
 from typing import Any
 
 from legged_torque.experiments.curves import CURVE_METRICS, Row, read_rows, to_row
-from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, read_plan
+from legged_torque.experiments.grounds import MEASURES, Crossings, read_crossings
+from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE, Cell, Matrix, read_plan
 from legged_torque.experiments.paper_values import ENVIRONMENTS, paper_value
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import CONFIG_FILE, load_config, steps_per_iteration
@@ -24,6 +25,7 @@ LAST_SHARE = 0.18
 PAPER_STEPS = 110_000_000
 TABLE_FILE = "table.csv"
 EVALUATIONS_FILE = "evaluations.csv.gz"
+GROUNDS_FILE = "grounds.csv"
 
 
 @dataclass
@@ -33,6 +35,7 @@ class CellResult:
     cell: Cell
     rows_in: dict[str, list[Row]] = field(default_factory=dict)  # evaluations during training, by environment
     results: dict[str, Row] = field(default_factory=dict)  # evaluations of the last checkpoint, by environment
+    crossings: Crossings = field(default_factory=dict)  # evaluation of the last checkpoint on rough ground
     configs: list[dict[str, Any]] = field(default_factory=list)  # config.yaml of its runs
     devices: set[str] = field(default_factory=set)  # where it was trained and evaluated
     notes: list[str] = field(default_factory=list)  # problems with its files
@@ -154,6 +157,7 @@ def read_cell(cell: Cell) -> CellResult:
             if rows:
                 before = [row for row in result.rows_in.get(name, []) if row["steps"] < rows[0]["steps"]]
                 result.rows_in[name] = before + rows
+    result.crossings = read_crossings(cell.result_file(ROUGH_GROUND), result.notes)
     for file in sorted([*cell.folder.glob("result_*.json"), *cell.folder.glob("*/result_*.json")]):
         try:
             values = json.loads(file.read_text(encoding="utf-8"))
@@ -215,7 +219,10 @@ def holm(p_values: list[float | None]) -> list[float | None]:
 
 
 def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
-    """Write all summaries as CSV, and every evaluation during training as compressed CSV, with four digits."""
+    """Write all summaries as CSV, and every evaluation during training as compressed CSV, with four digits.
+
+    If rough ground was planned, what came out there is a third file.
+    """
     names = [metric.name for metric in CURVE_METRICS]
     summaries: list[list[Any]] = [["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean"]]
     keys = [(task, column, name) for column, cells in table.items() for task in cells for name in names]
@@ -230,6 +237,11 @@ def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
         for row in rows:
             values = [f"{row[name]:.4g}" if math.isfinite(row[name]) else None for name in ("seconds", *names)]
             evaluations.append([cell.task, column, cell.seed, row["steps"], *values])
+    if experiment.plan.grounds:
+        tiles: list[list[Any]] = [["task", "environment", "seed", "kind", "level", *MEASURES]]
+        for cell, crossings in ((run.cell, run.crossings) for run in runs):
+            tiles += [[cell.task, cell.environment, cell.seed, *tile, *crossings[tile].values()] for tile in crossings]
+        (out / GROUNDS_FILE).write_bytes(csv_bytes(tiles))
     (out / TABLE_FILE).write_bytes(csv_bytes(summaries))
     (out / EVALUATIONS_FILE).write_bytes(gzip.compress(csv_bytes(evaluations), mtime=0))  # the same bytes every time
 

@@ -247,11 +247,12 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         start = time.perf_counter()
         seconds = self._seconds_before + self.logger.tot_time + start - iteration_start
         when = {"steps": steps, "iteration": self.current_learning_iteration + 1, "seconds": seconds}
+        levels = {name: float(level) for name, level in self.env.terrain.curriculum_values().items()}
         logged: dict[str, float] = {}
         for name in due:
             metrics = self._evaluators.get(name).evaluate()
             logged |= {f"{tagged('Evaluation', name)}/{metric}": value for metric, value in metrics.items()}
-            row = {**when, **metrics, "critic_gradient_norm": losses["critic_gradient_norm"]}
+            row = {**when, **metrics, "critic_gradient_norm": losses["critic_gradient_norm"], **levels}
             assert self.log_dir is not None  # there is a writer only where something is kept
             try:
                 append_row(evaluations_file(Path(self.log_dir), name), row)

@@ -11,31 +11,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from legged_torque.terrain.height_grid import HeightGrid
 
-class HeightMap:
-    """Ground whose height is given on a grid in x and y of the world.
+
+class HeightMap(HeightGrid):
+    """The surface of a grid of heights, on a device.
 
     Outside of the grid, the ground goes on as it is at the nearest place of the grid's edge.
 
     Attributes:
-        heights: Heights of the samples [m], along x and y. Shape: (rows, cols), float32.
-        horizontal_scale: Distance between neighbouring samples [m].
-        corner: x and y of sample (0, 0) [m].
         samples: The heights on the device. It has one axis, so that it is never taken for a row per world.
             Shape: (rows * cols,).
     """
 
     def __init__(self, heights: np.ndarray, horizontal_scale: float, corner: tuple[float, float], device: str) -> None:
         """Keep heights of shape (rows, cols), at least two of each, here and on the device."""
-        self.heights = np.ascontiguousarray(heights, dtype=np.float32)
-        self.horizontal_scale, self.corner = horizontal_scale, corner
+        super().__init__(heights, horizontal_scale, corner)
         self.samples = torch.as_tensor(self.heights, device=device).flatten()
-
-    @property
-    def size(self) -> tuple[float, float]:
-        """Extent of the grid along x and y [m]."""
-        rows, cols = self.heights.shape
-        return (rows - 1) * self.horizontal_scale, (cols - 1) * self.horizontal_scale
 
     def height(self, points: Tensor) -> Tensor:
         """Return the height of the surface at x and y of points [m]. Shapes: (..., 2 or more) to (...,).

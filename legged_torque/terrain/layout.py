@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ class Layout:
     difficulty_range: list[float]
     terrain_proportions: dict[str, float]
     seed: int
+    difficulties: list[float] = field(default_factory=list)
 
     @classmethod
     def of(cls, settings: Any) -> Layout:
@@ -55,6 +56,9 @@ class Layout:
                 f"the map of terrain.num_rows x terrain.num_cols tiles has {samples} samples, more than {MAX_SAMPLES}: "
                 "raise terrain.horizontal_scale, or make the map smaller"
             )
+        if len(self.difficulties) not in (0, self.num_rows):
+            given = f"not {len(self.difficulties)}: terrain.num_rows is {self.num_rows}"
+            raise UserError(f"terrain.difficulties must be empty or one number for each row, {given}")
         for name in self.terrain_proportions:
             if name not in TILES:
                 raise unknown_name("kind in terrain.terrain_proportions", name, TILES)
@@ -78,6 +82,8 @@ class Layout:
 
     def difficulty(self, row: int) -> float:
         """Return how difficult the tiles of a row are: of the range, the share of rows below, as in legged_gym."""
+        if self.difficulties:
+            return self.difficulties[row]
         lowest, highest = self.difficulty_range
         return lowest + (highest - lowest) * row / self.num_rows
 

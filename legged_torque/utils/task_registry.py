@@ -159,12 +159,12 @@ class TaskRegistry:
     def make_loaded(self, run: LoadedRun, options: Options, env_cfg: Any = None) -> tuple[VecEnv, OnPolicyRunner]:
         """Create the task of a run, and a runner that holds the policy of its checkpoint and keeps nothing.
 
-        ``env_cfg`` are settings of the task in place of the run's. A UserError if the checkpoint cannot be read or is
-        of another kind of policy.
+        ``env_cfg`` are settings of the task in place of the run's; its critic may see other things, as it is not
+        loaded. A UserError if the checkpoint cannot be read or is of another kind of policy.
         """
         env, _ = self.make_env(options.task, options, env_cfg or run.env_cfg)
         runner, _ = self.make_alg_runner(env, options.task, train_cfg=run.train_cfg, log_root=None)
-        runner.load(str(run.checkpoint))
+        runner.load(str(run.checkpoint), {"actor": True, "iteration": True})
         return env, runner
 
     def _copies(self, name: str) -> tuple[Any, Any]:

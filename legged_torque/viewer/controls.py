@@ -50,6 +50,7 @@ class Controls:
     def __init__(self, server: viser.ViserServer, session: Session, scene: Scene) -> None:
         """Build the panel."""
         self._gui, self._session, self._scene = server.gui, session, scene
+        self._ground = scene.ground
         self._loaded: tuple[int, str, int] | None = None
         self._weights: dict[str, viser.GuiInputHandle[float]] = {}
         self.status = self._gui.add_html("")
@@ -58,6 +59,7 @@ class Controls:
         self._add_push()
         self._add_run()
         self._add_mixing()
+        self._add_tile()
         self._add_view()
 
     def _add_command(self) -> None:
@@ -137,6 +139,26 @@ class Controls:
                 self._weights[name] = gui.add_slider(name.replace("_", " "), 0.0, 1.0, 0.05, start)
         connect(list(self._weights.values()), automatic, self._session.set_mixing)
 
+    def _add_tile(self) -> None:
+        """Add the tile of the followed robot, for a task on rough ground."""
+        self._tile: list[int] = []
+        if not self._ground:
+            return
+        gui, session, layout = self._gui, self._session, self._ground.layout
+        self._kinds = layout.kinds()
+        with gui.add_folder("Tile"):
+            names = tuple(dict.fromkeys(self._kinds))
+            self.kind = gui.add_dropdown("kind", names, hint="moves the followed robot onto such a tile")
+            hint = "the first is the easiest"
+            self.level = gui.add_slider("level", 0, max(layout.num_rows - 1, 1), 1, 0, hint=hint)
+            self.level.disabled = layout.num_rows == 1
+
+        def move() -> None:
+            session.set_tile(self.level.value, self._kinds.index(self.kind.value))
+
+        on_user_change(self.kind, move)
+        on_user_change(self.level, move)
+
     def _add_view(self) -> None:
         """Add what is drawn; drawing needs no step, so that these controls act at once."""
         gui, scene, num_envs = self._gui, self._scene, self._session.task.num_envs
@@ -148,6 +170,9 @@ class Controls:
                 on_user_change(world, lambda: self._session.follow_world(int(world.value)))
                 others = gui.add_checkbox("all worlds", True, hint="draw the other worlds too")
                 others.on_update(lambda event: setattr(scene, "shows_others", others.value))
+            if self._ground:
+                scan = gui.add_checkbox("height scan", scene.shows_scan, hint="where the ground is measured")
+                scan.on_update(lambda event: setattr(scene, "shows_scan", scan.value))
 
     def update(self, state: SessionState) -> None:
         """Show changes that no click has made: new checkpoints, what was loaded, what was refused."""
@@ -159,6 +184,11 @@ class Controls:
             self._loaded = loaded
             set_value(self.checkpoints, str(state.checkpoint))
             set_value(self.perturbation, state.perturbation)
+        tile = [] if state.reading is None else state.reading.tile.astype(int).tolist()
+        if tile != self._tile:  # as above
+            self._tile = tile
+            set_value(self.level, tile[0])
+            set_value(self.kind, self._kinds[tile[1]])
         if not state.is_mixing_set:
             for name, weight in state.mixing.items():
                 set_value(self._weights[name], round(weight, 2))

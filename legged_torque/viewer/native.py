@@ -18,6 +18,7 @@ import mujoco
 
 from legged_torque.deploy.simulation import Simulation
 from legged_torque.utils.errors import UserError
+from legged_torque.viewer.ground import Ground, drawn_model, ground_of
 from legged_torque.viewer.pacing import Pacer, stopping_on_ctrl_c
 from legged_torque.viewer.state import SessionState
 
@@ -90,7 +91,8 @@ def watch(session: Session, robot: Path) -> None:
     """Show the first world until the window is closed, or until Ctrl-C; the session steps in a thread of its own."""
     import mujoco.viewer  # needs a screen
 
-    model = mujoco.MjModel.from_xml_path(str(robot))
+    ground = ground_of(session.task)
+    model = drawn_model(robot, ground)
     data = mujoco.MjData(model)
     keyboard = Keyboard(session)
     print(KEYS, flush=True)
@@ -106,7 +108,7 @@ def watch(session: Session, robot: Path) -> None:
         stepping.start()
         with stopping_on_ctrl_c(session.stop):
             while window.is_running() and stepping.is_alive():
-                draw(session.state, window, model, data)
+                draw(session.state, window, model, data, ground)
                 stepping.join(FRAME_INTERVAL)
             session.stop()
             stepping.join()
@@ -114,8 +116,14 @@ def watch(session: Session, robot: Path) -> None:
         thread.join(timeout=5.0)  # Python would crash if it ended while the window still draws
 
 
-def draw(state: SessionState, window: mujoco.viewer.Handle, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Show the first world, and its command and velocity as text; the window draws ``data``."""
+def draw(
+    state: SessionState,
+    window: mujoco.viewer.Handle,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    ground: Ground | None = None,
+) -> None:
+    """Show the first world, and its command, velocity and tile as text; the window draws ``data``."""
     if state.reading is None:
         return
     with window.lock():
@@ -127,6 +135,9 @@ def draw(state: SessionState, window: mujoco.viewer.Handle, model: mujoco.MjMode
     rows = [f"{wanted:+.2f}   {actual:+.2f}" for wanted, actual in zip(command, velocity, strict=True)]
     running = "paused" if state.is_paused else f"{state.real_time:.2f} x real time"
     labels, values = ["", *names, f"model_{state.checkpoint}"], ["commanded, actual", *rows, running]
+    if ground:
+        labels.append("tile")
+        values.append(ground.tile_text(*state.reading.tile.astype(int)))
     window.set_texts((None, None, "\n".join(labels), "\n".join(values)))
     window.sync()
 

@@ -9,7 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from legged_torque.envs.base.height_scan import HeightScan
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.terrain.rough import RoughGround
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,8 @@ class Reading:
     torque_parts: np.ndarray  # those of WatchedRobot, of the followed world; (parts, num_dof)
     rewards: np.ndarray  # its weighted reward terms of this step, per second; (terms,)
     resets: np.ndarray  # number of worlds whose episode ended: [fallen or diverged, timed out]
+    tile: np.ndarray  # level and column of the followed world's tile; empty on a plane
+    scan: np.ndarray  # where its height scan meets the ground [m]; (points, 3), without any on a plane
 
 
 class WatchedRobot(LeggedRobot):
@@ -64,6 +68,7 @@ class TaskReader:
         self._task = task
         self._sums = task.episode_sums.clone()
         self._commands = task.commands.clone()
+        self._scan = HeightScan(task)
 
     def before_step(self) -> None:
         """Keep what the step will overwrite."""
@@ -76,6 +81,11 @@ class TaskReader:
         before = torch.where(task.reset_buf, 0.0, self._sums)
         rewards = (task.episode_sums - before)[:, world] / task.dt
         timeouts = task.time_out_buf.sum()
+        tile, scan = task.episode_sums.new_zeros(0), task.episode_sums.new_zeros(0, 3)
+        if isinstance(task.terrain, RoughGround):
+            tile = torch.stack([task.terrain.levels[world], task.terrain.columns[world]])
+            scan = self._scan.points()[world]
+            scan[:, 2] = task.terrain.height(scan)
         parts = [
             task.sim.qpos,
             self._commands,
@@ -84,6 +94,8 @@ class TaskReader:
             task.torque_parts[:, world],
             rewards,
             torch.stack([task.reset_buf.sum() - timeouts, timeouts]),
+            tile,
+            scan,
         ]
         flat = torch.cat([part.reshape(-1).float() for part in parts]).cpu().numpy()
         arrays = np.split(flat, np.cumsum([part.numel() for part in parts])[:-1])

@@ -8,29 +8,40 @@ import mujoco
 import numpy as np
 import trimesh
 import viser
+from PIL import Image
 from viser import transforms
 
-COMMAND_COLOR, VELOCITY_COLOR = (10, 150, 50), (20, 90, 230)
+from legged_torque.viewer.ground import Ground, Smooth
+from legged_torque.viewer.reading import Reading
+
+COMMAND_COLOR, VELOCITY_COLOR, SCAN_COLOR = (10, 150, 50), (20, 90, 230), (214, 51, 108)
 VISUAL_GROUPS = (0, 1, 2)  # groups of visual geoms; the others only collide
+GROUND_FACTOR = (0.6, 0.6, 0.6, 1.0)  # of the colors of rough ground: the light is bright
 SPACING = 2.0  # distance between neighbouring worlds [m]
+LIFTING = 0.2  # share of the way to where it sees the robot by which a camera moves up in a frame
 ARROW_LENGTH = 0.5  # length of the arrow of a velocity of 1 m/s [m]
 
 
 class Scene:
     """The robots of all worlds, their ground and light.
 
-    Worlds are drawn side by side, though all start at the same place in the simulator. Everything is moved such that
-    the followed robot stays where the page's camera looks; so users can turn and zoom freely.
+    On a plane, worlds are drawn side by side, though all start at the same place in the simulator. Everything is moved
+    such that the followed robot, or the rough ground below it, stays where the page's camera looks; so users can turn
+    and zoom freely. Rough ground does not get between camera and robot.
     """
 
-    def __init__(self, server: viser.ViserServer, robot: Path, num_envs: int) -> None:
-        """Build everything; ``robot`` is its MJCF, visual geoms included."""
-        self._server = server
+    def __init__(self, server: viser.ViserServer, robot: Path, num_envs: int, ground: Ground | None = None) -> None:
+        """Build everything; ``robot`` is its MJCF, visual geoms included, ``ground`` None for a plane."""
+        self._server, self.ground = server, ground
         self._model = mujoco.MjModel.from_xml_path(str(robot))
         self._data = mujoco.MjData(self._model)
         self.is_following, self.shows_others = True, True  # the camera follows; the other worlds are drawn
-        self._places, self._offset = places(num_envs), np.zeros(3)
-        self._ground = self._add_surroundings()
+        self.shows_scan = True  # where the height scan of the followed robot meets the ground
+        self._scan: viser.PointCloudHandle | None = None
+        self._places = np.zeros((num_envs, 3)) if ground else places(num_envs)
+        self._offset, self._height = np.zeros(3), Smooth()
+        self._floor = self._add_rough_ground(ground) if ground else self._add_plane()
+        self._add_surroundings()
         self._bodies = {}
         for body in range(1, self._model.nbody):
             glb = body_glb(self._model, body)
@@ -43,20 +54,27 @@ class Scene:
         nowhere = np.zeros((1, 2, 3))
         self._arrows = [server.scene.add_arrows(name, nowhere, color, **sizes) for name, color in colors.items()]
 
-    def update(self, qpos: np.ndarray, command: np.ndarray, velocity: np.ndarray, world: int) -> None:
-        """Draw a state: positions of all worlds, command and velocity of the followed one, as of a Reading."""
-        positions, quats = self._poses(qpos)
+    def update(self, reading: Reading, world: int) -> None:
+        """Draw a state, and command, velocity and height scan of a world to follow."""
+        positions, quats = self._poses(reading.qpos)
         shown = slice(None) if self.shows_others else slice(world, world + 1)
         if self.is_following:
             self._offset[:2] = -positions[world, 1, :2]
+            if self.ground:
+                self._offset[2] = -self._height.follow(float(self.ground.height(positions[world, 1])))
+                self._lift_cameras()
         positions += self._offset
         trunk, rotation = positions[world, 1], transforms.SO3(quats[world, 1]).as_matrix()
         with self._server.atomic():
-            self._ground.position = self._offset
+            self._floor.position = self._offset
             for body, handle in self._bodies.items():
                 handle.batched_positions = positions[shown, body]
                 handle.batched_wxyzs = quats[shown, body]
-            for handle, vector, height in zip(self._arrows, (command, velocity), (0.22, 0.17), strict=True):
+            if self._scan:
+                self._scan.visible = self.shows_scan and world == reading.world
+                self._scan.points = (reading.scan + self._offset + [0.0, 0.0, 0.01]).astype(np.float32)
+            velocities = (reading.commands[world], reading.velocities[world])
+            for handle, vector, height in zip(self._arrows, velocities, (0.22, 0.17), strict=True):
                 start = trunk + np.array([0.0, 0.0, height])
                 end = start + ARROW_LENGTH * rotation @ [vector[0], vector[1], 0.0]
                 handle.points = np.stack([start, end])[None].astype(np.float32)
@@ -73,10 +91,32 @@ class Scene:
             quats[world] = self._data.xquat
         return positions, quats
 
-    def _add_surroundings(self) -> viser.GridHandle:
-        """Add light and ground, place the camera, and return the ground."""
+    def _lift_cameras(self) -> None:
+        """Let the cameras of all browsers look over the ground between them and what they look at."""
+        assert self.ground
+        for client in self._server.get_clients().values():
+            camera = client.camera
+            place, target = np.array(camera.position), np.array(camera.look_at)
+            if not target.any():
+                continue  # the browser has not taken the page's camera yet
+            lowest = self.ground.lowest_view(target - self._offset, place - self._offset) + self._offset[2]
+            if place[2] < lowest - 0.01:
+                place[2] += LIFTING * (lowest - place[2])
+                with client.atomic():
+                    camera.position = place  # this moves what it looks at, too
+                    camera.look_at = target
+
+    def _add_surroundings(self) -> None:
+        """Add light, and place the camera."""
         scene = self._server.scene
-        ground = scene.add_grid(
+        scene.configure_default_lights(True, cast_shadow=True)
+        scene.configure_environment_map("studio", environment_intensity=0.5)
+        camera = self._server.initial_camera
+        camera.position, camera.look_at, camera.fov = (1.2, -1.2, 0.62), (0.0, 0.0, 0.24), 0.75
+
+    def _add_plane(self) -> viser.GridHandle:
+        """Add a plane, and return it."""
+        return self._server.scene.add_grid(
             "/ground",
             infinite_grid=True,
             cell_size=0.25,
@@ -88,11 +128,14 @@ class Scene:
             shadow_opacity=0.35,
             fade_distance=18.0,
         )
-        scene.configure_default_lights(True, cast_shadow=True)
-        scene.configure_environment_map("studio", environment_intensity=0.5)
-        camera = self._server.initial_camera
-        camera.position, camera.look_at, camera.fov = (1.2, -1.2, 0.62), (0.0, 0.0, 0.24), 0.75
-        return ground
+
+    def _add_rough_ground(self, ground: Ground) -> viser.GlbHandle:
+        """Add rough ground and the points of the height scan, and return the ground."""
+        scene = self._server.scene
+        self._scan = scene.add_point_cloud(
+            "/scan", np.zeros((1, 3)), SCAN_COLOR, point_size=0.009, point_shape="circle", precision="float32"
+        )
+        return scene.add_glb("/ground", ground_glb(ground), cast_shadow=False, receive_shadow=True)
 
 
 def places(num_envs: int) -> np.ndarray:
@@ -102,6 +145,17 @@ def places(num_envs: int) -> np.ndarray:
     centers = SPACING * (cells - (side - 1) // 2)
     order = np.argsort(np.linalg.norm(centers, axis=1), kind="stable")
     return np.pad(centers[order][:num_envs], ((0, 0), (0, 1)))
+
+
+def ground_glb(ground: Ground) -> bytes:
+    """Return rough ground as a binary glTF. It has no normals: browsers draw its triangles flat, with sharp edges."""
+    picture = Image.fromarray(ground.picture()[::-1])
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=picture, baseColorFactor=GROUND_FACTOR, metallicFactor=0.0, roughnessFactor=0.95
+    )
+    visual = trimesh.visual.TextureVisuals(ground.uv, material=material)
+    mesh = trimesh.Trimesh(ground.vertices, ground.faces, visual=visual, process=False)
+    return trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=False)
 
 
 def body_glb(model: mujoco.MjModel, body: int) -> bytes | None:

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.terrain.rough import RoughGround
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import apply_perturbation
 from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers
@@ -204,6 +205,20 @@ class Session:
         self._tell("reset")
 
     @request
+    def set_tile(self, level: int, column: int) -> None:
+        """Move the followed robot onto a tile of rough ground, where its episodes start from now on."""
+        ground, world = self.task.terrain, self.state.world
+        if not isinstance(ground, RoughGround):
+            raise UserError("there are no tiles on a plane")
+        layout = ground.layout
+        ground.levels[world] = min(max(level, 0), layout.num_rows - 1)
+        ground.columns[world] = min(max(column, 0), layout.num_cols - 1)
+        self.task.episode_length_buf[world] = 0  # of what it did elsewhere, the curriculum learns nothing
+        with torch.no_grad():
+            self._obs = self.task.reset(world)
+        self._tell(f"robot {world} is on a new tile")
+
+    @request
     def set_speed(self, speed: float) -> None:
         """Set the simulated seconds per second, from :data:`SLOWEST` to :data:`FASTEST`."""
         check_numbers("a speed", speed)
@@ -259,6 +274,9 @@ class Session:
         task = self._make_task(cfg)
         task.step_graph.enabled = old.step_graph.enabled
         task.load_state_dict(old.state_dict())
+        if isinstance(task.terrain, RoughGround) and isinstance(old.terrain, RoughGround):
+            task.terrain.levels.copy_(old.terrain.levels)
+            task.terrain.columns.copy_(old.terrain.columns)
         self._show(perturbation=name)
         self._adopt(task)
         self._tell(f"perturbation '{name}'")
@@ -287,6 +305,6 @@ class Session:
     def _load(self, number: int) -> None:
         """Load a checkpoint into the networks and its counters into the task."""
         with torch.no_grad():
-            infos = self._runner.load(str(checkpoint_file(self._run_dir, number)))
+            infos = self._runner.load(str(checkpoint_file(self._run_dir, number)), {"actor": True})
         self._trained_steps = self.task.total_steps.clone()
         self._show(checkpoint=number, trained_steps=int(infos["total_timesteps"]))

@@ -15,6 +15,7 @@ from legged_torque import resource_path
 from legged_torque.deploy.simulation import Simulation
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.rendering import INSTALL_HINT
+from legged_torque.viewer.ground import Ground, Smooth, drawn_model, ground_of
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -23,6 +24,7 @@ SIZE = (960, 540)  # width and height of a video of one robot [pixels]
 GRID_SIZE = (1280, 720)  # about the width and height of a video of several robots [pixels]
 COMMAND_COLOR = (0.1, 0.8, 0.2, 0.9)
 VELOCITY_COLOR = (0.1, 0.4, 1.0, 0.9)
+DISTANCE = 1.6  # of the camera from the robot on level ground [m]
 TRUNK = 1  # the trunk's body in the MJCF of a task
 _TEXT_COLORS = {"plain": (255, 255, 255), "command": (110, 240, 130), "velocity": (130, 190, 255)}
 _BOX_COLOR = (20, 24, 30, 190)
@@ -40,9 +42,9 @@ class Moment:
 class VideoRecorder:
     """Keeps what robots do, to draw them as a video."""
 
-    def __init__(self, model: mujoco.MjModel, trunk: int, control_step: float) -> None:
+    def __init__(self, model: mujoco.MjModel, trunk: int, control_step: float, ground: Ground | None = None) -> None:
         """Start without any steps; arguments as of :func:`write_video`."""
-        self._model, self._trunk, self._control_step = model, trunk, control_step
+        self._model, self._trunk, self._control_step, self._ground = model, trunk, control_step, ground
         self._steps: list[list[Moment]] = []
 
     def save(self, file: Path, no_renderer: str | None) -> None:
@@ -50,7 +52,7 @@ class VideoRecorder:
         try:
             if no_renderer:
                 raise UserError(no_renderer)
-            write_video(file, self._model, self._trunk, self._steps, self._control_step)
+            write_video(file, self._model, self._trunk, self._steps, self._control_step, self._ground)
             print(f"video: {file}")
         except UserError as error:
             print(f"no video: {error}")
@@ -76,7 +78,8 @@ class TaskRecorder(VideoRecorder):
 
     def __init__(self, task: LeggedRobot, num_worlds: int = 1) -> None:
         """Prepare to record the first worlds of a task; a single one is that with the fastest command at the start."""
-        super().__init__(mujoco.MjModel.from_xml_path(str(resource_path(task.cfg.asset.file))), TRUNK, task.dt)
+        ground = ground_of(task)
+        super().__init__(drawn_model(resource_path(task.cfg.asset.file), ground), TRUNK, task.dt, ground)
         self._task = task
         self._worlds = list(range(num_worlds)) if num_worlds > 1 else []
 
@@ -90,7 +93,12 @@ class TaskRecorder(VideoRecorder):
 
 
 def write_video(
-    file: Path, model: mujoco.MjModel, trunk: int, steps: Sequence[Sequence[Moment]], control_step: float
+    file: Path,
+    model: mujoco.MjModel,
+    trunk: int,
+    steps: Sequence[Sequence[Moment]],
+    control_step: float,
+    ground: Ground | None = None,
 ) -> None:
     """Write an mp4 of robots seen close up, in real time, with a frame for every second control step.
 
@@ -103,6 +111,7 @@ def write_video(
         trunk: Body that the camera follows.
         steps: What each robot does in each control step; the number of robots is a square number.
         control_step: Time between two steps [s].
+        ground: That of the model, above which cameras stay; None for a plane.
 
     Raises:
         UserError: If there is no renderer or no video encoder.
@@ -123,26 +132,47 @@ def write_video(
         raise UserError(f"the renderer does not start: {error} ({INSTALL_HINT})") from None
     file.parent.mkdir(parents=True, exist_ok=True)
     writer = imageio.get_writer(file, fps=round(0.5 / control_step), macro_block_size=1)
+    cameras = [Camera(ground) for _ in steps[0]]
     with renderer, writer:
         for number, moments in list(enumerate(steps, start=1))[::2]:
             tiles = []
-            for moment in moments:
-                image = _draw(renderer, data, trunk, moment)
+            for moment, camera in zip(moments, cameras, strict=True):
+                image = _draw(renderer, data, trunk, moment, camera)
                 rows = _table(number * control_step, moment) if side == 1 else _line(moment)
                 tiles.append(add_overlay(image, rows))
             rows_of_tiles = [np.hstack(tiles[i : i + side]) for i in range(0, len(tiles), side)]
             writer.append_data(np.vstack(rows_of_tiles))
 
 
-def _draw(renderer: mujoco.Renderer, data: mujoco.MjData, trunk: int, moment: Moment) -> np.ndarray:
+class Camera:
+    """Looks at a robot from a fixed direction, from above the ground."""
+
+    def __init__(self, ground: Ground | None) -> None:
+        """Prepare for a video; None is a plane."""
+        self._ground, self._target, self._height = ground, Smooth(), Smooth()
+
+    def look_at(self, position: np.ndarray) -> mujoco.MjvCamera:
+        """Return the camera of a frame, by the position of the robot's trunk [m]."""
+        camera, elevation = mujoco.MjvCamera(), np.radians(18.0)
+        camera.lookat[:] = (position[0], position[1], 0.25)
+        camera.azimuth = 130.0
+        ahead, height = DISTANCE * np.cos(elevation), DISTANCE * np.sin(elevation)
+        if self._ground:
+            camera.lookat[2] += self._target.follow(float(self._ground.height(position)))
+            azimuth = np.radians(camera.azimuth)
+            place = camera.lookat - ahead * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+            lowest = self._ground.lowest_view(camera.lookat, place)
+            height = self._height.follow(max(camera.lookat[2] + height, lowest)) - camera.lookat[2]
+        camera.distance, camera.elevation = np.hypot(ahead, height), -np.degrees(np.arctan2(height, ahead))
+        return camera
+
+
+def _draw(renderer: mujoco.Renderer, data: mujoco.MjData, trunk: int, moment: Moment, camera: Camera) -> np.ndarray:
     """Return the image of a robot and the arrows of its velocities. Shape: (height, width, 3)."""
     data.qpos[:] = moment.qpos
     mujoco.mj_forward(renderer.model, data)
     position, rotation = data.xpos[trunk], data.xmat[trunk].reshape(3, 3)
-    camera = mujoco.MjvCamera()  # looks at the robot from a fixed direction
-    camera.lookat[:] = (position[0], position[1], 0.25)
-    camera.distance, camera.azimuth, camera.elevation = 1.6, 130.0, -18.0
-    renderer.update_scene(data, camera)
+    renderer.update_scene(data, camera.look_at(position))
     for vector, color, height in ((moment.command, COMMAND_COLOR, 0.24), (moment.velocity, VELOCITY_COLOR, 0.2)):
         start = position + np.array([0.0, 0.0, height])
         _add_arrow(renderer.scene, start, rotation @ [vector[0], vector[1], 0.0], color)

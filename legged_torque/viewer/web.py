@@ -14,6 +14,7 @@ import viser
 from legged_torque.utils.errors import UserError
 from legged_torque.viewer.access import Guard
 from legged_torque.viewer.controls import Controls
+from legged_torque.viewer.ground import Ground, ground_of
 from legged_torque.viewer.pacing import stopping_on_ctrl_c
 from legged_torque.viewer.plots import Plots
 from legged_torque.viewer.scene import Scene
@@ -41,7 +42,8 @@ class Page:
         with self.guard.at_the_door():
             self.server = PrivateServer(host, free_port(host, port), label=title, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 125, 246))
-        self._scene = Scene(self.server, robot, session.task.num_envs)
+        self._ground = ground_of(session.task)
+        self._scene = Scene(self.server, robot, session.task.num_envs, self._ground)
         self.controls = Controls(self.server, session, self._scene)
         self._plots = Plots(self.server, session)
         self.server.gui.main_panel.dock_right()
@@ -69,13 +71,12 @@ class Page:
         while not self._closed.wait(FRAME_INTERVAL):
             state = self._session.state
             if state.reading is not None:
-                reading, world = state.reading, state.world
-                self._scene.update(reading.qpos, reading.commands[world], reading.velocities[world], world)
+                self._scene.update(state.reading, state.world)
             if time.perf_counter() >= next_plots:
                 next_plots = time.perf_counter() + PLOT_INTERVAL
                 with self.server.atomic():
                     self._plots.update(state)
-                    self.controls.status.content = status_html(state)
+                    self.controls.status.content = status_html(state, self._ground)
                     self.controls.update(state)
                     self._notify(state)
 
@@ -102,13 +103,14 @@ def free_port(host: str, port: int) -> int:
     raise UserError(f"no port from {port} on is free")
 
 
-def status_html(state: SessionState) -> str:
-    """Return the status in three lines: checkpoint, time, last message."""
+def status_html(state: SessionState, ground: Ground | None = None) -> str:
+    """Return the status line by line: checkpoint, time, tile of the followed robot on rough ground, last message."""
     running = "paused" if state.is_paused else f"{state.real_time:.2f} x real time"
     color = "#e03131" if state.is_error else "inherit"
     lines = [
         f"<b>model_{state.checkpoint}</b>, after {state.trained_steps / 1e6:,.1f} million steps",
         f"{state.time:.1f} s simulated, {running}, {state.falls} falls",
+        *([ground.tile_text(*state.reading.tile.astype(int))] if ground and state.reading else []),
         f'<span style="color:{color}">{html.escape(state.message) or "&nbsp;"}</span>',
     ]
     return f'<div style="font-size:13px;line-height:1.5;padding:4px 12px">{"<br>".join(lines)}</div>'

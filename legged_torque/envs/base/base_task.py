@@ -76,9 +76,11 @@ class BaseTask(VecEnv):
         groups = {name: self.obs_buf[name].nan_to_num() for name in map(str, self.obs_buf.keys())}
         return TensorDict(groups, [self.num_envs], device=self.device)
 
-    def reset(self) -> TensorDict:
-        """Start a new episode in every world and return the observations."""
-        self.reset_buf.fill_(True)
+    def reset(self, world: int | None = None) -> TensorDict:
+        """Start a new episode in every world, or in a single one, and return the observations."""
+        self.reset_buf.fill_(world is None)
+        if world is not None:
+            self.reset_buf[world] = True
         self._reset_worlds()
         self._finish_step()
         return self.get_observations()

@@ -30,11 +30,14 @@ class WalkingMetrics:
         """Forget all steps."""
         self._sums.zero_()
 
-    def add_step(self, commands: Tensor) -> None:
-        """Add the step that the task has just made, with a copy of the commands that held in it (num_envs, 3)."""
+    def add_step(self, commands: Tensor, counted: Tensor | None = None) -> None:
+        """Add the step that the task has just made, with a copy of the commands that held in it (num_envs, 3).
+
+        Only in the worlds that are ``counted``, if it is given. Shape: (num_envs,), bool.
+        """
         task = self._task
         velocity = task.planar_velocity()
-        self._sums += metrics.step_sums(
+        sums = metrics.step_sums(
             torch,
             commands,
             velocity,
@@ -45,6 +48,7 @@ class WalkingMetrics:
             fell=task.reset_buf & ~task.time_out_buf,
             ended=task.reset_buf,
         )
+        self._sums += sums if counted is None else sums * counted
 
     def ratios(self) -> dict[str, tuple[Tensor, Tensor]]:
         """Return numerator and denominator of each metric, per world. Shapes: (num_envs,)."""

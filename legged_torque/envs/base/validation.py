@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LinearChange
+from legged_torque.terrain.layout import Layout
 from legged_torque.utils.config import Section, section_keys
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import check_section
@@ -34,8 +35,6 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
 
 def _check_map(cfg: LeggedRobotCfg) -> None:
     """Refuse a map that cannot be, levels that it does not have, and a scan that leaves it."""
-    from legged_torque.terrain.layout import Layout  # it imports torch, which other grounds need not wait for
-
     settings = cfg.terrain
     Layout.of(settings)
     if settings.curriculum and settings.max_init_terrain_level >= settings.num_rows:

@@ -1,0 +1,155 @@
+"""Which ground a policy masters: whether robots cross tiles of all kinds and levels in time, in one batch of worlds.
+
+A trial is one episode: a robot starts in the middle of its tile, heads along x or y, is told to walk on in that
+direction, and crosses the tile if its trunk gets over the tile's edge before it falls, and before the trial is over.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.base.metrics import WalkingMetrics
+from legged_torque.learning.evaluator import evaluation_cfg
+from legged_torque.terrain.rough import RoughGround
+from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.math import quat_rotate_yaw
+from legged_torque.utils.metrics import Estimate, estimate, estimates
+
+SPEED = 0.6
+"""What robots are told to walk forwards, unless something else is asked for [m/s]."""
+SLOWNESS = 2.0
+"""A trial lasts this many times as long as the commanded speed needs: as in the curriculum, half of it is enough."""
+MIN_SPEED = 0.1
+"""Least commanded speed [m/s]; one that is slower would need minutes."""
+COLUMNS = 4
+"""Of each kind: where tiles are random, these differ."""
+SEED = 10_000
+"""Added to the seed of the map, so that its random tiles are not those of the training."""
+
+
+@dataclass(frozen=True)
+class Grounds:
+    """Which tiles robots shall cross.
+
+    Attributes:
+        kinds: Their kinds, each once.
+        levels: Their difficulties, in rising order.
+        command: Commanded v_x, v_y [m/s] in the trunk's frame.
+    """
+
+    kinds: list[str]
+    levels: list[float]
+    command: tuple[float, float]
+
+    @classmethod
+    def of(cls, kinds: Sequence[str], levels: Sequence[float], command: Sequence[float] | None = None) -> Grounds:
+        """Return grounds as users name them; a UserError if a kind, a level or a command of three makes no sense."""
+        chosen, rising = named_kinds(kinds), rising_levels(levels)
+        v_x, v_y, yaw_rate = command or (SPEED, 0.0, 0.0)
+        if math.hypot(v_x, v_y) < MIN_SPEED or yaw_rate:
+            needed = f"a speed of {MIN_SPEED} m/s or more and a yaw rate of 0, not {v_x:g} {v_y:g} {yaw_rate:g}"
+            raise UserError(f"robots cross tiles straight on: the command must have {needed}")
+        return cls(chosen, rising, (v_x, v_y))
+
+    def cfg(self, cfg: Any, worlds_per_tile: int) -> Any:
+        """Return settings of a task for trials of so many worlds on each kind and level.
+
+        What the policy sees is as in the settings given, whichever ground they are for; what the critic sees may not.
+        """
+        cfg = evaluation_cfg(cfg, worlds_per_tile * len(self.kinds) * len(self.levels))
+        terrain, ranges = cfg.terrain, cfg.commands.ranges
+        select_tiles(terrain, self.kinds, self.levels, COLUMNS)
+        terrain.seed += SEED
+        cfg.env.episode_length_s = self.time_limit(terrain.tile_size) + 1.0  # no trial ends with the episode
+        cfg.commands.resampling_probability = 0.0
+        ranges.lin_vel_x, ranges.lin_vel_y = ([speed, speed] for speed in self.command)
+        cfg.commands.heading_command = True
+        cfg.domain_rand.init_yaw = [0.0, 0.0]
+        return cfg
+
+    def time_limit(self, tile_size: float) -> float:
+        """Return how long a trial lasts at most, on tiles with sides of this length [s]."""
+        return SLOWNESS * 0.5 * tile_size / math.hypot(*self.command)
+
+
+@dataclass
+class Result:
+    """What came out on tiles of one kind and level."""
+
+    kind: str
+    level: float
+    worlds: int
+    crossed: Estimate  # share of robots that have crossed their tile in time
+    fell: Estimate  # share of robots that have fallen; the others were too slow
+    metrics: dict[str, Estimate]  # of walking, until robots have crossed or fallen
+
+
+def cross(task: LeggedRobot, policy: Callable[[TensorDict], Tensor], grounds: Grounds) -> list[Result]:
+    """Let a policy try to cross the tiles of a task with the settings of :meth:`Grounds.cfg`, once in each world.
+
+    Returns:
+        What came out, by kind and then by level.
+    """
+    ground = task.terrain
+    assert isinstance(ground, RoughGround), "tiles are those of rough ground"
+    half = 0.5 * ground.layout.tile_size
+    walking = WalkingMetrics(task)
+    obs = _start(task, ground, grounds.command)
+    starts = task.base_pos[:, :2].clone()
+    crossed, fell = (torch.zeros_like(task.reset_buf) for _ in range(2))
+    with torch.inference_mode():
+        for _ in range(math.ceil(grounds.time_limit(ground.layout.tile_size) / task.dt)):
+            commands, is_trying = task.commands.clone(), ~(crossed | fell)
+            obs = task.step(policy(obs))[0]
+            walking.add_step(commands, is_trying)
+            distance = (task.base_pos[:, :2] - starts).abs().amax(dim=1)
+            fell |= is_trying & task.reset_buf
+            crossed |= is_trying & ~task.reset_buf & (distance > half)
+    return _results(ground, grounds, walking, crossed, fell)
+
+
+def _start(task: LeggedRobot, ground: RoughGround, command: tuple[float, float]) -> TensorDict:
+    """Begin an episode in the middle of each tile, in turns along x, y, -x and -y, and return the observations."""
+    task.reset()
+    qpos, qvel = task.sim.qpos.clone(), task.sim.qvel.clone()
+    turns = torch.arange(task.num_envs, device=task.device) // ground.layout.num_rows % 4
+    angles = 0.5 * math.pi * turns - math.atan2(command[1], command[0])
+    cos, sin = (0.5 * angles).cos(), (0.5 * angles).sin()
+    w, x, y, z = qpos[:, 3:7].unbind(dim=1)  # without a yaw
+    qpos[:, :2] = ground.origins[:, :2]
+    qpos[:, 3:7] = torch.stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w], dim=1)
+    qvel[:, :3] = quat_rotate_yaw(qpos[:, 3:7], qvel[:, :3])
+    task.command_generator.headings.copy_(angles)
+    task.set_state(qpos, qvel)
+    return task.get_observations()
+
+
+def _results(
+    ground: RoughGround, grounds: Grounds, walking: WalkingMetrics, crossed: Tensor, fell: Tensor
+) -> list[Result]:
+    """Return what came out, in each group of worlds."""
+    kinds = ground.layout.kinds()
+    of_kind = [kinds[column] for column in ground.columns.tolist()]
+    of_level = [grounds.levels[row] for row in ground.levels.tolist()]
+    groups: dict[tuple[str, float], list[int]] = {group: [] for group in product(grounds.kinds, grounds.levels)}
+    for world, group in enumerate(zip(of_kind, of_level, strict=True)):
+        groups[group].append(world)
+    shares = {name: ended.double().cpu().numpy() for name, ended in {"crossed": crossed, "fell": fell}.items()}
+    ratios = {name: [part.double().cpu().numpy() for part in parts] for name, parts in walking.ratios().items()}
+    results = []
+    for (kind, level), worlds in groups.items():
+        share = {name: estimate(ended[worlds], np.ones(len(worlds))) for name, ended in shares.items()}
+        metrics = estimates({name: (above[worlds], below[worlds]) for name, (above, below) in ratios.items()})
+        results.append(Result(kind, level, len(worlds), share["crossed"], share["fell"], metrics))
+    return results

@@ -1,0 +1,44 @@
+"""Which kinds of rough ground, and how difficult, a policy is watched or measured on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from legged_torque.terrain.tiles import TILES
+from legged_torque.utils.config import section_keys
+from legged_torque.utils.errors import UserError, unknown_name
+
+ALL = "all"
+"""Stands for all kinds."""
+
+
+def named_kinds(names: Sequence[str]) -> list[str]:
+    """Return the kinds that a user has named, each once; a UserError if there is no such kind."""
+    for name in names:
+        if name not in (ALL, *TILES):
+            raise unknown_name("kind of terrain", str(name), [ALL, *TILES])
+    return list(TILES) if ALL in names else list(dict.fromkeys(names))
+
+
+def rising_levels(levels: Sequence[float]) -> list[float]:
+    """Return difficulties in rising order, each once; a UserError if one is not from 0 to 1."""
+    for level in levels:
+        if not 0.0 <= level <= 1.0:
+            raise UserError(f"a level must be from 0 to 1, not {level}")
+    return sorted(set(levels))
+
+
+def select_tiles(settings: Any, kinds: Sequence[str], levels: Sequence[float], columns: int) -> None:
+    """Let a section ``terrain`` be rough ground, a plane's as well: rows of these levels, so many columns of each kind.
+
+    Robots are to stay on their tiles. Without ``levels``, rows are as before.
+    """
+    settings.mesh_type, settings.curriculum = "heightfield", False
+    settings.num_cols = columns * len(kinds)
+    if levels:
+        settings.num_rows, settings.difficulties = len(levels), list(levels)
+    for kind in section_keys(settings.terrain_proportions):
+        setattr(settings.terrain_proportions, kind, 0.0)
+    for kind in kinds:
+        setattr(settings.terrain_proportions, kind, 1.0 / len(kinds))

@@ -1,0 +1,287 @@
+"""An exported policy on rough ground in plain MuJoCo: what it sees, where it starts and how it moves is the task's."""
+
+import copy
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from settings import error_of, flatten
+from test_scripts import assert_told_in_one_line, run_here
+from test_terrain import ground_cfg
+
+for package in ("onnx", "onnxruntime", "jsonschema"):
+    pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
+
+from test_export import change, export_random
+from test_sim2sim import XML, changed_xml
+
+from legged_torque.deploy import hfield_contacts
+from legged_torque.deploy.description import check
+from legged_torque.deploy.ground import select_ground
+from legged_torque.deploy.policy import Policy, State
+from legged_torque.deploy.robot import MujocoRobot
+from legged_torque.deploy.simulation import Events, Simulation, quaternion
+from legged_torque.envs.robots.a1 import A1Cfg
+from legged_torque.terrain.height_grid import HeightGrid
+from legged_torque.terrain.height_map import HeightMap
+from legged_torque.terrain.hfield import add_hfield
+from legged_torque.terrain.layout import Layout
+from legged_torque.utils.config import to_dict
+
+ROUGH = flatten({"terrain": to_dict(ground_cfg().terrain)}) | {"terrain.measure_heights": True}
+CALM = {"asset.terminate_after_contacts_on": [], "sim.solver_iterations": 100, "sim.ls_iterations": 50}
+STILL = (np.zeros(3), np.zeros(3), np.zeros(12))
+
+
+@pytest.fixture(scope="module")
+def exported(make_task, tmp_path_factory):
+    """Folder of an exported policy that sees stairs and rough slopes, its task, and its network."""
+    folder = tmp_path_factory.mktemp("export") / "out"
+    return folder, *export_random(make_task, "a1_position", folder, **ROUGH, **CALM)
+
+
+@pytest.fixture(scope="module")
+def policy(exported):
+    """The policy; whoever uses it resets it."""
+    return Policy(exported[0])
+
+
+@pytest.fixture(scope="module")
+def robot(policy):
+    """The A1 on the ground of the training."""
+    return MujocoRobot(XML, policy.description)
+
+
+@pytest.fixture(scope="module")
+def surface(policy):
+    """The same ground, as the task has it."""
+    layout = Layout(**policy.description["terrain"])
+    return HeightMap(layout.heights(), layout.horizontal_scale, layout.corner, "cpu")
+
+
+# --------------------------------------------------------------------------------------------------- the ground
+
+
+def test_ground_is_the_task_s(exported, policy, robot, surface):
+    """``policy.yaml`` has the settings of the map; robots start where the task's do, on the task's surface."""
+    task = exported[1]
+    assert robot.notes == [] and Layout(**policy.description["terrain"]) == task.terrain.layout
+    np.testing.assert_array_equal(task.terrain.map.heights, surface.heights)
+    np.testing.assert_array_equal(robot.origins, task.terrain._origins.flatten(0, 1))
+    robot.reset(np.zeros(3), quaternion(0, 0, 0), policy.nominal_pose, STILL)
+    places = np.random.default_rng(0).uniform(-0.499, 0.499, (500, 2)) * surface.size
+    np.testing.assert_allclose(robot.ground_heights(places), surface.height(torch.from_numpy(places)), atol=1e-5)
+    assert np.ptp(robot.ground_heights(places)) > 0.5
+
+
+def test_scan_by_rays(policy, robot):
+    """Point by point, what the policy sees is what rays meet below points that move and turn with the trunk."""
+    assert policy.scan_points.shape == (187, 2)
+    columns = slice(policy.description["network"]["num_observations"] - 187, None)
+    down, only_ground = np.array([0.0, 0.0, -1.0]), np.array([1, 0, 0, 0, 0, 0], np.uint8)
+    for position, angles, heading in (([2.0, 1.7, 0.9], (0.0, 0.0, 0.8), 0.8), ([-1.2, -3.1, 0.3], (3.0, 0, 0), 0.0)):
+        robot.reset(position, quaternion(*angles), policy.nominal_pose, STILL)
+        expected = np.empty((17, 11))
+        for i in range(17):
+            for j in range(11):
+                x, y = 0.1 * i - 0.8, 0.1 * j - 0.5
+                place = [math.cos(heading) * x - math.sin(heading) * y, math.sin(heading) * x + math.cos(heading) * y]
+                start = np.array([*(np.array(position[:2]) + place), 30.0])
+                depth = mujoco.mj_ray(robot.model, robot.data, start, down, only_ground, True, -1, None)
+                expected[i, j] = 5.0 * np.clip(position[2] - 0.5 - (30.0 - depth), -1.0, 1.0)
+        state = robot.state()
+        state.heights = robot.position[2] - robot.ground_heights(policy.scan_places(robot.position, robot.quat))
+        policy.reset()
+        scan = policy.observation(state, np.zeros(3))[columns]
+        np.testing.assert_allclose(scan, expected.flatten(), atol=1e-4)
+        assert np.ptp(scan) > 0.3
+
+
+def test_heights_are_needed(policy):
+    """A policy that sees the ground is not run without it, nor with heights of other places."""
+    state = State(np.zeros(3), np.zeros(12), np.zeros(12), quaternion=np.array([1.0, 0, 0, 0]))
+    for heights in (None, np.zeros(186)):
+        with pytest.raises(ValueError, match="a state needs 187 heights above the ground, at scan_places"):
+            policy.observation(dataclasses.replace(state, heights=heights), np.zeros(3))
+
+
+def test_motion_is_the_task_s(exported, policy, robot):
+    """From the task's states, the policy acts as in the task, and the robot moves as there and lands as there."""
+    _, task, model = exported
+    simulation = Simulation(policy, robot, Events())
+    simulation.run(0, 1)
+    for world in range(task.num_envs):
+        task.reset()
+        task.base_pos[:, 0] += 1.4  # half on the first step
+        task.compute_observations()
+        q, v = task.sim.qpos[world].numpy(), task.sim.qvel[world].numpy()
+        robot.reset(q[:3], q[3:7], q[7:], (v[:3], v[3:6], v[6:]))
+        policy.reset()
+        has_landed, steps_in_air = False, 0
+        for _ in range(15):
+            obs, simulation.command = task.get_observations(), task.commands[world].numpy().copy()
+            with torch.inference_mode():
+                task.step(model(obs))
+            simulation._control_step()
+            assert not task.reset_buf.any()
+            has_landed = has_landed or robot.contact_force() > 0.0
+            steps_in_air += not has_landed
+            difference = np.abs(robot.data.qpos - task.sim.qpos[world].numpy())
+            assert difference.max() < (5e-3 if has_landed else 1e-5)
+            close = 1e-3 if has_landed else 1e-4
+            np.testing.assert_allclose(policy.last_action, task.actions[world].numpy(), atol=close)
+            assert robot.height() == pytest.approx(float(task.base_height[world]), abs=5e-3)
+        assert steps_in_air > 1 and robot.contact_force() > 50.0
+
+
+def test_level_map_is_a_plane(policy):
+    """A robot that falls onto a level map, feet sinking in deep, moves as on a plane; MuJoCo alone differs."""
+    description = copy.deepcopy(policy.description)
+    select_ground(description, A1Cfg().terrain, ["flat"], [0.0])
+    on_map, untouched = MujocoRobot(XML, description), MujocoRobot(XML, description)
+    del description["terrain"]
+    on_plane, depths = MujocoRobot(XML, description), [0.0]
+    pose = policy.nominal_pose + np.random.default_rng(0).uniform(-0.2, 0.2, 12)
+    robots = (on_map, untouched, on_plane)
+    for robot in robots:
+        robot.reset([0.013, 0.021, 0.35], quaternion(0.1, -0.1, 0.7), pose, (np.array([0.5, 0.2, -3.0]), *STILL[1:]))
+    for _ in range(60):
+        for robot in robots:
+            torques = 60.0 * (policy.nominal_pose - robot.joint_positions()) - 2.0 * robot.joint_velocities()
+            robot.data.ctrl[:] = torques
+            mujoco.mj_step(robot.model, robot.data) if robot is untouched else robot.step(torques)
+        depths += on_plane.data.contact.dist.tolist()
+    np.testing.assert_allclose(on_map.data.qpos, on_plane.data.qpos, atol=1e-9)
+    assert np.abs(untouched.data.qpos - on_plane.data.qpos).max() > 0.1
+    assert min(depths) < -0.03, "a foot of 0.02 m was below the ground"
+
+
+def test_slope_is_a_tilted_plane():
+    """A ball that slides and rolls down a slope of triangles feels none of their edges."""
+    scene = "<mujoco><option timestep='0.002'/><worldbody>{}</worldbody></mujoco>"
+    ball = '<geom type="sphere" size="0.02" mass="0.3" friction="0.3" solref="-1000 -80"/>'
+    body = f'<body pos="-0.3 -0.2 0.2"><freejoint/>{ball}</body>'
+    ground = '<geom name="floor" type="plane" size="0 0 0.05" solref="-1000 -80" zaxis="0.3 0.2 1"/>'
+    specs = [mujoco.MjSpec.from_string(scene.format(ground + body)) for _ in range(2)]
+    places = np.arange(-20, 21) * 0.05
+    add_hfield(specs[0], HeightGrid(-0.3 * places[:, None] - 0.2 * places, 0.05, (-1.0, -1.0)), "floor")
+    models = [spec.compile() for spec in specs]
+    on_map, on_plane = (mujoco.MjData(model) for model in models)
+    for _ in range(400):
+        hfield_contacts.step(models[0], on_map)
+        mujoco.mj_step(models[1], on_plane)
+    np.testing.assert_allclose(on_map.qpos[:3], on_plane.qpos[:3], atol=1e-5)
+    assert on_plane.qpos[0] > 0.2 and on_plane.ncon == 1
+
+
+# --------------------------------------------------------------------------------------------------- episodes
+
+
+def test_episodes_start_on_tiles(policy, robot):
+    """Every robot has a tile for all of its episodes, any of them; one that leaves the map has fallen."""
+    simulation, starts = Simulation(policy, robot, Events()), []
+    for seed in range(40):
+        simulation.run(0, seed)
+        starts.append(robot.position.copy())
+        simulation._new_episode()
+        np.testing.assert_array_equal(robot.position, starts[-1])
+    expected = robot.origins + np.array([0.0, 0.0, 0.4])
+    np.testing.assert_allclose(np.unique(starts, axis=0), np.unique(expected, axis=0))
+    robot.position[0] = 9.9
+    robot.step(np.zeros(12))
+    assert not robot.has_fallen()
+    robot.position[0] = 10.1
+    robot.step(np.zeros(12))
+    assert robot.has_fallen() and math.isinf(robot.height())
+
+
+def test_height_is_above_the_ground(policy, robot):
+    """The metric is the trunk's height above the ground below it, wherever that is."""
+    simulation = Simulation(policy, robot, Events())
+    for seed in range(3):
+        steps, *_, height, _, falls = simulation.run(60, seed)
+        assert (steps, falls) == (60.0, 0.0) and 0.25 < height / steps < 0.35
+    assert np.ptp(robot.origins[:, 2]) > 0.5
+
+
+# --------------------------------------------------------------------------------------------------- other grounds
+
+
+def test_chosen_kinds(policy):
+    """Tiles of other kinds at other difficulties take the place of those of the training, and of a plane."""
+    description = copy.deepcopy(policy.description)
+    for trained in (description["terrain"], None):
+        select_ground(description, A1Cfg().terrain, ["pits", "flat"], [0.6, 0.25])
+        heights = MujocoRobot(XML, description).origins[:, 2].astype(float)
+        depths, counts = np.unique(heights.round(6), return_counts=True)
+        assert depths.tolist() == [-0.6, -0.25, 0.0] and counts.tolist() == [4, 4, 8]
+        assert Layout(**description["terrain"]).tile_size == (6.0 if trained else 8.0)
+        del description["terrain"]
+
+
+def test_ground_of_the_mjcf(policy, tmp_path):
+    """A plane without a name gives way to the tiles; boxes stay, and are seen by the scan."""
+
+    def edit(root):
+        (floor,) = root.findall("worldbody/geom")
+        del floor.attrib["name"]
+
+    assert len(MujocoRobot(changed_xml(tmp_path, edit), policy.description).origins) == 6
+
+    def add_step(root):
+        edit(root)
+        box = {"type": "box", "size": "0.5 1 0.1", "pos": "1 0 0.02"}
+        root.find("worldbody").append(root.makeelement("geom", box))
+
+    robot = MujocoRobot(changed_xml(tmp_path, add_step), policy.description)
+    assert robot.notes[0].startswith("the MJCF has ground of its own, on which the robot starts at the origin")
+    robot.reset([0.0, 0.0, 0.4], quaternion(0, 0, 0), policy.nominal_pose, STILL)
+    np.testing.assert_allclose(robot.ground_heights(np.array([[0.49, 0.0], [0.51, 0.9], [1.0, 1.1]])), [0.0, 0.12, 0.0])
+    assert robot.origins.tolist() == [[0.0, 0.0, 0.0]]
+
+
+# --------------------------------------------------------------------------------------------------- mistakes
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("observations.terms.6.scan", None, "the term 'height_scan' must have an entry scan, and no other term"),
+        ("observations.terms.6.name", "command", "the term 'command' occurs more than once"),
+        ("observations.terms.6.scan.points_x", [0.0, 0.1], "the term 'height_scan' must have size 22, not 187"),
+        ("observations.terms.6.scan.limit", 0.0, "observations.terms.6.scan.limit"),
+        ("terrain.difficulty_range", [0.0, 1.5], "terrain.difficulty_range.1"),
+        ("terrain.rows", 3, "'rows' was unexpected"),
+    ],
+)
+def test_damaged_descriptions(policy, path, value, message):
+    """What does not fit is told in one line that names the entry."""
+    damaged = copy.deepcopy(policy.description)
+    change(path, value)(damaged)
+    assert message in error_of(check, damaged)
+
+
+def test_impossible_ground(policy):
+    """Maps that cannot be are told when they are made."""
+    for path, value, message in (
+        ("terrain.terrain_proportions.pits", 0.5, "terrain.terrain_proportions must sum to 1, not 1.5"),
+        ("terrain.terrain_proportions.lava", 0.0, "unknown kind in terrain.terrain_proportions 'lava'"),
+    ):
+        description = copy.deepcopy(policy.description)
+        change(path, value)(description)
+        assert message in error_of(MujocoRobot, XML, description)
+
+
+def test_script(exported, tmp_path):
+    """``sim2sim.py`` takes kinds and a difficulty, and tells mistakes in one line."""
+    words = [str(exported[0]), "--robots=1", "--steps=3"]
+    status, output, error = run_here("sim2sim.py", *words, "--terrain", "pits", "--level=0.5", root=tmp_path)
+    assert (status, error) == (0, "") and "note" not in output and "height" in output
+    result = run_here("sim2sim.py", *words, "--terrain", "stair_up", root=tmp_path)
+    assert_told_in_one_line(result, "unknown kind of terrain 'stair_up'; did you mean 'stairs_up'?")
+    result = run_here("sim2sim.py", *words, "--terrain", "pits", "--level", "0.5", "1.5", root=tmp_path)
+    assert_told_in_one_line(result, "a level must be from 0 to 1, not 1.5")
+    assert_told_in_one_line(run_here("sim2sim.py", *words, "--level=0.5", root=tmp_path), "--level needs --terrain")
