@@ -5,7 +5,7 @@ import warp as wp
 from legged_torque.sim.fused.contact import Contact, contact_normal, half_size, make_contact
 from legged_torque.sim.fused.math import quat_to_matrix
 from legged_torque.sim.fused.smooth import Poses
-from legged_torque.sim.fused.surface import Surface, make_surface, touch_map
+from legged_torque.sim.fused.surface import Surface, is_clear, make_surface, touch_map
 from legged_torque.sim.fused.tables import Tables, of_world
 from legged_torque.sim.fused.types import vec4
 from legged_torque.sim.height_map import HeightMap
@@ -71,20 +71,33 @@ def find_map_contacts(
     hold a box that is more than half in it.
     """
     surface = contacts.ground.surface
+    points = tables.point_count[b]
     count = int(0)
     point = int(0)
-    while point < tables.point_count[b]:  # geom by geom
-        geom = tables.point_geom[b, point]
-        depth = tables.point_depth[b, point]
-        half = half_size(tables, world, geom)
-        radius = tables.point_radius[b, point] * of_world(tables.geom_size, world, geom)[0]
-        middle = poses[depth].pos + poses[depth].rot * of_world(tables.geom_pos, world, geom)
-        end = tables.point_next[b, point]
-        if origin[2] + middle[2] > surface.top + wp.length(half) + radius:
-            point = end  # the geom is above all of the map
-        turn = poses[depth].rot * quat_to_matrix(of_world(tables.geom_quat, world, geom))
-        while point < end:
-            centre = middle + turn * wp.cw_mul(tables.point_offset[b, point], half)
+    geom = int(-1)
+    depth = int(0)
+    radius = float(0.0)
+    half = wp.vec3()
+    middle = wp.vec3()
+    centre = wp.vec3()
+    turn = wp.mat33()
+    while point < points:
+        is_near = bool(False)
+        while point < points and not is_near:  # all threads find a point before they look at the ground together
+            if tables.point_geom[b, point] != geom:
+                geom = tables.point_geom[b, point]
+                depth = tables.point_depth[b, point]
+                half = half_size(tables, world, geom)
+                radius = tables.point_radius[b, point] * of_world(tables.geom_size, world, geom)[0]
+                middle = poses[depth].pos + poses[depth].rot * of_world(tables.geom_pos, world, geom)
+                turn = poses[depth].rot * quat_to_matrix(of_world(tables.geom_quat, world, geom))
+            if origin[2] + middle[2] > surface.top + wp.length(half) + radius:
+                point = tables.point_next[b, point]  # the geom is above all of the map
+            else:
+                centre = middle + turn * wp.cw_mul(tables.point_offset[b, point], half)
+                is_near = not is_clear(surface, origin + centre, radius)
+                point += 1
+        if is_near:
             touch = touch_map(surface, origin + centre, radius)
             for i in range(touch.count):
                 normal = wp.where(i == 0, touch.first, touch.second)
@@ -94,5 +107,4 @@ def find_map_contacts(
                     tables, world, geom, depth, poses[depth], turn, centre, radius, dist, normal
                 )
                 count += 1
-            point += 1
     return count
