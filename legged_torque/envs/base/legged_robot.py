@@ -158,7 +158,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.health.begin()
 
     def _add_up(self) -> None:
-        """End broken worlds without a reward, now that they are known, and add to sums; torch's operations only."""
+        """End broken worlds without a reward, now that they are known, add to sums and set levels; torch only."""
         diverged = self.sim.diverged
         self.health.end()
         self.num_diverged.add_(diverged.sum())
@@ -169,6 +169,8 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.episode_return.add_(self.rew_buf)
         self.log.add_step(self)
         self.update_feet_air_time()
+        seconds, steps = self.cfg.env.episode_length_s, self._episode_length_buf
+        self.terrain.end_episodes(self.reset_buf, steps, self.base_pos, self.commands, seconds)
 
     def _update_state(self) -> None:
         """Compute what follows from the simulator's state."""
@@ -211,17 +213,15 @@ class LeggedRobot(RewardTerms, BaseTask):
 
     def _reset_worlds(self) -> None:
         """Put the worlds of ``reset_buf`` where an episode starts; elsewhere draw anew what is due, and push."""
-        seconds, steps = self.cfg.env.episode_length_s, self._episode_length_buf
-        self.terrain.end_episodes(self.reset_buf, steps, self.base_pos, self.commands, seconds)
         self.events.happen(self.reset_buf)
-        self.terrain.move_to_origin(self.reset_buf, self.base_pos)
 
     def compute_observations(self) -> None:
         """Write the observations of this moment."""
         self.observations.compute(self.reset_buf)
 
     def _finish_step(self) -> None:
-        """Forget the episodes that have ended, and look at the state in which all worlds are now."""
+        """Move new episodes to their tiles, forget those that have ended, and look at the state of all worlds."""
+        self.terrain.move_to_origin(self.reset_buf, self.base_pos)
         per_world = (self.actions.T, self.feet_air_time.T, self.episode_sums, self.episode_return)
         for buffer in (*per_world, self._episode_length_buf):
             buffer.masked_fill_(self.reset_buf, 0)

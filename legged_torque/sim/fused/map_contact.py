@@ -5,7 +5,7 @@ import warp as wp
 from legged_torque.sim.fused.contact import Contact, contact_normal, half_size, make_contact
 from legged_torque.sim.fused.math import quat_to_matrix
 from legged_torque.sim.fused.smooth import Poses
-from legged_torque.sim.fused.surface import Surface, make_surface, touch_map
+from legged_torque.sim.fused.surface import Surface, is_clear, make_surface, touch_map
 from legged_torque.sim.fused.tables import Tables, of_world
 from legged_torque.sim.fused.types import vec4
 from legged_torque.sim.height_map import HeightMap
@@ -61,6 +61,34 @@ def contact_normal(contacts: MapContacts, k: int) -> wp.vec3:  # type: ignore[no
     return contacts.ground.normals[k]
 
 
+@wp.struct
+class Point:
+    """A point of a branch that may touch the ground."""
+
+    geom: wp.int32
+    depth: wp.int32  # of its body
+    middle: wp.vec3  # of the geom, from the trunk's origin, in world axes [m]
+    turn: wp.mat33  # from the geom's axes to the world's
+    half: wp.vec3  # see half_size
+    centre: wp.vec3  # where the point is, as the middle
+    radius: wp.float32  # how thick the geom is around it [m]
+    is_near: wp.bool  # whether the ground may be so near
+
+
+@wp.func
+def see_geom(tables: Tables, world: int, b: int, index: int, poses: Poses) -> Point:
+    """Return a point of a branch with all that it shares with the others of its geom."""
+    out = Point()
+    out.geom = tables.point_geom[b, index]
+    out.depth = tables.point_depth[b, index]
+    out.half = half_size(tables, world, out.geom)
+    out.radius = tables.point_radius[b, index] * of_world(tables.geom_size, world, out.geom)[0]
+    pose = poses[out.depth]
+    out.middle = pose.pos + pose.rot * of_world(tables.geom_pos, world, out.geom)
+    out.turn = pose.rot * quat_to_matrix(of_world(tables.geom_quat, world, out.geom))
+    return out
+
+
 @wp.func
 def find_map_contacts(
     tables: Tables, world: int, b: int, origin: wp.vec3, poses: Poses, contacts: MapContacts, first: int
@@ -68,31 +96,42 @@ def find_map_contacts(
     """Write the contacts of a branch with the height map from index ``first`` on and return how many there are.
 
     Of a box all corners touch: without those above its centre, which MuJoCo leaves out on a plane, rough ground would
-    hold a box that is more than half in it.
+    hold a box that is more than half in it. The inner loop lets all threads of a group find a point before they look
+    at the ground together, which takes much longer.
     """
     surface = contacts.ground.surface
     count = int(0)
-    point = int(0)
-    while point < tables.point_count[b]:  # geom by geom
-        geom = tables.point_geom[b, point]
-        depth = tables.point_depth[b, point]
-        half = half_size(tables, world, geom)
-        radius = tables.point_radius[b, point] * of_world(tables.geom_size, world, geom)[0]
-        middle = poses[depth].pos + poses[depth].rot * of_world(tables.geom_pos, world, geom)
-        end = tables.point_next[b, point]
-        if origin[2] + middle[2] > surface.top + wp.length(half) + radius:
-            point = end  # the geom is above all of the map
-        turn = poses[depth].rot * quat_to_matrix(of_world(tables.geom_quat, world, geom))
-        while point < end:
-            centre = middle + turn * wp.cw_mul(tables.point_offset[b, point], half)
-            touch = touch_map(surface, origin + centre, radius)
+    index = int(0)
+    point = Point()
+    point.geom = -1
+    while index < tables.point_count[b]:
+        point.is_near = False
+        while index < tables.point_count[b] and not point.is_near:
+            if tables.point_geom[b, index] != point.geom:
+                point = see_geom(tables, world, b, index, poses)
+            if origin[2] + point.middle[2] > surface.top + wp.length(point.half) + point.radius:
+                index = tables.point_next[b, index]  # the geom is above all of the map
+            else:
+                point.centre = point.middle + point.turn * wp.cw_mul(tables.point_offset[b, index], point.half)
+                point.is_near = not is_clear(surface, origin + point.centre, point.radius)
+                index += 1
+        if point.is_near:
+            touch = touch_map(surface, origin + point.centre, point.radius)
             for i in range(touch.count):
                 normal = wp.where(i == 0, touch.first, touch.second)
                 dist = wp.where(i == 0, touch.dist[0], touch.dist[1])
                 contacts.ground.normals[first + count] = normal
                 contacts.found[first + count] = make_contact(
-                    tables, world, geom, depth, poses[depth], turn, centre, radius, dist, normal
+                    tables,
+                    world,
+                    point.geom,
+                    point.depth,
+                    poses[point.depth],
+                    point.turn,
+                    point.centre,
+                    point.radius,
+                    dist,
+                    normal,
                 )
                 count += 1
-            point += 1
     return count

@@ -262,8 +262,6 @@ def touch_map(surface: Surface, centre: wp.vec3, radius: float) -> Touch:
     triangles of one plane are never felt. Of a sphere whose centre is below the surface it is the shortest way out.
     """
     out = Touch()
-    if is_clear(surface, centre, radius):
-        return out
     under = triangle_under(surface, centre)
     above = under.dist / under.normal[2]
     reach = wp.max(radius, wp.min(-above, MAX_REACH))
