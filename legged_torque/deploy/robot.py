@@ -23,6 +23,7 @@ class MujocoRobot:
     """One robot in MuJoCo; vectors of joints are in the policy's order, not the file's.
 
     Attributes:
+        file: The MJCF.
         model: The compiled MJCF, with the policy's time step.
         data: Its state.
         notes: Differences of the MJCF from ``policy.yaml``, a line each.
@@ -41,7 +42,8 @@ class MujocoRobot:
         A UserError if the file cannot be read, or lacks a joint or a motor that the policy needs.
         """
         self.notes: list[str] = []
-        self.model, self.origins = self._load(Path(xml), description)
+        self.file = Path(xml)
+        self.model, self.origins = self._load(self.file, description)
         self.data = mujoco.MjData(self.model)
         old, step = self.model.opt.timestep, 1.0 / description["timing"]["physics_frequency"]
         if not np.isclose(old, step, rtol=1e-6):

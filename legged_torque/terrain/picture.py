@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legged_torque.terrain.colors import color_of
 from legged_torque.terrain.tiles import TILES, Grid
 from legged_torque.utils.plotting import load_pyplot, save_figure
 
@@ -26,9 +27,9 @@ def draw_tiles(file: Path, difficulty: float, seed: int) -> None:
         axis.set_axis_off()
     for axis, (name, function) in zip(axes.flat, TILES.items(), strict=False):
         heights = function(difficulty, np.random.default_rng(seed), grid)
-        colors = pyplot.get_cmap("viridis")(0.5 + 0.27 * heights)
         quads, light = _project(heights, grid)
-        faces = (colors[:-1, :-1, :3].reshape(-1, 3)[::-1] * light[:, None]).clip(0.0, 1.0)
+        depth = 1.0 + 0.2 * heights[:-1, :-1].clip(max=0.0).reshape(-1, 1)[::-1]  # what is deep is darker
+        faces = (np.array(color_of(name)) / 255.0 * depth * light[:, None]).clip(0.0, 1.0)
         ahead, across = (quads[:, corner + 2] - quads[:, corner] for corner in (0, 1))
         is_seen = ahead[:, 0] * across[:, 1] > ahead[:, 1] * across[:, 0]  # not those that face away
         axis.add_collection(PolyCollection(list(quads[is_seen]), facecolors=faces[is_seen], antialiased=False))

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from legged_torque.sim.model import FLOOR
 from legged_torque.terrain.colors import NEUTRAL, color_of
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.layout import Layout
@@ -85,7 +84,7 @@ class Ground:
         return float((target[2] + (ground - target[2]) / share).max()) + CLEARANCE
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
-        """Draw this surface in place of the floor of a robot, which will collide with nothing."""
+        """Draw this surface in place of a robot's plane, if it has one; it collides with nothing."""
         picture = self.picture()
         height, width, _ = picture.shape
         texture = spec.add_texture(name="ground", type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)
@@ -101,7 +100,8 @@ class Ground:
         mesh.usertexcoord = self.uv[[p0, p1, p2, p3]].transpose(1, 0, 2).ravel()
         starts = 4 * np.arange(len(p0), dtype=np.int32)[:, None]
         mesh.userface = (starts + np.array([0, 1, 2, 0, 2, 3], np.int32)).ravel()
-        floor = next(geom for geom in spec.worldbody.geoms if geom.name == FLOOR)
+        planes = [geom for geom in spec.worldbody.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
+        floor = planes[0] if planes else spec.worldbody.add_geom()
         floor.type, floor.meshname, floor.material = mujoco.mjtGeom.mjGEOM_MESH, "ground", "ground"
         floor.pos, floor.quat, floor.contype, floor.conaffinity = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], 0, 0
 

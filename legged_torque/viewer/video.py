@@ -13,6 +13,8 @@ import numpy as np
 
 from legged_torque import resource_path
 from legged_torque.deploy.simulation import Simulation
+from legged_torque.terrain.height_grid import HeightGrid
+from legged_torque.terrain.layout import Layout
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.rendering import INSTALL_HINT
 from legged_torque.viewer.ground import Ground, Smooth, drawn_model, ground_of
@@ -63,8 +65,13 @@ class SimulationRecorder(VideoRecorder):
 
     def __init__(self, simulation: Simulation) -> None:
         """Prepare to record a simulation."""
-        robot, timing = simulation.robot, simulation.policy.description["timing"]
-        super().__init__(robot.model, robot.trunk, 1.0 / timing["control_frequency"])
+        robot, description = simulation.robot, simulation.policy.description
+        ground, model = None, robot.model
+        if "terrain" in description and model.nhfield:
+            layout = Layout(**description["terrain"])
+            ground = Ground(layout, HeightGrid(layout.heights(), layout.horizontal_scale, layout.corner))
+            model = drawn_model(robot.file, ground)
+        super().__init__(model, robot.trunk, 1.0 / description["timing"]["control_frequency"], ground)
         self._simulation = simulation
 
     def add_step(self) -> None:
