@@ -143,7 +143,7 @@ def style(tasks: Sequence[str], task: str) -> Style:
     color, line, hatch = STYLES[plain] if plain in STYLES else OTHER_STYLES[others.index(plain) % len(OTHER_STYLES)]
     if task == plain:
         return color, line, hatch
-    return (color, "--", 2 * hatch) if task.endswith("_scan") else (color, "-", hatch)
+    return (color, "--", 2 * hatch or "oo") if task.endswith("_scan") else (color, "-", hatch)
 
 
 def draw_single_curves(runs: list[LearningCurve]) -> Figure:
