@@ -146,9 +146,11 @@ def test_page(session, page, browser, tmp_path):
     assert not complaints
 
 
-@pytest.mark.parametrize("session", [["discrete_obstacles", "stairs_up"]], indirect=True)
+@pytest.mark.parametrize("session", [["discrete_obstacles", "waves"]], indirect=True)
 def test_rough_ground(session, page, browser, tmp_path):
     """The ground is drawn in the color of its kind, with the points of the scan; a level chosen on the page counts."""
+    session.set_command((0.0, 0.0, 0.0))
+    session.reset()
     browser.get(page.url)
     wait_for(lambda: browser.find_elements(By.TAG_NAME, "canvas"))
 
