@@ -112,11 +112,9 @@ def test_a_plane_per_foot():
     state["qpos"][:, 7:] += rng.normal(0.0, 0.05, (20, 12))
     put_on_floor(tilted, state, rng.uniform(-1e-3, 5e-3, 20))
     states = {name: torch.tensor(values) for name, values in state.items()}
-    (expected, _), (found, comparable) = (
-        reference_step(tilted, states),
-        reference_step(planes.model, states, planes.pose),
-    )
-    assert comparable.all() and np.abs(expected[:, 2]).max() > 0.05
+    expected, _ = reference_step(tilted, states)
+    found, comparable = reference_step(planes.model, states, planes.pose)
+    assert comparable.all() and (expected[:, 2] > -0.9 * 9.81 * tilted.opt.timestep).mean() > 0.5  # the ground holds
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
     states["qpos"][:, 2] -= 0.2  # until trunks are in the ground
     assert not reference_step(planes.model, states, planes.pose)[1].any()

@@ -144,15 +144,17 @@ def test_what_is_done_is_not_done_again(finished, tmp_path):
     assert " of CPU time for training; 640 steps of training, " in spent
 
 
-@pytest.mark.parametrize("name", ["paper", "hard", "low", "smoke"])
+@pytest.mark.parametrize("name", ["paper", "hard", "low", "smoke", "rough"])
 def test_dry_run(name, tmp_path):
     """The experiments of this repository are valid; ``--dry-run`` lists their cells and touches nothing."""
     out = tmp_path / "out"
     file = ROOT / "experiments" / f"{name}.yaml"
     status, output, error = experiment_here(file, f"--out={out}", "--dry-run", "--device=cpu", tmp_path=tmp_path)
     assert (status, error) == (0, "") and not out.exists()
-    assert len(output.splitlines()) == {"paper": 84, "hard": 28, "low": 12, "smoke": 2}[name]
-    assert output.splitlines()[0].startswith("a1_position-low-s1: train, evaluate in low")
+    assert len(output.splitlines()) == {"paper": 84, "hard": 28, "low": 12, "smoke": 2, "rough": 16}[name]
+    first = "a1_rough_position" if name == "rough" else "a1_position"
+    assert output.splitlines()[0].startswith(f"{first}-low-s1: train, evaluate in low")
+    assert output.count(", rough ground\n") == (16 if name == "rough" else 0)
     assert ("a1_multihead-high_frequency-s4: train, evaluate in high_frequency, doubled" in output) == (name == "paper")
 
 

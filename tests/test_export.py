@@ -241,6 +241,7 @@ DAMAGE = [
     ("actions.terms.1.name", "position_residual", "the term 'position_residual' occurs more than once"),
     ("actions.clip", [1.0, -1.0], "actions.clip must be [lowest, highest]"),
     ("timing.decimation", 0, "timing.decimation"),
+    ("timing.decimation", 4.0, "timing.decimation: 4.0 is not of type 'integer'"),
     ("timing.decimation", 5, "timing.physics_frequency is not control_frequency times decimation"),
     ("timing.refresh_torques", "often", "timing.refresh_torques"),
     ("commands.resampling_probability", 1.5, "commands.resampling_probability"),

@@ -10,7 +10,7 @@ LEVELS = [
     ("utils",),
     ("sim", "terrain", "motors"),
     ("envs.base",),
-    ("envs.robots", "envs.approaches"),
+    ("envs.robots", "envs.approaches", "envs.grounds"),
     ("envs",),
     ("learning",),
     ("control", "deploy"),

@@ -140,6 +140,17 @@ def test_tracking_percentage_by_hand(task):
     assert math.isnan(metrics.means()["track_percentage"]) and metrics.means()["track_xy"] > 1.0
 
 
+def test_tracking_of_headings_by_hand(make_task):
+    """A yaw rate that turns to a heading does not count for the percentage, but for its own error."""
+    task = make_task("a1_position", num_envs=2, **{"commands.heading_command": True})
+    metrics = WalkingMetrics(task)
+    commands = [[0.5, 0.0, 0.001], [1.0, 0.5, 0.0]]
+    add(task, metrics, commands=commands, lin_vel=[[0.4, 0.3, 0.0], [0.5, 0.5, 0.0]], ang_vel=[[0.0, 0.0, 0.3]] * 2)
+    numerator, counted = metrics.ratios()["track_percentage"]
+    assert counted.tolist() == [1.0, 1.0] and numerator.tolist() == pytest.approx([0.8, (0.5 + 1.0) / 2])
+    assert metrics.means()["track_angular"] == pytest.approx((0.299**2 + 0.3**2) / 2)
+
+
 def test_falls_by_hand(task):
     """Two falls in 47 steps of 0.02 s that were no resets; a time-out is no fall, and resets spoil nothing else."""
     metrics = WalkingMetrics(task)

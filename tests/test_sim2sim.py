@@ -250,7 +250,8 @@ def test_recorder(policy, monkeypatch):
 
     simulation.run(3, 1, on_step)
     recorder.save(Path("out.mp4"), None)
-    ((file, model, trunk, steps, control_step, _),) = saved
+    ((file, model, trunk, steps, control_step, ground),) = saved
+    assert ground is None, "a plane"
     assert (file, model, control_step) == (Path("out.mp4"), robot.model, 0.02) and model.body(trunk).name == "trunk"
     assert [(m.qpos.tolist(), m.command.tolist(), m.velocity.tolist()) for (m,) in steps] == seen
 

@@ -32,6 +32,7 @@ from legged_torque.terrain.layout import Layout
 from legged_torque.utils.config import to_dict
 
 ROUGH = flatten({"terrain": to_dict(ground_cfg().terrain)}) | {"terrain.measure_heights": True}
+ROUGH |= {"terrain.measure_delay": 2, "commands.heading_command": True, "domain_rand.init_place": [-0.2, 0.3]}
 CALM = {"asset.terminate_after_contacts_on": [], "sim.solver_iterations": 100, "sim.ls_iterations": 50}
 STILL = (np.zeros(3), np.zeros(3), np.zeros(12))
 
@@ -116,13 +117,19 @@ def test_motion_is_the_task_s(exported, policy, robot):
     for world in range(task.num_envs):
         task.reset()
         task.base_pos[:, 0] += 1.4  # half on the first step
+        task.reset_buf.fill_(True)  # scans start anew, too
         task.compute_observations()
         q, v = task.sim.qpos[world].numpy(), task.sim.qvel[world].numpy()
         robot.reset(q[:3], q[3:7], q[7:], (v[:3], v[3:6], v[6:]))
         policy.reset()
+        simulation._heights.clear()
         has_landed, steps_in_air = False, 0
         for _ in range(15):
-            obs, simulation.command = task.get_observations(), task.commands[world].numpy().copy()
+            obs, command = task.get_observations(), task.commands[world].numpy().copy()
+            simulation._heading = float(task.command_generator.headings[world])
+            simulation.command[:2] = command[:2]
+            simulation._follow_heading()
+            np.testing.assert_allclose(simulation.command, command, atol=1e-3)
             with torch.inference_mode():
                 task.step(model(obs))
             simulation._control_step()
@@ -182,20 +189,39 @@ def test_slope_is_a_tilted_plane():
 
 def test_episodes_start_on_tiles(policy, robot):
     """Every robot has a tile for all of its episodes, any of them; one that leaves the map has fallen."""
-    simulation, starts = Simulation(policy, robot, Events()), []
+    simulation, tiles, places = Simulation(policy, robot, Events()), [], []
     for seed in range(40):
         simulation.run(0, seed)
-        starts.append(robot.position.copy())
-        simulation._new_episode()
-        np.testing.assert_array_equal(robot.position, starts[-1])
-    expected = robot.origins + np.array([0.0, 0.0, 0.4])
-    np.testing.assert_allclose(np.unique(starts, axis=0), np.unique(expected, axis=0))
+        for _ in range(2):
+            offsets = robot.position - robot.origins - [0.0, 0.0, 0.4]
+            tiles.append(int(np.abs(offsets).sum(axis=1).argmin()))
+            places.append(offsets[tiles[-1]])
+            simulation._new_episode()
+        assert tiles[-1] == tiles[-2]
+    lowest, highest = np.min(places, axis=0), np.max(places, axis=0)
+    assert set(tiles) == set(range(6)) and not lowest[2] and not highest[2]
+    assert (lowest[:2] > -0.2).all() and (lowest[:2] < -0.17).all()
+    assert (highest[:2] < 0.3).all() and (highest[:2] > 0.27).all()
     robot.position[0] = 9.9
     robot.step(np.zeros(12))
     assert not robot.has_fallen()
     robot.position[0] = 10.1
     robot.step(np.zeros(12))
     assert robot.has_fallen() and math.isinf(robot.height())
+
+
+def test_headings(policy, robot):
+    """Yaw rates turn to a heading the shorter way, half of what is left per second, within their range."""
+    simulation = Simulation(policy, robot, Events())
+    simulation.run(0, 1)
+    for heading, angle, rate in ((3.0, -3.0, -0.5 * (2 * math.pi - 6.0)), (1.0, 0.2, 0.4), (0.0, 3.0, -1.0)):
+        robot.reset(np.zeros(3), quaternion(0.1, 0.0, angle), policy.nominal_pose, STILL)
+        simulation._heading = heading
+        simulation._follow_heading()
+        assert simulation.command[2] == pytest.approx(rate, abs=0.02)
+    fixed = Simulation(policy, robot, Events(command=(0.5, 0.0, -0.2)))
+    fixed.run(2, 1)
+    assert fixed.command.tolist() == [0.5, 0.0, -0.2]
 
 
 def test_height_is_above_the_ground(policy, robot):
@@ -223,7 +249,7 @@ def test_chosen_kinds(policy):
 
 
 def test_ground_of_the_mjcf(policy, tmp_path):
-    """A plane without a name gives way to the tiles; boxes stay, and are seen by the scan."""
+    """A plane without a name gives way to the tiles; boxes stay, and are seen by the scan, on a plane without end."""
 
     def edit(root):
         (floor,) = root.findall("worldbody/geom")
@@ -233,13 +259,15 @@ def test_ground_of_the_mjcf(policy, tmp_path):
 
     def add_step(root):
         edit(root)
+        root.find("worldbody/geom").set("size", "2 2 0.05")
         box = {"type": "box", "size": "0.5 1 0.1", "pos": "1 0 0.02"}
         root.find("worldbody").append(root.makeelement("geom", box))
 
     robot = MujocoRobot(changed_xml(tmp_path, add_step), policy.description)
     assert robot.notes[0].startswith("the MJCF has ground of its own, on which the robot starts at the origin")
     robot.reset([0.0, 0.0, 0.4], quaternion(0, 0, 0), policy.nominal_pose, STILL)
-    np.testing.assert_allclose(robot.ground_heights(np.array([[0.49, 0.0], [0.51, 0.9], [1.0, 1.1]])), [0.0, 0.12, 0.0])
+    places = np.array([[0.49, 0.0], [0.51, 0.9], [1.0, 1.1], [9.0, 9.0]])
+    np.testing.assert_allclose(robot.ground_heights(places), [0.0, 0.12, 0.0, 0.0], atol=1e-12)
     assert robot.origins.tolist() == [[0.0, 0.0, 0.0]]
 
 
@@ -255,6 +283,7 @@ def test_ground_of_the_mjcf(policy, tmp_path):
         ("observations.terms.6.scan.limit", 0.0, "observations.terms.6.scan.limit"),
         ("terrain.difficulty_range", [0.0, 1.5], "terrain.difficulty_range.1"),
         ("terrain.rows", 3, "'rows' was unexpected"),
+        ("terrain.tile_size", 1.0, "terrain.tile_size: 1.0 is less than the minimum of 6"),
     ],
 )
 def test_damaged_descriptions(policy, path, value, message):

@@ -88,7 +88,7 @@ def parameters(task: LeggedRobot, fixed: LeggedRobot) -> list[Panel]:
     """Return the panels of initial state, robot, ground and controller; ``fixed`` has no random parameters."""
     panels = [action_delay(task)]
     for drawn in domain_rand.initial_state(task):
-        if drawn.name not in ("base_pos", "action_delay"):  # never random, and a whole number
+        if drawn.name not in ("base_height", "action_delay"):  # never random, and a whole number
             panels.append(panel_of(drawn, "initial state", per_column(drawn.base or 0.0, len(drawn.columns))))
     readers = (domain_rand.robot_parameters, domain_rand.ground_parameters, domain_rand.control_parameters)
     group_of = {drawn.name: group for group, read in zip(GROUPS[1:], readers, strict=False) for drawn in read(task)}

@@ -28,7 +28,8 @@ COMMENTS = {
     "nominal_trunk_height": "[m] above the ground",
     "observations": "terms in order, each clip(scale * value); with history_length > 1 the newest step comes first,\n"
     "and an episode starts with copies of its first step; scan: height of the trunk's origin above the ground at each\n"
-    "y of points_y for each x of points_x [m], level, along the heading; less offset, then clipped to +-limit",
+    "y of points_y for each x of points_x [m], level, along the heading; less offset, then clipped to +-limit;\n"
+    "delay: how many control steps old they are, but not older than the episode",
     "actions": "terms in order; actions are clipped first. Torque: the sum over terms of mixing_weight times\n"
     "position_residual: stiffness * (nominal_pose + scale * action - q) - damping * qd\n"
     "torque: scale * action\n"
@@ -38,8 +39,10 @@ COMMENTS = {
     "torque_limits": "[N m]",
     "timing": "[Hz]; actions hold for decimation physics steps; refresh_torques: torques are computed anew from q and\n"
     "qd at every physics step, otherwise once per control step",
-    "commands": "[m/s, m/s, rad/s] in the trunk's frame, as trained; resampling_probability per control step",
+    "commands": "[m/s, m/s, rad/s] in the trunk's frame, as trained; resampling_probability per control step; with a\n"
+    "heading [rad], yaw rates are heading_gain [1/s] times what is left to it, inside of ang_vel_yaw",
     "initial_state": "of an episode in training, drawn uniformly: [m], [rad], [m/s], [rad/s];\n"
+    "trunk_place is added to x and y of trunk_position;\n"
     "joint positions are nominal_pose times joint_position_scale, then inside the joint limits",
     "episode": "length [s]; parts of names of geoms whose contact with the ground ends an episode",
     "terrain": "ground of the training, from which its map follows",
@@ -122,7 +125,10 @@ def _check_schema(description: Any, where: str) -> None:
         import jsonschema
     except ImportError:
         raise missing_extra("jsonschema") from None
-    error = jsonschema.exceptions.best_match(jsonschema.Draft202012Validator(_schema()).iter_errors(description))
+    draft = jsonschema.Draft202012Validator  # for which 4.0 is an integer, but it cannot count anything here
+    types = draft.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
+    validator = jsonschema.validators.extend(draft, type_checker=types)(_schema())
+    error = jsonschema.exceptions.best_match(validator.iter_errors(description))
     if error is not None:
         path = ".".join(str(key) for key in error.absolute_path) or "the file"
         message = " ".join(error.message.split())

@@ -30,6 +30,7 @@ from legged_torque.deploy.description import (
     to_yaml,
 )
 from legged_torque.deploy.policy import Policy, State
+from legged_torque.envs.base.commands import HEADING_GAIN
 from legged_torque.envs.base.height_scan import CLIP, OFFSET
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.terrain.layout import Layout
@@ -39,6 +40,7 @@ from legged_torque.utils.runs import package_versions
 TORCHSCRIPT_FILE = "policy.pt"
 NUM_SAMPLES = 256  # random observations on which the exported networks are compared
 INITIAL_STATE = {
+    "trunk_place": "init_place",
     **{angle: f"init_{angle}" for angle in ("roll", "pitch", "yaw")},
     "joint_position_scale": "init_dof_pos_scale",
     "trunk_linear_velocity": "init_lin_vel",
@@ -165,7 +167,8 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
             "refresh_torques": cfg.control.refresh_torques,
         },
         "commands": {name: list(getattr(ranges, name)) for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")}
-        | {"resampling_probability": cfg.commands.resampling_probability},
+        | {"resampling_probability": cfg.commands.resampling_probability}
+        | ({"heading": list(ranges.heading), "heading_gain": HEADING_GAIN} if cfg.commands.heading_command else {}),
         "initial_state": {"trunk_position": list(cfg.init_state.pos)}
         | {name: list(getattr(cfg.domain_rand, setting)) for name, setting in INITIAL_STATE.items()},
         "episode": {"length": cfg.env.episode_length_s, "ends_on_contact_of": list(asset.terminate_after_contacts_on)},
@@ -177,7 +180,7 @@ def _observation_terms(task: LeggedRobot) -> list[dict[str, Any]]:
     """Return the terms of the policy's observations in their order."""
     clip, sizes = float(task.cfg.normalization.clip_observations), task.observations.sizes
     points = {f"points_{axis}": list(getattr(task.cfg.terrain, f"measured_points_{axis}")) for axis in "xy"}
-    scan = points | {"offset": OFFSET, "limit": CLIP}
+    scan = points | {"offset": OFFSET, "limit": CLIP, "delay": task.cfg.terrain.measure_delay}
     return [
         {
             "name": term.name,

@@ -74,4 +74,6 @@ def _depth(model: mujoco.MjModel, data: mujoco.MjData, geom: int, point: np.ndar
         return mujoco.mj_rayHfield(model, data, geom, point, down)
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         return mujoco.mj_rayMesh(model, data, geom, point, down)
-    return mujoco.mju_rayGeom(data.geom_xpos[geom], data.geom_xmat[geom], model.geom_size[geom], point, down, kind)
+    drawn_only = kind == mujoco.mjtGeom.mjGEOM_PLANE  # robots stand on a plane beyond its size, too
+    size = np.zeros(3) if drawn_only else model.geom_size[geom]
+    return mujoco.mju_rayGeom(data.geom_xpos[geom], data.geom_xmat[geom], size, point, down, kind)

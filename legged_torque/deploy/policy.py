@@ -45,8 +45,9 @@ class Policy:
         joint_order: Names of the joints, in the order of all vectors of joints.
         nominal_pose: Shape: (joints,) [rad].
         torque_limits: Lowest and highest torques. Shape: (2, joints) [N m].
+        scan: Entry ``scan`` of the observations; None if the policy does not see the ground.
         scan_points: Where the height scan measures: x along the trunk's heading and y to its left, from the trunk's
-            origin; none if the policy does not see the ground. Shape: (points, 2) [m].
+            origin. Shape: (points, 2) [m].
         last_action: Actions that acted in the last step, clipped; 0 after a reset. Shape: (actions,).
         session: The network in onnxruntime.
     """
@@ -77,7 +78,7 @@ class Policy:
         self._scale = np.concatenate([np.full(term["size"], term["scale"], dtype) for term in terms])
         self._clip: np.ndarray = np.repeat(np.array([term["clip"] for term in terms], dtype), sizes, axis=0).T
         scans = [term["scan"] for term in terms if "scan" in term]
-        self._scan: dict[str, Any] | None = scans[0] if scans else None
+        self.scan: dict[str, Any] | None = scans[0] if scans else None
         points = [(x, y) for scan in scans for x in scan["points_x"] for y in scan["points_y"]]
         self.scan_points = np.array(points, float).reshape(-1, 2)
         self.session = load_network(network, self.description)
@@ -156,12 +157,12 @@ class Policy:
 
     def _height_scan(self, heights: np.ndarray | None) -> np.ndarray:
         """Return the height scan for heights above the ground, in the policy's precision. Shapes: (points,) [m]."""
-        if self._scan is None:
+        if self.scan is None:
             return np.zeros(0, self.dtype)
         if heights is None or np.shape(heights) != (len(self.scan_points),):
             raise ValueError(f"a state needs {len(self.scan_points)} heights above the ground, at scan_places")
-        limit = self._scan["limit"]
-        return np.clip(np.asarray(heights, self.dtype) - self.dtype(self._scan["offset"]), -limit, limit)
+        limit = self.scan["limit"]
+        return np.clip(np.asarray(heights, self.dtype) - self.dtype(self.scan["offset"]), -limit, limit)
 
     def _phase(self, name: str) -> float:
         """Return the share of its interval for which the actions of a term have been held; 0: new ones are due."""

@@ -45,8 +45,10 @@ class Simulation:
             ranges = [[value, value] for value in events.command]
         self._command_range = np.array(ranges, float).T
         self._resampling_probability = commands["resampling_probability"]
+        self._headings, self._heading_gain = commands.get("heading"), commands.get("heading_gain", 0.0)
+        self._scan_delay = policy.scan["delay"] if policy.scan else 0
         self.command = np.zeros(3)  # the present one
-        self._steps = 0
+        self._steps, self._heights = 0, list[np.ndarray]()
 
     def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:
         """Run one robot for some control steps and return sums of metrics, see ``step_sums``. Shape: (NUM_SUMS,).
@@ -61,6 +63,7 @@ class Simulation:
         self._rng = np.random.default_rng(seed)
         self._origin = self.robot.origins[self._rng.integers(len(self.robot.origins))]
         self._new_episode()
+        self._follow_heading()
         sums = np.zeros(NUM_SUMS)
         with np.errstate(over="ignore", invalid="ignore"):  # told below, in one line
             for _ in range(num_steps):
@@ -76,7 +79,9 @@ class Simulation:
         """Observe, act, and apply torques in all physics steps of a control step."""
         policy, robot = self.policy, self.robot
         state = robot.state()
-        state.heights = robot.position[2] - robot.ground_heights(policy.scan_places(robot.position, robot.quat))
+        heights = robot.position[2] - robot.ground_heights(policy.scan_places(robot.position, robot.quat))
+        self._heights = [heights, *(self._heights or [heights] * self._scan_delay)][: self._scan_delay + 1]
+        state.heights = self._heights[-1]
         actions = policy.act(policy.observation(state, self.command))
         for i in range(self._timing["decimation"]):
             if i == 0 or self._timing["refresh_torques"]:
@@ -94,9 +99,10 @@ class Simulation:
         if ended:
             self._new_episode()
         elif self._rng.random() < self._resampling_probability:
-            self.command = self._rng.uniform(*self._command_range)
+            self._draw_command()
         if self._rng.random() < self.events.push_probability:
             self._push()
+        self._follow_heading()
         velocity = robot.planar_velocity()
         numbers = (np.linalg.norm(velocity[:2]), force, power, robot.height(), fell, ended)
         return step_sums(np, command[None], velocity[None], *(np.array([number]) for number in numbers))[:, 0]
@@ -114,15 +120,35 @@ class Simulation:
         pose = self.policy.nominal_pose * self._draw("joint_position_scale", num_joints)
         sizes = {"trunk_linear_velocity": 3, "trunk_angular_velocity": 3, "joint_velocity": num_joints}
         velocities = tuple(self._draw(name, size) for name, size in sizes.items())
-        self.robot.reset(start["trunk_position"] + self._origin, quaternion(*angles), pose, velocities)
+        position = start["trunk_position"] + self._origin
+        if any(start.get("trunk_place", ())):
+            position[:2] += self._draw("trunk_place", 2)
+        self.robot.reset(position, quaternion(*angles), pose, velocities)
         self.policy.reset()
-        self.command = rng.uniform(*self._command_range)
-        self._steps = 0
+        self._draw_command()
+        self._steps, self._heights = 0, []
+
+    def _draw_command(self) -> None:
+        """Draw a command, and a heading if yaw rates follow one."""
+        self.command = self._rng.uniform(*self._command_range)
+        if self._headings:
+            self._heading = self._rng.uniform(*self._headings)
+
+    def _follow_heading(self) -> None:
+        """Command the yaw rate that turns the trunk to its heading, if there is one, as in training."""
+        if self._headings:
+            left = (self._heading - yaw(self.robot.quat) + math.pi) % (2.0 * math.pi) - math.pi
+            self.command[2] = np.clip(self._heading_gain * left, *self._command_range[:, 2])
 
     def _draw(self, name: str, size: int) -> np.ndarray:
         """Draw numbers from a range of the initial state. Shape: (size,)."""
         low, high = self._start[name]
         return self._rng.uniform(low, high, size)
+
+
+def yaw(quat: np.ndarray) -> float:
+    """Return the angle about the world's z axis by which a trunk with an orientation (w, x, y, z) is turned [rad]."""
+    return 2.0 * math.atan2(quat[3], quat[0])
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:

@@ -5,10 +5,14 @@ Task classes are named, not imported, so that a command line is answered before 
 
 from __future__ import annotations
 
+from typing import Any
+
 from legged_torque.envs.approaches import multi_head_config as multi_head
 from legged_torque.envs.approaches import torque_config as torque
 from legged_torque.envs.approaches import torque_curriculum_config as torque_curriculum
 from legged_torque.envs.approaches import torque_gravity
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_torque.envs.grounds.rough import RoughCfg, RoughCfgPPO, RoughScanCfg
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.utils.task_registry import task_registry
 
@@ -93,7 +97,7 @@ _MULTI_HEAD = "legged_torque.envs.approaches.multi_head:MultiHeadRobot"
 _CURRICULUM_MULTI_HEAD = "legged_torque.envs.approaches.multi_head:CurriculumMultiHeadRobot"
 _TWO_RATES = "legged_torque.envs.approaches.multi_head:MultiHeadTwoRatesRobot"
 
-for name, robot, env_cfg, train_cfg in (
+TASKS: tuple[tuple[str, str, type[LeggedRobotCfg], type[LeggedRobotCfgPPO]], ...] = (
     ("a1_position", _ROBOT, A1Cfg, A1CfgPPO),
     ("a1_torque", _TORQUE, A1TorqueCfg, A1TorqueCfgPPO),
     ("a1_torque_gravity", _TORQUE, A1TorqueCfg, A1TorqueGravityCfgPPO),
@@ -105,5 +109,17 @@ for name, robot, env_cfg, train_cfg in (
     ("a1_torque_gravity_multihead", _MULTI_HEAD, A1TorqueMultiHeadCfg, A1GravityMultiHeadCfgPPO),
     ("a1_torque_curriculum_high", _CURRICULUM, A1TorqueCurriculumHighCfg, A1TorqueCurriculumCfgPPO),
     ("a1_multihead_two_rates", _TWO_RATES, A1MultiHeadTwoRatesCfg, A1MultiHeadTwoRatesCfgPPO),
-):
+)
+"""Tasks on a plane: name, class, settings and training."""
+
+
+def on_ground(ground: type, task: type) -> Any:
+    """Return settings of a task on another ground, which has the last word."""
+    return type(ground.__name__, (ground, task), {"__doc__": f"{task.__doc__} On: {ground.__doc__}"})()
+
+
+for name, robot, env_cfg, train_cfg in TASKS:
     task_registry.register(name, robot, env_cfg(), train_cfg())
+    rough_name, rough_training = name.replace("_", "_rough_", 1), on_ground(RoughCfgPPO, train_cfg)
+    task_registry.register(rough_name, robot, on_ground(RoughCfg, env_cfg), rough_training)
+    task_registry.register(f"{rough_name}_scan", robot, on_ground(RoughScanCfg, env_cfg), rough_training)

@@ -12,6 +12,7 @@ from typing import Any
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
+from legged_torque.terrain.selection import named_kinds, rising_levels
 from legged_torque.utils.config import convert, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
@@ -150,10 +151,8 @@ def read_matrix(file: Path) -> Matrix:
     for key, source in CELL_SETTINGS.items():
         if key in matrix.train:
             raise UserError(f"train.{key} cannot be set: it comes from {source}")
-    if matrix.grounds:
-        from legged_torque.learning.crossing import Grounds
-
-        Grounds.of(matrix.grounds["kinds"], matrix.grounds["levels"])
+    named_kinds(matrix.grounds.get("kinds", []))
+    rising_levels(matrix.grounds.get("levels", []))
     ranges, words = str(matrix.ranges) if matrix.ranges else None, matrix.set_words()
     for cell in matrix.cells(Path()):
         options = Options(device="cpu", seed=cell.seed, perturbation=cell.environment, ranges=ranges, set=words)

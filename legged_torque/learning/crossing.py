@@ -1,7 +1,7 @@
 """Which ground a policy masters: whether robots cross tiles of all kinds and levels in time, in one batch of worlds.
 
-A trial is one episode: a robot starts in the middle of its tile, heads along x or y, is told to walk straight on, and
-crosses the tile if its trunk gets over the tile's edge before it falls, and before the trial is over.
+A trial is one episode: a robot starts in the middle of its tile, heads along x or y, is told to walk on in that
+direction, and crosses the tile if its trunk gets over the tile's edge before it falls, and before the trial is over.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Grounds:
         cfg.env.episode_length_s = self.time_limit(terrain.tile_size) + 1.0  # no trial ends with the episode
         cfg.commands.resampling_probability = 0.0
         ranges.lin_vel_x, ranges.lin_vel_y = ([speed, speed] for speed in self.command)
-        ranges.ang_vel_yaw = [0.0, 0.0]
+        cfg.commands.heading_command = True
         cfg.domain_rand.init_yaw = [0.0, 0.0]
         return cfg
 
@@ -130,6 +130,7 @@ def _start(task: LeggedRobot, ground: RoughGround, command: tuple[float, float])
     qpos[:, :2] = ground.origins[:, :2]
     qpos[:, 3:7] = torch.stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w], dim=1)
     qvel[:, :3] = quat_rotate_yaw(qpos[:, 3:7], qvel[:, :3])
+    task.command_generator.headings.copy_(angles)
     task.set_state(qpos, qvel)
     return task.get_observations()
 

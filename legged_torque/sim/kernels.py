@@ -73,19 +73,21 @@ def flag_diverged(qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverg
 
 
 @wp.func
-def draw_command(seed: int, low: Numbers, span: Numbers, commands: Rows, world: int):
-    """Write the command of one world."""
+def draw_command(seed: int, low: Numbers, span: Numbers, commands: Rows, headings: Numbers, world: int):
+    """Write the command and the heading of one world."""
     random = wp.rand_init(seed, 1)
     for i in range(commands.shape[1]):
         commands[world, i] = low[i] + span[i] * wp.randf(random)
+    heading = commands.shape[1]
+    headings[world] = low[heading] + span[heading] * wp.randf(random)
 
 
 @wp.kernel(enable_backward=False)
-def draw_commands(mask: Mask, seeds: Integers, low: Numbers, span: Numbers, commands: Rows):
+def draw_commands(mask: Mask, seeds: Integers, low: Numbers, span: Numbers, commands: Rows, headings: Numbers):
     """Draw the command of one world."""
     world = wp.tid()
     if mask[world]:
-        draw_command(seeds[world], low, span, commands, world)
+        draw_command(seeds[world], low, span, commands, headings, world)
 
 
 @wp.kernel(enable_backward=False)
@@ -102,6 +104,7 @@ def happen(
     # Out:
     new_parameters: Mask,
     commands: Rows,
+    headings: Numbers,
     qpos: Rows,
     qvel: Rows,
 ):
@@ -112,7 +115,7 @@ def happen(
     if is_new[world]:
         turn(qpos, world, angles[world, 0], angles[world, 1], angles[world, 2])
     if is_new[world] or drawn[0] < chances[0]:
-        draw_command(seeds[world], low, span, commands, world)
+        draw_command(seeds[world], low, span, commands, headings, world)
     new_parameters[world] = is_new[world] or drawn[1] < chances[1]
     if drawn[2] < chances[2]:
         lowest, width = push_velocity[0], push_velocity[1] - push_velocity[0]

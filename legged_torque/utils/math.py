@@ -23,3 +23,9 @@ def quat_rotate_yaw(quat: Tensor, vec: Tensor) -> Tensor:
     cos, sin = (w.square() - z.square()) / norm, 2.0 * w * z / norm
     x, y, height = vec.unbind(dim=-1)
     return torch.stack(torch.broadcast_tensors(cos * x - sin * y, sin * x + cos * y, height), dim=-1)
+
+
+def yaw(quat: Tensor) -> Tensor:
+    """Return by which angle unit quaternions (..., 4) turn about the world's z axis [rad], -pi to pi. Shape: (...,)."""
+    w, z = quat[..., 0], quat[..., 3]
+    return torch.atan2(2.0 * w * z, w.square() - z.square())

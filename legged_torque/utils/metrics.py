@@ -3,7 +3,8 @@
 Every metric is a ratio of two sums over steps. Velocities are those of the trunk in its own frame. Steps after which a
 world was reset are left out, but for the count of falls.
 
-- track_percentage: mean of max(0, mean over the commands that are not 0 of 1 - |v - v*| / |v*|); 1 is perfect.
+- track_percentage: mean of max(0, mean over the commands that are not 0 of 1 - |v - v*| / |v*|); 1 is perfect. A yaw
+  rate that turns to a heading is not among them: it is nearly 0 where the heading is right.
 - track_xy: mean of |v*_xy - v_xy|^2 [m^2/s^2]. track_angular: mean of (w*_z - w_z)^2 [rad^2/s^2].
 - collision_force: mean of the sum over geoms of the norm of the ground's force, in the last physics step of a
   control step [N]. A robot that stands still has its weight, 122 N for the A1, and a little more where its feet
@@ -77,7 +78,8 @@ class Estimate:
 def tracking_percentage(xp: ModuleType, error: Array, commands: Array) -> tuple[Array, Array]:
     """Return how much of its commands each world follows, and 1 where anything was commanded, else 0.
 
-    ``xp`` is ``numpy`` or ``torch``. The error is |v - v*|; commands of exactly 0 do not count. Shapes: (worlds, 3).
+    ``xp`` is ``numpy`` or ``torch``. The error is |v - v*|; commands of exactly 0 do not count. Shapes: (worlds,
+    commands).
     """
     counts = commands != 0.0
     relative = xp.where(counts, 1.0 - error / xp.where(counts, abs(commands), 1.0), 0.0)
@@ -95,6 +97,8 @@ def step_sums(
     height: Array,
     fell: Array,
     ended: Array,
+    *,
+    tracked: int = 3,
 ) -> Array:
     """Return what one control step of each world adds to the sums.
 
@@ -108,13 +112,14 @@ def step_sums(
         height: Of the trunk's origin above the ground [m]. Shape: (worlds,).
         fell: Whether the episode ended with the step, but not by its time. Shape: (worlds,), bool.
         ended: Whether it ended at all; then nothing but the fall counts. Shape: (worlds,), bool.
+        tracked: How many of the commands count for the tracking percentage: 2 if the yaw rate turns to a heading.
 
     Returns:
         Shape: (:data:`NUM_SUMS`, worlds): steps, tracking percentage, steps with a command, xy, angular, force, power,
         height, speed, falls.
     """
     error = abs(commands - velocity)
-    percentage, is_commanded = tracking_percentage(xp, error, commands)
+    percentage, is_commanded = tracking_percentage(xp, error[:, :tracked], commands[:, :tracked])
     one, zero = xp.ones_like(percentage), xp.zeros_like(percentage)
     xy, angular = (error[:, :2] ** 2).sum(axis=1), error[:, 2] ** 2
     rows = xp.stack([one, percentage, is_commanded, xy, angular, force, power, height, speed, zero])

@@ -30,6 +30,7 @@ def initial_state(task: LeggedRobot) -> list[Parameter]:
     qpos, qvel, dofs = task.sim.qpos, task.sim.qvel, range(task.num_dof)
     limits = task.sim.mj_model.jnt_range[1:].T.tolist()
     shortest, longest = rand.action_delay
+    pos = task.cfg.init_state.pos
 
     def velocity(name: str, columns: Any) -> Parameter:
         return Parameter(name, qvel, list(columns), base=0.0, offset=pair(getattr(rand, name)))
@@ -37,7 +38,7 @@ def initial_state(task: LeggedRobot) -> list[Parameter]:
     delay: dict[str, Any] = {"base": 0.0, "offset": (shortest, longest + 1), "limits": ([shortest], [longest + 0.5])}
     dof_pos: dict[str, Any] = {"base": pose, "scale": pair(rand.init_dof_pos_scale), "limits": limits}
     return [
-        Parameter("base_pos", qpos, range(3), base=task.cfg.init_state.pos, shared=True),
+        Parameter("base_height", qpos, [2], base=pos[2]),
         Parameter("roll", task.init_angles, [0], base=0.0, offset=pair(rand.init_roll)),
         Parameter("pitch", task.init_angles, [1], base=0.0, offset=pair(rand.init_pitch)),
         Parameter("yaw", task.init_angles, [2], base=0.0, offset=pair(rand.init_yaw)),
@@ -46,6 +47,7 @@ def initial_state(task: LeggedRobot) -> list[Parameter]:
         velocity("init_ang_vel", range(3, 6)),
         velocity("init_dof_vel", [6 + dof for dof in dofs]),
         Parameter("action_delay", task.action_delay.drawn, [0], **delay),
+        Parameter("init_place", qpos, range(2), base=pos[:2], offset=pair(rand.init_place)),
     ]
 
 

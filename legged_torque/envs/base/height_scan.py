@@ -43,3 +43,20 @@ class HeightScan:
     def __call__(self) -> Tensor:
         """Return the scan of this moment [m]. Shape: (num_envs, points)."""
         return (self._task.terrain.height_above(self.points()) - OFFSET).clamp(-CLIP, CLIP)
+
+
+class LateScan:
+    """A height scan as it was some control steps ago; what is older than the episode is as at its start."""
+
+    def __init__(self, task: LeggedRobot, scan: HeightScan, steps: int) -> None:
+        """Prepare a delay of ``steps``; nothing has been measured yet."""
+        self._task, self._scan = task, scan
+        # Scans of the steps before, the newest first. Shape: (num_envs, steps, points).
+        self._before = torch.zeros(task.num_envs, steps, len(scan.offsets), device=task.device)
+
+    def __call__(self) -> Tensor:
+        """Return the late scan, and keep that of this moment [m]. Shape: (num_envs, points)."""
+        now = self._scan().unsqueeze(1)
+        before = torch.where(self._task.reset_buf.view(-1, 1, 1), now, self._before)
+        self._before.copy_(torch.cat([now, before[:, :-1]], dim=1))
+        return before[:, -1]

@@ -18,6 +18,7 @@ from legged_torque.envs.base.health import watched
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
 from legged_torque.envs.base.random_events import RandomEvents
+from legged_torque.envs.base.reward_terms import RewardTerms
 from legged_torque.envs.base.rewards import Rewards
 from legged_torque.envs.base.symmetry import Mirror, RobotSymmetry, make_mirror
 from legged_torque.envs.base.task_log import TaskLog
@@ -34,7 +35,7 @@ from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.math import quat_rotate_inverse
 
 
-class LeggedRobot(BaseTask):
+class LeggedRobot(RewardTerms, BaseTask):
     """A batch of robots with position control, and what all approaches share.
 
     An approach overrides :meth:`_compute_torques` and :meth:`action_terms`, adds ``_reward_<term>`` methods or
@@ -230,6 +231,7 @@ class LeggedRobot(BaseTask):
     def _observe(self) -> None:
         """Look at the simulator's state, compute the observations, and keep what the next rewards compare with."""
         self._update_state()
+        self.command_generator.follow_headings(self.base_quat)
         self.compute_observations()
         self.last_actions.copy_(self.actions)
         self.last_dof_vel.copy_(self.dof_vel)
@@ -334,67 +336,3 @@ class LeggedRobot(BaseTask):
     def _tensor(self, values) -> Tensor:
         """Return values as a float tensor on the task's device."""
         return torch.as_tensor(values, dtype=torch.float32, device=self.device).clone()
-
-    # ---- reward terms: one value per world without its weight, shape (num_envs,) -------------------------------------
-
-    def _reward_tracking_lin_vel(self) -> Tensor:
-        """exp(-gamma |v*_xy - v_xy|^2), velocities in the trunk's frame [m/s]."""
-        error = (self.commands[:, :2] - self.base_lin_vel[:, :2]).square().sum(dim=1)
-        return torch.exp(-self.cfg.rewards.tracking_temperature * error)
-
-    def _reward_tracking_ang_vel(self) -> Tensor:
-        """exp(-gamma (w*_z - w_z)^2), trunk frame [rad/s]."""
-        error = (self.commands[:, 2] - self.base_ang_vel[:, 2]).square()
-        return torch.exp(-self.cfg.rewards.tracking_temperature * error)
-
-    def _reward_lin_vel_z(self) -> Tensor:
-        """v_z^2, trunk frame [m^2/s^2]."""
-        return self.base_lin_vel[:, 2].square()
-
-    def _reward_ang_vel_xy(self) -> Tensor:
-        """|w_xy|^2, trunk frame [rad^2/s^2]."""
-        return self.base_ang_vel[:, :2].square().sum(dim=1)
-
-    def _reward_orientation(self) -> Tensor:
-        """|g_xy|^2 of the unit gravity vector in the trunk's frame."""
-        return self.projected_gravity[:, :2].square().sum(dim=1)
-
-    def _reward_dof_pos_limits(self) -> Tensor:
-        """Sum over joints of how far they are beyond their soft limits [rad]."""
-        below = (self.dof_pos_limits[:, 0] - self.dof_pos).clamp(min=0.0)
-        above = (self.dof_pos - self.dof_pos_limits[:, 1]).clamp(min=0.0)
-        return (below + above).sum(dim=1)
-
-    def _reward_dof_acc(self) -> Tensor:
-        """|(qd_last - qd) / Delta t|^2, from control step to control step [rad^2/s^4]."""
-        return ((self.last_dof_vel - self.dof_vel) / self.dt).square().sum(dim=1)
-
-    def _reward_torques(self) -> Tensor:
-        """|tau|^2 of the applied torques [N^2 m^2]."""
-        return self.torques.square().sum(dim=1)
-
-    def _reward_action_rate(self) -> Tensor:
-        """|a_last - a|^2."""
-        return (self.last_actions - self.actions).square().sum(dim=1)
-
-    def _reward_collision(self) -> Tensor:
-        """Number of calves, thighs and trunks that touch the ground."""
-        return self.contacts[:, self.penalized_contact_indices].sum(dim=1)
-
-    def _reward_base_height(self) -> Tensor:
-        """(z - z_nominal - z_terrain)^2 of the trunk [m^2]."""
-        return (self.base_height - self.cfg.rewards.base_height_target).square()
-
-    def _reward_feet_air_time(self) -> Tensor:
-        """Sum over the feet on the ground of (t_swing - target), t_swing being the swing that has just ended.
-
-        Table III has a weight of -0.1 and a caption by which positive weights encourage; the authors' environment has
-        +0.1, which rewards long swings and is used here. A foot that stays on the ground has t_swing = 0.
-        """
-        return ((self.feet_air_time - self.cfg.rewards.feet_air_time_target) * self.feet_contact).sum(dim=1)
-
-    def _reward_symmetry(self) -> Tensor:
-        """1 for each pair of left and right feet, front or rear, of which both are in the air."""
-        in_air = 1.0 - self.feet_contact
-        pairs = [in_air[:, right] * in_air[:, left] for right, left in self.symmetry.foot_pairs]
-        return sum(pairs[1:], pairs[0])

@@ -74,6 +74,7 @@ class LeggedRobotCfg(BaseConfig):
         curriculum: bool = True  # whether robots change levels; if not, they are spread evenly over all
         max_init_terrain_level: Number = 5  # with the curriculum, highest level on which robots start
         measure_heights: bool = False  # whether the policy sees the height scan, too; the critic always does
+        measure_delay: Annotated[int, Limits(0, 100)] = 0  # control steps by which what the policy sees of it is late
         measured_points_x: Scan = [x / 10 for x in range(-8, 9)]  # [m] where the height scan measures: ahead
         measured_points_y: Scan = [y / 10 for y in range(-5, 6)]  # [m] and to the left
 
@@ -104,6 +105,7 @@ class LeggedRobotCfg(BaseConfig):
         """
 
         # initial state, at every reset
+        init_place: Annotated[list[float], Limits(-1, 1, ordered=True)] = [0.0, 0.0]  # [m] of the trunk, on x and y
         init_roll: Interval = [-0.19635, 0.19635]  # [rad] +-pi/16
         init_pitch: Interval = [-0.19635, 0.19635]  # [rad] +-pi/16
         init_yaw: Interval = [-3.14159, 3.14159]  # [rad]
@@ -164,10 +166,13 @@ class LeggedRobotCfg(BaseConfig):
     class commands:  # commanded velocities, in the trunk's frame
         resampling_probability: Share = 0.002  # per control step: about every 10 s at 50 Hz
 
+        heading_command: bool = False  # whether headings are drawn, and yaw rates are what turns to them
+
         class ranges:  # drawn uniformly
             lin_vel_x: Interval = [-1.0, 1.0]  # [m/s]
             lin_vel_y: Interval = [-1.0, 1.0]  # [m/s]
-            ang_vel_yaw: Interval = [-1.0, 1.0]  # [rad/s]
+            ang_vel_yaw: Interval = [-1.0, 1.0]  # [rad/s]; the limits of what turns to headings
+            heading: Annotated[list[float], Limits(-3.14160, 3.14160, ordered=True)] = [-3.14159, 3.14159]  # [rad]
 
     class control:  # from actions to torques
         decimation: Annotated[int, Limits(1, 1000)] = 4  # physics steps per control step: 50 Hz
@@ -198,6 +203,7 @@ class LeggedRobotCfg(BaseConfig):
             base_height: float = -30.0  # distance from base_height_target
             feet_air_time: float = 0.1  # long swings
             symmetry: float = -0.5  # right and left foot of a pair both in the air
+            stumble: float = 0.0  # feet pushed against walls
 
         class curriculum:  # factors on the scales: linear from start to end between two total step counts (eq. 1)
             class tracking_lin_vel(LinearChange):

@@ -47,6 +47,7 @@ class WalkingMetrics:
             height=task.base_height,
             fell=task.reset_buf & ~task.time_out_buf,
             ended=task.reset_buf,
+            tracked=num_tracked(task),
         )
         self._sums += sums if counted is None else sums * counted
 
@@ -81,7 +82,8 @@ class CommandBreakdown:
         task = self._task
         velocity = task.planar_velocity()
         error = (commands - velocity).abs()
-        tracking = torch.stack(metrics.tracking_percentage(torch, error, commands))
+        tracked = num_tracked(task)
+        tracking = torch.stack(metrics.tracking_percentage(torch, error[:, :tracked], commands[:, :tracked]))
         low, high = self._ranges.T
         place = ((commands - low) / (high - low).clamp(min=1e-6) * NUM_BINS).long().clamp(0, NUM_BINS - 1)
         member = torch.nn.functional.one_hot(place, NUM_BINS) * ~task.reset_buf.view(-1, 1, 1)
@@ -111,6 +113,11 @@ class CommandBreakdown:
                 if count[part]
             ]
         return result
+
+
+def num_tracked(task: LeggedRobot) -> int:
+    """Return how many of a task's commands count for the tracking percentage, the yaw rate being the last."""
+    return 2 if task.cfg.commands.heading_command else 3
 
 
 def measure(

@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque.envs.base.height_scan import CLIP, OFFSET, HeightScan
+from legged_torque.envs.base.height_scan import CLIP, OFFSET, HeightScan, LateScan
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import AXIAL_VECTOR, PLANAR_VELOCITY, SCALAR, VECTOR, Mirroring
 
@@ -43,6 +43,7 @@ _DESCRIPTIONS = {
     "joint_velocity": ("rad/s", "joint", "qd"),
     "last_action": ("", "none", "clipped actions of the step before, 0 at the start"),
     "height_scan": ("m", "trunk", f"trunk's height - {OFFSET} - ground's, +-{CLIP}; points level, along the heading"),
+    "height_scan_now": ("m", "trunk", "height_scan without its delay"),
     "random_parameters": ("", "none", "drawn parameters as shares of their ranges, -1 to 1"),
 }
 """Unit, frame and meaning of the standard terms."""
@@ -77,10 +78,15 @@ def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
         term("feet_contact", lambda: task.feet_contact, feet, privileged=True),
         term("random_parameters", lambda: task.randomization.values, parameter_mirror, privileged=True),
     ]
-    if task.cfg.terrain.mesh_type == "heightfield":
-        scan, is_hidden = HeightScan(task), not task.cfg.terrain.measure_heights
-        scan_settings = (scales.height_measurements, noise.height_measurements, is_hidden)
-        terms.append(term("height_scan", scan, scan.mirror, *scan_settings))
+    ground = task.cfg.terrain
+    if ground.mesh_type == "heightfield":
+        scan = HeightScan(task)
+        seen: HeightScan | LateScan = scan
+        factors = (scales.height_measurements, noise.height_measurements)
+        if ground.measure_heights and ground.measure_delay:
+            seen = LateScan(task, scan, ground.measure_delay)
+            terms.append(term("height_scan_now", scan, scan.mirror, *factors, privileged=True))
+        terms.append(term("height_scan", seen, scan.mirror, *factors, privileged=not ground.measure_heights))
     return terms
 
 

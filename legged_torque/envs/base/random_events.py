@@ -60,7 +60,7 @@ class RandomEvents:
         pushes = (wp.vec2(*settings.push_velocity), settings.push_set_factor)
         new, seeds = map(wp.from_torch, (is_new, self._seeds[0]))
         read = map(wp.from_torch, (self.init_angles, commands.low, commands.span))
-        written = map(wp.from_torch, (self._new_parameters, commands.values))
+        written = map(wp.from_torch, (self._new_parameters, commands.values, commands.headings))
         arguments = [new, seeds, self._chances, *pushes, *read, *written, data.qpos, data.qvel]
         wp.launch(kernels.happen, self._sim.num_envs, arguments, device=seeds.device)
         if settings.randomize_parameters:

@@ -187,6 +187,14 @@ def distance_sq_to_cell(cell: Cell) -> float:
 
 
 @wp.func
+def farthest_along(cell: Cell, point: wp.vec3, direction: wp.vec3) -> float:
+    """Return how far a cell is in front of a point at most, times the length of the direction."""
+    first = wp.max(wp.dot(cell.low, direction), wp.dot(cell.next_row, direction))
+    second = wp.max(wp.dot(cell.next_col, direction), wp.dot(cell.high, direction))
+    return wp.max(first, second) - wp.dot(point, direction)
+
+
+@wp.func
 def is_clear(surface: Surface, centre: wp.vec3, radius: float) -> bool:
     """Return whether a sphere is above all that is near, which is all that most spheres need to know."""
     i = int(wp.clamp((centre[0] - surface.corner[0]) / surface.scale, 0.0, float(surface.ceiling.shape[0] - 1)))
@@ -205,7 +213,10 @@ def nearest_triangle(surface: Surface, window: Window, reach: float, under: Tria
     for i in range(window.first[0], window.last[0] + 1):
         for j in range(window.first[1], window.last[1] + 1):
             cell = see_cell(surface, i, j, window)
-            if distance_sq_to_cell(cell) < (1.0 + ON_EDGE) * wp.min(best_sq, reach * reach):
+            is_near = distance_sq_to_cell(cell) < (1.0 + ON_EDGE) * wp.min(best_sq, reach * reach)
+            if best.is_face and farthest_along(cell, best.nearest, -best.nearest) <= ON_EDGE * best_sq:
+                is_near = False  # all of it is behind that face
+            if is_near:
                 for half in range(2):
                     other = see_triangle(cell, half)
                     weight = float(1.0)
@@ -232,7 +243,8 @@ def second_face(surface: Surface, window: Window, radius: float, point: wp.vec3,
     for i in range(window.first[0], window.last[0] + 1):
         for j in range(window.first[1], window.last[1] + 1):
             cell = see_cell(surface, i, j, window)
-            if distance_sq_to_cell(cell) < radius * radius:
+            is_near = distance_sq_to_cell(cell) < radius * radius
+            if is_near and farthest_along(cell, point, normal) > 10.0 * MIN_DISTANCE:
                 for half in range(2):
                     other = see_triangle(cell, half)
                     if other.is_face and other.dist < best.dist and wp.dot(normal, other.normal) < ALIKE:

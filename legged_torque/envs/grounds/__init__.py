@@ -1,0 +1,1 @@
+"""The settings of each ground, one module each; they name no robot and no approach."""
