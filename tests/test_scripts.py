@@ -206,6 +206,8 @@ def test_mistakes_when_training(root, words, message):
         ),
         ("play.py", "--num_envs=0", "num_envs must be from 1 to 10000000, not 0"),
         ("play.py", "--steps=0", "--steps must be at least 1, not 0"),
+        ("play.py", "--terrain=stairs", "unknown kind of terrain 'stairs'; did you mean 'stairs_up'?"),
+        ("play.py", "--level=0.5", "--level needs --terrain: the kinds of rough ground"),
         ("play.py", "--grid=5", "--grid must be 1, 4, 9, 16 or 25, not 5"),
         ("play.py", "--grid=0", "--grid must be 1, 4, 9, 16 or 25, not 0"),
         ("play.py", "--grid=36", "--grid must be 1, 4, 9, 16 or 25, not 36"),

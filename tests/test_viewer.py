@@ -15,7 +15,7 @@ from test_pacer import Clock
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
-from legged_torque.utils.config import set_by_path
+from legged_torque.utils.config import set_by_path, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import checkpoint_file
 from legged_torque.utils.task_registry import LoadedRun
@@ -327,6 +327,54 @@ def test_perturbation(make_session):
     session.set_perturbation(AS_LOADED)
     session.tick()
     assert not session.task.cfg.domain_rand.push_robots and session.state.perturbation == AS_LOADED
+
+
+ROUGH = {"mesh_type": "heightfield", "num_rows": 3, "num_cols": 2, "tile_size": 6.0, "border_size": 1.0}
+ROUGH |= {"curriculum": False, "terrain_proportions": {"stairs_up": 0.5, "pits": 0.5}}
+
+
+def rough(shares):
+    """Dotted paths and values of a small rough map."""
+    ground = {f"terrain.{name}": value for name, value in ROUGH.items() if name != "terrain_proportions"}
+    return ground | {
+        f"terrain.terrain_proportions.{kind}": ROUGH["terrain_proportions"].get(kind, 0.0) for kind in shares
+    }
+
+
+def test_tiles(make_session):
+    """A policy that was trained on a plane is watched on a tile; only the followed robot moves to another one."""
+    shares = to_dict(task_registry.get_cfgs("a1_torque")[0].terrain.terrain_proportions)
+    session, _, _ = make_session("a1_torque", **rough(shares))
+    ticks(session, 3)
+    ground, reading = session.task.terrain, session.state.reading
+    assert reading.tile.tolist() == [0, 0] and ground.levels.tolist() == [0, 1] and ground.columns.tolist() == [0, 1]
+    assert reading.scan.shape == (17 * 11, 3)
+    np.testing.assert_allclose(reading.scan[:, 2], ground.height(torch.from_numpy(reading.scan)).numpy(), atol=1e-5)
+    np.testing.assert_allclose(reading.scan[:, :2].mean(axis=0), reading.qpos[0, :2], atol=1e-5)
+    other = session.task.sim.qpos[1].clone()
+    session.set_paused(True)
+    session.set_tile(2, 1)
+    session.tick()
+    task = session.task
+    assert ground.levels.tolist() == [2, 1] and ground.columns.tolist() == [1, 1]
+    middle = torch.tensor([6.0, 3.0, -2 / 3 + 0.4])  # of a pit in the last of three rows and the second of two columns
+    torch.testing.assert_close(task.base_pos[0], middle, atol=1e-4, rtol=0.0)
+    assert torch.equal(task.sim.qpos[1], other) and task.episode_length_buf.tolist() == [0, 3]
+    session.set_tile(99, -1)
+    session.set_perturbation("low")
+    session.set_paused(False)
+    ticks(session, 2)
+    assert session.task is not task and session.task.terrain.levels.tolist() == [2, 1]
+    assert session.task.terrain.columns.tolist() == [0, 1] and session.state.reading.tile.tolist() == [2, 0]
+
+
+def test_no_tiles_on_a_plane(make_session):
+    """There are none to choose, and nothing is scanned."""
+    session, _, _ = make_session("a1_torque")
+    session.set_tile(0, 0)
+    session.tick()
+    assert session.state.is_error and "plane" in session.state.message
+    assert session.state.reading.tile.shape == (0,) and session.state.reading.scan.shape == (0, 3)
 
 
 def test_requests_from_other_threads(make_session):

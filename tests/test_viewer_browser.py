@@ -20,6 +20,8 @@ from selenium.webdriver.common.keys import Keys
 
 from legged_torque import resource_path
 from legged_torque.envs import task_registry
+from legged_torque.terrain.selection import select_tiles
+from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import LoadedRun
 from legged_torque.viewer.session import Session
@@ -46,9 +48,17 @@ def wait_for(condition):
 
 
 @pytest.fixture
-def session(make_task, tmp_path):
-    """A running session of two multi-head robots that glide as they are told to, without any training."""
-    env = make_task("a1_torque_multihead", num_envs=2)
+def session(make_task, tmp_path, request):
+    """A running session of two multi-head robots that glide as they are told to, without any training.
+
+    On a plane, or on tiles of the kinds that ``request.param`` names.
+    """
+    env_cfg = task_registry.get_cfgs("a1_torque_multihead")[0]
+    if hasattr(request, "param"):
+        env_cfg.terrain.tile_size, env_cfg.terrain.border_size = 6.0, 1.0
+        select_tiles(env_cfg.terrain, request.param, [0.2, 0.5], 1)
+    settings = {f"terrain.{name}": value for name, value in flat(to_dict(env_cfg.terrain)).items()}
+    env = make_task("a1_torque_multihead", num_envs=2, **settings)
     runner = task_registry.make_alg_runner(env, "a1_torque_multihead", log_root=None)[0]
     runner.save(str(tmp_path / "model_0.pt"))
     run = LoadedRun(tmp_path, {}, env.cfg, task_registry.get_cfgs("a1_torque_multihead")[1], tmp_path / "model_0.pt")
@@ -134,6 +144,40 @@ def test_page(session, page, browser, tmp_path):
     wait_for(lambda: abs(session.state.reading.velocities[:, 0]).max() < 0.1)
     complaints = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
     assert not complaints
+
+
+@pytest.mark.parametrize("session", [["discrete_obstacles", "waves"]], indirect=True)
+def test_rough_ground(session, page, browser, tmp_path):
+    """The ground is drawn in the color of its kind, with the points of the scan; a level chosen on the page counts."""
+    session.set_command((0.0, 0.0, 0.0))
+    session.reset()
+    browser.get(page.url)
+    wait_for(lambda: browser.find_elements(By.TAG_NAME, "canvas"))
+
+    def shares():
+        """How much of the middle of the page is orange, as discrete obstacles are, and as red as the scan's points."""
+        browser.save_screenshot(str(tmp_path / "ground.png"))
+        picture = np.array(Image.open(tmp_path / "ground.png").convert("RGB")).astype(int)
+        height, width, _ = picture.shape
+        red, green, blue = picture[height // 3 :, width * 2 // 5 : width * 3 // 5].reshape(-1, 3).T
+        return (red > blue + 8).mean(), ((red > 180) & (green < 90)).mean()
+
+    wait_for(lambda: shares()[0] > 0.3 and shares()[1] > 0.001)
+    print(f"the page: {tmp_path / 'ground.png'}")
+    assert "discrete_obstacles, level 0 (difficulty 0.20)" in browser.find_element(By.TAG_NAME, "body").text
+    path = "//label[normalize-space()='level']/following::input[not(@type='hidden')][1]"
+
+    def is_moved():
+        """Type a level into the field beside its slider."""
+        field = browser.find_element(By.XPATH, path)
+        field.send_keys(Keys.CONTROL + "a")
+        field.send_keys("1", Keys.TAB)
+        time.sleep(0.5)
+        return session.task.terrain.levels.tolist() == [1, 1]
+
+    wait_for(is_moved)
+    wait_for(lambda: "level 1 (difficulty 0.50)" in browser.find_element(By.TAG_NAME, "body").text)
+    assert not [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
 
 
 def test_token(session, browser):

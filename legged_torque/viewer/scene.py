@@ -16,7 +16,7 @@ from legged_torque.viewer.reading import Reading
 
 COMMAND_COLOR, VELOCITY_COLOR, SCAN_COLOR = (10, 150, 50), (20, 90, 230), (214, 51, 108)
 VISUAL_GROUPS = (0, 1, 2)  # groups of visual geoms; the others only collide
-GROUND_FACTOR = (0.6, 0.6, 0.6, 1.0)  # of the colors of rough ground: the light is bright
+GROUND_FACTOR = (0.45, 0.45, 0.45, 1.0)  # of the colors of rough ground: the light is bright
 SPACING = 2.0  # distance between neighbouring worlds [m]
 LIFTING = 0.2  # share of the way to where it sees the robot by which a camera moves up in a frame
 ARROW_LENGTH = 0.5  # length of the arrow of a velocity of 1 m/s [m]

@@ -1,0 +1,124 @@
+"""Rough ground as it is drawn: it is where the physics has it, in the colors of its kinds, and never hides a robot."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from test_terrain import make_ground, rays
+
+from legged_torque.terrain.colors import NEUTRAL, color_of
+from legged_torque.viewer.ground import CLEARANCE, Ground, drawn_model, patches
+from legged_torque.viewer.video import DISTANCE, Camera
+
+XML = Path(__file__).resolve().parents[1] / "resources" / "robots" / "a1" / "a1.xml"
+KINDS = {"stairs_up": 0.25, "rough_slope": 0.25, "stepping_stones": 0.25, "pits": 0.25}
+
+
+@pytest.fixture(scope="module")
+def terrain():
+    """A small map, as the task has it."""
+    return make_ground(1, terrain_proportions=KINDS, num_cols=4, num_rows=2, max_init_terrain_level=0)
+
+
+@pytest.fixture(scope="module")
+def ground(terrain):
+    """The same, to be drawn."""
+    return Ground(terrain.layout, terrain.map)
+
+
+def test_surface(terrain, ground):
+    """Rays meet the drawn triangles, few as they are, at the heights of the map; in twisted rectangles, near them."""
+    model = drawn_model(XML, ground)
+    floor = model.geom("floor")
+    assert floor.type == mujoco.mjtGeom.mjGEOM_MESH and floor.contype == floor.conaffinity == 0
+    points = np.random.default_rng(0).uniform(-0.499, 0.499, (600, 2)) * terrain.map.size
+    points = points[np.abs(points).max(axis=1) > 1.0]  # where no robot is in the way
+    found, _ = rays(model, points)
+    errors = np.abs(found - terrain.map.height(torch.from_numpy(points)).numpy())
+    assert errors.max() < 0.01 and np.quantile(errors, 0.8) < 1e-5
+    assert len(ground.faces) < 0.2 * 2 * terrain.map.heights.size
+
+
+@pytest.mark.parametrize("kind", range(4))
+def test_patches(terrain, kind):
+    """Rectangles cover every cell once; what is level or has one slope is not cut finer than 1 m."""
+    heights = [
+        np.zeros((51, 41)),
+        0.1 * np.arange(51)[:, None] + 0.2 * np.arange(41),
+        np.random.default_rng(0).normal(size=(51, 41)),
+        terrain.map.heights[:200, :90],
+    ][kind].astype(np.float32)
+    found = patches(heights)
+    covered = np.zeros((heights.shape[0] - 1, heights.shape[1] - 1), int)
+    for first_row, last_row, first_col, last_col in found:
+        covered[first_row:last_row, first_col:last_col] += 1
+        corners = heights[[first_row, last_row]][:, [first_col, last_col]].astype(float)
+        shares = np.linspace(0.0, 1.0, last_col - first_col + 1)
+        for row, (start, end) in zip((first_row, last_row), corners, strict=True):
+            line = heights[row, first_col : last_col + 1]
+            np.testing.assert_allclose(line, start + shares * (end - start), atol=2e-3)
+    assert (covered == 1).all()
+    if kind == 0:
+        assert len(found) == 3 * 2
+
+
+def test_picture(terrain, ground):
+    """The middle of each tile has the color of its kind, with y upwards from the first row; around it is neutral."""
+    picture, layout = ground.picture(), terrain.layout
+    pixels = np.array(picture.shape[:2]) / terrain.map.size[::-1]
+    for row in range(layout.num_rows):
+        for col, kind in enumerate(layout.kinds()):
+            place = np.array([col, row]) * layout.tile_size + layout.border_size + 2.5  # between two lines
+            assert tuple(picture[tuple((place * pixels).astype(int))]) == color_of(kind)
+    assert tuple(picture[5, 5]) == NEUTRAL and color_of("my own") not in map(color_of, KINDS)
+    assert ground.tile_text(1, 3) == "pits, level 1 (difficulty 0.50)"
+
+
+def test_heights(terrain, ground):
+    """Heights at samples are those of the map; outside they are those of the edge."""
+    points = np.array([[-7.0 + 0.05 * 20, 3.0], [99.0, -99.0]])
+    expected = [float(terrain.map.heights[20, round((3.0 + 13.0) / 0.05)]), float(terrain.map.heights[-1, 0])]
+    np.testing.assert_allclose(ground.height(points), expected)
+
+
+@pytest.mark.parametrize("azimuth", np.radians([0.0, 50.0, 90.0, 180.0, 300.0]))
+def test_camera(terrain, ground, azimuth):
+    """From anywhere in a pit or beside stones, the camera of a video sees the robot; on level ground it is as ever."""
+    for row, col in ((1, 3), (1, 2), (1, 0)):
+        middle = terrain.layout.origins(terrain.map.heights)[row, col]
+        position = middle + 1.7 * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        position[2] = ground.height(position) + 0.3
+        camera = Camera(ground).look_at(position)
+        lookat, (azimuth_of, elevation) = np.array(camera.lookat), np.radians([camera.azimuth, camera.elevation])
+        ahead = np.array([np.cos(azimuth_of), np.sin(azimuth_of), np.tan(elevation)]) * np.cos(elevation)
+        ways = lookat - np.linspace(0.3, 1.0, 50)[:, None] * camera.distance * ahead
+        assert lookat[2] == pytest.approx(ground.height(position) + 0.25, abs=1e-5)
+        assert (ways[:, 2] > ground.height(ways)).all() and ways[-1, 2] > ground.height(ways[-1]) + 0.9 * CLEARANCE
+    plane = Camera(None).look_at(np.array([1.0, 2.0, 0.5]))
+    assert (plane.distance, plane.azimuth, plane.elevation) == pytest.approx((DISTANCE, 130.0, -18.0))
+    np.testing.assert_allclose(plane.lookat, [1.0, 2.0, 0.25])
+
+
+def test_camera_follows_smoothly():
+    """A step lifts the camera little by little; a robot that starts anew is seen at once."""
+    levels = [0.0, 0.2, 0.2, 2.0]
+
+    class Steps(Ground):
+        """Level ground that rises from frame to frame."""
+
+        frame = 0
+
+        def __init__(self):
+            """Need no map."""
+
+        def height(self, points):
+            """Return the level of this frame everywhere."""
+            return np.full(points.shape[:-1], levels[self.frame])
+
+    steps = Steps()
+    camera, seen = Camera(steps), []
+    for steps.frame in range(len(levels)):
+        seen.append(camera.look_at(np.zeros(3)).lookat[2] - 0.25)
+    assert seen[0] == 0.0 < seen[1] < seen[2] < 0.1 and seen[3] == pytest.approx(2.0)
