@@ -113,7 +113,8 @@ def test_recorded_worlds(make_task, monkeypatch):
         task.commands[:, 0] = 0.2  # the robot of the video stays the same
     for recorder, worlds in ((one, [3]), (four, [0, 1, 2, 3])):
         recorder.save(Path("out.mp4"), None)
-        file, model, trunk, steps, control_step = saved[-1]
+        file, model, trunk, steps, control_step, ground = saved[-1]
+        assert ground is None, "a plane"
         assert (file, model.body(trunk).name, control_step) == (Path("out.mp4"), "trunk", task.dt)
         for number, moments in enumerate(steps):
             assert len(moments) == len(worlds)
