@@ -219,6 +219,9 @@ def test_headings(policy, robot):
         simulation._heading = heading
         simulation._follow_heading()
         assert simulation.command[2] == pytest.approx(rate, abs=0.02)
+    robot.reset(robot.origins[0] + [0.0, 0.0, 0.4], quaternion(0, 0, 0), policy.nominal_pose, STILL)
+    robot.velocity[0] = 0.25
+    assert simulation._finish_step(np.array([0.5, 0.0, 0.3]))[1] == 0.5, "tracking does not count the yaw rate"
     fixed = Simulation(policy, robot, Events(command=(0.5, 0.0, -0.2)))
     fixed.run(2, 1)
     assert fixed.command.tolist() == [0.5, 0.0, -0.2]

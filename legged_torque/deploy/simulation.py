@@ -105,7 +105,8 @@ class Simulation:
         self._follow_heading()
         velocity = robot.planar_velocity()
         numbers = (np.linalg.norm(velocity[:2]), force, power, robot.height(), fell, ended)
-        return step_sums(np, command[None], velocity[None], *(np.array([number]) for number in numbers))[:, 0]
+        arrays = [command[None], velocity[None], *(np.array([number]) for number in numbers)]
+        return step_sums(np, *arrays, tracked=2 if self._headings else 3)[:, 0]
 
     def _push(self) -> None:
         """Push the trunk: half of the pushes set its velocity, the others add to it."""
