@@ -1,4 +1,4 @@
-"""Every task by name: robot x approach x ground, by listing their settings as bases, the approach first.
+"""Every task by name: robot x approach x ground, by listing their settings as bases: ground, approach, robot.
 
 Task classes are named, not imported, so that a command line is answered before torch is there.
 """
@@ -120,6 +120,8 @@ def on_ground(ground: type, task: type) -> Any:
 
 for name, robot, env_cfg, train_cfg in TASKS:
     task_registry.register(name, robot, env_cfg(), train_cfg())
-    rough_name, rough_training = name.replace("_", "_rough_", 1), on_ground(RoughCfgPPO, train_cfg)
-    task_registry.register(rough_name, robot, on_ground(RoughCfg, env_cfg), rough_training)
-    task_registry.register(f"{rough_name}_scan", robot, on_ground(RoughScanCfg, env_cfg), rough_training)
+
+for name, robot, env_cfg, train_cfg in TASKS:
+    rough_name, training = name.replace("_", "_rough_", 1), on_ground(RoughCfgPPO, train_cfg)
+    task_registry.register(rough_name, robot, on_ground(RoughCfg, env_cfg), training)
+    task_registry.register(f"{rough_name}_scan", robot, on_ground(RoughScanCfg, env_cfg), training)
