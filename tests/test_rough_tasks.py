@@ -96,7 +96,7 @@ def test_places_of_starts(make_task):
 def test_late_scan(make_task):
     """The policy sees the scan of two steps ago, at the start of an episode that of the start; the critic both."""
     changes = {"terrain.measure_delay": 2, "env.episode_length_s": 0.1}  # five steps
-    task = make_task("a1_rough_torque_scan", 6, **SMALL, **changes)
+    task = make_task("a1_rough_position_scan", 6, **SMALL, **changes)
     columns = task.observations.policy_columns("height_scan")
     sizes = list(task.observations.sizes.items())
     start = sum(size for _, size in sizes[: [name for name, _ in sizes].index("height_scan_now")])
