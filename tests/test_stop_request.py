@@ -109,9 +109,7 @@ def test_a_terminal_that_closes(tmp_path, before):
             process.wait(0.5)
         process.terminate()
     process.send_signal(signal.SIGHUP)
-    assert process.wait(20) in (
-        (1, 120) if before else (0,)
-    )  # 120: of Python itself, which cannot write to the terminal
+    assert process.wait(20) == (1 if before else 0)
     assert (tmp_path / "number").exists() != bool(before)
     if not before:
         assert (tmp_path / "number").read_text() == str(int(signal.SIGHUP))

@@ -12,10 +12,9 @@ import numpy as np
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.hfield import add_hfield
 from legged_torque.terrain.layout import Layout
-from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
+from legged_torque.terrain.selection import COLUMNS, named_kinds, rising_levels, select_tiles
 from legged_torque.utils.config import update_from_dict
 
-COLUMNS = 4  # tiles of each chosen kind and level
 _ABOVE = 100.0  # [m] height from which one looks down on the ground
 
 

@@ -21,7 +21,7 @@ from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import WalkingMetrics
 from legged_torque.learning.evaluator import evaluation_cfg
 from legged_torque.terrain.rough import RoughGround
-from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
+from legged_torque.terrain.selection import COLUMNS, named_kinds, rising_levels, select_tiles
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.math import quat_rotate_yaw
 from legged_torque.utils.metrics import Estimate, estimate, estimates
@@ -32,8 +32,6 @@ SLOWNESS = 2.0
 """A trial lasts this many times as long as the commanded speed needs: as in the curriculum, half of it is enough."""
 MIN_SPEED = 0.1
 """Least commanded speed [m/s]; one that is slower would need minutes."""
-COLUMNS = 4
-"""Of each kind: where tiles are random, these differ."""
 SEED = 10_000
 """Added to the seed of the map, so that its random tiles are not those of the training."""
 

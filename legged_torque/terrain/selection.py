@@ -11,6 +11,8 @@ from legged_torque.utils.errors import UserError, unknown_name
 
 ALL = "all"
 """Stands for all kinds."""
+COLUMNS = 4
+"""Of each kind, for trials: where tiles are random, these differ."""
 
 
 def named_kinds(names: Sequence[str]) -> list[str]:

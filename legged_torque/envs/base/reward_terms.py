@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import torch
 from torch import Tensor
 
@@ -13,7 +15,7 @@ STUMBLING = 5.0
 """A foot stumbles if the force on it is this many times as large horizontally as vertically, as in legged_gym."""
 
 
-class RewardTerms:
+class RewardTerms(ABC):
     """A term is a method ``_reward_<term>`` of the task; ``rewards.scales.<term>`` is its weight.
 
     What terms read are attributes of :class:`~legged_torque.envs.base.legged_robot.LeggedRobot`.
@@ -41,9 +43,9 @@ class RewardTerms:
     feet_air_time: Tensor
 
     @property
+    @abstractmethod
     def base_height(self) -> Tensor:
         """Height of the trunk's origin above the ground under it [m]. Shape: (num_envs,)."""
-        raise NotImplementedError
 
     def _reward_tracking_lin_vel(self) -> Tensor:
         """exp(-gamma |v*_xy - v_xy|^2), velocities in the trunk's frame [m/s]."""
