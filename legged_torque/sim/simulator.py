@@ -21,6 +21,7 @@ from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.height_map import HeightMap
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
 from legged_torque.sim.per_world import check_fields, expand, owner
+from legged_torque.sim.robot_file import actuator_problems, refuse
 from legged_torque.sim.warp_step import WarpStep
 from legged_torque.utils.errors import UserError, unknown_name
 
@@ -78,6 +79,7 @@ class Simulator:
             raise unknown_name("sim.engine", engine, ENGINES)
         if height_map is not None and engine != "fused":
             raise ValueError("only the fused engine takes a height map; the model of others has a hfield")
+        refuse(list(actuator_problems(model)), f"sim.engine '{engine}' needs motors")
         self.mj_model, self.num_envs, self.device = model, num_envs, device
         prepare_device(device)
         self._wp_device = wp.get_device(device)
