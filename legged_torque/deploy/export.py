@@ -160,6 +160,7 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
         "actions": {"clip": [-clip, clip], "terms": _action_terms(task)},
         "gains": {"stiffness": _by_joint(task, task.p_gains[0]), "damping": _by_joint(task, task.d_gains[0])},
         "torque_limits": _by_joint(task, task.torque_limits.T),
+        "joints": _joints(task),
         "timing": {
             "control_frequency": 1.0 / task.dt,
             "physics_frequency": 1.0 / cfg.sim.dt,
@@ -192,6 +193,16 @@ def _observation_terms(task: LeggedRobot) -> list[dict[str, Any]]:
         }
         for term in task.observations.policy_terms()
     ]
+
+
+def _joints(task: LeggedRobot) -> dict[str, Any]:
+    """Return axes and passive forces of the joints, by which other files of the robot are compared with this one."""
+    result = {}
+    for name, axis in zip(task.dof_names, task.asset.dof_axes(), strict=True):
+        joint = task.sim.mj_model.joint(name)
+        passive = {field: float(getattr(joint, field)[0]) for field in ("damping", "armature", "frictionloss")}
+        result[name] = {"axis": [round(float(part), 6) + 0.0 for part in axis], **passive}
+    return result
 
 
 def _action_terms(task: LeggedRobot) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import motors_of, torque_range, why_no_motor
 
 DRAWN_GROUPS = (0, 1, 2)  # of geoms that videos and viewers draw
-_ONE_NUMBER = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_ONE_NUMBER = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))  # types of joints
 
 
 def spec_problems(spec: mujoco.MjSpec) -> Iterator[str]:
@@ -34,12 +34,12 @@ def joint_problems(model: mujoco.MjModel) -> Iterator[str]:
         return
     trunk = model.jnt_bodyid[0]
     for joint in range(1, model.njnt):
-        name, body = model.joint(joint).name, model.body(model.jnt_bodyid[joint])
+        name, body = model.joint(joint).name, model.jnt_bodyid[joint]
         if not name:
-            yield f"a joint of the body '{body.name}' has no name"
+            yield f"a joint of the body '{model.body(body).name}' has no name"
         if model.jnt_type[joint] not in _ONE_NUMBER:
             yield f"the joint '{name}' must be a hinge"
-        elif body.rootid != trunk:
+        elif model.body_rootid[body] != trunk:
             yield f"the joint '{name}' does not hang on the trunk '{model.body(trunk).name}'"
 
 
