@@ -262,7 +262,8 @@ class LeggedRobot(RewardTerms, BaseTask):
         axes = self.asset.dof_axes().tolist()
         self.symmetry = RobotSymmetry(cfg.asset.mirrored_legs, self.dof_names, axes, self.foot_names)
         if self.symmetry.joints and self.symmetry.feet:
-            self.symmetry.problem = mirror_problem(model, self.symmetry.joints, self.symmetry.feet, self.foot_names)
+            problem = mirror_problem(model, self.symmetry.joints, self.symmetry.feet, self.foot_names)
+            self.symmetry.refuse(problem)
         self.motors = make_motors(cfg.motors.model, self.num_envs, self._tensor(model.actuator_forcerange.T))
         self.torque_limits, self.motor_strength = self.motors.limits, self.motors.strength
         self.base_pos, self.base_quat = self.sim.qpos[:, :3], self.sim.qpos[:, 3:7]

@@ -44,7 +44,12 @@ class RobotSymmetry:
             self.joints = Mirroring(order, _mirror_signs(dof_names, dof_axes, order))
             self.feet = Mirroring(counterparts(foot_names, mirrored_legs), (1.0,) * len(foot_names))
         except UserError as error:
-            self.problem = str(error)
+            self.refuse(str(error))
+
+    def refuse(self, problem: str) -> None:
+        """Have no symmetry, because of a problem; empty if there is none."""
+        if problem:
+            self.joints, self.feet, self.problem = None, None, problem
 
 
 def _mirror_signs(names: Names, axes: Sequence[Sequence[float]], order: Sequence[int]) -> tuple[float, ...]:
