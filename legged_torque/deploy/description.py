@@ -140,7 +140,8 @@ def _check_schema(description: Any, where: str) -> None:
 def _check_joints(description: dict[str, Any], where: str) -> None:
     """Check that values by joint cover all joints and no others."""
     joints = description["joint_order"]
-    by_joint = {key: description[key] for key in ("nominal_pose", "torque_limits", "joints") if key in description}
+    keys = ("nominal_pose", "torque_limits", "joints")  # older files lack the last one
+    by_joint = {key: description[key] for key in keys if key in description}
     by_joint |= {f"gains.{key}": values for key, values in description["gains"].items()}
     for path, values in by_joint.items():
         for name in values:

@@ -54,13 +54,14 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     UserError, which tells all that is wrong at once, if the file cannot be read, names in the settings match nothing,
     or tasks cannot simulate the robot.
     """
-    settings, places = cfg.asset, []
+    settings = cfg.asset
     spec = read_spec(resource_path(settings.file))
     problems, notes = list(spec_problems(spec)), list(notes_on(spec))
     geoms = collision_geoms(spec)
+    chosen: list[list[int]] = []
     for parts in ([settings.foot_name], settings.penalize_contacts_on, settings.terminate_after_contacts_on):
         with told_in(problems):
-            places.append(indices_matching(geoms, parts))
+            chosen.append(indices_matching(geoms, parts))
     refuse(problems, f"'{settings.file}' cannot be simulated")
     if terrain:
         terrain.add_to(spec, FLOOR)
@@ -76,7 +77,8 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
         problems += pose_problems(nominal_pose(cfg.init_state.default_joint_angles, dof_names), model)
     refuse(problems, f"'{settings.file}' cannot be simulated")
     model.opt.timestep = cfg.sim.dt
-    asset = Asset(model, dof_names, geoms, *places, notes)
+    feet, penalized, terminating = chosen
+    asset = Asset(model, dof_names, geoms, feet, penalized, terminating, notes)
     notes += foot_notes(model, asset.foot_names)
     return asset
 
