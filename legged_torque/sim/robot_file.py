@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import mujoco
+import numpy as np
 
 from legged_torque.sim.model import FLOOR
 from legged_torque.utils.errors import UserError
@@ -25,6 +26,14 @@ def spec_problems(spec: mujoco.MjSpec) -> Iterator[str]:
     bodies = dict.fromkeys(f"'{geom.parent.name}'" for geom in unnamed)
     if unnamed:
         yield f"geoms that collide need names, by which settings know them; those of {', '.join(bodies)} have none"
+
+
+def model_problems(model: mujoco.MjModel) -> Iterator[str]:
+    """Yield what is wrong with joints, motors and masses."""
+    yield from joint_problems(model)
+    yield from motor_problems(model)
+    if not np.isfinite([*model.body_mass, *model.body_inertia.flat]).all():
+        yield "it has a mass or an inertia that is not finite"
 
 
 def joint_problems(model: mujoco.MjModel) -> Iterator[str]:

@@ -13,8 +13,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.robot_checks import foot_notes, pose_problems
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching, read_spec
 from legged_torque.sim.robot_file import (
-    joint_problems,
-    motor_problems,
+    model_problems,
     notes_on,
     refuse,
     spec_problems,
@@ -54,33 +53,29 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     UserError, which tells all that is wrong at once, if the file cannot be read, names in the settings match nothing,
     or tasks cannot simulate the robot.
     """
-    settings = cfg.asset
-    spec = read_spec(resource_path(settings.file))
-    problems, notes = list(spec_problems(spec)), list(notes_on(spec))
-    geoms = collision_geoms(spec)
+    settings, file = cfg.asset, resource_path(cfg.asset.file)
+    spec = read_spec(file)
+    problems, notes, geoms = list(spec_problems(spec)), list(notes_on(spec)), collision_geoms(spec)
     chosen: list[list[int]] = []
     for parts in ([settings.foot_name], settings.penalize_contacts_on, settings.terminate_after_contacts_on):
         with told_in(problems):
             chosen.append(indices_matching(geoms, parts))
-    refuse(problems, f"'{settings.file}' cannot be simulated")
-    if terrain:
-        terrain.add_to(spec, FLOOR)
-    with loading(resource_path(settings.file)):
-        model = build_model(spec, geoms)
-        problems = [*joint_problems(model), *motor_problems(model)]
-        if not problems and use_plain_motors(spec, model):
-            model = spec.compile()
-    if not np.isfinite([*model.body_mass, *model.body_inertia.flat]).all():
-        problems.append("it has a mass or an inertia that is not finite")
+    with loading(file):
+        if terrain and not problems:
+            terrain.add_to(spec, FLOOR)
+        model = spec.compile() if problems else build_model(spec, geoms)
     dof_names = [model.joint(i).name for i in range(1, model.njnt)]
     with told_in(problems):
+        problems += model_problems(model)
         problems += pose_problems(nominal_pose(cfg.init_state.default_joint_angles, dof_names), model)
     refuse(problems, f"'{settings.file}' cannot be simulated")
+    if use_plain_motors(spec, model):
+        with loading(file):
+            model = spec.compile()
     model.opt.timestep = cfg.sim.dt
     feet, penalized, terminating = chosen
-    asset = Asset(model, dof_names, geoms, feet, penalized, terminating, notes)
-    notes += foot_notes(model, asset.foot_names)
-    return asset
+    notes += foot_notes(model, [geoms[place] for place in feet])
+    return Asset(model, dof_names, geoms, feet, penalized, terminating, notes)
 
 
 def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:
