@@ -197,11 +197,9 @@ def test_servos_are_refused(changed, make_task, engine):
     """Every engine says which actuators are no motors, and what to do, in tasks and in simulators of a model."""
     file = changed(servo(3, 4))
     told = error_of(make_task, "a1_torque", 1, **{"asset.file": file, "sim.engine": engine})
-    for name in ("FL_hip", "FL_thigh"):
-        assert f"the actuator '{name}' is a servo, whose control is a target: make it a <motor>" in told
-    assert "'FR_hip'" not in told
+    assert "make a <motor> with a forcerange of what is a servo, whose control is a target (FL_hip, FL_thigh)" in told
     model = build_model(read_spec(file), [])
-    assert "the actuator 'FL_hip' is a servo" in error_of(Simulator, model, 1, "cpu", engine)
+    assert "is a servo, whose control is a target (FL_hip, FL_thigh)" in error_of(Simulator, model, 1, "cpu", engine)
 
 
 # --------------------------------------------------------------------------------------------------- what is refused
@@ -225,11 +223,11 @@ def arm_beside(root):
 
 
 REFUSED = {
-    "no motor": ([remove("actuator/motor[4]")], "the joint 'FL_hip_joint' must have one motor, not 0"),
-    "two motors": ([second_motor], "the joint 'FR_hip_joint' must have one motor, not 2"),
+    "no motor": ([remove("actuator/motor[4]")], "each joint must have one motor, not 0 (FL_hip_joint)"),
+    "two motors": ([second_motor], "each joint must have one motor, not 2 (FR_hip_joint)"),
     "no limits": (
         [setting(".//default/motor", forcerange=None, ctrlrange=None)],
-        "the motor of the joint 'FR_hip_joint' has no torque limits",
+        "motors need torque limits, for example a forcerange (FR_hip_joint, FR_thigh_joint",
     ),
     "unnamed geom": (
         [setting(".//geom[@name='RL_calf']", name=None)],
@@ -266,13 +264,13 @@ def test_all_problems_at_once(changed):
     beyond, limits = joint("FL_calf_joint", range="-2.6 -1.6"), setting("actuator/motor[1]", ctrllimited="false")
     none = setting("actuator/motor[1]", forcelimited="false")
     told = error_of(load_asset, cfg_of(changed(servo(11), beyond, limits, none)))
-    for part in ("'RL_calf' is a servo", "'FR_hip_joint' has no torque limits", "has -1.5 for 'FL_calf_joint'"):
+    for part in ("a target (RL_calf)", "a forcerange (FR_hip_joint,", "has -1.5 for 'FL_calf_joint'"):
         assert part in told
     unnamed, floor = setting(".//geom[@name='RL_calf']", name=None), setting(".//geom[@name='floor']", name="ground")
     told = error_of(
         load_asset, cfg_of(changed(unnamed, floor, setting(".//geom[@name='trunk']", name="base"), servo(11)))
     )
-    for part in ("those of 'RL_calf'", "a geom 'floor'", "geom (part of its name) 'trunk'", "'RL_calf' is a servo"):
+    for part in ("those of 'RL_calf'", "a geom 'floor'", "geom (part of its name) 'trunk'", "a target (RL_calf)"):
         assert part in told
 
 

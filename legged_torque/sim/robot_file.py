@@ -55,24 +55,32 @@ def joint_problems(model: mujoco.MjModel) -> Iterator[str]:
 def motor_problems(model: mujoco.MjModel) -> Iterator[str]:
     """Yield what is wrong with the motors: one of its own for each joint, with limits."""
     yield from actuator_problems(model)
+    wrong: dict[str, list[str]] = {}
     for joint in range(1, model.njnt):
         name, motors = model.joint(joint).name, motors_of(model, joint)
         if len(motors) != 1:
-            yield f"the joint '{name}' must have one motor, not {len(motors)}"
-            continue
-        low, high = torque_range(model, motors[0])
-        if not low < high or abs(low) == float("inf") or abs(high) == float("inf"):
-            yield f"the motor of the joint '{name}' has no torque limits: give it a forcerange"
+            wrong.setdefault(f"each joint must have one motor, not {len(motors)}", []).append(name)
+        elif not -np.inf < np.subtract(*torque_range(model, motors[0])) < 0.0:  # lowest less highest
+            wrong.setdefault("motors need torque limits, for example a forcerange", []).append(name)
+    yield from _with_names(wrong)
     if model.opt.disableactuator or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
         yield "its options switch actuators off"
 
 
 def actuator_problems(model: mujoco.MjModel) -> Iterator[str]:
     """Yield which actuators are no motors: their controls would not be the torques that tasks send."""
+    wrong: dict[str, list[str]] = {}
     for actuator in range(model.nu):
         reason = why_no_motor(model, actuator)
         if reason:
-            yield f"the actuator '{_name(model, actuator)}' {reason}: make it a <motor> with a forcerange"
+            wrong.setdefault(f"make a <motor> with a forcerange of what {reason}", []).append(_name(model, actuator))
+    yield from _with_names(wrong)
+
+
+def _with_names(wrong: dict[str, list[str]]) -> Iterator[str]:
+    """Yield problems with the names of the parts that have them."""
+    for problem, names in wrong.items():
+        yield f"{problem} ({', '.join(names)})"
 
 
 def refuse(problems: list[str], what: str) -> None:
