@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from settings import error_of
+from test_scripts import run_here
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.envs.base.asset import load_asset
@@ -222,7 +223,13 @@ def arm_beside(root):
     ElementTree.SubElement(body, "geom", name="door", size="0.1")
 
 
+def post_before(root):
+    """A body that stands still, before the trunk."""
+    root.find("worldbody").insert(0, ElementTree.Element("body", name="post"))
+
+
 REFUSED = {
+    "trunk after others": ([post_before], "the trunk 'trunk' must be the first body, before 'post'"),
     "no motor": ([remove("actuator/motor[4]")], "each joint must have one motor, not 0 (FL_hip_joint)"),
     "two motors": ([second_motor], "each joint must have one motor, not 2 (FR_hip_joint)"),
     "no limits": (
@@ -322,6 +329,13 @@ def test_nominal_pose_is_held(changed, make_task):
     weak = standing_note(make_task("a1_torque", 1, **{"control.stiffness": 3.0}))
     assert "does not stand under PD control, after " in weak and "'trunk' touches the ground" in weak
     assert standing_note(make_task("a1_torque", 1, **{"control.stiffness": 0.0})) == "", "it is not held at all"
+
+
+def test_training_says_that_the_robot_falls(tmp_path):
+    """Before a training, its nominal pose is tried."""
+    words = ["--task=a1_torque", "--num_envs=2", "--max_iterations=1", "--device=cpu", "--set", "control.stiffness=3"]
+    status, output, _ = run_here("train.py", *words, root=tmp_path)
+    assert status == 0 and output.splitlines()[0].startswith("Note: the nominal pose does not stand under PD control")
 
 
 # --------------------------------------------------------------------------------------------------- symmetry

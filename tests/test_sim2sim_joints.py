@@ -66,6 +66,16 @@ def test_differences_of_joints_are_told(policy, changed):
     ]
 
 
+def test_geoms_are_told(policy, changed):
+    """Geoms that should end episodes and are missing, and a robot that no view would draw."""
+    hidden = setting(".//default[@class='visual']/geom", group="5")
+    description = policy.description | {"episode": {"length": 20.0, "ends_on_contact_of": ["trunk", "head"]}}
+    assert MujocoRobot(changed(hidden), description).notes == [
+        "no view draws the robot: its geoms are in group 3, 5; put those to be seen into group 0, 1 or 2",
+        "no geom's name contains head: it ends no episode",
+    ]
+
+
 def test_older_exports(policy, changed):
     """Descriptions that do not tell the joints' axes are run as they were, and a line says what is not compared."""
     older = {key: value for key, value in policy.description.items() if key != "joints"}

@@ -15,6 +15,7 @@ from legged_torque.deploy.ground import ground_heights, place_ground
 from legged_torque.deploy.policy import State
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.mjcf import (
+    drawing_notes,
     loading,
     motors_of,
     torque_per_control,
@@ -152,6 +153,7 @@ class MujocoRobot:
         """Compile the file with the policy's ground, and return it with the places where episodes may start."""
         with loading(file):
             spec = mujoco.MjSpec.from_file(str(file))
+            self.notes += drawing_notes(spec)
             origins = place_ground(spec, description, self.notes)
             return spec.compile(), origins
 
@@ -214,10 +216,14 @@ class MujocoRobot:
         self._is_ground = model.body_weldid[model.geom_bodyid] == 0
         (self._grounds,) = np.nonzero(self._is_ground & (model.geom_contype | model.geom_conaffinity != 0))
         names = [model.geom(i).name or model.body(model.geom_bodyid[i]).name for i in range(model.ngeom)]
-        is_ending = np.array([any(part in name for part in ends_on_contact_of) for name in names]) & ~self._is_ground
-        if ends_on_contact_of and not is_ending.any():
-            parts, trunk = ", ".join(ends_on_contact_of), model.body(self.trunk).name
-            self.notes.append(f"no geom's name contains {parts}: those of '{trunk}' end an episode")
+        matching = {part: np.array([part in name for name in names]) & ~self._is_ground for part in ends_on_contact_of}
+        is_ending = np.any([np.zeros(model.ngeom, bool), *matching.values()], axis=0)
+        missing = ", ".join(part for part, geoms in matching.items() if not geoms.any())
+        if missing and is_ending.any():
+            self.notes.append(f"no geom's name contains {missing}: it ends no episode")
+        elif missing:
+            trunk = model.body(self.trunk).name
+            self.notes.append(f"no geom's name contains {missing}: those of '{trunk}' end an episode")
             is_ending = model.geom_bodyid == self.trunk
         self._is_ending = is_ending
 

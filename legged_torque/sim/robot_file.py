@@ -11,7 +11,6 @@ from legged_torque.sim.model import FLOOR
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import motors_of, torque_range, why_no_motor
 
-DRAWN_GROUPS = (0, 1, 2)  # of geoms that videos and viewers draw
 _ONE_NUMBER = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))  # types of joints
 
 
@@ -42,6 +41,8 @@ def joint_problems(model: mujoco.MjModel) -> Iterator[str]:
         yield "its first joint must be the trunk's free joint"
         return
     trunk = model.jnt_bodyid[0]
+    if trunk != 1:
+        yield f"the trunk '{model.body(trunk).name}' must be the first body, before '{model.body(1).name}'"
     for joint in range(1, model.njnt):
         name, body = model.joint(joint).name, model.jnt_bodyid[joint]
         if not name:
@@ -127,11 +128,3 @@ def _name(model: mujoco.MjModel, actuator: int) -> str:
     joint = model.actuator_trnid[actuator, 0]
     on_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
     return model.actuator(actuator).name or (model.joint(joint).name if on_joint else str(actuator))
-
-
-def notes_on(spec: mujoco.MjSpec) -> Iterator[str]:
-    """Yield what a user should know of a file that can be simulated."""
-    robot = [geom for geom in spec.geoms if geom.parent.name != "world"]
-    if robot and not any(geom.group in DRAWN_GROUPS for geom in robot):
-        groups = ", ".join(sorted({str(geom.group) for geom in robot}))
-        yield f"no view draws the robot: its geoms are in group {groups}; put those to be seen into group 0, 1 or 2"

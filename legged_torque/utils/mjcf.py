@@ -12,6 +12,8 @@ import numpy as np
 
 from legged_torque.utils.errors import UserError
 
+DRAWN_GROUPS = (0, 1, 2)  # of geoms that videos and viewers draw
+
 
 @contextlib.contextmanager
 def loading(file: str | Path) -> Iterator[None]:
@@ -95,3 +97,11 @@ def joint_axes(model: mujoco.MjModel) -> np.ndarray:
 def joint_limits(model: mujoco.MjModel) -> np.ndarray:
     """Return lowest and highest position of each joint, infinite without a range. Shape: (njnt, 2) [rad]."""
     return np.where(model.jnt_limited[:, np.newaxis] > 0, model.jnt_range, [-np.inf, np.inf])
+
+
+def drawing_notes(spec: mujoco.MjSpec) -> Iterator[str]:
+    """Yield what to do if no view would draw the robot, since all its geoms are in other groups."""
+    robot = [geom for geom in spec.geoms if geom.parent.name != "world"]
+    if robot and not any(geom.group in DRAWN_GROUPS for geom in robot):
+        groups = ", ".join(sorted({str(geom.group) for geom in robot}))
+        yield f"no view draws the robot: its geoms are in group {groups}; put those to be seen into group 0, 1 or 2"

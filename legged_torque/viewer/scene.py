@@ -11,7 +11,7 @@ import viser
 from PIL import Image
 from viser import transforms
 
-from legged_torque.sim.robot_file import DRAWN_GROUPS
+from legged_torque.utils.mjcf import DRAWN_GROUPS
 from legged_torque.viewer.ground import Ground, Smooth
 from legged_torque.viewer.reading import Reading
 

@@ -14,14 +14,13 @@ from legged_torque.envs.base.robot_checks import foot_notes, pose_problems
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching, read_spec
 from legged_torque.sim.robot_file import (
     model_problems,
-    notes_on,
     refuse,
     spec_problems,
     use_plain_motors,
 )
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.errors import UserError, told_in, unknown_name
-from legged_torque.utils.mjcf import joint_axes, loading
+from legged_torque.utils.mjcf import drawing_notes, joint_axes, loading
 
 
 @dataclass
@@ -55,7 +54,7 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     """
     settings, file = cfg.asset, resource_path(cfg.asset.file)
     spec = read_spec(file)
-    problems, notes, geoms = list(spec_problems(spec)), list(notes_on(spec)), collision_geoms(spec)
+    problems, notes, geoms = list(spec_problems(spec)), list(drawing_notes(spec)), collision_geoms(spec)
     chosen: list[list[int]] = []
     for parts in ([settings.foot_name], settings.penalize_contacts_on, settings.terminate_after_contacts_on):
         with told_in(problems):
