@@ -28,6 +28,8 @@ def test_gains_by_joint():
     assert by_joint("gains", {"hip": 1.0, "calf": 2.0}, names) == [1.0, 2.0] * 4
     assert by_joint("gains", {"FR_hip": 5.0, "hip": 1.0, "calf": 2.0}, names)[:3] == [5.0, 2.0, 1.0]
     assert "gains lacks the joint 'FR_calf_joint'" in error_of(by_joint, "gains", {"hip": 1.0}, names)
+    unused = {"hip": 1.0, "FR_hip": 5.0, "calf": 2.0}
+    assert "'FR_hip' in gains has no effect" in error_of(by_joint, "gains", unused, names)
     assert "did you mean" in error_of(by_joint, "gains", {"FR_hipp_joint": 1.0}, names)
 
 

@@ -87,13 +87,16 @@ def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence
     for part in values:
         if not any(part in name for name in dof_names):
             raise unknown_name(f"joint (part of its name) in {setting}", part, dof_names)
-    result = []
+    taken = []
     for name in dof_names:
-        matching = [value for part, value in values.items() if part in name]
+        matching = [part for part in values if part in name]
         if not matching:
             raise UserError(f"{setting} lacks the joint '{name}'; it has {', '.join(values) or 'no entries'}")
-        result.append(matching[0])
-    return result
+        taken.append(matching[0])
+    for part in values:
+        if part not in taken:
+            raise UserError(f"'{part}' in {setting} has no effect: its joints take a name before it")
+    return [values[part] for part in taken]
 
 
 def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[float]:
