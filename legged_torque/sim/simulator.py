@@ -42,7 +42,8 @@ class Simulator:
         qvel: Velocities: trunk linear (world frame) [m/s], trunk angular (trunk frame) [rad/s], joints [rad/s].
             Shape: (num_envs, nv).
         qacc_warmstart: Accelerations from which the constraint solver starts. Shape: (num_envs, nv).
-        ctrl: Joint torques [N m]. Shape: (num_envs, nu).
+        ctrl: Torques of the motors [N m] in the model's order, which is that of the joints for robots of tasks; times
+            gear, if a motor has one. Shape: (num_envs, nu).
         contact_found: Number of contacts of each sensed geom with the floor, as of the start of the last physics step;
             after one that does not sense, it is what it was ("fused") or 0 ("mujoco_warp"). Shape: (num_envs, geoms).
         contact_force: Net contact force on each sensed geom in the world frame [N], likewise.
