@@ -54,11 +54,17 @@ def test_mirrored_axes_are_turned_around(policy, changed):
 
 
 def test_differences_of_joints_are_told(policy, changed):
-    """Damping, armature, friction, tilted axes, and a nominal pose beyond limits."""
+    """Mass, damping, armature, tilted axes, and a nominal pose beyond limits."""
     passive = setting(".//default[@class='a1']/joint", damping="2", frictionloss="0.2", armature="0.01")
-    edits = [passive, joint("RR_calf_joint", armature="0.02"), joint("FR_hip_joint", axis="1 0 0.2")]
+    edits = [
+        setting("worldbody/body/inertial", mass="5.713"),
+        passive,
+        joint("RR_calf_joint", armature="0.02"),
+        joint("FR_hip_joint", axis="1 0 0.2"),
+    ]
     robot = MujocoRobot(changed(*edits, joint("RL_calf_joint", range="-2.6 -1.6")), policy.description)
     assert robot.notes == [
+        "mass: the MJCF has 13.453 kg, the robot of the training 12.453 kg",
         "axes: those of the MJCF are not the policy's (FR_hip_joint)",
         "nominal pose: beyond the joint limits of the MJCF, where episodes start instead (RL_calf_joint)",
         "damping of joints: the MJCF has 2, the robot of the training 0 (all joints)",

@@ -11,6 +11,7 @@ import numpy as np
 from legged_torque.deploy.description import DESCRIPTION_FILE
 from legged_torque.utils.mjcf import joint_axes, joint_limits
 
+MASS_TOLERANCE = 1e-3  # share of the mass below which robots count as equally heavy
 ALIKE = 0.999  # least cosine between axes that count as parallel
 
 
@@ -26,7 +27,10 @@ def policy_limits(model: mujoco.MjModel, joints: np.ndarray, signs: np.ndarray) 
 
 
 def joint_notes(model: mujoco.MjModel, joints: np.ndarray, description: dict[str, Any]) -> Iterator[str]:
-    """Yield a line for each difference of axes, limits, and passive forces, with the joints that it concerns."""
+    """Yield a line for each difference of mass, axes, limits, and passive forces, with the joints that it concerns."""
+    mass, trained = float(model.body_mass.sum()), description["robot"].get("mass")
+    if trained and not np.isclose(mass, trained, rtol=MASS_TOLERANCE):
+        yield f"mass: the MJCF has {mass:.3f} kg, the robot of the training {trained:.3f} kg"
     along = _along(model, joints, description)
     turned = {"axes: those of the MJCF point the other way; angles and torques are negated": along < -ALIKE}
     turned["axes: those of the MJCF are not the policy's"] = np.abs(along) <= ALIKE

@@ -142,13 +142,14 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
     cfg, asset, ranges = task.cfg, task.cfg.asset, task.cfg.commands.ranges
     is_rough = cfg.terrain.mesh_type == "heightfield"
     clip = float(cfg.normalization.clip_actions)
-    file = Path(asset.file)
+    file, model = Path(asset.file), task.sim.mj_model
     if file.is_absolute() and file.is_relative_to(RESOURCES_DIR):
         file = file.relative_to(RESOURCES_DIR.parent)
     return {
         "format_version": FORMAT_VERSION,
         "task": name,
-        "robot": {"name": file.stem, "file": file.as_posix(), "trunk": task.sim.mj_model.body(1).name},
+        "robot": {"name": file.stem, "file": file.as_posix(), "trunk": model.body(1).name}
+        | {"mass": round(float(model.body_mass.sum()), 6)},
         "versions": package_versions() | {"legged_torque": __version__},
         "training": training,
         "network": {"file": NETWORK_FILE, "torchscript": TORCHSCRIPT_FILE, "input": "obs", "output": "actions"}
