@@ -24,7 +24,7 @@ from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.options import DEFAULT_PRESET, Options
 from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, package_versions
-from legged_torque.utils.task_registry import experiment_dir, num_iterations, set_seed
+from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
 
 if TYPE_CHECKING:
     from legged_torque.learning.runner import OnPolicyRunner
@@ -70,6 +70,8 @@ def main() -> None:
 
 def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
     """Build the task and train it, from a pre-trained policy if the task has one."""
+    from legged_torque.envs.base.held_pose import standing_note
+    from legged_torque.envs.base.legged_robot import LeggedRobot
     from legged_torque.learning.pretrained import find_pretrained, pretrained_file, start_from
 
     is_first = distributed.rank() == 0
@@ -78,6 +80,8 @@ def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
     if starts_pretrained:
         find_pretrained(pretrained, options.task, env_cfg, train_cfg, resolve_device(options.device))
     env, _ = task_registry.make_env(options.task, options, env_cfg)
+    if is_first and isinstance(env, LeggedRobot) and not options.resume:
+        print_notes(filter(None, [standing_note(env)]))
     runner, _ = task_registry.make_alg_runner(env, options.task, options, train_cfg)
     if starts_pretrained:
         start_from(runner, pretrained)  # the other processes get the networks of the first one

@@ -22,6 +22,7 @@ FORMAT_VERSION = 1
 COMMENTS = {
     "format_version": "How to run policy.onnx on a robot; docs/deploy.md of legged_torque explains it.",
     "training": "total_steps: environment steps over all worlds",
+    "robot": "of the training; mass [kg] of all its parts",
     "network": "one row of observations per robot in, one row of actions out; mean actions, normalization is inside",
     "joint_order": "order of joints in observations, actions and torques",
     "nominal_pose": "[rad]",
@@ -37,6 +38,8 @@ COMMENTS = {
     "start of an episode on: those in between do not count, nor as last_action",
     "gains": "stiffness Kp [N m/rad], damping Kd [N m s/rad]",
     "torque_limits": "[N m]",
+    "joints": "of the robot in training: axis in the trunk's frame where all angles are 0, damping [N m s/rad],\n"
+    "armature [kg m^2], frictionloss [N m]",
     "timing": "[Hz]; actions hold for decimation physics steps; refresh_torques: torques are computed anew from q and\n"
     "qd at every physics step, otherwise once per control step",
     "commands": "[m/s, m/s, rad/s] in the trunk's frame, as trained; resampling_probability per control step; with a\n"
@@ -138,7 +141,8 @@ def _check_schema(description: Any, where: str) -> None:
 def _check_joints(description: dict[str, Any], where: str) -> None:
     """Check that values by joint cover all joints and no others."""
     joints = description["joint_order"]
-    by_joint = {key: description[key] for key in ("nominal_pose", "torque_limits")}
+    keys = ("nominal_pose", "torque_limits", "joints")  # older files lack the last one
+    by_joint = {key: description[key] for key in keys if key in description}
     by_joint |= {f"gains.{key}": values for key, values in description["gains"].items()}
     for path, values in by_joint.items():
         for name in values:

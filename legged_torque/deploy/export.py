@@ -142,13 +142,14 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
     cfg, asset, ranges = task.cfg, task.cfg.asset, task.cfg.commands.ranges
     is_rough = cfg.terrain.mesh_type == "heightfield"
     clip = float(cfg.normalization.clip_actions)
-    file = Path(asset.file)
+    file, model = Path(asset.file), task.sim.mj_model
     if file.is_absolute() and file.is_relative_to(RESOURCES_DIR):
         file = file.relative_to(RESOURCES_DIR.parent)
     return {
         "format_version": FORMAT_VERSION,
         "task": name,
-        "robot": {"name": file.stem, "file": file.as_posix(), "trunk": task.sim.mj_model.body(1).name},
+        "robot": {"name": file.stem, "file": file.as_posix(), "trunk": model.body(1).name}
+        | {"mass": round(float(model.body_mass.sum()), 6)},
         "versions": package_versions() | {"legged_torque": __version__},
         "training": training,
         "network": {"file": NETWORK_FILE, "torchscript": TORCHSCRIPT_FILE, "input": "obs", "output": "actions"}
@@ -160,6 +161,7 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
         "actions": {"clip": [-clip, clip], "terms": _action_terms(task)},
         "gains": {"stiffness": _by_joint(task, task.p_gains[0]), "damping": _by_joint(task, task.d_gains[0])},
         "torque_limits": _by_joint(task, task.torque_limits.T),
+        "joints": _joints(task),
         "timing": {
             "control_frequency": 1.0 / task.dt,
             "physics_frequency": 1.0 / cfg.sim.dt,
@@ -192,6 +194,16 @@ def _observation_terms(task: LeggedRobot) -> list[dict[str, Any]]:
         }
         for term in task.observations.policy_terms()
     ]
+
+
+def _joints(task: LeggedRobot) -> dict[str, Any]:
+    """Return axes and passive forces of the joints, by which other files of the robot are compared with this one."""
+    result = {}
+    for name, axis in zip(task.dof_names, task.asset.dof_axes(), strict=True):
+        joint = task.sim.mj_model.joint(name)
+        passive = {field: float(getattr(joint, field)[0]) for field in ("damping", "armature", "frictionloss")}
+        result[name] = {"axis": [round(float(part), 6) + 0.0 for part in axis], **passive}
+    return result
 
 
 def _action_terms(task: LeggedRobot) -> list[dict[str, Any]]:

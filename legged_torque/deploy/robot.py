@@ -10,17 +10,25 @@ import mujoco
 import numpy as np
 
 from legged_torque.deploy import hfield_contacts
+from legged_torque.deploy.differences import axis_signs, joint_notes, policy_limits
 from legged_torque.deploy.ground import ground_heights, place_ground
 from legged_torque.deploy.policy import State
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.mjcf import loading
+from legged_torque.utils.mjcf import (
+    drawing_notes,
+    loading,
+    motors_of,
+    torque_per_control,
+    torque_range,
+    why_no_motor,
+)
 
 _WARNINGS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 _JOINTS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 class MujocoRobot:
-    """One robot in MuJoCo; vectors of joints are in the policy's order, not the file's.
+    """One robot in MuJoCo; vectors of joints are in the policy's order and about its axes, not the file's.
 
     Attributes:
         file: The MJCF.
@@ -50,7 +58,8 @@ class MujocoRobot:
             self.notes.append(f"time step: the MJCF has {old:g} s, policy.yaml's {step:g} s is used")
         self.model.opt.timestep = step
         self._find_root()
-        self._find_joints(description["joint_order"])
+        self._find_joints(description)
+        self.notes += joint_notes(self.model, self._joint_ids, description)
         self._find_motors(description)
         self._find_geoms(description["episode"]["ends_on_contact_of"])
         self.weight = float(self.model.body_mass.sum() * np.linalg.norm(self.model.opt.gravity))
@@ -64,15 +73,15 @@ class MujocoRobot:
 
     def joint_positions(self) -> np.ndarray:
         """Return joint positions. Shape: (joints,) [rad]."""
-        return self.data.qpos[self._qpos]
+        return self._signs * self.data.qpos[self._qpos]
 
     def joint_velocities(self) -> np.ndarray:
         """Return joint velocities. Shape: (joints,) [rad/s]."""
-        return self.data.qvel[self._dofs]
+        return self._signs * self.data.qvel[self._dofs]
 
     def applied_torques(self) -> np.ndarray:
         """Return the motors' torques in the last physics step. Shape: (joints,) [N m]."""
-        return self.data.qfrc_actuator[self._dofs]
+        return self._signs * self.data.qfrc_actuator[self._dofs]
 
     def step(self, torques: np.ndarray) -> None:
         """Advance by one physics step with torques of shape (joints,) [N m]."""
@@ -95,9 +104,9 @@ class MujocoRobot:
         """
         mujoco.mj_resetData(self.model, self.data)
         self.position[:], self.quat[:] = position, quat
-        self.data.qpos[self._qpos] = np.clip(joint_positions, *self._joint_limits)
+        self.data.qpos[self._qpos] = self._signs * np.clip(joint_positions, *self._joint_limits)
         self.velocity[:], self.angular_velocity[:] = velocities[:2]
-        self.data.qvel[self._dofs] = velocities[2]
+        self.data.qvel[self._dofs] = self._signs * velocities[2]
         mujoco.mj_kinematics(self.model, self.data)  # places the ground
 
     # ---- the ground --------------------------------------------------------------------------------------------------
@@ -144,6 +153,7 @@ class MujocoRobot:
         """Compile the file with the policy's ground, and return it with the places where episodes may start."""
         with loading(file):
             spec = mujoco.MjSpec.from_file(str(file))
+            self.notes += drawing_notes(spec)
             origins = place_ground(spec, description, self.notes)
             return spec.compile(), origins
 
@@ -157,36 +167,41 @@ class MujocoRobot:
         self.position, self.quat = qpos[:3], qpos[3:]
         self.velocity, self.angular_velocity = qvel[:3], qvel[3:]
 
-    def _find_joints(self, joint_order: list[str]) -> None:
-        """Find the policy's joints by name."""
-        model = self.model
+    def _find_joints(self, description: dict[str, Any]) -> None:
+        """Find the policy's joints by name, and which of them turn about an axis that points the other way."""
+        joint_order = description["joint_order"]
+        model, problems = self.model, list[str]()
         names = {model.joint(i).name: i for i in range(model.njnt) if model.jnt_type[i] in _JOINTS}
         for name in joint_order:
             if name not in names:
-                raise unknown_name("joint of the policy in the MJCF", name, names)
+                problems.append(str(unknown_name("joint of the policy in the MJCF", name, names)))
+        _refuse(problems)
         self._joint_ids = np.array([names[name] for name in joint_order])
         self._qpos, self._dofs = model.jnt_qposadr[self._joint_ids], model.jnt_dofadr[self._joint_ids]
-        limited = model.jnt_limited[self._joint_ids, np.newaxis] > 0
-        self._joint_limits = np.where(limited, model.jnt_range[self._joint_ids], [-np.inf, np.inf]).T
+        self._signs = axis_signs(model, self._joint_ids, description)
+        self._joint_limits = policy_limits(model, self._joint_ids, self._signs)
 
     def _find_motors(self, description: dict[str, Any]) -> None:
-        """Find the motor of each joint, and compare its limits with the policy's."""
-        model, motors, scales = self.model, [], []
+        """Find the motor of each joint by its transmission, and compare its limits with the policy's."""
+        model, motors, problems = self.model, list[int](), list[str]()
         different: dict[tuple[tuple[float, float], tuple[float, float]], list[str]] = {}
-        for name, joint in zip(description["joint_order"], self._joint_ids, strict=True):
-            on_joint = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
-            (found,) = np.nonzero(on_joint)
+        for name, joint, sign in zip(description["joint_order"], self._joint_ids, self._signs, strict=True):
+            found = motors_of(model, joint)
+            reason = why_no_motor(model, found[0]) if len(found) == 1 else ""
             if len(found) != 1:
-                raise UserError(f"the MJCF must have one motor for the joint '{name}', it has {len(found)}")
-            motor = int(found[0])
-            if not _is_torque_motor(model, motor):
-                raise UserError(f"the MJCF's actuator of the joint '{name}' must be a motor, ctrl being its torque")
-            motors.append(motor)
-            scales.append(model.actuator_gainprm[motor, 0] * model.actuator_gear[motor, 0])
-            limits = _torque_range(model, motor, int(joint), scales[-1])
-            if not np.allclose(limits, description["torque_limits"][name], rtol=1e-4):
-                different.setdefault((limits, tuple(description["torque_limits"][name])), []).append(name)
-        self._motors, self._torque_per_ctrl = np.array(motors), np.array(scales)
+                problems.append(f"the MJCF must have one motor for the joint '{name}', it has {len(found)}")
+            elif reason:
+                problems.append(
+                    f"the MJCF's actuator of the joint '{name}' must be a motor, ctrl its torque; it {reason}"
+                )
+            else:
+                motors.append(found[0])
+                low, high = sorted(sign * limit for limit in torque_range(model, found[0]))
+                if not np.allclose((low, high), description["torque_limits"][name], rtol=1e-4):
+                    different.setdefault(((low, high), tuple(description["torque_limits"][name])), []).append(name)
+        _refuse(problems)
+        self._motors = np.array(motors)
+        self._torque_per_ctrl = self._signs * [torque_per_control(model, motor) for motor in motors]
         for (limits, expected), names in different.items():
             self.notes.append(
                 f"motor limits: the MJCF has {limits[0]:g} to {limits[1]:g} N m, policy.yaml {expected[0]:g} to "
@@ -201,30 +216,19 @@ class MujocoRobot:
         self._is_ground = model.body_weldid[model.geom_bodyid] == 0
         (self._grounds,) = np.nonzero(self._is_ground & (model.geom_contype | model.geom_conaffinity != 0))
         names = [model.geom(i).name or model.body(model.geom_bodyid[i]).name for i in range(model.ngeom)]
-        is_ending = np.array([any(part in name for part in ends_on_contact_of) for name in names]) & ~self._is_ground
-        if ends_on_contact_of and not is_ending.any():
-            parts, trunk = ", ".join(ends_on_contact_of), model.body(self.trunk).name
-            self.notes.append(f"no geom's name contains {parts}: those of '{trunk}' end an episode")
+        matching = {part: np.array([part in name for name in names]) & ~self._is_ground for part in ends_on_contact_of}
+        is_ending = np.any([np.zeros(model.ngeom, bool), *matching.values()], axis=0)
+        missing = ", ".join(part for part, geoms in matching.items() if not geoms.any())
+        if missing and is_ending.any():
+            self.notes.append(f"no geom's name contains {missing}: it ends no episode")
+        elif missing:
+            trunk = model.body(self.trunk).name
+            self.notes.append(f"no geom's name contains {missing}: those of '{trunk}' end an episode")
             is_ending = model.geom_bodyid == self.trunk
         self._is_ending = is_ending
 
 
-def _is_torque_motor(model: mujoco.MjModel, motor: int) -> bool:
-    """Return whether an actuator's torque is proportional to its control."""
-    return (
-        model.actuator_gaintype[motor] == mujoco.mjtGain.mjGAIN_FIXED
-        and model.actuator_biastype[motor] == mujoco.mjtBias.mjBIAS_NONE
-        and model.actuator_dyntype[motor] == mujoco.mjtDyn.mjDYN_NONE
-        and model.actuator_gainprm[motor, 0] * model.actuator_gear[motor, 0] != 0.0
-    )
-
-
-def _torque_range(model: mujoco.MjModel, motor: int, joint: int, scale: float) -> tuple[float, float]:
-    """Return the lowest and highest torque that a motor can apply to its joint [N m]."""
-    ranges = (
-        (model.actuator_ctrllimited[motor], model.actuator_ctrlrange[motor] * scale),
-        (model.actuator_forcelimited[motor], model.actuator_forcerange[motor] * model.actuator_gear[motor, 0]),
-        (model.jnt_actfrclimited[joint], model.jnt_actfrcrange[joint]),
-    )
-    limits = [limits for is_limited, limits in ranges if is_limited] or [np.array([-np.inf, np.inf])]
-    return max(float(each.min()) for each in limits), min(float(each.max()) for each in limits)
+def _refuse(problems: list[str]) -> None:
+    """Raise a UserError with all problems of a MJCF in one line, if there are any."""
+    if problems:
+        raise UserError("; ".join(problems))

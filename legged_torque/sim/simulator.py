@@ -21,6 +21,7 @@ from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.height_map import HeightMap
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
 from legged_torque.sim.per_world import check_fields, expand, owner
+from legged_torque.sim.robot_file import actuator_problems, refuse
 from legged_torque.sim.warp_step import WarpStep
 from legged_torque.utils.errors import UserError, unknown_name
 
@@ -41,7 +42,8 @@ class Simulator:
         qvel: Velocities: trunk linear (world frame) [m/s], trunk angular (trunk frame) [rad/s], joints [rad/s].
             Shape: (num_envs, nv).
         qacc_warmstart: Accelerations from which the constraint solver starts. Shape: (num_envs, nv).
-        ctrl: Joint torques [N m]. Shape: (num_envs, nu).
+        ctrl: Torques of the motors [N m] in the model's order, which is that of the joints for robots of tasks; times
+            gear, if a motor has one. Shape: (num_envs, nu).
         contact_found: Number of contacts of each sensed geom with the floor, as of the start of the last physics step;
             after one that does not sense, it is what it was ("fused") or 0 ("mujoco_warp"). Shape: (num_envs, geoms).
         contact_force: Net contact force on each sensed geom in the world frame [N], likewise.
@@ -78,6 +80,7 @@ class Simulator:
             raise unknown_name("sim.engine", engine, ENGINES)
         if height_map is not None and engine != "fused":
             raise ValueError("only the fused engine takes a height map; the model of others has a hfield")
+        refuse(list(actuator_problems(model)), f"sim.engine '{engine}' needs motors")
         self.mj_model, self.num_envs, self.device = model, num_envs, device
         prepare_device(device)
         self._wp_device = wp.get_device(device)

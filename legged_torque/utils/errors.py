@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 OUT_OF_MEMORY = ("out of memory", "Failed to allocate", "can't allocate memory")
 """Parts of the messages of CUDA, Warp and torch on the CPU when memory has run out."""
@@ -30,6 +31,15 @@ def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
     match = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
     hint = f" did you mean '{match[0]}'?" if match else ""
     return UserError(f"unknown {kind} '{given}';{hint} allowed: {', '.join(allowed)}")
+
+
+@contextlib.contextmanager
+def told_in(problems: list[str]) -> Iterator[None]:
+    """Add the UserError raised inside to problems, which are told together later."""
+    try:
+        yield
+    except UserError as error:
+        problems.append(str(error))
 
 
 def is_out_of_memory(error: BaseException | None) -> bool:

@@ -1,4 +1,4 @@
-"""Reading robots from MJCF files: what MuJoCo does not like is told in one line, which names the file."""
+"""Reading robots from MJCF files: what MuJoCo does not like is told in one line; joints and motors by transmission."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from legged_torque.utils.errors import UserError
+
+DRAWN_GROUPS = (0, 1, 2)  # of geoms that videos and viewers draw
 
 
 @contextlib.contextmanager
@@ -37,3 +40,68 @@ def kept_warnings() -> Iterator[list[str]]:
         yield told
     finally:
         mujoco.set_mju_user_warning(before)
+
+
+def motors_of(model: mujoco.MjModel, joint: int) -> list[int]:
+    """Return the actuators that act on a joint, found by their transmission."""
+    on_joint = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
+    return np.flatnonzero(on_joint).tolist()
+
+
+def why_no_motor(model: mujoco.MjModel, actuator: int) -> str:
+    """Return why an actuator's control is no torque of a joint, up to a factor; empty if it is."""
+    if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
+        return "does not act on a joint"
+    if model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED:
+        return "has a gain that is not fixed"
+    if model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_NONE:
+        return "is a servo, whose control is a target"
+    if model.actuator_dyntype[actuator] != mujoco.mjtDyn.mjDYN_NONE:
+        return "has dynamics of its own"
+    if not torque_per_control(model, actuator):
+        return "has a gear or gain of 0"
+    extras = ("actuator_delay", "actuator_damping", "actuator_dampingpoly", "actuator_armature")  # not in all versions
+    found = [name for name in extras if np.any(getattr(model, name, np.zeros(model.nu))[actuator])]
+    return f"has {', '.join(name.removeprefix('actuator_') for name in found)}" if found else ""
+
+
+def torque_per_control(model: mujoco.MjModel, motor: int) -> float:
+    """Return the torque of a motor per unit of its control [N m]."""
+    return float(model.actuator_gainprm[motor, 0] * model.actuator_gear[motor, 0])
+
+
+def torque_range(model: mujoco.MjModel, motor: int) -> tuple[float, float]:
+    """Return the lowest and highest torque that a motor can apply to its joint [N m]: the tightest of all limits.
+
+    They are its forcerange times gear, its ctrlrange times gear and gain, and its joint's actuatorfrcrange.
+    """
+    joint, gear = model.actuator_trnid[motor, 0], model.actuator_gear[motor, 0]
+    ranges = (
+        (model.actuator_ctrllimited[motor], model.actuator_ctrlrange[motor] * torque_per_control(model, motor)),
+        (model.actuator_forcelimited[motor], model.actuator_forcerange[motor] * gear),
+        (model.jnt_actfrclimited[joint], model.jnt_actfrcrange[joint]),
+    )
+    limits = [limits for is_limited, limits in ranges if is_limited] or [np.array([-np.inf, np.inf])]
+    return max(float(each.min()) for each in limits), min(float(each.max()) for each in limits)
+
+
+def joint_axes(model: mujoco.MjModel) -> np.ndarray:
+    """Return the axes of all joints in the level trunk's frame, where all angles are 0. Shape: (njnt, 3)."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.0
+    data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE] + 3] = 1.0
+    mujoco.mj_kinematics(model, data)
+    return data.xaxis.copy()
+
+
+def joint_limits(model: mujoco.MjModel) -> np.ndarray:
+    """Return lowest and highest position of each joint, infinite without a range. Shape: (njnt, 2) [rad]."""
+    return np.where(model.jnt_limited[:, np.newaxis] > 0, model.jnt_range, [-np.inf, np.inf])
+
+
+def drawing_notes(spec: mujoco.MjSpec) -> Iterator[str]:
+    """Yield what to do if no view would draw the robot, since all its geoms are in other groups."""
+    robot = [geom for geom in spec.geoms if geom.parent.name != "world"]
+    if robot and not any(geom.group in DRAWN_GROUPS for geom in robot):
+        groups = ", ".join(sorted({str(geom.group) for geom in robot}))
+        yield f"no view draws the robot: its geoms are in group {groups}; put those to be seen into group 0, 1 or 2"

@@ -9,6 +9,7 @@ import io
 import math
 import os
 import pkgutil
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -95,12 +96,15 @@ class TaskRegistry:
     def make_env(self, name: str, args: Options | None = None, env_cfg: Any | None = None) -> tuple[VecEnv, Any]:
         """Create a task on the device of ``args``; return it and its settings.
 
-        ``env_cfg`` are settings to use as they are; None takes the registered ones with ``args`` applied.
+        ``env_cfg`` are settings to use as they are; None takes the registered ones with ``args`` applied. What the task
+        notes of its robot is printed.
         """
         task_class = self.get_task_class(name)
         if env_cfg is None:
             env_cfg, _ = self.get_cfgs(name, args)
-        return task_class(env_cfg, resolve_device(args.device if args else None)), env_cfg
+        env = task_class(env_cfg, resolve_device(args.device if args else None))
+        print_notes(getattr(env, "notes", ()))
+        return env, env_cfg
 
     def make_alg_runner(
         self,
@@ -178,6 +182,12 @@ class TaskRegistry:
         if name not in self._tasks:
             raise unknown_name("task", name, self._tasks)
         return self._tasks[name]
+
+
+def print_notes(notes: Iterable[str]) -> None:
+    """Print what a user should know of a task's robot, once for all processes."""
+    for note in notes if distributed.rank() == 0 else ():
+        print(f"Note: {note}", flush=True)
 
 
 def experiment_dir(train_cfg: Any, log_root: str | None = None) -> Path:

@@ -11,11 +11,11 @@ import viser
 from PIL import Image
 from viser import transforms
 
+from legged_torque.utils.mjcf import DRAWN_GROUPS
 from legged_torque.viewer.ground import Ground, Smooth
 from legged_torque.viewer.reading import Reading
 
 COMMAND_COLOR, VELOCITY_COLOR, SCAN_COLOR = (10, 150, 50), (20, 90, 230), (214, 51, 108)
-VISUAL_GROUPS = (0, 1, 2)  # groups of visual geoms; the others only collide
 GROUND_FACTOR = (0.45, 0.45, 0.45, 1.0)  # of the colors of rough ground: the light is bright
 SPACING = 2.0  # distance between neighbouring worlds [m]
 LIFTING = 0.2  # share of the way to where it sees the robot by which a camera moves up in a frame
@@ -162,7 +162,7 @@ def body_glb(model: mujoco.MjModel, body: int) -> bytes | None:
     """Return a body's visual geoms as a binary glTF in its frame, one mesh per material; None if it has none."""
     by_material: dict[int, list[trimesh.Trimesh]] = {}
     for geom in range(model.ngeom):
-        if model.geom_bodyid[geom] == body and model.geom_group[geom] in VISUAL_GROUPS:
+        if model.geom_bodyid[geom] == body and model.geom_group[geom] in DRAWN_GROUPS:
             by_material.setdefault(int(model.geom_matid[geom]), []).append(geom_mesh(model, geom))
     if not by_material:
         return None

@@ -10,10 +10,17 @@ import numpy as np
 
 from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.envs.base.robot_checks import foot_notes, pose_problems
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching, read_spec
+from legged_torque.sim.robot_file import (
+    model_problems,
+    refuse,
+    spec_problems,
+    use_plain_motors,
+)
 from legged_torque.terrain.terrain import Terrain
-from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.mjcf import loading
+from legged_torque.utils.errors import UserError, told_in, unknown_name
+from legged_torque.utils.mjcf import drawing_notes, joint_axes, loading
 
 
 @dataclass
@@ -26,6 +33,7 @@ class Asset:
     feet: list[int]  # in the order of ``foot_names``
     penalized: list[int]  # geoms of the collision term
     terminating: list[int]  # geoms that end an episode
+    notes: list[str]  # what a user should know of the robot, a line each
 
     @property
     def foot_names(self) -> list[str]:
@@ -33,51 +41,40 @@ class Asset:
         return [self.geom_names[place] for place in self.feet]
 
     def dof_axes(self) -> np.ndarray:
-        """Return the axes of the joints in the frames of their bodies. Shape: (num_dof, 3)."""
-        return self.mj_model.jnt_axis[1:]
+        """Return the axes of the joints in the trunk's frame, where all angles are 0. Shape: (num_dof, 3)."""
+        return joint_axes(self.mj_model)[1:]
 
 
 def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     """Load the robot of ``cfg.asset``, to be simulated in steps of ``cfg.sim.dt``, on the file's plane or a terrain.
 
-    A UserError if the file cannot be read, a name in the settings matches nothing, or motors are in another order.
+    Its motors are plain ones in the order of its joints, see :func:`~legged_torque.sim.robot_file.use_plain_motors`. A
+    UserError, which tells all that is wrong at once, if the file cannot be read, names in the settings match nothing,
+    or tasks cannot simulate the robot.
     """
-    settings = cfg.asset
-    spec = read_spec(resource_path(settings.file))
-    _check_parts(spec, settings.file)
-    geoms = collision_geoms(spec)
-    feet = indices_matching(geoms, [settings.foot_name])
-    penalized = indices_matching(geoms, settings.penalize_contacts_on)
-    terminating = indices_matching(geoms, settings.terminate_after_contacts_on)
-    if terrain:
-        terrain.add_to(spec, FLOOR)
-    with loading(resource_path(settings.file)):
-        model = build_model(spec, geoms)
-    if not np.isfinite([*model.body_mass, *model.body_inertia.flat]).all():
-        raise UserError(f"'{settings.file}' has a mass or an inertia that is not finite")
-    model.opt.timestep = cfg.sim.dt
+    settings, file = cfg.asset, resource_path(cfg.asset.file)
+    spec = read_spec(file)
+    problems, notes, geoms = list(spec_problems(spec)), list(drawing_notes(spec)), collision_geoms(spec)
+    chosen: list[list[int]] = []
+    for parts in ([settings.foot_name], settings.penalize_contacts_on, settings.terminate_after_contacts_on):
+        with told_in(problems):
+            chosen.append(indices_matching(geoms, parts))
+    with loading(file):
+        if terrain and not problems:
+            terrain.add_to(spec, FLOOR)
+        model = spec.compile() if problems else build_model(spec, geoms)
     dof_names = [model.joint(i).name for i in range(1, model.njnt)]
-    _check_motors(model, dof_names, settings.file)
-    return Asset(model, dof_names, geoms, feet, penalized, terminating)
-
-
-def _check_parts(spec: mujoco.MjSpec, file: str) -> None:
-    """Refuse a robot that does not float, or does not stand on a floor of that name, beside which nothing collides."""
-    trunks = [body for body in spec.worldbody.bodies if any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in body.joints)]
-    if len(trunks) != 1:
-        raise UserError(f"'{file}' must have one body with a free joint, the trunk, not {len(trunks)}")
-    if FLOOR not in [geom.name for geom in spec.worldbody.geoms]:
-        raise UserError(f"'{file}' must have a geom '{FLOOR}' in its worldbody")
-
-
-def _check_motors(model: mujoco.MjModel, dof_names: list[str], file: str) -> None:
-    """Refuse motors in another order than joints, whose torques would go to other joints, and motors without limits."""
-    driven = [model.joint(joint).name for joint in model.actuator_trnid[:, 0]]
-    if driven != dof_names:
-        raise UserError(f"the motors of '{file}' must be in the order of its joints, {dof_names}, not {driven}")
-    for actuator, name in enumerate(driven):
-        if not model.actuator_forcelimited[actuator]:
-            raise UserError(f"the motor of the joint '{name}' in '{file}' has no forcerange: its torque limits")
+    with told_in(problems):
+        problems += model_problems(model)
+        problems += pose_problems(nominal_pose(cfg.init_state.default_joint_angles, dof_names), model)
+    refuse(problems, f"'{settings.file}' cannot be simulated")
+    if use_plain_motors(spec, model):
+        with loading(file):
+            model = spec.compile()
+    model.opt.timestep = cfg.sim.dt
+    feet, penalized, terminating = chosen
+    notes += foot_notes(model, [geoms[place] for place in feet])
+    return Asset(model, dof_names, geoms, feet, penalized, terminating, notes)
 
 
 def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:
@@ -90,13 +87,16 @@ def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence
     for part in values:
         if not any(part in name for name in dof_names):
             raise unknown_name(f"joint (part of its name) in {setting}", part, dof_names)
-    result = []
+    taken = []
     for name in dof_names:
-        matching = [value for part, value in values.items() if part in name]
+        matching = [part for part in values if part in name]
         if not matching:
             raise UserError(f"{setting} lacks the joint '{name}'; it has {', '.join(values) or 'no entries'}")
-        result.append(matching[0])
-    return result
+        taken.append(matching[0])
+    for part in values:
+        if part not in taken:
+            raise UserError(f"'{part}' in {setting} has no effect: its joints take a name before it")
+    return [values[part] for part in taken]
 
 
 def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[float]:
@@ -112,5 +112,6 @@ def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[flo
         if name not in angles:
             raise UserError(f"{key} lacks the joint '{name}'")
     if list(angles) != list(dof_names):
-        raise UserError(f"{key} must be in the order of the MJCF's joints: {', '.join(dof_names)}")
+        why = "in which policies see and drive them"
+        raise UserError(f"{key} must be in the order of the MJCF's joints, {why}: {', '.join(dof_names)}")
     return list(angles.values())

@@ -10,6 +10,7 @@ from torch import Tensor
 from legged_torque.sim.randomization import Parameter, Range
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import SCALAR, VECTOR, Mirroring
+from legged_torque.utils.mjcf import joint_limits
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -28,7 +29,7 @@ def initial_state(task: LeggedRobot) -> list[Parameter]:
     """Return what is drawn at the start of an episode: its state, the trunk's orientation as angles, and the delay."""
     rand, pose = task.cfg.domain_rand, task.default_dof_pos.tolist()
     qpos, qvel, dofs = task.sim.qpos, task.sim.qvel, range(task.num_dof)
-    limits = task.sim.mj_model.jnt_range[1:].T.tolist()
+    limits = joint_limits(task.sim.mj_model)[1:].T.tolist()
     shortest, longest = rand.action_delay
     pos = task.cfg.init_state.pos
 

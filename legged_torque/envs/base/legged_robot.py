@@ -20,6 +20,7 @@ from legged_torque.envs.base.observations import Observations, ObservationTerm, 
 from legged_torque.envs.base.random_events import RandomEvents
 from legged_torque.envs.base.reward_terms import RewardTerms
 from legged_torque.envs.base.rewards import Rewards
+from legged_torque.envs.base.robot_checks import mirror_problem, range_notes
 from legged_torque.envs.base.symmetry import Mirror, RobotSymmetry, make_mirror
 from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
@@ -33,6 +34,7 @@ from legged_torque.terrain import make_terrain
 from legged_torque.utils.config import section_keys, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.math import quat_rotate_inverse
+from legged_torque.utils.mjcf import joint_limits
 
 
 class LeggedRobot(RewardTerms, BaseTask):
@@ -57,6 +59,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         commands: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
         contacts: 1 for each collision geom that touches the ground, else 0. Shape: (num_envs, geoms).
         feet_contact: The same for the feet. Shape: (num_envs, feet).
+        notes: What a user should know of this robot with these settings, a line each.
     """
 
     cfg: LeggedRobotCfg
@@ -258,14 +261,17 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.num_dof = len(self.dof_names)
         axes = self.asset.dof_axes().tolist()
         self.symmetry = RobotSymmetry(cfg.asset.mirrored_legs, self.dof_names, axes, self.foot_names)
+        if self.symmetry.joints and self.symmetry.feet:
+            problem = mirror_problem(model, self.symmetry.joints, self.symmetry.feet, self.foot_names)
+            self.symmetry.refuse(problem)
         self.motors = make_motors(cfg.motors.model, self.num_envs, self._tensor(model.actuator_forcerange.T))
         self.torque_limits, self.motor_strength = self.motors.limits, self.motors.strength
         self.base_pos, self.base_quat = self.sim.qpos[:, :3], self.sim.qpos[:, 3:7]
         self.dof_pos, self.dof_vel = self.sim.qpos[:, 7:], self.sim.qvel[:, 6:]
         self.base_ang_vel = self.sim.qvel[:, 3:6]
         self.torques = self.sim.ctrl
-        ranges = self._tensor(model.jnt_range[1:])
-        middle = ranges.mean(dim=1, keepdim=True)
+        ranges = self._tensor(joint_limits(model)[1:])
+        middle = ranges.mean(dim=1, keepdim=True).nan_to_num()  # of joints without a range
         self.dof_pos_limits = middle + cfg.rewards.soft_dof_pos_limit * (ranges - middle)
         places = (self.asset.feet, self.asset.penalized, self.asset.terminating)
         self.feet_indices, self.penalized_contact_indices, self.termination_contact_indices = (
@@ -325,6 +331,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.events = RandomEvents(cfg, self.sim, self.command_generator, self.init_angles, initial_state(self), drawn)
         self.randomization = self.events.parameters
         self.parameter_mirrors = mirrors(drawn, self.randomization.sizes)
+        self.notes = [*self.asset.notes, *(range_notes(drawn) if cfg.domain_rand.randomize_parameters else ())]
         if cfg.domain_rand.randomize_parameters and changes_legs(drawn):
             self.sim.vary_legs()
 

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mirroring import Mirroring
+from legged_torque.utils.mirroring import AXIAL_VECTOR, Mirroring
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -22,8 +22,7 @@ class RobotSymmetry:
     """Which joints and feet of a robot are mirror images of each other.
 
     Attributes:
-        joints: Mirroring of joint angles; those of joints that turn about the x axis change their sign. None without
-            symmetry.
+        joints: Mirroring of joint angles; their signs follow from the axes. None without symmetry.
         feet: Mirroring of one number per foot. None without symmetry.
         foot_pairs: Places of the right and left foot of each pair of legs.
         problem: Why there is no symmetry, empty if there is one.
@@ -34,18 +33,36 @@ class RobotSymmetry:
     ) -> None:
         """Match names: those of the legs in ``asset.mirrored_legs``, and of joints and feet in their order.
 
-        ``dof_axes`` are the joints' axes in the frames of their bodies. Shape: (num_dof, 3).
+        ``dof_axes`` are the joints' axes in the trunk's frame where all angles are 0. Shape: (num_dof, 3).
         """
         self.joints: Mirroring | None = None
         self.feet: Mirroring | None = None
         self.foot_pairs = [(_place(foot_names, right), _place(foot_names, left)) for right, left in mirrored_legs]
         self.problem = ""
         try:
-            signs = tuple(-1.0 if abs(axis[0]) > 0.5 else 1.0 for axis in dof_axes)
-            self.joints = Mirroring(counterparts(dof_names, mirrored_legs), signs)
+            order = counterparts(dof_names, mirrored_legs)
+            self.joints = Mirroring(order, _mirror_signs(dof_names, dof_axes, order))
             self.feet = Mirroring(counterparts(foot_names, mirrored_legs), (1.0,) * len(foot_names))
         except UserError as error:
-            self.problem = str(error)
+            self.refuse(str(error))
+
+    def refuse(self, problem: str) -> None:
+        """Have no symmetry, because of a problem; empty if there is none."""
+        if problem:
+            self.joints, self.feet, self.problem = None, None, problem
+
+
+def _mirror_signs(names: Names, axes: Sequence[Sequence[float]], order: Sequence[int]) -> tuple[float, ...]:
+    """Return whether mirrored angles have the other sign: a turn about (x, y, z) becomes one about (-x, y, -z)."""
+    signs = []
+    for name, axis, other in zip(names, axes, order, strict=True):
+        alike = sum(
+            sign * part * image for sign, part, image in zip(AXIAL_VECTOR.signs, axes[other], axis, strict=True)
+        )
+        if abs(alike) < 0.999:
+            raise UserError(f"the axes of '{name}' and '{names[other]}' are not mirror images of each other")
+        signs.append(1.0 if alike > 0.0 else -1.0)
+    return tuple(signs)
 
 
 def _place(names: Names, leg: str) -> int:

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.mjcf import why_no_motor
 
 MAX_BRANCHES = 16  # threads of a world must fit into half a warp
 _CAPSULE_ENDS = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
@@ -43,19 +44,19 @@ class Tree:
 def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:1]) -> Tree:
     """Return the structure of a robot on a floor of one of some types.
 
-    A UserError if it has something that the fused step does not simulate.
+    A UserError, which tells all of it, if it has something that the fused step does not simulate.
     """
-    _check(model, floors)
-    children = [[c for c in range(2, model.nbody) if model.body_parentid[c] == b] for b in range(model.nbody)]
-    chains = []
-    for body in children[1]:
-        chain = [body]
-        while children[chain[-1]]:
-            _require(len(children[chain[-1]]) == 1, f"body '{model.body(chain[-1]).name}' branches")
-            chain.append(children[chain[-1]][0])
-        chains.append(chain)
-    _require(bool(chains) and len({len(chain) for chain in chains}) == 1, "its legs have unlike numbers of joints")
-    _require(len(chains) <= MAX_BRANCHES, f"it has more than {MAX_BRANCHES} legs")
+    reasons = [*_of_bodies(model), *_of_contacts(model, floors), *_of_motors(model), *_of_options(model)]
+    chains = _chains(model)
+    lengths = {len(chain) for chain in chains}
+    for body in (chain[-1] for chain in chains):
+        if body in model.body_parentid:
+            reasons.append(f"body '{model.body(body).name}' branches")
+    if len(lengths) != 1:
+        reasons.append("its legs have unlike numbers of joints")
+    if len(chains) > MAX_BRANCHES:
+        reasons.append(f"it has more than {MAX_BRANCHES} legs")
+    _refuse(reasons)
     points: list[list] = [[] for _ in chains]
     depths = {body: (i, j + 1) for i, chain in enumerate(chains) for j, body in enumerate(chain)}
     trunk_geoms = 0
@@ -82,68 +83,95 @@ def check_map(model: mujoco.MjModel) -> None:
     """Raise a UserError if the floor of an accepted robot cannot become a height map, whose heights are the world's."""
     floor = find_floor(model)
     posed = model.geom_pos[floor].any() or not np.array_equal(model.geom_quat[floor], (1.0, 0.0, 0.0, 0.0))
-    _require(not posed, "its floor is not at the origin, where a height map needs it")
+    _refuse(["its floor is not at the origin, where a height map needs it"] if posed else [])
 
 
-def _require(holds: bool, reason: str) -> None:
-    """Raise a UserError with the reason if something does not hold."""
-    if not holds:
+def _refuse(reasons: list[str]) -> None:
+    """Raise a UserError with all reasons not to simulate a robot, if there are any."""
+    if reasons:
         advice = "use sim.engine = 'mujoco_warp', without randomize_parameters"
-        raise UserError(f"sim.engine 'fused' cannot simulate this robot: {reason}; {advice}")
+        raise UserError(f"sim.engine 'fused' cannot simulate this robot: {'; '.join(reasons)}; {advice}")
 
 
-def _check(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> None:
-    """Raise a UserError for whatever the fused step does not simulate."""
-    _check_bodies(model)
-    _check_contacts(model, floors)
-    _check_motors(model)
+def _broken(rules: dict[str, bool]) -> list[str]:
+    """Return the reasons of the rules that do not hold."""
+    return [reason for reason, holds in rules.items() if not holds]
+
+
+def _chains(model: mujoco.MjModel) -> list[list[int]]:
+    """Return the bodies of each branch, from the trunk to where it ends, or branches itself."""
+    children = [[c for c in range(2, model.nbody) if model.body_parentid[c] == b] for b in range(model.nbody)]
+    chains = [[body] for body in children[1]] if model.nbody > 1 else []
+    for chain in chains:
+        while len(children[chain[-1]]) == 1:
+            chain += children[chain[-1]]
+    return chains
+
+
+def _of_options(model: mujoco.MjModel) -> list[str]:
+    """Return which options and other parts of the model the fused step does not simulate."""
     option = model.opt
-    _require(option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL, "the friction cone must be pyramidal")
-    _require(option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST, "the integrator must be implicitfast")
     enabled = option.enableflags & ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)  # which changes no motion
     flags = option.disableflags or enabled or option.noslip_iterations or option.disableactuator
-    _require(not flags, "it sets flags in its options")
-    _require(not (option.density or option.viscosity), "it moves through a fluid")
     others = model.eq_active0.any() or model.ntendon or model.npair or model.nmocap
-    _require(not others, "equalities, tendons, pairs or mocap")
-    _require(not (_excluded(model) == 0).any(), "some contacts are excluded")
+    return _broken(
+        {
+            "the friction cone must be pyramidal": option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL,
+            "the integrator must be implicitfast": option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+            "it sets flags in its options": not flags,
+            "it moves through a fluid": not (option.density or option.viscosity),
+            "equalities, tendons, pairs or mocap": not others,
+            "some contacts are excluded": not (_excluded(model) == 0).any(),
+        }
+    )
 
 
-def _check_bodies(model: mujoco.MjModel) -> None:
-    """Check bodies and joints."""
+def _of_bodies(model: mujoco.MjModel) -> list[str]:
+    """Return what the fused step does not simulate of bodies and joints."""
     hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
-    _require(model.nbody > 1 and model.jnt_type[0] == free and model.jnt_bodyid[0] == 1, "its trunk is not free")
-    hinges = bool((model.body_jntnum[1:] == 1).all() and (model.jnt_type[1:] == hinge).all())
-    _require(hinges, "each body but the trunk must have one hinge joint (fixed bodies: compiler fusestatic)")
-    _require(not (model.body_parentid[2:] == 0).any(), "something beside the trunk hangs on the world")
-    _require(not model.body_gravcomp.any(), "bodies are compensated for gravity")
-    _require(bool(model.jnt_limited[1:].all()), "each joint needs a range")
-    _require(not model.jnt_margin.any(), "joint limits have margins")
-    _require(not (model.jnt_actfrclimited.any()), "joints limit the forces of their actuators")
+    is_free = model.njnt > 0 and model.jnt_type[0] == free and model.jnt_bodyid[0] == 1
+    hinges = (model.body_jntnum[1:] == 1).all() and (model.jnt_type[1:] == hinge).all()
     root = [model.dof_damping[:6], model.dof_armature[:6], model.dof_frictionloss[:6], model.jnt_stiffness[:1]]
-    _require(not any(values.any() for values in root), "the trunk's free joint has passive forces or armature")
+    passive = is_free and any(values.any() for values in root)
     nonlinear = _any_of(model, "jnt_stiffnesspoly", "jnt_springyield", "dof_dampingpoly")
-    _require(not nonlinear, "springs or dampers are not linear")
+    return _broken(
+        {
+            "its trunk is not free": is_free,
+            "each body but the trunk must have one hinge joint (fixed bodies: compiler fusestatic)": bool(hinges),
+            "something beside the trunk hangs on the world": not (model.body_parentid[2:] == 0).any(),
+            "bodies are compensated for gravity": not model.body_gravcomp.any(),
+            "each joint needs a range": bool(model.jnt_limited[1:].all()),
+            "joint limits have margins": not model.jnt_margin.any(),
+            "joints limit the forces of their actuators": not model.jnt_actfrclimited.any(),
+            "the trunk's free joint has passive forces or armature": not passive,
+            "springs or dampers are not linear": not nonlinear,
+        }
+    )
 
 
-def _check_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> None:
-    """Check the floor and what collides with it."""
+def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> list[str]:
+    """Return what the fused step does not simulate of the floor and of what collides with it."""
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     floor = np.flatnonzero(np.isin(model.geom_type, floors) & collides)
     robot = collides & (model.geom_bodyid > 0)
-    _require(bool(len(floor) == 1 and (collides & ~robot).sum() == 1), "it needs one plane and no other obstacle")
     types, affinities, bodies = model.geom_contype[robot], model.geom_conaffinity[robot], model.geom_bodyid[robot]
     kinds = {mujoco.mjtGeom(kind) for kind in model.geom_type[robot]}
-    _require(kinds <= set(_GEOM_POINTS), "only spheres, capsules and boxes may collide")
     apart = _may_collide(model)[np.ix_(bodies, bodies)]
-    _require(not (types[:, None] & affinities)[apart].any(), "parts of the robot collide with each other")
-    touch = (types & model.geom_conaffinity[floor]) | (affinities & model.geom_contype[floor])
-    _require(bool((touch != 0).all()), "the floor lets some of its geoms through")
-    _require(bool((model.geom_condim[collides] == 3).all()), "condim must be 3")
-    _require(not (model.geom_margin[collides].any() or model.geom_gap[collides].any()), "geoms have margins or gaps")
-    _require(not _any_of(model, "geom_surfacevel", "geom_adhesion"), "surfaces move or stick")
+    on_floor = [(types & model.geom_conaffinity[one]) | (affinities & model.geom_contype[one]) for one in floor]
     solrefs = np.concatenate([model.geom_solref[collides], model.jnt_solref, model.dof_solref])
-    _require(bool(((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1)).all()), "a solref mixes its two formats")
+    mixed = ~((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1))
+    return _broken(
+        {
+            "it needs one plane and no other obstacle": len(floor) == 1 and (collides & ~robot).sum() == 1,
+            "only spheres, capsules and boxes may collide": kinds <= set(_GEOM_POINTS),
+            "parts of the robot collide with each other": not (types[:, None] & affinities)[apart].any(),
+            "the floor lets some of its geoms through": all((touch != 0).all() for touch in on_floor),
+            "condim must be 3": bool((model.geom_condim[collides] == 3).all()),
+            "geoms have margins or gaps": not (model.geom_margin[collides].any() or model.geom_gap[collides].any()),
+            "surfaces move or stick": not _any_of(model, "geom_surfacevel", "geom_adhesion"),
+            "a solref mixes its two formats": not mixed.any(),
+        }
+    )
 
 
 def _excluded(model: mujoco.MjModel) -> np.ndarray:
@@ -160,17 +188,17 @@ def _may_collide(model: mujoco.MjModel) -> np.ndarray:
     return apart
 
 
-def _check_motors(model: mujoco.MjModel) -> None:
-    """Check the actuators: at most one plain motor per hinge."""
-    plain = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-    plain &= model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED
-    plain &= model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE
-    plain &= model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE
-    extras = _any_of(model, "actuator_delay", "actuator_damping", "actuator_dampingpoly", "actuator_armature")
-    _require(bool((plain & (model.actuator_gainprm[:, 0] == 1)).all()) and not extras, "actuators must be motors")
+def _of_motors(model: mujoco.MjModel) -> list[str]:
+    """Return what the fused step does not simulate of the actuators: all but a plain motor per hinge at most."""
+    plain = not any(why_no_motor(model, actuator) for actuator in range(model.nu))
     joints = model.actuator_trnid[:, 0]
-    _require(len(set(joints)) == len(joints) and 0 not in joints, "each motor needs a hinge of its own")
-    _require(bool(model.actuator_forcelimited.all() and model.actuator_ctrllimited.all()), "motors need ranges")
+    return _broken(
+        {
+            "actuators must be motors": plain and bool((model.actuator_gainprm[:, 0] == 1).all()),
+            "each motor needs a hinge of its own": len(set(joints)) == len(joints) and 0 not in joints,
+            "motors need ranges": bool(model.actuator_forcelimited.all() and model.actuator_ctrllimited.all()),
+        }
+    )
 
 
 def _any_of(model: mujoco.MjModel, *names: str) -> bool:

@@ -1,0 +1,130 @@
+"""What a robot's MJCF must have, whichever engine simulates it; all that it lacks is told at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+
+from legged_torque.sim.model import FLOOR
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.mjcf import motors_of, torque_range, why_no_motor
+
+_ONE_NUMBER = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))  # types of joints
+
+
+def spec_problems(spec: mujoco.MjSpec) -> Iterator[str]:
+    """Yield what is wrong with the parts of a file: trunk, floor and names of geoms."""
+    trunks = [body for body in spec.worldbody.bodies if any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in body.joints)]
+    if len(trunks) != 1:
+        yield f"it must have one body with a free joint, the trunk, not {len(trunks)}"
+    if FLOOR not in [geom.name for geom in spec.worldbody.geoms]:
+        yield f"it must have a geom '{FLOOR}' in its worldbody, on which it stands"
+    unnamed = [geom for geom in spec.geoms if not geom.name and (geom.contype or geom.conaffinity)]
+    bodies = dict.fromkeys(f"'{geom.parent.name}'" for geom in unnamed)
+    if unnamed:
+        yield f"geoms that collide need names, by which settings know them; those of {', '.join(bodies)} have none"
+
+
+def model_problems(model: mujoco.MjModel) -> Iterator[str]:
+    """Yield what is wrong with joints, motors and masses."""
+    yield from joint_problems(model)
+    yield from motor_problems(model)
+    if not np.isfinite([*model.body_mass, *model.body_inertia.flat]).all():
+        yield "it has a mass or an inertia that is not finite"
+
+
+def joint_problems(model: mujoco.MjModel) -> Iterator[str]:
+    """Yield what is wrong with the joints: the trunk's is the first, all others hang on it, and each has a name."""
+    if not model.njnt or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        yield "its first joint must be the trunk's free joint"
+        return
+    trunk = model.jnt_bodyid[0]
+    if trunk != 1:
+        yield f"the trunk '{model.body(trunk).name}' must be the first body, before '{model.body(1).name}'"
+    for joint in range(1, model.njnt):
+        name, body = model.joint(joint).name, model.jnt_bodyid[joint]
+        if not name:
+            yield f"a joint of the body '{model.body(body).name}' has no name"
+        if model.jnt_type[joint] not in _ONE_NUMBER:
+            yield f"the joint '{name}' must be a hinge"
+        elif model.body_rootid[body] != trunk:
+            yield f"the joint '{name}' does not hang on the trunk '{model.body(trunk).name}'"
+
+
+def motor_problems(model: mujoco.MjModel) -> Iterator[str]:
+    """Yield what is wrong with the motors: one of its own for each joint, with limits."""
+    yield from actuator_problems(model)
+    wrong: dict[str, list[str]] = {}
+    for joint in range(1, model.njnt):
+        name, motors = model.joint(joint).name, motors_of(model, joint)
+        if len(motors) != 1:
+            wrong.setdefault(f"each joint must have one motor, not {len(motors)}", []).append(name)
+        elif not -np.inf < np.subtract(*torque_range(model, motors[0])) < 0.0:  # lowest less highest
+            wrong.setdefault("motors need torque limits, for example a forcerange", []).append(name)
+    yield from _with_names(wrong)
+    if model.opt.disableactuator or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
+        yield "its options switch actuators off"
+
+
+def actuator_problems(model: mujoco.MjModel) -> Iterator[str]:
+    """Yield which actuators are no motors: their controls would not be the torques that tasks send."""
+    wrong: dict[str, list[str]] = {}
+    for actuator in range(model.nu):
+        reason = why_no_motor(model, actuator)
+        if reason:
+            wrong.setdefault(f"make a <motor> with a forcerange of what {reason}", []).append(_name(model, actuator))
+    yield from _with_names(wrong)
+
+
+def _with_names(wrong: dict[str, list[str]]) -> Iterator[str]:
+    """Yield problems with the names of the parts that have them."""
+    for problem, names in wrong.items():
+        yield f"{problem} ({', '.join(names)})"
+
+
+def refuse(problems: list[str], what: str) -> None:
+    """Raise a UserError with all problems in one line, behind ``what`` they are problems of; none is fine."""
+    if problems:
+        raise UserError(f"{what}: {'; '.join(problems)}")
+
+
+def use_plain_motors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
+    """Put the motors of a file without problems in the order of its joints, so that controls are torques of joints.
+
+    Each becomes a motor without gear, whose only limits are the tightest of the file's. Returns whether anything has
+    changed, so that ``model``, compiled from ``spec``, is out of date.
+    """
+    joints = range(1, model.njnt)
+    motors = [motors_of(model, joint)[0] for joint in joints]
+    names = [_name(model, motor) for motor in motors]
+    limits = [torque_range(model, motor) for motor in motors]
+    if motors == list(range(model.nu)) and all(_is_plain(model, motor) for motor in motors):
+        return False
+    for place, actuator in enumerate(spec.actuators):
+        actuator.name = f"motor {place}"  # no two may have the same name, even for a moment
+    for actuator, joint, name, limit in zip(spec.actuators, joints, names, limits, strict=True):
+        actuator.name, actuator.target = name, model.joint(joint).name
+        actuator.gainprm[0], actuator.gear = 1.0, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+        actuator.ctrlrange = actuator.forcerange = limit
+        actuator.ctrllimited = actuator.forcelimited = True
+        spec.joint(model.joint(joint).name).actfrclimited = False
+    for key in spec.keys:
+        key.ctrl = []  # in the old order and units
+    return True
+
+
+def _is_plain(model: mujoco.MjModel, motor: int) -> bool:
+    """Return whether a motor has no gear, and its own two ranges are the same and its only limits."""
+    limited = model.actuator_ctrllimited[motor] and model.actuator_forcelimited[motor]
+    same = (model.actuator_ctrlrange[motor] == model.actuator_forcerange[motor]).all()
+    no_gear = model.actuator_gainprm[motor, 0] == 1.0 and model.actuator_gear[motor, 0] == 1.0
+    return bool(limited and same and no_gear and not model.jnt_actfrclimited[model.actuator_trnid[motor, 0]])
+
+
+def _name(model: mujoco.MjModel, actuator: int) -> str:
+    """Return the name of an actuator, or of what it acts on if it has none."""
+    joint = model.actuator_trnid[actuator, 0]
+    on_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
+    return model.actuator(actuator).name or (model.joint(joint).name if on_joint else str(actuator))

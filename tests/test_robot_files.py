@@ -1,0 +1,390 @@
+"""Files with a trap each, made from the A1's: read by name and transmission, or refused with all that is wrong."""
+
+import xml.etree.ElementTree as ElementTree
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from settings import error_of
+from test_scripts import run_here
+
+from legged_torque import RESOURCES_DIR
+from legged_torque.envs.base.asset import load_asset
+from legged_torque.envs.base.held_pose import standing_note
+from legged_torque.envs.robots.a1 import A1Cfg
+from legged_torque.sim.model import build_model, read_spec
+from legged_torque.sim.simulator import ENGINES, Simulator
+
+A1 = RESOURCES_DIR / "robots/a1/a1.xml"
+POSE = A1Cfg.init_state.default_joint_angles
+UNITREE_ORDER = ("FL", "FR", "RL", "RR")
+
+
+@pytest.fixture
+def changed(tmp_path):
+    """Factory of files: the A1's MJCF with a change of its tree, without its keyframe."""
+
+    def write(*changes):
+        root = ElementTree.parse(A1).getroot()
+        root.remove(root.find("keyframe"))
+        for change in changes:
+            change(root)
+        ElementTree.ElementTree(root).write(tmp_path / "robot.xml")
+        return str(tmp_path / "robot.xml")
+
+    return write
+
+
+def cfg_of(file):
+    """Settings of the A1 with another file."""
+    cfg = A1Cfg()
+    cfg.asset.file, cfg.env.num_envs = file, 2
+    return cfg
+
+
+def shuffle_motors(root):
+    """Motors in an order that is not that of the joints."""
+    motors = root.find("actuator")
+    motors[:] = motors[7:] + motors[:7]
+
+
+def unitree_order(root):
+    """Joints FL, FR, RL, RR, motors FR, FL, RR, RL, as in Unitree's own go2.xml."""
+    trunk = root.find("worldbody/body")
+    legs = {leg.get("name")[:2]: leg for leg in trunk.findall("body")}
+    for leg in UNITREE_ORDER:
+        trunk.remove(legs[leg])
+        trunk.append(legs[leg])
+
+
+def setting(path, **attributes):
+    """A change of the attributes of all elements of a path; None takes one away."""
+
+    def change(root):
+        found = root.findall(path)
+        assert found
+        for element in found:
+            for name, value in attributes.items():
+                element.set(name, value) if value is not None else element.attrib.pop(name)
+
+    return change
+
+
+def joint(name, **attributes):
+    """A change of a joint."""
+    return setting(f".//joint[@name='{name}']", **attributes)
+
+
+def servo(*numbers):
+    """A change that makes position servos of some actuators."""
+
+    def change(root):
+        for number in numbers:
+            actuator = root.find("actuator")[number]
+            actuator.tag = "position"
+            actuator.attrib.pop("class", None)
+            actuator.set("kp", "50")
+
+    return change
+
+
+def torques_of(file, ctrl):
+    """What plain MuJoCo makes of the same control of all motors of a file: torques by joint."""
+    model = mujoco.MjModel.from_xml_path(file)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = ctrl
+    mujoco.mj_forward(model, data)
+    return {name: data.joint(name).qfrc_actuator[0] for name in POSE}
+
+
+# --------------------------------------------------------------------------------------------------- orders
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_motors_in_another_order(changed, engine):
+    """Torques reach the joints that they are meant for: a step is that of plain MuJoCo, whose motors go by name."""
+    file = changed(shuffle_motors, setting("option", iterations="100"))
+    cfg = cfg_of(file)
+    asset = load_asset(cfg)
+    assert asset.dof_names == list(POSE)
+    sim = Simulator(asset.mj_model, 1, "cpu", engine, 100, 50)
+    reference = mujoco.MjModel.from_xml_path(file)
+    assert [reference.actuator(i).name for i in range(12)] != [asset.mj_model.actuator(i).name for i in range(12)]
+    data = mujoco.MjData(reference)
+    torques = np.random.default_rng(1).uniform(-20, 20, 12)
+    qpos = np.array([0, 0, 1, 1, 0, 0, 0, *POSE.values()])
+    data.qpos[:] = qpos
+    sim.qpos.copy_(torch.tensor(qpos))
+    sim.ctrl.copy_(torch.tensor(torques))
+    for name, torque in zip(POSE, torques, strict=True):
+        data.actuator(name.removesuffix("_joint")).ctrl = torque
+    for _ in range(5):
+        mujoco.mj_step(reference, data)
+        sim.step()
+    np.testing.assert_allclose(sim.qvel[0], data.qvel, atol=2e-3)
+    assert np.abs(data.qvel[6:]).max() > 1.0
+
+
+def test_the_same_robot_in_another_order(changed, make_task):
+    """Unitree's orders of joints and motors lead to the torques per joint and the rewards of ours."""
+    file = changed(unitree_order)
+    names = [f"{leg}_{part}_joint" for leg in UNITREE_ORDER for part in ("hip", "thigh", "calf")]
+    order = [list(POSE).index(name) for name in names]
+    pose = {name: POSE[name] for name in names}
+    ours = make_task("a1_torque_multihead", 2)
+    theirs = make_task("a1_torque_multihead", 2, **{"asset.file": file, "init_state.default_joint_angles": pose})
+    assert theirs.dof_names == names
+    qpos, qvel = ours.sim.qpos.clone(), ours.sim.qvel.clone()
+    theirs.commands.copy_(ours.commands)
+    theirs.sim.qpos.copy_(torch.cat([qpos[:, :7], qpos[:, 7:][:, order]], dim=1))
+    theirs.sim.qvel.copy_(torch.cat([qvel[:, :6], qvel[:, 6:][:, order]], dim=1))
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(12):
+        actions = 0.3 * torch.randn(2, 2, 12, generator=generator)
+        ours.step(actions.flatten(1))
+        theirs.step(actions[:, :, order].flatten(1))
+        torch.testing.assert_close(theirs.torques, ours.torques[:, order], atol=2e-3, rtol=1e-3)
+        torch.testing.assert_close(theirs.rew_buf, ours.rew_buf, atol=1e-5, rtol=0)
+    assert (ours.torques.abs() > 1.0).any() and ours.contacts.any()
+
+
+def test_pose_in_another_order_is_refused(changed):
+    """Policies see joints in the order of the settings, so that a file in another one cannot pass unseen."""
+    assert "must be in the order of the MJCF's joints" in error_of(load_asset, cfg_of(changed(unitree_order)))
+
+
+# --------------------------------------------------------------------------------------------------- motors
+
+LIMITS = {
+    "ctrlrange alone": [setting(".//default/motor", forcerange=None)],
+    "forcerange alone": [setting(".//default/motor", ctrlrange=None)],
+    "gear": [setting(".//default/motor", gear="-2", ctrlrange="-5 6", forcerange="-4 9")],
+    "joint": [joint("FL_calf_joint", actuatorfrcrange="-7 3")],
+    "all": [
+        setting(".//default/motor", gear="0.5", ctrlrange="-30 40"),
+        joint("FL_calf_joint", actuatorfrcrange="-7 9"),
+    ],
+}
+
+
+@pytest.mark.parametrize("changes", LIMITS.values(), ids=LIMITS)
+def test_torque_limits_are_the_tightest(changed, changes):
+    """They are what plain MuJoCo cuts torques at, whichever way the file says so; less than that arrives as it is."""
+    file = changed(*changes)
+    model = load_asset(cfg_of(file)).mj_model
+    extremes = [torques_of(file, ctrl) for ctrl in (-1e6, 1e6)]
+    for i, name in enumerate(POSE):
+        expected = sorted(extreme[name] for extreme in extremes)
+        np.testing.assert_allclose(model.actuator_forcerange[i], expected, rtol=1e-6, err_msg=name)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = wanted = np.linspace(-2.0, 2.0, 12)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose([data.joint(name).qfrc_actuator[0] for name in POSE], wanted)
+
+
+def test_the_a1_stays_as_it_is():
+    """Its motors are plain and in order: its model is that of its file, and nothing is noted."""
+    asset = load_asset(A1Cfg())
+    spec = read_spec(A1)
+    model = build_model(spec, asset.geom_names)
+    for field in ("ctrlrange", "forcerange", "gear", "trnid"):
+        np.testing.assert_array_equal(getattr(asset.mj_model, f"actuator_{field}"), getattr(model, f"actuator_{field}"))
+    assert asset.notes == []
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_servos_are_refused(changed, make_task, engine):
+    """Every engine says which actuators are no motors, and what to do, in tasks and in simulators of a model."""
+    file = changed(servo(3, 4))
+    told = error_of(make_task, "a1_torque", 1, **{"asset.file": file, "sim.engine": engine})
+    assert "make a <motor> with a forcerange of what is a servo, whose control is a target (FL_hip, FL_thigh)" in told
+    model = build_model(read_spec(file), [])
+    assert "is a servo, whose control is a target (FL_hip, FL_thigh)" in error_of(Simulator, model, 1, "cpu", engine)
+
+
+# --------------------------------------------------------------------------------------------------- what is refused
+
+
+def remove(path):
+    """A change that takes an element away."""
+    return lambda root: [parent.remove(root.find(path)) for parent in root.iter() if root.find(path) in list(parent)]
+
+
+def second_motor(root):
+    """Another motor of a joint that has one."""
+    ElementTree.SubElement(root.find("actuator"), "motor", name="x", joint="FR_hip_joint", ctrlrange="-1 1")
+
+
+def arm_beside(root):
+    """A hinge that hangs on the world."""
+    body = ElementTree.SubElement(root.find("worldbody"), "body")
+    ElementTree.SubElement(body, "joint", name="door")
+    ElementTree.SubElement(body, "geom", name="door", size="0.1")
+
+
+def post_before(root):
+    """A body that stands still, before the trunk."""
+    root.find("worldbody").insert(0, ElementTree.Element("body", name="post"))
+
+
+REFUSED = {
+    "trunk after others": ([post_before], "the trunk 'trunk' must be the first body, before 'post'"),
+    "no motor": ([remove("actuator/motor[4]")], "each joint must have one motor, not 0 (FL_hip_joint)"),
+    "two motors": ([second_motor], "each joint must have one motor, not 2 (FR_hip_joint)"),
+    "no limits": (
+        [setting(".//default/motor", forcerange=None, ctrlrange=None)],
+        "motors need torque limits, for example a forcerange (FR_hip_joint, FR_thigh_joint",
+    ),
+    "unnamed geom": (
+        [setting(".//geom[@name='RL_calf']", name=None)],
+        "need names, by which settings know them; those of 'RL_calf'",
+    ),
+    "no floor": ([setting(".//geom[@name='floor']", name="ground")], "it must have a geom 'floor' in its worldbody"),
+    "no free joint": ([remove(".//freejoint")], "must have one body with a free joint, the trunk, not 0"),
+    "unnamed joint": (
+        [setting(".//joint[@name='RL_calf_joint']", name=None), remove("actuator/motor[12]")],
+        "a joint of the body 'RL_calf' has no name",
+    ),
+    "beside the trunk": ([arm_beside], "the joint 'door' does not hang on the trunk 'trunk'"),
+    "nominal pose": (
+        [joint("FL_calf_joint", range="-2.6 -1.6")],
+        "init_state.default_joint_angles has -1.5 for 'FL_calf_joint', whose range is -2.6 to -1.6",
+    ),
+    "missing geoms": (
+        [setting(".//geom[@name='trunk']", name="base")],
+        "unknown collision geom (part of its name) 'trunk'",
+    ),
+}
+
+
+@pytest.mark.parametrize(("changes", "reason"), REFUSED.values(), ids=REFUSED)
+def test_refused(changed, changes, reason):
+    """What a task cannot simulate is told in a line that names the file and the part."""
+    file = changed(*changes)
+    told = error_of(load_asset, cfg_of(file))
+    assert told.startswith(f"'{file}' cannot be simulated: ") and reason in told
+
+
+def test_all_problems_at_once(changed):
+    """A file with several traps is refused once, with a clause for each."""
+    beyond, limits = joint("FL_calf_joint", range="-2.6 -1.6"), setting("actuator/motor[1]", ctrllimited="false")
+    none = setting("actuator/motor[1]", forcelimited="false")
+    told = error_of(load_asset, cfg_of(changed(servo(11), beyond, limits, none)))
+    for part in ("a target (RL_calf)", "a forcerange (FR_hip_joint,", "has -1.5 for 'FL_calf_joint'"):
+        assert part in told
+    unnamed, floor = setting(".//geom[@name='RL_calf']", name=None), setting(".//geom[@name='floor']", name="ground")
+    told = error_of(
+        load_asset, cfg_of(changed(unnamed, floor, setting(".//geom[@name='trunk']", name="base"), servo(11)))
+    )
+    for part in ("those of 'RL_calf'", "a geom 'floor'", "geom (part of its name) 'trunk'", "a target (RL_calf)"):
+        assert part in told
+
+
+def test_fused_tells_all(changed, make_task):
+    """Whatever the fused step cannot simulate of a robot is told together."""
+    file = changed(
+        setting("option", integrator="Euler", cone="elliptic"),
+        setting(".//geom[@name='FL_hip']", type="cylinder", size="0.04 0.04"),
+    )
+    told = error_of(make_task, "a1_torque", 1, **{"asset.file": file})
+    for reason in ("integrator must be implicitfast", "cone must be pyramidal", "only spheres, capsules and boxes"):
+        assert reason in told
+
+
+# --------------------------------------------------------------------------------------------------- what is noted
+
+
+def test_notes(changed):
+    """A robot that no view draws, legs without feet or with two, are told."""
+    hidden = [setting(".//default[@class='visual']/geom", group="4")]
+    hidden += [
+        setting(".//geom[@name='FL_foot']", name="FL_toe"),
+        setting(".//geom[@name='RL_calf']", name="RL_foot_2"),
+    ]
+    notes = load_asset(cfg_of(changed(*hidden))).notes
+    assert notes[0].startswith("no view draws the robot: its geoms are in group 3, 4;")
+    assert notes[1:] == [
+        "the body 'FL_calf' has 0 feet; asset.foot_name chooses FR_foot, RR_foot, RL_foot_2, RL_foot",
+        "the body 'RL_calf' has 2 feet; asset.foot_name chooses FR_foot, RR_foot, RL_foot_2, RL_foot",
+    ]
+
+
+def test_ranges_of_another_robot(changed, make_task, capsys):
+    """Ranges that leave out the robot's own values are told when they are drawn; a negative trunk is refused."""
+    file = changed(setting(".//default[@class='foot_collision']/geom", size="0.022"))
+    drawn = {"asset.file": file, "domain_rand.randomize_parameters": True}
+    assert make_task("a1_torque", 1, **{"asset.file": file}).notes == []
+    capsys.readouterr()
+    (note,) = make_task("a1_torque", 1, **drawn).notes
+    assert note.startswith("domain_rand.foot_radius draws 0.019 to 0.021, but the robot's own value is 0.022")
+    assert f"Note: {note}\n" in capsys.readouterr().out
+    heavy = {"domain_rand.trunk_mass_offset": [-6.0, 6.0]}
+    assert "random parameter 'trunk_mass' can be -1.287" in error_of(make_task, "a1_torque", 1, **drawn, **heavy)
+
+
+def test_nominal_pose_is_held(changed, make_task):
+    """The A1 stands; with weak gains its trunk falls to the ground, and without feet on one side it tilts over."""
+    assert standing_note(make_task("a1_torque", 1)) == ""
+    weak = standing_note(make_task("a1_torque", 1, **{"control.stiffness": 3.0}))
+    assert "does not stand under PD control, after " in weak and "'trunk' touches the ground" in weak
+    assert standing_note(make_task("a1_torque", 1, **{"control.stiffness": 0.0})) == "", "it is not held at all"
+
+
+def test_training_says_that_the_robot_falls(tmp_path):
+    """Before a training, its nominal pose is tried."""
+    words = ["--task=a1_torque", "--num_envs=2", "--max_iterations=1", "--device=cpu", "--set", "control.stiffness=3"]
+    status, output, _ = run_here("train.py", *words, root=tmp_path)
+    assert status == 0 and output.splitlines()[0].startswith("Note: the nominal pose does not stand under PD control")
+
+
+# --------------------------------------------------------------------------------------------------- symmetry
+
+
+EVEN_TRUNK = setting(
+    "worldbody/body/inertial", pos="0 0 -0.0005", fullinertia="0.0158533 0.0377999 0.0456542 0 -6.11e-05 0"
+)
+
+
+def turn_left_hips(root):
+    """Left hips turn about an axis that points backwards; their range is symmetric."""
+    for leg in ("FL", "RL"):
+        joint(f"{leg}_hip_joint", axis="-1 0 0")(root)
+
+
+def test_mirror_images_follow_axes(changed, make_task):
+    """Where left axes are mirrored ones, angles keep their signs: the mirrored robot moves as a mirror image."""
+    pose = {name: -angle if name in ("FL_hip_joint", "RL_hip_joint") else angle for name, angle in POSE.items()}
+    task = make_task(
+        "a1_torque", 1, **{"asset.file": changed(turn_left_hips, EVEN_TRUNK), "init_state.default_joint_angles": pose}
+    )
+    assert task.symmetry.problem == ""
+    mirroring, model = task.symmetry.joints, mujoco.MjModel.from_xml_path(task.cfg.asset.file)
+    moved = []
+    rng = np.random.default_rng(3)
+    angles, torques = np.array([*pose.values()]) + rng.uniform(-0.2, 0.2, 12), rng.uniform(-5, 5, 12)
+    for mirrored in (False, True):
+        data = mujoco.MjData(model)
+        order, signs = (list(mirroring.order), mirroring.signs) if mirrored else (list(range(12)), np.ones(12))
+        data.qpos[:3], data.qpos[7:], data.ctrl[:] = (0, 0, 1), angles[order] * signs, torques[order] * signs
+        for _ in range(20):
+            mujoco.mj_step(model, data)
+        moved.append(np.concatenate([data.qvel[:6], data.geom("FL_foot" if mirrored else "FR_foot").xpos]))
+    np.testing.assert_allclose(moved[1], moved[0] * (1, -1, 1, -1, 1, -1, 1, -1, 1), atol=1e-4)
+    assert np.abs(moved[0][[1, 3, 5]]).min() > 0.03
+
+
+def test_unlike_sides_are_no_mirror_images(changed, make_task):
+    """A leg at another place, or with another axis, has no mirror image."""
+    task = make_task("a1_torque", 1, **{"asset.file": changed(setting(".//body[@name='FL_calf']", pos="0 0 -0.25"))})
+    assert "beside the mirror image of its counterpart" in error_of(lambda: task.mirror)
+    task = make_task("a1_torque", 1, **{"asset.file": changed(joint("FL_hip_joint", axis="1 0 0.3"))})
+    assert "the axes of 'FR_hip_joint' and 'FL_hip_joint' are not mirror images" in error_of(lambda: task.mirror)
+
+
+def test_joints_without_range(changed, make_task):
+    """They have no limits, neither for rewards nor for initial angles, instead of the range 0 to 0 of their fields."""
+    free = joint("FL_hip_joint", limited="false")
+    task = make_task("a1_torque", 2, **{"asset.file": changed(free), "sim.engine": "mujoco_warp"})
+    assert task.dof_pos_limits[3].tolist() == [-np.inf, np.inf] and task.dof_pos_limits[0].isfinite().all()
+    assert (task.dof_pos[:, 3] > 0.04).all() and task.rew_buf.isfinite().all()

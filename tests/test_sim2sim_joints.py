@@ -1,0 +1,103 @@
+"""Sim2sim with files of other conventions: axes are turned around, differences told, all problems at once."""
+
+import numpy as np
+import pytest
+from settings import error_of
+from test_robot_files import EVEN_TRUNK, changed, joint, servo, setting, shuffle_motors, turn_left_hips
+
+for package in ("onnx", "onnxruntime", "jsonschema"):
+    pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
+
+from test_export import export_random
+
+from legged_torque.deploy.policy import Policy
+from legged_torque.deploy.robot import MujocoRobot
+
+__all__ = ["changed"]
+STATE = np.array([0.0, 0.0, 0.31]), np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def policy(make_task, tmp_path_factory):
+    """An exported policy of the A1."""
+    folder = tmp_path_factory.mktemp("export") / "out"
+    export_random(make_task, "a1_torque_multihead", folder)
+    return Policy(folder)
+
+
+def walk(robot, policy, steps=10):
+    """Trunk, joints, torques and velocities after some control steps from a bent pose."""
+    pose = policy.nominal_pose + np.random.default_rng(1).uniform(-0.1, 0.1, 12)
+    robot.reset(*STATE, pose, (np.zeros(3), np.zeros(3), np.linspace(-1, 1, 12)))
+    policy.reset()
+    for _ in range(steps):
+        actions = policy.act(policy.observation(robot.state(), [0.5, 0.0, 0.1]))
+        for _ in range(4):
+            torques = policy.torques(actions, robot.joint_positions(), robot.joint_velocities())
+            robot.step(torques)
+    return np.concatenate([robot.position, robot.quat, robot.joint_positions(), robot.joint_velocities(), torques])
+
+
+def test_mirrored_axes_are_turned_around(policy, changed):
+    """A file whose left hips turn the other way, as the authors' A1's do, walks as ours does, and a line says so."""
+    expected = walk(MujocoRobot(changed(EVEN_TRUNK), policy.description), policy)
+    weak = [setting(f".//joint[@name='{leg}_hip_joint']", range="-0.7 0.8") for leg in ("FL", "RL")]
+    robot = MujocoRobot(changed(EVEN_TRUNK, turn_left_hips, shuffle_motors, *weak), policy.description)
+    assert robot.notes == [
+        "axes: those of the MJCF point the other way; angles and torques are negated (FL_hip_joint, RL_hip_joint)"
+    ]
+    np.testing.assert_allclose(walk(robot, policy), expected, atol=1e-6)
+    robot.reset(*STATE, np.full(12, 5.0), (np.zeros(3), np.zeros(3), np.zeros(12)))
+    assert robot.data.joint("FL_hip_joint").qpos[0] == pytest.approx(-0.7)
+    np.testing.assert_allclose(robot.joint_positions()[3], 0.7)
+    np.testing.assert_allclose(robot.applied_torques(), 0.0)
+
+
+def test_differences_of_joints_are_told(policy, changed):
+    """Mass, damping, armature, tilted axes, and a nominal pose beyond limits."""
+    passive = setting(".//default[@class='a1']/joint", damping="2", frictionloss="0.2", armature="0.01")
+    edits = [
+        setting("worldbody/body/inertial", mass="5.713"),
+        passive,
+        joint("RR_calf_joint", armature="0.02"),
+        joint("FR_hip_joint", axis="1 0 0.2"),
+    ]
+    robot = MujocoRobot(changed(*edits, joint("RL_calf_joint", range="-2.6 -1.6")), policy.description)
+    assert robot.notes == [
+        "mass: the MJCF has 13.453 kg, the robot of the training 12.453 kg",
+        "axes: those of the MJCF are not the policy's (FR_hip_joint)",
+        "nominal pose: beyond the joint limits of the MJCF, where episodes start instead (RL_calf_joint)",
+        "damping of joints: the MJCF has 2, the robot of the training 0 (all joints)",
+        "armature of joints: the MJCF has 0.02, the robot of the training 0.01 (RR_calf_joint)",
+    ]
+
+
+def test_geoms_are_told(policy, changed):
+    """Geoms that should end episodes and are missing, and a robot that no view would draw."""
+    hidden = setting(".//default[@class='visual']/geom", group="5")
+    description = policy.description | {"episode": {"length": 20.0, "ends_on_contact_of": ["trunk", "head"]}}
+    assert MujocoRobot(changed(hidden), description).notes == [
+        "no view draws the robot: its geoms are in group 3, 5; put those to be seen into group 0, 1 or 2",
+        "no geom's name contains head: it ends no episode",
+    ]
+
+
+def test_older_exports(policy, changed):
+    """Descriptions that do not tell the joints' axes are run as they were, and a line says what is not compared."""
+    older = {key: value for key, value in policy.description.items() if key != "joints"}
+    (note,) = MujocoRobot(changed(), older).notes
+    assert note == "axes, damping, armature and friction of joints are not compared: policy.yaml lacks them"
+
+
+def test_all_problems_are_told(policy, changed):
+    """Actuators that are no motors are told together, and so are missing joints."""
+    told = error_of(MujocoRobot, changed(servo(3, 7)), policy.description)
+    assert (
+        told.count("must be a motor, ctrl its torque; it is a servo") == 2
+        and "'FL_hip_joint'" in told
+        and "'RR_thigh_joint'" in told
+    )
+    renamed = [setting(f".//joint[@name='{leg}_calf_joint']", name=f"{leg}_knee") for leg in ("RR", "RL")]
+    motors = [setting(f".//motor[@joint='{leg}_calf_joint']", joint=f"{leg}_knee") for leg in ("RR", "RL")]
+    told = error_of(MujocoRobot, changed(*renamed, *motors), policy.description)
+    assert "'RR_calf_joint'" in told and "'RL_calf_joint'" in told
