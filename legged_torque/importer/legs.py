@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 
 import mujoco
@@ -85,7 +84,9 @@ def find_legs(source: Source, shapes: dict[int, list[Shape]]) -> list[Leg]:
 
 def _chains(model: mujoco.MjModel) -> list[list[int]]:
     """Return the paths from the trunk's children to every end of the tree."""
-    children = {body: [c for c in range(2, model.nbody) if model.body_parentid[c] == body] for body in range(model.nbody)}
+    children = {
+        body: [c for c in range(2, model.nbody) if model.body_parentid[c] == body] for body in range(model.nbody)
+    }
     ends = [body for body in range(2, model.nbody) if not children[body]]
     chains = []
     for body in ends:
@@ -121,7 +122,7 @@ def _take_foot(source: Source, shapes: dict[int, list[Shape]], chain: list[int],
     near = [i for i, shape in enumerate(found) if np.linalg.norm(shape.pos - tip) < 0.03 and len(found) > 1]
     radius = FOOT_RADIUS
     if near:
-        radius = float(np.mean(found.pop(near[0]).size[:1]))
+        radius = float(np.mean(found.pop(near[0]).half_sizes()))
     elif found[last].kind == "capsule":
         radius = 1.1 * found[last].radius
     source.notes.append(f"a sphere of {radius:.3f} m is the foot at the end of '{model.body(body).name}'")
@@ -133,7 +134,7 @@ def _leg_names(source: Source, chains: list[list[int]], data: mujoco.MjData) -> 
     names = []
     for chain in chains:
         joints = [source.model.joint(source.model.body_jntadr[body]).name for body in chain]
-        prefix = os.path.commonprefix(joints)
+        prefix = _common(joints)
         names.append(prefix[: prefix.rfind("_")] if "_" in prefix else "")
     clash = any(a and b and a != b and b.startswith(a) for a in names for b in names)
     if all(names) and len(set(names)) == len(names) and not clash:
@@ -148,6 +149,12 @@ def _leg_names(source: Source, chains: list[list[int]], data: mujoco.MjData) -> 
         names = [f"leg{number}" for number in range(1, len(names) + 1)]
     source.notes.append(f"names of joints do not begin with that of their leg: prefixed with {', '.join(names)}")
     return names
+
+
+def _common(names: list[str]) -> str:
+    """Return what all names begin with."""
+    same = [len(set(letters)) == 1 for letters in zip(*names, strict=False)]
+    return names[0][: same.index(False) if False in same else len(same)]
 
 
 def joint_names(source: Source, legs: list[Leg]) -> list[str]:

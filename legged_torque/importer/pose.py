@@ -12,7 +12,8 @@ from legged_torque.importer.source import Source
 
 BANDWIDTH = 4.0  # [Hz] natural frequency of a joint under its gains, with the inertia of the leg below it
 DAMPING_RATIO = 0.5  # of the same
-SAG = 0.15  # [rad] by which a joint may give way under the robot's weight
+SAG = 0.1  # [rad] by which a joint may give way under the robot's weight
+TIPPING = 2.0  # times the stiffness below which a robot with level trunk tips over its feet, shared by its legs
 CROUCH = {False: 0.75, True: 0.93}  # height of hips over feet in stance, of stretched legs'; with ankles and without
 BEND = {False: (0.8, -1.6), True: (-0.4, 0.8)}  # [rad] angles of thigh and knee about y to start from, likewise
 ARMATURE = 0.01 / 33.5  # [kg m^2 per N m] rotor's inertia per torque, that of the A1, where a file has none
@@ -45,9 +46,7 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
             _bend(model, leg, angles, ranges)
         share = CROUCH[legs[0].is_walking_on_soles]
         source.notes.append(f"nominal pose: inverse kinematics, feet below hips at {share:.0%} of the stretched legs")
-    outside = [
-        name for name, q, (low, high) in zip(source.joints, angles, ranges, strict=True) if not low <= q <= high
-    ]
+    outside = [name for name, q, (low, high) in zip(source.joints, angles, ranges, strict=True) if not low <= q <= high]
     if outside:
         source.notes.append(f"the nominal pose was beyond the limits of {', '.join(outside)} and is moved inside")
         angles = np.clip(angles, ranges[:, 0], ranges[:, 1])
@@ -62,9 +61,14 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
         )
     lows = [world_shape(data, leg.bodies[-1], leg.foot) for leg in legs]
     inertia, holding = _inertias(model, data) + armature, _holding_torques(model, data, legs, lows)
+    height = -float(np.mean([low[2] for low in lows]))
     stiffness = np.maximum((2 * np.pi * BANDWIDTH) ** 2 * inertia, np.abs(holding) / SAG)
+    weight = -float(model.opt.gravity[2] * model.body_mass.sum())
+    for leg in legs:
+        joints = model.body_jntadr[leg.bodies] - 1
+        stiffness[joints] = np.maximum(stiffness[joints], TIPPING * weight * height / len(legs))
     damping = 2 * DAMPING_RATIO * np.sqrt(stiffness * inertia)
-    return Stance(angles, -float(np.mean([low[2] for low in lows])), armature, stiffness, damping, holding)
+    return Stance(angles, height, armature, stiffness, damping, holding)
 
 
 def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarray) -> None:
@@ -97,7 +101,9 @@ def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarra
         rows, error = jacp[:, joints + 5], goal - foot
         if leg.is_walking_on_soles:
             turned = flat @ data.xmat[leg.bodies[-1]].reshape(3, 3).T
-            lean = 0.5 * np.array([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]])
+            lean = 0.5 * np.array(
+                [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
+            )
             rows, error = np.vstack([rows, 0.3 * jacr[:, joints + 5]]), np.concatenate([error, 0.3 * lean])
         step = rows.T @ np.linalg.solve(rows @ rows.T + 1e-4 * np.eye(len(rows)), error)
         q = np.clip(q + np.clip(step, -0.2, 0.2), low, high)
@@ -112,9 +118,7 @@ def _inertias(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     return np.diag(matrix)[6:] - model.dof_armature[6:]
 
 
-def _holding_torques(
-    model: mujoco.MjModel, data: mujoco.MjData, legs: list[Leg], lows: list[np.ndarray]
-) -> np.ndarray:
+def _holding_torques(model: mujoco.MjModel, data: mujoco.MjData, legs: list[Leg], lows: list[np.ndarray]) -> np.ndarray:
     """Return the torques [N m] that hold the robot still, the ground pushing up evenly on all feet."""
     mujoco.mj_comVel(model, data)
     mujoco.mj_rne(model, data, 0, data.qfrc_bias)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names, mirrored_legs, zero_pose
+from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names, mirrored_legs, world_shape, zero_pose
 from legged_torque.importer.pose import Stance, find_stance
 from legged_torque.importer.shapes import Shape
 from legged_torque.importer.source import Source, read_source
@@ -36,6 +36,18 @@ class Robot:
     mirrored: list[list[str]]
     stance: Stance
 
+    def by_kind(self, values: np.ndarray) -> dict[str, float]:
+        """Return numbers by the kinds of joints, to two digits: the highest of each."""
+        numbers: dict[str, float] = {}
+        for kind, value in zip(self.kinds, values, strict=True):
+            numbers[kind] = max(numbers.get(kind, 0.0), float(f"{value:.2g}"))
+        return numbers
+
+    def gains(self) -> np.ndarray:
+        """Return stiffness [N m/rad] and damping [N m s/rad] as the settings have them. Shape: (2, joints)."""
+        tables = self.by_kind(self.stance.stiffness), self.by_kind(self.stance.damping)
+        return np.array([[table[kind] for kind in self.kinds] for table in tables])
+
     @property
     def notes(self) -> list[str]:
         """What was changed and why, a line each."""
@@ -59,6 +71,8 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     mirrored = mirrored_legs(source, legs)
     if len(mirrored) * 2 != len(legs):
         source.notes.append("not every leg has a mirror image: training without symmetry")
+    if torque_limit is not None:
+        source.notes.append(f"torque limits: {torque_limit:g} N m, as given")
     speed = max(source.speed_limits, default=SPEED)
     if not source.speed_limits:
         source.notes.append(f"the file has no speed limits: {SPEED:g} rad/s assumed, asset.max_dof_vel")
@@ -69,8 +83,8 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     damped = source.model.dof_damping[6:]
     if (damped > stance.damping / 4).any():
         source.notes.append(
-            f"joint damping up to {damped.max():g} N m s/rad is kept; it often stands for a servo's and is too much for "
-            "torque control: set it to 0 if it is not friction that you measured"
+            f"joint damping up to {damped.max():g} N m s/rad is kept; it often stands for a servo's and is too much "
+            "for torque control: set it to 0 if it is not friction that you measured"
         )
     _name_shapes(source, legs, shapes)
     return Robot(name, source, legs, shapes, joints, kinds, ranges, torques, speed, mirrored, stance)
@@ -93,8 +107,8 @@ def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None
     if given is not None:
         return np.full(model.njnt - 1, given)
     data = zero_pose(model, source.pose)
-    lows = [(s.ends() @ data.xmat[b].reshape(3, 3).T + data.xpos[b])[:, 2].min() for b in shapes for s in shapes[b]]
-    enough = -model.opt.gravity[2] * float(model.body_mass.sum()) * -float(min(lows))
+    lowest = min(world_shape(data, body, shape)[2] for body, found in shapes.items() for shape in found)
+    enough = float(model.opt.gravity[2] * model.body_mass.sum() * lowest)
     known = np.array([np.inf if limit is None else limit for limit in source.torque_limits])
     odd = [name for name, limit in zip(source.joints, known, strict=True) if not 0 < limit < IMPLAUSIBLE * enough]
     if odd:

@@ -78,9 +78,9 @@ def settings(robot: Robot, path: str) -> str:
         bandwidth=BANDWIDTH,
         sag=SAG,
         ratio=DAMPING_RATIO,
-        stiffness=_by_kind(robot, stance.stiffness),
-        damping=_by_kind(robot, stance.damping),
-        torque_scale=_rounded(0.12 * float(max(robot.torques))),
+        stiffness=_table(robot.by_kind(stance.stiffness)),
+        damping=_table(robot.by_kind(stance.damping)),
+        torque_scale=float(f"{0.12 * max(robot.torques):.2g}"),
         ranges=RANGES.format(low=round(0.95 * radius, 4), high=round(1.05 * radius, 4)) if radius else "",
         height=round(stance.height, 3),
         symmetry=SYMMETRY if len(robot.mirrored) * 2 == len(robot.legs) else "",
@@ -108,16 +108,8 @@ def _quoted(value: object) -> str:
     return repr(value).replace("'", '"')
 
 
-def _rounded(value: float) -> float:
-    """Return a number to two digits."""
-    return float(f"{value:.2g}")
-
-
-def _by_kind(robot: Robot, values: object) -> str:
-    """Return numbers by the kinds of joints, the highest of each; one number if they are all the same."""
-    numbers: dict[str, float] = {}
-    for kind, value in zip(robot.kinds, list(values), strict=True):  # type: ignore[call-overload]
-        numbers[kind] = max(numbers.get(kind, 0.0), _rounded(float(value)))
+def _table(numbers: dict[str, float]) -> str:
+    """Return numbers by the kinds of joints as a dictionary; one number if they are all the same."""
     if len(set(numbers.values())) == 1:
         return str(next(iter(numbers.values())))
     ordered = sorted(numbers, key=len, reverse=True)  # the first part that matches counts

@@ -33,6 +33,12 @@ class Shape:
             local = signs * self.size
         return local @ rotation(self.quat).T + self.pos
 
+    def half_sizes(self) -> list[float]:
+        """Return how far it reaches from its centre along its axes [m]."""
+        if self.kind == "box":
+            return self.size
+        return [self.size[0], self.size[0], sum(self.size)]
+
     @property
     def radius(self) -> float:
         """How thick it is around its ends [m]."""
