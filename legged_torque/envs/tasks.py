@@ -14,6 +14,8 @@ from legged_torque.envs.approaches import torque_gravity
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 from legged_torque.envs.grounds.rough import RoughCfg, RoughCfgPPO, RoughScanCfg
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
+from legged_torque.envs.robots.go1 import Go1Cfg, Go1CfgPPO
+from legged_torque.envs.robots.go2 import Go2Cfg, Go2CfgPPO
 from legged_torque.utils.task_registry import task_registry
 
 
@@ -110,7 +112,37 @@ TASKS: tuple[tuple[str, str, type[LeggedRobotCfg], type[LeggedRobotCfgPPO]], ...
     ("a1_torque_curriculum_high", _CURRICULUM, A1TorqueCurriculumHighCfg, A1TorqueCurriculumCfgPPO),
     ("a1_multihead_two_rates", _TWO_RATES, A1MultiHeadTwoRatesCfg, A1MultiHeadTwoRatesCfgPPO),
 )
-"""Tasks on a plane: name, class, settings and training."""
+"""Tasks of the A1 on a plane: name, class, settings and training."""
+
+APPROACHES: tuple[tuple[str, str, type, type], ...] = (
+    ("torque", _TORQUE, torque.TorqueCfg, torque.TorqueCfgPPO),
+    ("torque_gravity", _TORQUE, torque.TorqueCfg, torque_gravity.TorqueGravityCfgPPO),
+    ("torque_curriculum", _CURRICULUM, torque_curriculum.TorqueCurriculumCfg, torque_curriculum.TorqueCurriculumCfgPPO),
+    ("torque_multihead", _MULTI_HEAD, multi_head.TorqueMultiHeadCfg, multi_head.MultiHeadCfgPPO),
+    ("multihead", _MULTI_HEAD, multi_head.MultiHeadCfg, multi_head.MultiHeadCfgPPO),
+    (
+        "torque_curriculum_multihead",
+        _CURRICULUM_MULTI_HEAD,
+        multi_head.CurriculumMultiHeadCfg,
+        multi_head.MultiHeadCfgPPO,
+    ),
+    ("multihead_two_rates", _TWO_RATES, multi_head.MultiHeadTwoRatesCfg, multi_head.MultiHeadTwoRatesCfgPPO),
+)
+"""Approaches that combine with any robot: name, task class, settings and training; position control is the robot's."""
+
+
+def tasks_of(name: str, cfg: Any, train_cfg: Any) -> list[tuple[str, str, Any, Any]]:
+    """Return the tasks of a robot with all approaches on a plane, as in :data:`TASKS`."""
+    tasks = [(f"{name}_position", _ROBOT, cfg, train_cfg)]
+    for approach, robot, approach_cfg, approach_train_cfg in APPROACHES:
+        text = {"__doc__": f"{cfg.__doc__} Approach: {approach_cfg.__doc__}"}
+        settings, training = (approach_cfg, cfg), (approach_train_cfg, train_cfg)
+        tasks.append((f"{name}_{approach}", robot, type(cfg.__name__, settings, text), type("CfgPPO", training, text)))
+    return tasks
+
+
+ROBOTS = (("go1", Go1Cfg, Go1CfgPPO), ("go2", Go2Cfg, Go2CfgPPO))
+"""Further robots by name, with their settings and training."""
 
 
 def on_ground(ground: type, task: type) -> Any:
@@ -118,7 +150,7 @@ def on_ground(ground: type, task: type) -> Any:
     return type(ground.__name__, (ground, task), {"__doc__": f"{task.__doc__} On: {ground.__doc__}"})()
 
 
-for name, robot, env_cfg, train_cfg in TASKS:
+for name, robot, env_cfg, train_cfg in TASKS + tuple(task for parts in ROBOTS for task in tasks_of(*parts)):
     task_registry.register(name, robot, env_cfg(), train_cfg())
     rough_name, rough_training = name.replace("_", "_rough_", 1), on_ground(RoughCfgPPO, train_cfg)
     task_registry.register(rough_name, robot, on_ground(RoughCfg, env_cfg), rough_training)
