@@ -30,7 +30,7 @@ def main() -> None:
         from legged_torque.importer.mjcf import mjcf
         from legged_torque.importer.robot import import_robot
         from legged_torque.importer.settings import settings
-        from legged_torque.importer.standing import draw, fused_problem, load, measure
+        from legged_torque.importer.standing import draw, fused_problem, measure, parse
     robot = import_robot(args.file, args.name, args.torque_limit)
     folder = args.out or RESOURCES_DIR / "robots" / robot.name
     model_file = folder / f"{robot.name}.xml"
@@ -40,16 +40,17 @@ def main() -> None:
         if file.exists() and not args.force:
             raise UserError(f"'{file}' exists; --force writes over it, --name and --out write elsewhere")
     path = str(model_file) if args.out else f"resources/robots/{robot.name}/{robot.name}.xml"
-    code = settings(robot, path)
+    text = mjcf(robot)
+    model = parse(text, args.file)
+    problem = fused_problem(model)
+    code = settings(robot, path, is_fused=not problem)
     folder.mkdir(parents=True, exist_ok=True)
-    model_file.write_text(mjcf(robot), encoding="utf-8")
+    model_file.write_text(text, encoding="utf-8")
     code_file.write_text(code, encoding="utf-8")
     for note in robot.notes:
         print(f"- {note}")
     print(f"wrote {model_file}\nwrote {code_file}")
-    model = load(model_file)
-    problem = fused_problem(model)
-    print(f"sim.engine 'fused': {problem or 'simulates it'}")
+    print(problem or "sim.engine 'fused' simulates it")
     if args.check:
         result, data = measure(model, *robot.gains())
         print(f"5 s under PD: {result}")

@@ -157,14 +157,26 @@ def _common(names: list[str]) -> str:
     return names[0][: same.index(False) if False in same else len(same)]
 
 
-def joint_names(source: Source, legs: list[Leg]) -> list[str]:
-    """Return the names of all joints in the order of the file, beginning with that of their leg."""
+def joint_names(source: Source, legs: list[Leg], mirrored: list[list[str]]) -> list[str]:
+    """Return the names of all joints in the order of the file, beginning with that of their leg.
+
+    Where names differ on the other side beyond that, joints are numbered. Adds a note.
+    """
     owner = {body: leg.name for leg in legs for body in leg.bodies}
-    result = []
-    for joint, name in enumerate(source.joints):
-        leg = owner.get(source.body_of(joint), "")
-        result.append(name if name.startswith(leg) else f"{leg}_{name}")
-    return result
+    owners = [owner.get(source.body_of(joint), "") for joint in range(len(source.joints))]
+    names = [name if name.startswith(leg) else f"{leg}_{name}" for name, leg in zip(source.joints, owners, strict=True)]
+    kinds = {
+        leg.name: [n.removeprefix(leg.name) for n, o in zip(names, owners, strict=True) if o == leg.name]
+        for leg in legs
+    }
+    if all(kinds[right] == kinds[left] for right, left in mirrored):
+        return names
+    source.notes.append("joints are numbered along their legs: their names differ between left and right")
+    places = {body: place for leg in legs for place, body in enumerate(leg.bodies, 1)}
+    return [
+        f"{leg}_joint{places[source.body_of(joint)]}" if leg else name
+        for joint, (name, leg) in enumerate(zip(names, owners, strict=True))
+    ]
 
 
 def mirrored_legs(source: Source, legs: list[Leg]) -> list[list[str]]:

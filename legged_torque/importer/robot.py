@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legged_torque.envs.base.symmetry import counterparts
 from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names, mirrored_legs, world_shape, zero_pose
 from legged_torque.importer.pose import Stance, find_stance
 from legged_torque.importer.shapes import Shape
@@ -33,7 +34,8 @@ class Robot:
     ranges: np.ndarray  # [rad]. Shape: (joints, 2)
     torques: np.ndarray  # [N m]
     speed: float  # [rad/s] the highest
-    mirrored: list[list[str]]
+    mirrored: list[list[str]]  # pairs of right and left legs
+    symmetric: bool  # whether every joint has a mirror image
     stance: Stance
 
     def by_kind(self, values: np.ndarray) -> dict[str, float]:
@@ -69,16 +71,15 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     ranges = _ranges(source)
     torques = _torques(source, shapes, torque_limit)
     mirrored = mirrored_legs(source, legs)
-    if len(mirrored) * 2 != len(legs):
-        source.notes.append("not every leg has a mirror image: training without symmetry")
     if torque_limit is not None:
         source.notes.append(f"torque limits: {torque_limit:g} N m, as given")
     speed = max(source.speed_limits, default=SPEED)
     if not source.speed_limits:
         source.notes.append(f"the file has no speed limits: {SPEED:g} rad/s assumed, asset.max_dof_vel")
     stance = find_stance(source, legs, ranges, torques)
-    joints = joint_names(source, legs)
+    joints = joint_names(source, legs, mirrored)
     prefixes = [leg.name + "_" for leg in legs]
+    symmetric = _is_symmetric(source, joints, mirrored)
     kinds = [next((j.removeprefix(p) for p in prefixes if j.startswith(p)), j) for j in joints]
     damped = source.model.dof_damping[6:]
     if (damped > stance.damping / 4).any():
@@ -87,7 +88,17 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
             "for torque control: set it to 0 if it is not friction that you measured"
         )
     _name_shapes(source, legs, shapes)
-    return Robot(name, source, legs, shapes, joints, kinds, ranges, torques, speed, mirrored, stance)
+    return Robot(name, source, legs, shapes, joints, kinds, ranges, torques, speed, mirrored, symmetric, stance)
+
+
+def _is_symmetric(source: Source, joints: list[str], mirrored: list[list[str]]) -> bool:
+    """Return whether every joint has its counterpart, which training with mirror images needs; note if not."""
+    try:
+        counterparts(joints, mirrored)
+    except UserError as error:
+        source.notes.append(f"training without mirror images: {error}")
+        return False
+    return True
 
 
 def _ranges(source: Source) -> np.ndarray:

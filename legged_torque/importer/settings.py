@@ -23,7 +23,7 @@ class {cls}Cfg(LeggedRobotCfg):
         mirrored_legs = {mirrored}
         max_dof_vel = {speed}
 
-    class init_state:
+{engine}    class init_state:
         pos = [0.0, 0.0, {drop}]
         default_joint_angles = (
 {angles}
@@ -41,6 +41,10 @@ class {cls}Cfg(LeggedRobotCfg):
 class {cls}CfgPPO(LeggedRobotCfgPPO):
     """Training of it."""
 {symmetry}'''
+ENGINE = """    class sim:
+        engine = "mujoco_warp"  # slower; the fused step cannot simulate this robot
+
+"""
 RANGES = """    class domain_rand:
         foot_radius = [{low}, {high}]
 
@@ -57,8 +61,11 @@ def class_name(name: str) -> str:
     return "".join(part.capitalize() for part in name.split("_"))
 
 
-def settings(robot: Robot, path: str) -> str:
-    """Return the text of the module with a robot's settings; ``path`` is that of its MJCF, as it is to be found."""
+def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
+    """Return the text of the module with a robot's settings.
+
+    ``path`` is that of its MJCF, as it is to be found; ``is_fused`` says whether the fused step can simulate it.
+    """
     stance = robot.stance
     feet = [leg.foot for leg in robot.legs]
     radius = feet[0].size[0] if feet[0].kind == "sphere" else None
@@ -68,6 +75,7 @@ def settings(robot: Robot, path: str) -> str:
         file=robot.source.file.name,
         cls=class_name(robot.name),
         path=path,
+        engine="" if is_fused else ENGINE,
         foot=FOOT,
         trunk=TRUNK,
         penalized=_quoted(_penalized(robot, kept)),
@@ -83,7 +91,7 @@ def settings(robot: Robot, path: str) -> str:
         torque_scale=float(f"{0.12 * max(robot.torques):.2g}"),
         ranges=RANGES.format(low=round(0.95 * radius, 4), high=round(1.05 * radius, 4)) if radius else "",
         height=round(stance.height, 3),
-        symmetry=SYMMETRY if len(robot.mirrored) * 2 == len(robot.legs) else "",
+        symmetry=SYMMETRY if robot.symmetric else "",
     )
 
 

@@ -86,10 +86,10 @@ def draw(model: mujoco.MjModel, data: mujoco.MjData, file: Path, size: tuple[int
     renderer.close()
 
 
-def load(file: Path) -> mujoco.MjModel:
-    """Return the model of a written MJCF."""
+def parse(text: str, file: Path) -> mujoco.MjModel:
+    """Return the model of the text of a MJCF that was made of a file, which an error names."""
     with loading(file):
-        return mujoco.MjModel.from_xml_path(str(file))
+        return mujoco.MjModel.from_xml_string(text)
 
 
 def fused_problem(model: mujoco.MjModel) -> str:
