@@ -5,8 +5,12 @@ Task classes are named, not imported, so that a command line is answered before 
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
+from collections.abc import Iterator
 from typing import Any
 
+from legged_torque.envs import robots
 from legged_torque.envs.approaches import multi_head_config as multi_head
 from legged_torque.envs.approaches import torque_config as torque
 from legged_torque.envs.approaches import torque_curriculum_config as torque_curriculum
@@ -14,8 +18,6 @@ from legged_torque.envs.approaches import torque_gravity
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 from legged_torque.envs.grounds.rough import RoughCfg, RoughCfgPPO, RoughScanCfg
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
-from legged_torque.envs.robots.go1 import Go1Cfg, Go1CfgPPO
-from legged_torque.envs.robots.go2 import Go2Cfg, Go2CfgPPO
 from legged_torque.utils.task_registry import task_registry
 
 
@@ -141,8 +143,15 @@ def tasks_of(name: str, cfg: Any, train_cfg: Any) -> list[tuple[str, str, Any, A
     return tasks
 
 
-ROBOTS = (("go1", Go1Cfg, Go1CfgPPO), ("go2", Go2Cfg, Go2CfgPPO))
-"""Further robots by name, with their settings and training."""
+def further_robots() -> Iterator[tuple[str, Any, Any]]:
+    """Yield name, settings and training of the robots in ``envs/robots`` but the A1: modules with two such classes."""
+    for module in pkgutil.iter_modules(robots.__path__):
+        if module.name != "a1":
+            parts = vars(importlib.import_module(f"{robots.__name__}.{module.name}"))
+            own = [part for part in parts.values() if getattr(part, "__module__", "") == parts["__name__"]]
+            settings = next(part for part in own if issubclass(part, LeggedRobotCfg))
+            training = next(part for part in own if issubclass(part, LeggedRobotCfgPPO))
+            yield module.name, settings, training
 
 
 def on_ground(ground: type, task: type) -> Any:
@@ -150,8 +159,10 @@ def on_ground(ground: type, task: type) -> Any:
     return type(ground.__name__, (ground, task), {"__doc__": f"{task.__doc__} On: {ground.__doc__}"})()
 
 
-for name, robot, env_cfg, train_cfg in TASKS + tuple(task for parts in ROBOTS for task in tasks_of(*parts)):
-    task_registry.register(name, robot, env_cfg(), train_cfg())
-    rough_name, rough_training = name.replace("_", "_rough_", 1), on_ground(RoughCfgPPO, train_cfg)
-    task_registry.register(rough_name, robot, on_ground(RoughCfg, env_cfg), rough_training)
-    task_registry.register(f"{rough_name}_scan", robot, on_ground(RoughScanCfg, env_cfg), rough_training)
+for robot_name, tasks in [("a1", TASKS), *((parts[0], tasks_of(*parts)) for parts in further_robots())]:
+    for name, robot, env_cfg, train_cfg in tasks:
+        task_registry.register(name, robot, env_cfg(), train_cfg())
+        rough_name = f"{robot_name}_rough_{name.removeprefix(f'{robot_name}_')}"
+        rough_training = on_ground(RoughCfgPPO, train_cfg)
+        task_registry.register(rough_name, robot, on_ground(RoughCfg, env_cfg), rough_training)
+        task_registry.register(f"{rough_name}_scan", robot, on_ground(RoughScanCfg, env_cfg), rough_training)
