@@ -9,6 +9,7 @@ from legged_torque.utils.errors import UserError
 TASKS = ["a1_position", "a1_torque", "a1_torque_gravity", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
 COMBINATIONS = ["a1_torque_curriculum_multihead", "a1_torque_gravity_curriculum", "a1_torque_gravity_multihead"]
 COMBINATIONS += ["a1_torque_curriculum_high", "a1_multihead_two_rates"]
+ROUGH = [f"a1_rough_{name[3:]}{scan}" for name in TASKS + COMBINATIONS for scan in ("", "_scan")]
 
 
 def parse(*words):

@@ -9,6 +9,7 @@ import pytest
 import torch
 from settings import error_of, get_cfgs
 
+from legged_torque.checks import distributions
 from legged_torque.envs.base.domain_rand import of_model
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.sim.randomization import Parameter, Randomization, changes_legs
@@ -119,6 +120,14 @@ def test_derived_constants(make_task):
         new = task.sim.field(name)
         assert torch.equal(new[~mask], old[~mask]), name
         assert not torch.equal(new[mask], old[mask]), name
+
+
+def test_picture_of_places(make_task):
+    """Where robots start on rough ground is drawn from the middles of their tiles."""
+    small = {"terrain.num_rows": 2, "terrain.max_init_terrain_level": 1, "terrain.border_size": 1.0}
+    tasks = [make_task("a1_rough_position", count, **small) for count in (40, 1)]
+    panel = next(panel for panel in distributions.parameters(*tasks) if panel.title == "init place [m]")
+    assert panel.values.shape == (40, 2) and 0.5 < np.abs(panel.values).max() <= 1.0 + 1e-5
 
 
 def test_distributions(make_task):

@@ -4,7 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from settings import error_of
 from test_rewards import TABLE_III
+
+from legged_torque.learning.worlds import check_identity, identity
+from legged_torque.terrain.tiles import TILES
 
 
 def random_rotation(rng):
@@ -108,3 +112,17 @@ def test_log(make_task):
     assert set(terms) == {f"Episode_Reward/{term}" for term in TABLE_III}
     assert 0.1 * sum(terms.values()) == pytest.approx(log["return"], rel=1e-4)
     assert task.log.read(0.1) == {"Health/diverged_worlds": 0.0}
+
+
+def test_worlds_know_their_map(make_task, monkeypatch):
+    """Worlds do not go on where a kind of tile has changed: robots would be in the ground."""
+    ground = {"num_rows": 1, "max_init_terrain_level": 0, "border_size": 1.0}
+    changes = {f"terrain.{name}": value for name, value in ground.items()}
+
+    def now():
+        return identity(make_task("a1_rough_position", 2, **changes), {"num_envs": 1, "perturbation": ""})
+
+    was = now()
+    check_identity(was, now())
+    monkeypatch.setitem(TILES, "stairs_up", lambda difficulty, rng, grid: grid.flat() + 0.4)
+    assert error_of(check_identity, was, now()) == "the map of the ground is another one"

@@ -268,18 +268,16 @@ def test_levels_move_by_legged_gyms_rule():
     torch.manual_seed(0)
     ground = make_ground(2000, num_rows=4, max_init_terrain_level=3)
     before = ground.levels.clone()
-    mask, steps, distance = torch.rand(2000) < 0.7, torch.randint(0, 5, (2000,)), 6.0 * torch.rand(2000)
+    mask, distance = torch.rand(2000) < 0.7, 6.0 * torch.rand(2000)
     commands = torch.rand(2000, 3) - 0.5
     commanded = 10.0 * commands[:, 0].hypot(commands[:, 1])
     direction = torch.nn.functional.normalize(torch.randn(2000, 2), dim=1)
     place = ground.origins + torch.cat([direction * distance.unsqueeze(1), torch.rand(2000, 1)], dim=1)
     kept = ground.levels
-    ground.end_episodes(mask, steps, place, commands, 10.0)
+    ground.end_episodes(mask, place, commands, 10.0)
     assert ground.levels is kept, "written in place"
     drawn = []
-    for was, is_over, got, asked, now in zip(
-        before.tolist(), mask & (steps > 0), distance, commanded, kept.tolist(), strict=True
-    ):
+    for was, is_over, got, asked, now in zip(before.tolist(), mask, distance, commanded, kept.tolist(), strict=True):
         change = 0 if not is_over else 1 if got > 3.0 else -1 if got < 0.5 * asked else 0
         if was + change == 4:
             drawn.append(now)
@@ -295,7 +293,7 @@ def test_levels_stay_in_evaluations():
     before = ground.levels.clone()
     assert set(before.tolist()) == {0, 1, 2}
     ended = torch.ones(12, dtype=torch.bool)
-    ground.end_episodes(ended, ended.long(), ground.origins + 5.0, torch.ones(12, 3), 20.0)
+    ground.end_episodes(ended, ground.origins + 5.0, torch.ones(12, 3), 20.0)
     assert torch.equal(ground.levels, before)
 
 
@@ -359,6 +357,9 @@ def test_levels_and_places_in_episodes(make_rough_task):
     task.step(torch.zeros(4, 12))
     assert task.reset_buf.all() and task.terrain.levels.tolist() == [1, 2, 0, 1]
     torch.testing.assert_close(task.base_pos[:, :2], task.terrain.origins[:, :2])
+    task.base_pos[0, 0], task.base_pos[1, 1] = torch.inf, 1e30  # broken worlds have walked nowhere
+    task.step(torch.zeros(4, 12))
+    assert task.reset_buf.tolist() == [True, True, False, False] and task.terrain.levels.tolist() == [1, 2, 0, 1]
 
 
 def test_robots_stand_on_their_tiles(make_rough_task):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -23,7 +23,7 @@ STEPS = 1000  # control steps over which events are watched
 UNITS = {
     "rad": ("roll", "pitch", "yaw", "joint_offset", "action_scale"),
     "rad/s": ("init_ang_vel", "init_dof_vel"),
-    "m": ("trunk_com", "foot_radius", "foot_offset"),
+    "m": ("init_place", "trunk_com", "foot_radius", "foot_offset"),
     "m/s": ("init_lin_vel",),
     "m/s²": ("gravity",),
     "kg": ("trunk_mass",),
@@ -88,6 +88,8 @@ def parameters(task: LeggedRobot, fixed: LeggedRobot) -> list[Panel]:
     """Return the panels of initial state, robot, ground and controller; ``fixed`` has no random parameters."""
     panels = [action_delay(task)]
     for drawn in domain_rand.initial_state(task):
+        if drawn.name == "init_place":
+            drawn = replace(drawn, field=from_origins(task))
         if drawn.name not in ("base_height", "action_delay"):  # never random, and a whole number
             panels.append(panel_of(drawn, "initial state", per_column(drawn.base or 0.0, len(drawn.columns))))
     readers = (domain_rand.robot_parameters, domain_rand.ground_parameters, domain_rand.control_parameters)
@@ -97,6 +99,13 @@ def parameters(task: LeggedRobot, fixed: LeggedRobot) -> list[Panel]:
             drawn = Parameter(own.name, own.field, own.columns, shared=own.shared)
         panels.append(panel_of(drawn, group_of.get(own.name, "other"), own.field[0, list(own.columns)].tolist()))
     return panels
+
+
+def from_origins(task: LeggedRobot) -> torch.Tensor:
+    """Return where trunks are, from where the episodes of their worlds start [m]. Shape: (num_envs, 3)."""
+    origins = torch.zeros_like(task.base_pos)
+    task.terrain.move_to_origin(torch.ones_like(task.reset_buf), origins)
+    return task.base_pos - origins
 
 
 def action_delay(task: LeggedRobot) -> Panel:

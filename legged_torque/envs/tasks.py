@@ -1,4 +1,4 @@
-"""Every task by name: robot x approach x ground, by listing their settings as bases, the approach first.
+"""Every task by name: robot x approach x ground, by listing their settings as bases: ground, approach, robot.
 
 Task classes are named, not imported, so that a command line is answered before torch is there.
 """
@@ -162,7 +162,8 @@ def on_ground(ground: type, task: type) -> Any:
 for robot_name, tasks in [("a1", TASKS), *((parts[0], tasks_of(*parts)) for parts in further_robots())]:
     for name, robot, env_cfg, train_cfg in tasks:
         task_registry.register(name, robot, env_cfg(), train_cfg())
+    for name, robot, env_cfg, train_cfg in tasks:
         rough_name = f"{robot_name}_rough_{name.removeprefix(f'{robot_name}_')}"
-        rough_training = on_ground(RoughCfgPPO, train_cfg)
-        task_registry.register(rough_name, robot, on_ground(RoughCfg, env_cfg), rough_training)
-        task_registry.register(f"{rough_name}_scan", robot, on_ground(RoughScanCfg, env_cfg), rough_training)
+        training = on_ground(RoughCfgPPO, train_cfg)
+        task_registry.register(rough_name, robot, on_ground(RoughCfg, env_cfg), training)
+        task_registry.register(f"{rough_name}_scan", robot, on_ground(RoughScanCfg, env_cfg), training)

@@ -59,13 +59,15 @@ def read_worlds(checkpoint_file: Path, digest: str | None) -> dict[str, Any]:
 
 
 def identity(task: LeggedRobot, evaluation: dict[str, Any]) -> dict[str, str]:
-    """Return what must be the same for worlds to go on: the settings, those of ``evaluation`` too, and the robot."""
+    """Return what must be the same for worlds to go on: the settings, those of ``evaluation`` too, robot and map."""
     model = task.sim.mj_model
     robot = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, robot)
     chosen = {key: evaluation[key] for key in ("num_envs", "perturbation")}
     settings = json.dumps(flat({**to_dict(task.cfg), "evaluation": chosen}))
-    return {"settings": settings, "robot": hashlib.sha256(robot.tobytes()).hexdigest()}
+    ground = task.terrain.map  # a user's own kinds of tiles are no settings
+    parts = {"robot": robot} | ({"ground": ground.heights} if ground else {})
+    return {"settings": settings, **{name: hashlib.sha256(part.data).hexdigest() for name, part in parts.items()}}
 
 
 def check_identity(was: dict[str, str], now: dict[str, str]) -> None:
@@ -76,6 +78,8 @@ def check_identity(was: dict[str, str], now: dict[str, str]) -> None:
             raise UserError(f"{name} is {after.get(name)}, was {before.get(name)}")
     if was["robot"] != now["robot"]:
         raise UserError("the robot's model, or the version of MuJoCo, is another one")
+    if was.get("ground", now.get("ground")) != now.get("ground"):
+        raise UserError("the map of the ground is another one")
 
 
 def world_tensors(task: BaseTask) -> dict[str, Tensor]:

@@ -28,9 +28,7 @@ class Plane(Terrain):
     def move_to_origin(self, mask: Tensor, base_pos: Tensor) -> None:
         """Leave trunks where they are."""
 
-    def end_episodes(
-        self, mask: Tensor, steps: Tensor, base_pos: Tensor, commands: Tensor, episode_length_s: float
-    ) -> None:
+    def end_episodes(self, mask: Tensor, base_pos: Tensor, commands: Tensor, episode_length_s: float) -> None:
         """Stay as it is."""
 
     def curriculum_values(self) -> dict[str, Tensor]:

@@ -68,9 +68,7 @@ class RoughGround(Terrain):
         """Move trunks to the middles of their tiles."""
         base_pos.add_(torch.where(mask.unsqueeze(1), self.origins, 0.0))
 
-    def end_episodes(
-        self, mask: Tensor, steps: Tensor, base_pos: Tensor, commands: Tensor, episode_length_s: float
-    ) -> None:
+    def end_episodes(self, mask: Tensor, base_pos: Tensor, commands: Tensor, episode_length_s: float) -> None:
         """Change levels by legged_gym's rule, if there is a curriculum.
 
         A robot that got further than half a tile goes a level up, and from the highest to any; else one that got less
@@ -84,7 +82,7 @@ class RoughGround(Terrain):
         levels = (self.levels + up.long() - down.long()).clamp(min=0)
         num_rows = self.layout.num_rows
         levels = torch.where(levels < num_rows, levels, torch.randint_like(levels, num_rows))
-        self.levels.copy_(torch.where(mask & (steps > 0), levels, self.levels))
+        self.levels.copy_(torch.where(mask, levels, self.levels))
 
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the mean level of all worlds."""

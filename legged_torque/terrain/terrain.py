@@ -42,14 +42,11 @@ class Terrain(ABC):
         """
 
     @abstractmethod
-    def end_episodes(
-        self, mask: Tensor, steps: Tensor, base_pos: Tensor, commands: Tensor, episode_length_s: float
-    ) -> None:
+    def end_episodes(self, mask: Tensor, base_pos: Tensor, commands: Tensor, episode_length_s: float) -> None:
         """Learn from the episodes that end in the worlds of ``mask``, before :meth:`move_to_origin` begins the next.
 
-        They have lasted so many ``steps``, 0 where none has begun yet, of ``episode_length_s`` at most. Trunks have got
-        to ``base_pos`` under ``commands``: v_x, v_y [m/s] and yaw rate. Shapes: (num_envs,), bool; (num_envs,), int64;
-        (num_envs, 3) both.
+        They last ``episode_length_s`` at most. Trunks have got to ``base_pos`` under ``commands``: v_x, v_y [m/s] and
+        yaw rate. Shapes: (num_envs,), bool; (num_envs, 3) both.
         """
 
     @abstractmethod

@@ -77,7 +77,10 @@ class BaseTask(VecEnv):
         return TensorDict(groups, [self.num_envs], device=self.device)
 
     def reset(self, world: int | None = None) -> TensorDict:
-        """Start a new episode in every world, or in a single one, and return the observations."""
+        """Start a new episode in every world, or in a single one, and return the observations.
+
+        A single one is for viewers: the others are observed once more, and what happens at random may happen there.
+        """
         self.reset_buf.fill_(world is None)
         if world is not None:
             self.reset_buf[world] = True

@@ -169,8 +169,8 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.episode_return.add_(self.rew_buf)
         self.log.add_step(self)
         self.update_feet_air_time()
-        seconds, steps = self.cfg.env.episode_length_s, self._episode_length_buf
-        self.terrain.end_episodes(self.reset_buf, steps, self.base_pos, self.commands, seconds)
+        ended = self.reset_buf & ~diverged  # where broken worlds have got to says nothing
+        self.terrain.end_episodes(ended, self.base_pos, self.commands, self.cfg.env.episode_length_s)
 
     def _update_state(self) -> None:
         """Compute what follows from the simulator's state."""

@@ -94,7 +94,7 @@ class CommandBreakdown:
         """Return for each command its parts that occurred.
 
         Returns:
-            Per part: "from" and "to" of the command, "share" of the steps, "track_percentage" (of all three commands,
+            Per part: "from" and "to" of the command, "share" of the steps, "track_percentage" (of all that are tracked,
             NaN if all were 0), and "error": mean |v - v*| of this command [m/s or rad/s].
         """
         result: dict[str, list[dict[str, float]]] = {}
