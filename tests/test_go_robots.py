@@ -3,8 +3,11 @@
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from legged_torque import resource_path
+from legged_torque.envs import task_registry
+from legged_torque.utils.options import Options
 
 PUBLISHED = {
     "go1": """
@@ -131,3 +134,19 @@ def test_nominal_pose(name):
     mujoco.mj_forward(model, data)
     gaps = [data.geom(f"{leg}_foot").xpos[2] - model.geom(f"{leg}_foot").size[0] for leg in LEGS]
     assert 0 < min(gaps) < 1e-3
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_tasks(name):
+    """Every approach and ground has a task; robots held at their nominal pose for half a second do not fall."""
+    approaches = [task.removeprefix("a1_") for task in task_registry.names() if task.startswith("a1_")]
+    own = {"torque_gravity_curriculum", "torque_gravity_multihead", "torque_curriculum_high"}  # the A1's alone
+    plain = {approach.removeprefix("rough_").removesuffix("_scan") for approach in approaches} - own
+    assert {f"{name}_{approach}" for approach in plain} <= set(task_registry.names())
+    assert {f"{name}_rough_{approach}_scan" for approach in plain} <= set(task_registry.names())
+    settings = ["domain_rand.init_roll=[0, 0]", "domain_rand.init_pitch=[0, 0]"]
+    task = task_registry.make_env(f"{name}_position", Options(device="cpu", num_envs=2, set=settings))[0]
+    task.reset()
+    for _ in range(25):
+        done = task.step(torch.zeros(2, task.num_actions))[2]
+        assert not done.any()
