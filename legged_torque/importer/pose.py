@@ -114,7 +114,8 @@ def _inertias(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Return the inertia [kg m^2] about each joint of what it moves, without armature."""
     mujoco.mj_crb(model, data)
     matrix = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, matrix)
+    for row, unit in zip(matrix, np.eye(model.nv), strict=True):
+        mujoco.mj_mulM(model, data, row, unit)
     return np.diag(matrix)[6:] - model.dof_armature[6:]
 
 
