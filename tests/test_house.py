@@ -10,7 +10,7 @@ LEVELS = [
     ("utils",),
     ("sim", "terrain", "motors"),
     ("envs.base",),
-    ("envs.robots", "envs.approaches", "envs.grounds"),
+    ("envs.robots", "envs.approaches", "envs.grounds", "importer"),
     ("envs",),
     ("learning",),
     ("control", "deploy"),

@@ -5,7 +5,7 @@ import inspect
 
 import pytest
 import torch
-from settings import COMBINATIONS, ROUGH, TASKS, error_of, flatten, parse
+from settings import COMBINATIONS, OTHER_ROBOTS, ROUGH, TASKS, error_of, flatten, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -19,7 +19,7 @@ from legged_torque.utils.task_registry import TaskRegistry
 def test_registered_tasks():
     """The approaches and what combines them are there, each with settings of its own."""
     names = task_registry.names()
-    assert names == TASKS + COMBINATIONS + ROUGH
+    assert names == TASKS + COMBINATIONS + ROUGH + OTHER_ROBOTS
     classes = {name: task_registry.get_task_class(name).__name__ for name in TASKS + COMBINATIONS}
     assert classes == {
         "a1_position": "LeggedRobot",
@@ -46,7 +46,7 @@ def test_unknown_task(function, name):
     """The nearest task is proposed and all are listed."""
     line = error_of(getattr(task_registry, function), name)
     assert line.startswith(f"unknown task '{name}'; did you mean 'a1_position'? allowed: ")
-    assert line.split("allowed: ")[1].split(", ") == sorted(TASKS + COMBINATIONS + ROUGH)
+    assert line.split("allowed: ")[1].split(", ") == sorted(TASKS + COMBINATIONS + ROUGH + OTHER_ROBOTS)
 
 
 def test_name_without_a_near_match():

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from settings import COMBINATIONS, ROUGH, TASKS
+from settings import COMBINATIONS, OTHER_ROBOTS, ROUGH, TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -346,7 +346,8 @@ def test_learning_curve(root, tmp_path):
 
 def test_list_of_tasks(tmp_path):
     """``train.py --list`` prints the names of all tasks, one a line, and writes nothing."""
-    assert run_here("train.py", "--list", root=tmp_path) == (0, "\n".join([*TASKS, *COMBINATIONS, *ROUGH, ""]), "")
+    names = [*TASKS, *COMBINATIONS, *ROUGH, *OTHER_ROBOTS, ""]
+    assert run_here("train.py", "--list", root=tmp_path) == (0, "\n".join(names), "")
     assert not list(tmp_path.iterdir())
 
 

@@ -5,8 +5,12 @@ Task classes are named, not imported, so that a command line is answered before 
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
+from collections.abc import Iterator
 from typing import Any
 
+from legged_torque.envs import robots
 from legged_torque.envs.approaches import multi_head_config as multi_head
 from legged_torque.envs.approaches import torque_config as torque
 from legged_torque.envs.approaches import torque_curriculum_config as torque_curriculum
@@ -110,7 +114,44 @@ TASKS: tuple[tuple[str, str, type[LeggedRobotCfg], type[LeggedRobotCfgPPO]], ...
     ("a1_torque_curriculum_high", _CURRICULUM, A1TorqueCurriculumHighCfg, A1TorqueCurriculumCfgPPO),
     ("a1_multihead_two_rates", _TWO_RATES, A1MultiHeadTwoRatesCfg, A1MultiHeadTwoRatesCfgPPO),
 )
-"""Tasks on a plane: name, class, settings and training."""
+"""Tasks of the A1 on a plane: name, class, settings and training."""
+
+APPROACHES: tuple[tuple[str, str, type, type], ...] = (
+    ("torque", _TORQUE, torque.TorqueCfg, torque.TorqueCfgPPO),
+    ("torque_gravity", _TORQUE, torque.TorqueCfg, torque_gravity.TorqueGravityCfgPPO),
+    ("torque_curriculum", _CURRICULUM, torque_curriculum.TorqueCurriculumCfg, torque_curriculum.TorqueCurriculumCfgPPO),
+    ("torque_multihead", _MULTI_HEAD, multi_head.TorqueMultiHeadCfg, multi_head.MultiHeadCfgPPO),
+    ("multihead", _MULTI_HEAD, multi_head.MultiHeadCfg, multi_head.MultiHeadCfgPPO),
+    (
+        "torque_curriculum_multihead",
+        _CURRICULUM_MULTI_HEAD,
+        multi_head.CurriculumMultiHeadCfg,
+        multi_head.MultiHeadCfgPPO,
+    ),
+    ("multihead_two_rates", _TWO_RATES, multi_head.MultiHeadTwoRatesCfg, multi_head.MultiHeadTwoRatesCfgPPO),
+)
+"""Approaches that combine with any robot: name, task class, settings and training; position control is the robot's."""
+
+
+def tasks_of(name: str, cfg: Any, train_cfg: Any) -> list[tuple[str, str, Any, Any]]:
+    """Return the tasks of a robot with all approaches on a plane, as in :data:`TASKS`."""
+    tasks = [(f"{name}_position", _ROBOT, cfg, train_cfg)]
+    for approach, robot, approach_cfg, approach_train_cfg in APPROACHES:
+        text = {"__doc__": f"{cfg.__doc__} Approach: {approach_cfg.__doc__}"}
+        settings, training = (approach_cfg, cfg), (approach_train_cfg, train_cfg)
+        tasks.append((f"{name}_{approach}", robot, type(cfg.__name__, settings, text), type("CfgPPO", training, text)))
+    return tasks
+
+
+def further_robots() -> Iterator[tuple[str, Any, Any]]:
+    """Yield name, settings and training of the robots in ``envs/robots`` but the A1: modules with two such classes."""
+    for module in pkgutil.iter_modules(robots.__path__):
+        if module.name != "a1":
+            parts = vars(importlib.import_module(f"{robots.__name__}.{module.name}"))
+            own = [part for part in parts.values() if getattr(part, "__module__", "") == parts["__name__"]]
+            settings = next(part for part in own if issubclass(part, LeggedRobotCfg))
+            training = next(part for part in own if issubclass(part, LeggedRobotCfgPPO))
+            yield module.name, settings, training
 
 
 def on_ground(ground: type, task: type) -> Any:
@@ -118,10 +159,11 @@ def on_ground(ground: type, task: type) -> Any:
     return type(ground.__name__, (ground, task), {"__doc__": f"{task.__doc__} On: {ground.__doc__}"})()
 
 
-for name, robot, env_cfg, train_cfg in TASKS:
-    task_registry.register(name, robot, env_cfg(), train_cfg())
-
-for name, robot, env_cfg, train_cfg in TASKS:
-    rough_name, training = name.replace("_", "_rough_", 1), on_ground(RoughCfgPPO, train_cfg)
-    task_registry.register(rough_name, robot, on_ground(RoughCfg, env_cfg), training)
-    task_registry.register(f"{rough_name}_scan", robot, on_ground(RoughScanCfg, env_cfg), training)
+for robot_name, tasks in [("a1", TASKS), *((parts[0], tasks_of(*parts)) for parts in further_robots())]:
+    for name, robot, env_cfg, train_cfg in tasks:
+        task_registry.register(name, robot, env_cfg(), train_cfg())
+    for name, robot, env_cfg, train_cfg in tasks:
+        rough_name = f"{robot_name}_rough_{name.removeprefix(f'{robot_name}_')}"
+        training = on_ground(RoughCfgPPO, train_cfg)
+        task_registry.register(rough_name, robot, on_ground(RoughCfg, env_cfg), training)
+        task_registry.register(f"{rough_name}_scan", robot, on_ground(RoughScanCfg, env_cfg), training)

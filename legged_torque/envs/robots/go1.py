@@ -1,0 +1,51 @@
+"""The Unitree Go1: figures of MuJoCo Menagerie and of Unitree's URDF, the same for all approaches."""
+
+from __future__ import annotations
+
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+
+
+class Go1Cfg(LeggedRobotCfg):
+    """Settings of the Go1; alone, of position control on a plane: task ``go1_position``."""
+
+    class asset:
+        file = "resources/robots/go1/go1.xml"
+        foot_name = "foot"
+        penalize_contacts_on = ["calf", "thigh", "trunk"]
+        terminate_after_contacts_on = ["trunk"]
+        mirrored_legs = [["FR", "FL"], ["RR", "RL"]]
+        max_dof_vel = 30.1
+
+    class init_state:
+        pos = [0.0, 0.0, 0.42]
+        default_joint_angles = (
+            {"FR_hip_joint": -0.1, "FR_thigh_joint": 0.8, "FR_calf_joint": -1.5}
+            | {"FL_hip_joint": 0.1, "FL_thigh_joint": 0.8, "FL_calf_joint": -1.5}
+            | {"RR_hip_joint": -0.1, "RR_thigh_joint": 1.0, "RR_calf_joint": -1.5}
+            | {"RL_hip_joint": 0.1, "RL_thigh_joint": 1.0, "RL_calf_joint": -1.5}
+        )
+
+    class control:
+        stiffness = 20.0
+        damping = 0.5
+        action_scale = 0.25
+        torque_scale = 4.0
+
+    class domain_rand:
+        trunk_mass_offset = [-1.0, 1.0]
+        foot_radius = [0.0219, 0.0241]
+        dof_damping = [0.0, 0.2]
+        dof_armature = [0.008, 0.02]
+        dof_stiffness = [0.0, 0.2]
+        dof_frictionloss = [0.0, 0.4]
+
+    class rewards:
+        base_height_target = 0.325
+
+
+class Go1CfgPPO(LeggedRobotCfgPPO):
+    """Training of a Go1, which is the same left and right."""
+
+    class algorithm:
+        class symmetry_cfg:
+            use_data_augmentation = True

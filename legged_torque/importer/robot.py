@@ -1,0 +1,147 @@
+"""An imported robot: everything that its MJCF and its settings need, and what was decided on the way."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from legged_torque.envs.base.symmetry import counterparts
+from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names, mirrored_legs, world_shape, zero_pose
+from legged_torque.importer.pose import Stance, find_stance
+from legged_torque.importer.shapes import Shape
+from legged_torque.importer.source import Source, read_source
+from legged_torque.utils.errors import UserError
+
+UNLIMITED = np.pi  # [rad] to both sides, of joints without a range
+IMPLAUSIBLE = 20.0  # times weight x height: torque limits beyond this are none
+SPEED = 20.0  # [rad/s] of joints without a speed limit
+FOOT, TRUNK = "foot", "trunk"  # in the names of the geoms of feet and trunk
+
+
+@dataclass
+class Robot:
+    """A robot as it will be written; lists are by joint, in the order of the file."""
+
+    name: str
+    source: Source
+    legs: list[Leg]
+    shapes: dict[int, list[Shape]]  # named, by body; feet are among them
+    joints: list[str]
+    kinds: list[str]  # names of the joints without that of their leg
+    ranges: np.ndarray  # [rad]. Shape: (joints, 2)
+    torques: np.ndarray  # [N m]
+    speed: float  # [rad/s] the highest
+    mirrored: list[list[str]]  # pairs of right and left legs
+    symmetric: bool  # whether every joint has a mirror image
+    stance: Stance
+
+    def by_kind(self, values: np.ndarray) -> dict[str, float]:
+        """Return numbers by the kinds of joints, to two digits: the highest of each."""
+        numbers: dict[str, float] = {}
+        for kind, value in zip(self.kinds, values, strict=True):
+            numbers[kind] = max(numbers.get(kind, 0.0), float(f"{value:.2g}"))
+        return numbers
+
+    def gains(self) -> np.ndarray:
+        """Return stiffness [N m/rad] and damping [N m s/rad] as the settings have them. Shape: (2, joints)."""
+        tables = self.by_kind(self.stance.stiffness), self.by_kind(self.stance.damping)
+        return np.array([[table[kind] for kind in self.kinds] for table in tables])
+
+    @property
+    def notes(self) -> list[str]:
+        """What was changed and why, a line each."""
+        return self.source.notes
+
+
+def import_robot(file: Path, name: str = "", torque_limit: float | None = None) -> Robot:
+    """Read a file and decide everything about its robot.
+
+    ``name`` is that of its files and classes, that of the file by default. A ``torque_limit`` [N m] replaces those of
+    the file. A UserError says why the file cannot be imported.
+    """
+    name = name or re.sub(r"\W", "_", file.stem).lower()
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise UserError(f"--name must be of small letters, digits and _, and begin with a letter, not '{name}'")
+    source = read_source(file)
+    shapes = find_shapes(source)
+    legs = find_legs(source, shapes)
+    ranges = _ranges(source)
+    torques = _torques(source, shapes, torque_limit)
+    mirrored = mirrored_legs(source, legs)
+    if torque_limit is not None:
+        source.notes.append(f"torque limits: {torque_limit:g} N m, as given")
+    speed = max(source.speed_limits, default=SPEED)
+    if not source.speed_limits:
+        source.notes.append(f"the file has no speed limits: {SPEED:g} rad/s assumed, asset.max_dof_vel")
+    stance = find_stance(source, legs, ranges, torques)
+    joints = joint_names(source, legs, mirrored)
+    prefixes = [leg.name + "_" for leg in legs]
+    symmetric = _is_symmetric(source, joints, mirrored)
+    kinds = [next((j.removeprefix(p) for p in prefixes if j.startswith(p)), j) for j in joints]
+    damped = source.model.dof_damping[6:]
+    if (damped > stance.damping / 4).any():
+        source.notes.append(
+            f"joint damping up to {damped.max():g} N m s/rad is kept; it often stands for a servo's and is too much "
+            "for torque control: set it to 0 if it is not friction that you measured"
+        )
+    _name_shapes(source, legs, shapes)
+    return Robot(name, source, legs, shapes, joints, kinds, ranges, torques, speed, mirrored, symmetric, stance)
+
+
+def _is_symmetric(source: Source, joints: list[str], mirrored: list[list[str]]) -> bool:
+    """Return whether every joint has its counterpart, which training with mirror images needs; note if not."""
+    try:
+        counterparts(joints, mirrored)
+    except UserError as error:
+        source.notes.append(f"training without mirror images: {error}")
+        return False
+    return True
+
+
+def _ranges(source: Source) -> np.ndarray:
+    """Return the ranges of the joints [rad]; those without one get a wide one. Shape: (joints, 2)."""
+    model = source.model
+    ranges, limited = model.jnt_range[1:].copy(), model.jnt_limited[1:].astype(bool)
+    free = [name for name, known in zip(source.joints, limited, strict=True) if not known]
+    ranges[~limited] = -UNLIMITED, UNLIMITED
+    if free:
+        source.notes.append(f"without a range, +-{UNLIMITED:.2f} rad given: {', '.join(free)}")
+    return ranges
+
+
+def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None) -> np.ndarray:
+    """Return the torque limits of the joints [N m]."""
+    model = source.model
+    if given is not None:
+        return np.full(model.njnt - 1, given)
+    data = zero_pose(model, source.pose)
+    lowest = min(world_shape(data, body, shape)[2] for body, found in shapes.items() for shape in found)
+    enough = float(model.opt.gravity[2] * model.body_mass.sum() * lowest)
+    known = np.array([np.inf if limit is None else limit for limit in source.torque_limits])
+    odd = [name for name, limit in zip(source.joints, known, strict=True) if not 0 < limit < IMPLAUSIBLE * enough]
+    if odd:
+        source.notes.append(
+            f"no torque limit that means anything at {', '.join(odd)}: weight x height, {enough:.1f} N m, assumed; "
+            "give --torque_limit"
+        )
+    return np.where((known > 0) & (known < IMPLAUSIBLE * enough), known, enough)
+
+
+def _name_shapes(source: Source, legs: list[Leg], shapes: dict[int, list[Shape]]) -> None:
+    """Name all shapes after their bodies: trunk, <leg>_<kind>, <leg>_foot; feet join the shapes of their bodies."""
+    model = source.model
+    owner = {body: leg for leg in legs for body in leg.bodies}
+    for body, found in shapes.items():
+        name = TRUNK if body == 1 else model.body(body).name or f"body{body}"
+        if body in owner:
+            leg = owner[body]
+            kind = name.removeprefix(leg.name).strip("_").replace(FOOT, "sole") or f"link{leg.bodies.index(body) + 1}"
+            name = f"{leg.name}_{kind}"
+        for number, shape in enumerate(found, 1):
+            shape.name = name if number == 1 else f"{name}_{number}"
+    for leg in legs:
+        leg.foot.name = f"{leg.name}_{FOOT}"
+        shapes[leg.bodies[-1]].append(leg.foot)

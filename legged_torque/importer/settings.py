@@ -1,0 +1,141 @@
+"""Writing the settings class of an imported robot."""
+
+from __future__ import annotations
+
+from legged_torque.importer.pose import BANDWIDTH, DAMPING_RATIO, SAG
+from legged_torque.importer.robot import FOOT, TRUNK, Robot
+
+TEMPLATE = '''"""{title}: settings of ``{file}``, imported; each number is a proposal to look at."""
+
+from __future__ import annotations
+
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+
+
+class {cls}Cfg(LeggedRobotCfg):
+    """Settings of the robot; alone, of position control on a plane."""
+
+    class asset:
+        file = "{path}"
+        foot_name = "{foot}"
+        penalize_contacts_on = {penalized}
+        terminate_after_contacts_on = ["{trunk}"]
+        mirrored_legs = {mirrored}
+        max_dof_vel = {speed}
+
+{engine}    class init_state:
+        pos = [0.0, 0.0, {drop}]
+        default_joint_angles = (
+{angles}
+        )
+
+    class control:  # {bandwidth:g} Hz with a leg's own inertia, {sag:g} rad under its weight; damping ratio {ratio:g}
+        stiffness = {stiffness}
+        damping = {damping}
+        torque_scale = {torque_scale}
+
+{ranges}    class rewards:
+        base_height_target = {height}
+
+
+class {cls}CfgPPO(LeggedRobotCfgPPO):
+    """Training of it."""
+{symmetry}'''
+ENGINE = """    class sim:
+        engine = "mujoco_warp"  # slower; the fused step cannot simulate this robot
+
+"""
+RANGES = """    class domain_rand:
+        foot_radius = [{low}, {high}]
+
+"""
+SYMMETRY = """
+    class algorithm:
+        class symmetry_cfg:
+            use_data_augmentation = True
+"""
+
+
+def class_name(name: str) -> str:
+    """Return the beginning of the names of a robot's classes: Go2 of go2, AnymalC of anymal_c."""
+    return "".join(part.capitalize() for part in name.split("_"))
+
+
+def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
+    """Return the text of the module with a robot's settings.
+
+    ``path`` is that of its MJCF, as it is to be found; ``is_fused`` says whether the fused step can simulate it.
+    """
+    stance = robot.stance
+    feet = [leg.foot for leg in robot.legs]
+    radius = feet[0].size[0] if feet[0].kind == "sphere" else None
+    kept = {shape.name for found in robot.shapes.values() for shape in found}
+    return TEMPLATE.format(
+        title=robot.name,
+        file=robot.source.file.name,
+        cls=class_name(robot.name),
+        path=path,
+        engine="" if is_fused else ENGINE,
+        foot=FOOT,
+        trunk=TRUNK,
+        penalized=_quoted(_penalized(robot, kept)),
+        mirrored=_quoted(robot.mirrored),
+        speed=f"{robot.speed:.4g}" if "." in f"{robot.speed:.4g}" else f"{robot.speed:.1f}",
+        drop=round(1.3 * stance.height, 2),
+        angles=_angles(robot),
+        bandwidth=BANDWIDTH,
+        sag=SAG,
+        ratio=DAMPING_RATIO,
+        stiffness=_table(robot.by_kind(stance.stiffness)),
+        damping=_table(robot.by_kind(stance.damping)),
+        torque_scale=float(f"{0.12 * max(robot.torques):.2g}"),
+        ranges=RANGES.format(low=round(0.95 * radius, 4), high=round(1.05 * radius, 4)) if radius else "",
+        height=round(stance.height, 3),
+        symmetry=SYMMETRY if robot.symmetric else "",
+    )
+
+
+def _penalized(robot: Robot, geoms: set[str]) -> list[str]:
+    """Return parts of names that mean all geoms but feet and the links next to the trunk."""
+    model = robot.source.model
+    first = {body for body in range(2, model.nbody) if model.body_parentid[body] == 1}
+    spared = {s.name for body in first for s in robot.shapes[body] if len(robot.legs[0].bodies) > 2}
+    spared |= {leg.foot.name for leg in robot.legs}
+    parts = [TRUNK]
+    for name in sorted(geoms - spared):
+        leg = next((leg.name for leg in robot.legs if name.startswith(leg.name + "_")), "")
+        part = name.removeprefix(leg).strip("_")
+        if not any(known in name for known in parts):
+            means_spared = any(part in other for other in spared)
+            parts.append(name if means_spared else part)
+    return parts
+
+
+def _quoted(value: object) -> str:
+    """Return a list as ruff formats it."""
+    return repr(value).replace("'", '"')
+
+
+def _table(numbers: dict[str, float]) -> str:
+    """Return numbers by the kinds of joints as a dictionary; one number if they are all the same."""
+    if len(set(numbers.values())) == 1:
+        return str(next(iter(numbers.values())))
+    ordered = sorted(numbers, key=len, reverse=True)  # the first part that matches counts
+    entries = [f'"{kind}": {numbers[kind]}' for kind in ordered]
+    line = "{" + ", ".join(entries) + "}"
+    return line if len(line) < 90 else "{\n" + "".join(f"            {entry},\n" for entry in entries) + "        }"
+
+
+def _angles(robot: Robot) -> str:
+    """Return the lines of the nominal pose: a dictionary per leg, joined."""
+    groups: list[tuple[str, list[str]]] = []
+    for joint, kind, angle in zip(robot.joints, robot.kinds, robot.stance.angles, strict=True):
+        leg = joint.removesuffix(kind)
+        if not groups or groups[-1][0] != leg or (not leg and len(groups[-1][1]) > 3):
+            groups.append((leg, []))
+        groups[-1][1].append(f'"{joint}": {round(float(angle), 3) + 0.0}')
+    rows: list[str] = []
+    for _, entries in groups:
+        for start in range(0, len(entries), 3):
+            rows.append("{" + ", ".join(entries[start : start + 3]) + "}")
+    return "\n".join(f"            {'| ' if number else ''}{row}" for number, row in enumerate(rows))

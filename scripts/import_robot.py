@@ -1,0 +1,65 @@
+"""Make a robot of this library out of a MJCF or URDF: ``python scripts/import_robot.py go2.urdf --name go2 --check``.
+
+Writes resources/robots/NAME/NAME.xml and legged_torque/envs/robots/NAME.py, or both into the folder --out, and prints
+what was changed and why.
+"""
+
+from pathlib import Path
+
+from legged_torque import RESOURCES_DIR
+from legged_torque import __file__ as package
+from legged_torque.utils.cli import Parser, check_output, finite, importing, run_script
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.rendering import choose_offscreen_renderer, without_renderer
+
+
+def main() -> None:
+    """Import a robot and, if asked, stand it up."""
+    parser = Parser(__doc__)
+    parser.add_argument("file", type=Path, help="MJCF or URDF; its meshes are used if they are near it")
+    parser.add_argument("--name", default="", help="name of the robot; default: that of the file")
+    parser.add_argument("--out", type=Path, help="folder for both files; default: where the library keeps its robots")
+    parser.add_argument("--torque_limit", type=finite, help="[N m] of all joints; default: those of the file")
+    parser.add_argument("--check", action="store_true", help="hold the nominal pose for 5 s and draw a picture of it")
+    parser.add_argument("--force", action="store_true", help="write over files that exist")
+    args = parser.parse_args()
+    if args.torque_limit is not None and args.torque_limit <= 0:
+        raise UserError(f"--torque_limit must be above 0, not {args.torque_limit}")
+    no_picture = choose_offscreen_renderer() if args.check else without_renderer()
+    with importing():
+        from legged_torque.importer.mjcf import mjcf
+        from legged_torque.importer.robot import import_robot
+        from legged_torque.importer.settings import settings
+        from legged_torque.importer.standing import draw, fused_problem, measure, parse
+    robot = import_robot(args.file, args.name, args.torque_limit)
+    folder = args.out or RESOURCES_DIR / "robots" / robot.name
+    model_file = folder / f"{robot.name}.xml"
+    code_file = (args.out or Path(package).parent / "envs" / "robots") / f"{robot.name}.py"
+    for file in (model_file, code_file):
+        check_output(file)
+        if file.exists() and not args.force:
+            raise UserError(f"'{file}' exists; --force writes over it, --name and --out write elsewhere")
+    path = str(model_file) if args.out else f"resources/robots/{robot.name}/{robot.name}.xml"
+    text = mjcf(robot)
+    model = parse(text, args.file)
+    problem = fused_problem(model)
+    code = settings(robot, path, is_fused=not problem)
+    folder.mkdir(parents=True, exist_ok=True)
+    model_file.write_text(text, encoding="utf-8")
+    code_file.write_text(code, encoding="utf-8")
+    for note in robot.notes:
+        print(f"- {note}")
+    print(f"wrote {model_file}\nwrote {code_file}")
+    print(problem or "sim.engine 'fused' simulates it")
+    if args.check:
+        result, data = measure(model, *robot.gains())
+        print(f"5 s under PD: {result}")
+        if no_picture:
+            print(f"no picture: {no_picture}")
+        else:
+            draw(model, data, folder / f"{robot.name}.png")
+            print(f"wrote {folder / robot.name}.png")
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,179 @@
+"""Robots out of others' files: URDF and MJCF with what such files have, down to a robot that stands and trains."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from legged_torque.envs.base.asset import by_joint, load_asset
+from legged_torque.importer.mjcf import mjcf
+from legged_torque.importer.robot import import_robot
+from legged_torque.importer.settings import settings
+from legged_torque.importer.standing import fused_problem, measure, parse
+from legged_torque.utils.errors import UserError
+
+ROOT = Path(__file__).resolve().parents[1]
+LINK = """
+  <link name="{name}">
+    <inertial><origin xyz="{com}"/><mass value="{mass}"/>
+      <inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin xyz="{com}"/><geometry>{shape}</geometry></collision>
+  </link>"""
+JOINT = """
+  <joint name="{leg}_{part}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><origin xyz="{pos}"/>
+    <axis xyz="{axis}"/><limit effort="20" velocity="15" lower="{low}" upper="{high}"/></joint>"""
+TRANSMISSION = """
+  <transmission name="{leg}_{part}_t"><type>transmission_interface/SimpleTransmission</type>
+    <joint name="{leg}_{part}"/><actuator name="{leg}_{part}_m"><mechanicalReduction>1</mechanicalReduction></actuator>
+  </transmission>"""
+
+
+def urdf(mesh="base.stl"):
+    """A quadruped as vendors write them: fixed feet and an IMU, cylinders, a mesh that is not there, transmissions."""
+    parts = [
+        LINK.format(name="base", com="0 0 0", mass=6, i=0.06, shape=f'<mesh filename="package://dog/{mesh}"/>'),
+        '<link name="imu"><inertial><mass value="0.001"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
+        '</inertial></link><joint name="imu_joint" type="fixed"><parent link="base"/><child link="imu"/></joint>',
+    ]
+    for leg, x, y in (("LF", 0.2, 0.1), ("RF", 0.2, -0.1), ("LH", -0.2, 0.1), ("RH", -0.2, -0.1)):
+        rod = '<cylinder radius="0.02" length="0.2"/>'
+        box = '<box size="0.05 0.05 0.05"/>'
+        ball = '<sphere radius="0.025"/>'
+        links = (("hip", "0 0 0", 0.5, box), ("thigh", "0 0 -0.1", 0.8, rod), ("shank", "0 0 -0.1", 0.2, rod))
+        parts += [LINK.format(name=f"{leg}_{n}", com=c, mass=m, i=0.004, shape=s) for n, c, m, s in links]
+        parts.append(LINK.format(name=f"{leg}_foot", com="0 0 0", mass=0.05, i=1e-5, shape=ball))
+        side = 0.05 if y > 0 else -0.05
+        for part, parent, child, pos, axis, low, high in (
+            ("HAA", "base", f"{leg}_hip", f"{x} {y} 0", "1 0 0", -0.8, 0.8),
+            ("HFE", f"{leg}_hip", f"{leg}_thigh", f"0 {side} 0", "0 1 0", -1.0, 3.0),
+            ("KFE", f"{leg}_thigh", f"{leg}_shank", "0 0 -0.2", "0 1 0", -2.6, -0.5),
+        ):
+            names = {"leg": leg, "part": part, "parent": parent, "child": child, "kind": "revolute"}
+            parts.append(JOINT.format(pos=pos, axis=axis, low=low, high=high, **names))
+            parts.append(TRANSMISSION.format(**names))
+        fixed = {"kind": "fixed", "parent": f"{leg}_shank", "child": f"{leg}_foot"}
+        parts.append(JOINT.format(leg=leg, part="end", pos="0 0 -0.2", axis="0 0 1", low=0, high=0, **fixed))
+    return f'<robot name="dog">{"".join(parts)}\n</robot>'
+
+
+def as_mjcf(text):
+    """A file in which motors are in another order than joints, limits are ctrlrange, one joint has a servo."""
+    head = '<mujoco><compiler angle="radian"/><worldbody><body name="base" pos="0 0 1"><freejoint/>'
+    body = '<geom type="box" size="0.2 0.1 0.05" mass="5"/>'
+    motors = []
+    for leg, x, y in (("FL", 0.2, 0.1), ("FR", 0.2, -0.1), ("RL", -0.2, 0.1), ("RR", -0.2, -0.1)):
+        body += (
+            f'<body name="{leg}_thigh" pos="{x} {y} 0"><joint name="{leg}_thigh" axis="0 1 0" range="-1 3"/>'
+            f'<geom type="cylinder" size="0.02 0.09" pos="0 0 -0.1" mass="0.6"/><body name="{leg}_calf" pos="0 0 -0.2">'
+            f'<joint name="{leg}_calf" axis="0 1 0" range="-2.6 -0.4"/>'
+            '<geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.15" mass="0.2"/>'
+            '<geom type="sphere" size="0.02" pos="0 0 -0.2" mass="0.05"/></body></body>'
+        )
+        motors.insert(0, f'<motor joint="{leg}_calf" ctrlrange="-3 3" gear="6" ctrllimited="true"/>')
+        motors.insert(0, f'<position joint="{leg}_thigh" kp="80" forcerange="-12 12" forcelimited="true"/>')
+    return f"{head}{body}</body></worldbody><actuator>{''.join(motors)}</actuator>{text}</mujoco>"
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Import a text and write both files; returns the robot, its model and its settings."""
+
+    def write(source, suffix):
+        file = tmp_path / f"source.{suffix}"
+        file.write_text(source)
+        robot = import_robot(file, "dog")
+        model_file = tmp_path / "dog.xml"
+        text = mjcf(robot)
+        model_file.write_text(text)
+        (tmp_path / "dog.py").write_text(settings(robot, str(model_file)))
+        return robot, parse(text, file), runpy.run_path(str(tmp_path / "dog.py"))["DogCfg"]()
+
+    return write
+
+
+def check(model, cfg):
+    """The settings fit the model, the fused step takes it, and it stands under the gains of the settings."""
+    asset = load_asset(cfg)
+    assert len(asset.feet) == 4
+    assert not fused_problem(model)
+    gains = [by_joint("gains", values, asset.dof_names) for values in (cfg.control.stiffness, cfg.control.damping)]
+    result, _ = measure(model, *np.array(gains), seconds=3.0)
+    assert result.stands, str(result)
+    assert result.height == pytest.approx(cfg.rewards.base_height_target, rel=0.15)
+
+
+def test_urdf(written):
+    """Fixed links, cylinders, a missing mesh and transmissions go through; masses, limits and places stay."""
+    robot, model, cfg = written(urdf(), "urdf")
+    assert model.body_mass.sum() == pytest.approx(6.001 + 4 * (0.5 + 0.8 + 0.2 + 0.05), abs=1e-5)
+    assert robot.joints == [f"{leg}_{part}" for leg in ("LF", "RF", "LH", "RH") for part in ("HAA", "HFE", "KFE")]
+    assert model.jnt_range[1:4].tolist() == [[-0.8, 0.8], [-1.0, 3.0], [-2.6, -0.5]]
+    assert (model.actuator_forcerange == [-20, 20]).all()
+    assert cfg.asset.max_dof_vel == 15.0
+    assert cfg.asset.mirrored_legs == [["RF", "LF"], ["RH", "LH"]]
+    foot = model.geom("RH_foot")
+    assert foot.size[0] == 0.025
+    np.testing.assert_allclose(foot.pos, [0, 0, -0.2], atol=1e-9)
+    assert any("base" in note and "missing" in note for note in robot.notes)
+    check(model, cfg)
+
+
+def test_mjcf(written):
+    """Motors follow the joints, each with its own limit; the keyframe is the nominal pose."""
+    pose = "0.7 -1.4 " * 4
+    robot, model, cfg = written(as_mjcf(f'<keyframe><key qpos="0 0 0.3 1 0 0 0 {pose}"/></keyframe>'), "xml")
+    assert model.actuator_trnid[:, 0].tolist() == list(range(1, 9))
+    assert model.actuator_forcerange[:, 1].tolist() == [12, 18] * 4
+    assert list(cfg.init_state.default_joint_angles.values()) == [0.7, -1.4] * 4
+    assert cfg.rewards.base_height_target == pytest.approx(2 * 0.2 * np.cos(0.7) + 0.02, abs=1e-3)
+    assert any("servos became motors" in note for note in robot.notes)
+    check(model, cfg)
+
+
+def test_feet_below_hips(written):
+    """Without a keyframe, inverse kinematics puts level feet below the joints that swing the legs."""
+    robot, model, _ = written(as_mjcf(""), "xml")
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    for leg in robot.legs:
+        place = data.geom(f"{leg.name}_foot").xpos
+        np.testing.assert_allclose(place[:2], data.body(f"{leg.name}_thigh").xpos[:2], atol=1e-3)
+        assert place[2] == pytest.approx(0.02, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (as_mjcf("").replace("<freejoint/>", ""), "its trunk"),
+        (as_mjcf('<equality><joint joint1="FL_calf" joint2="FR_calf"/></equality>'), "equalities"),
+        (as_mjcf("").replace('axis="0 1 0"', 'axis="1 0 0"'), "no joint turns about y"),
+        ("<mujoco><worldbody/></mujoco>", "0 bodies with joints"),
+        ("<mujoco", "Error"),
+    ],
+)
+def test_refusals(tmp_path, text, reason):
+    """What cannot become a robot is told in one line."""
+    file = tmp_path / "robot.xml"
+    file.write_text(text)
+    if reason == "its trunk":  # a trunk on the world gets its free joint
+        assert any("floats now" in note for note in import_robot(file).notes)
+        return
+    with pytest.raises(UserError, match=reason):
+        import_robot(file)
+
+
+def test_script(tmp_path, monkeypatch, capsys):
+    """The script writes both files once, says what simulates the robot, and writes over nothing."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dog.urdf").write_text(urdf())
+    monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--out", "new"])
+    runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
+    assert "sim.engine 'fused' simulates it" in capsys.readouterr().out
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["dog.py", "dog.xml"]
+    with pytest.raises(SystemExit, match="2"):
+        runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
+    assert "exists" in capsys.readouterr().err
