@@ -5,10 +5,14 @@ import math
 import numpy as np
 import warp as wp
 
+from legged_torque.sim.fused.math import inverse_sqrt
 from legged_torque.sim.height_map import HeightMap
 
-USUAL_RADIUS = 0.05
-"""Spheres up to this size [m] that are high enough above the ground are known to be so from one number."""
+NEAR, FAR = 0.05, 0.2
+"""Spheres up to the first size, and geoms up to the second [m], that are high enough above the ground are known to be
+so from one number."""
+BLOCK = wp.constant(2)
+"""Cells along a side of what shares such a number for geoms."""
 MAX_REACH = wp.constant(0.2)
 """How far around the centre of a sphere that is below the surface the way out is looked for [m]."""
 ALIKE = wp.constant(0.999)
@@ -17,6 +21,8 @@ ON_EDGE = wp.constant(1.0e-5)
 """A point this share of a triangle's height outside of it is still inside, so that rounding leaves no gaps."""
 MIN_DISTANCE = wp.constant(1.0e-6)
 """A direction over a shorter way [m] is lost in float32."""
+FAR_AWAY = wp.constant(1.0e10)
+"""Squared distance of what has not been found [m^2]."""
 
 
 @wp.struct
@@ -26,27 +32,35 @@ class Surface:
     heights: wp.array2d(dtype=wp.float32)  # in the world [m]. Shape: (rows, cols); rows along x, columns along y
     scale: wp.float32  # side of a cell [m]
     corner: wp.vec2  # x and y of the first height [m]
-    top: wp.float32  # the greatest height [m]
     ceiling: wp.array2d(dtype=wp.float32)  # the greatest height near each cell [m]. Shape: (rows - 1, cols - 1)
     near: wp.float32  # how far around a cell that is [m]
+    far_ceiling: wp.array2d(dtype=wp.float32)  # the greatest height in a wider neighbourhood of each block of cells [m]
+    far: wp.float32  # how far around a block that is [m]
 
 
 def make_surface(height_map: HeightMap) -> Surface:
     """Return a height map on the current device."""
     heights, scale = np.asarray(height_map.heights, np.float32), height_map.horizontal_scale
-    cells = math.ceil(USUAL_RADIUS / scale)
-    ceiling = np.pad(heights, cells, "edge")
-    for _ in range(2):  # along one axis after the other: a cell's greatest height of so many cells on either side
-        ends = range(len(ceiling) - 2 * cells - 1, len(ceiling) + 1)
-        ceiling = np.maximum.reduce([ceiling[first:end] for first, end in enumerate(ends)]).T
+    near, far = math.ceil(NEAR / scale), math.ceil(FAR / scale)
     surface = Surface()
     surface.heights = wp.array(heights, dtype=wp.float32)
     surface.scale = scale
     surface.corner = wp.vec2(*height_map.corner)
-    surface.top = float(heights.max())
-    surface.ceiling = wp.array(ceiling, dtype=wp.float32)
-    surface.near = cells * scale
+    surface.ceiling = wp.array(_greatest(heights, 1, near), dtype=wp.float32)
+    surface.near = near * scale
+    surface.far_ceiling = wp.array(_greatest(heights, BLOCK, far), dtype=wp.float32)
+    surface.far = far * scale
     return surface
+
+
+def _greatest(heights: np.ndarray, side: int, around: int) -> np.ndarray:
+    """Return the greatest height in each square of so many cells a side, and in so many cells around it."""
+    for _ in range(2):  # along one axis after the other
+        squares = -(-(len(heights) - 1) // side)
+        padded = np.pad(heights, ((around, around + side), (0, 0)), "edge")
+        ends = range(side + 2 * around + 1)
+        heights = np.maximum.reduce([padded[i : i + squares * side : side] for i in ends]).T
+    return heights
 
 
 @wp.struct
@@ -60,198 +74,252 @@ class Touch:
 
 
 @wp.struct
-class Triangle:
-    """A triangle as seen from the centre of a sphere."""
+class Patch:
+    """Four cells of a map as seen from the centre of a sphere: their nine samples."""
 
-    nearest: wp.vec3  # the point of its plane that is nearest to the centre; once known, that of the triangle
-    is_face: wp.bool  # whether that is inside of it, not on its edges or at a vertex
-    normal: wp.vec3  # upwards
-    dist: wp.float32  # of the centre above its plane [m]
+    x: wp.vec3  # of the three rows
+    y: wp.vec3  # of the three columns
+    z: wp.mat33
+    scale: wp.float32  # side of a cell [m]
 
 
 @wp.struct
-class Cell:
-    """The corners of a cell as seen from the centre of a sphere."""
+class Face:
+    """A triangle as seen from the centre of a sphere."""
 
-    low: wp.vec3
-    next_row: wp.vec3
-    next_col: wp.vec3
-    high: wp.vec3
+    nearest: wp.vec3  # the point of its plane that is nearest to the centre
+    is_inside: wp.bool  # whether that is inside of the triangle
+    normal: wp.vec3  # upwards
+    above: wp.float32  # how far the centre is above its plane, vertically [m]
+    dist: wp.float32  # the same along the normal
+
+
+@wp.struct
+class Nearest:
+    """The point of the surface that is nearest to the centre of a sphere, as far as it has been looked at."""
+
+    point: wp.vec3  # from the centre
+    away_sq: wp.float32  # its squared distance from there
+    is_face: wp.bool  # whether it is inside of a triangle, not on an edge or at a vertex
+    normal: wp.vec3  # of a face, upwards: of this one if it is one
+    dist: wp.float32  # of the centre above that face, else 0
+    above: wp.float32  # how far the centre is above the surface, vertically [m]
+    other: wp.vec3  # the normal of one of the faces that the sphere touches; 0 if there is none
+    is_mixed: wp.bool  # whether it touches faces that are not like that one
+
+
+@wp.func
+def place_on_map(surface: Surface, centre: wp.vec3, radius: float) -> wp.vec3:
+    """Return the centre of a sphere from the map's corner, in x and y.
+
+    Outside of the map all is flat outwards: a place further out is like one near the border.
+    """
+    place = centre
+    margin = wp.max(radius, MAX_REACH) + 2.0 * surface.scale
+    for k in range(2):
+        end = float(surface.heights.shape[k] - 1) * surface.scale
+        place[k] = wp.clamp(centre[k] - surface.corner[k], -margin, end + margin)
+    return place
+
+
+@wp.func
+def see_patch(surface: Surface, place: wp.vec3, i: int, j: int) -> Patch:
+    """Return the four cells between samples (i, j) and (i + 2, j + 2) as seen from a place on the map."""
+    last_row, last_col = surface.heights.shape[0] - 1, surface.heights.shape[1] - 1
+    x, y = float(i) * surface.scale - place[0], float(j) * surface.scale - place[1]
+    patch = Patch()
+    patch.scale = surface.scale
+    for a in range(3):
+        patch.x[a] = x + float(a) * surface.scale
+        patch.y[a] = y + float(a) * surface.scale
+        for b in range(3):
+            patch.z[a, b] = surface.heights[wp.clamp(i + a, 0, last_row), wp.clamp(j + b, 0, last_col)] - place[2]
+    return patch
+
+
+@wp.func
+def see_face(patch: Patch, a: int, b: int, half: int) -> Face:
+    """Return one of the two triangles of a cell (a, b) of a patch.
+
+    The diagonal runs from a cell's corner (0, 0) to (1, 1); the half 0 has the corner (1, 0).
+    """
+    falls = wp.vec2(patch.z[a, b] - patch.z[a + 1, b], patch.z[a + 1, b] - patch.z[a + 1, b + 1])
+    if half == 1:
+        falls = wp.vec2(patch.z[a, b + 1] - patch.z[a + 1, b + 1], patch.z[a, b] - patch.z[a, b + 1])
+    falls = falls / patch.scale
+    face = Face()
+    face.above = -(patch.z[a, b] + falls[0] * patch.x[a] + falls[1] * patch.y[b])
+    face.normal = inverse_sqrt(1.0 + wp.length_sq(falls)) * wp.vec3(falls[0], falls[1], 1.0)
+    face.dist = face.above * face.normal[2]
+    face.nearest = -face.dist * face.normal
+    u, v = face.nearest[0] - patch.x[a], face.nearest[1] - patch.y[b]
+    long, short = wp.where(half == 0, u, v), wp.where(half == 0, v, u)
+    face.is_inside = wp.min(patch.scale - long, wp.min(long - short, short)) >= -ON_EDGE * patch.scale
+    return face
+
+
+@wp.func
+def is_under(patch: Patch, a: int, b: int, half: int) -> bool:
+    """Return whether the centre is vertically over, or under, a triangle of a patch."""
+    in_cell = patch.x[a] <= 0.0 and patch.x[a + 1] > 0.0 and patch.y[b] <= 0.0 and patch.y[b + 1] > 0.0
+    return in_cell and (half == 0) == (patch.x[a] <= patch.y[b])
+
+
+@wp.func
+def look_at_faces(patch: Patch, radius: float, best: Nearest) -> Nearest:
+    """Return what is nearest when a patch's triangles are known, without their edges; a face wins among equals."""
+    for a in range(2):
+        for b in range(2):
+            for half in range(2):
+                face = see_face(patch, a, b, half)
+                if is_under(patch, a, b, half):
+                    best.above = face.above
+                if face.is_inside:
+                    away_sq = face.dist * face.dist
+                    if wp.where(best.is_face, 1.0, 1.0 - ON_EDGE) * away_sq < best.away_sq:
+                        best.point = face.nearest
+                        best.away_sq = away_sq
+                        best.is_face = True
+                        best.normal = face.normal
+                        best.dist = face.dist
+                    if face.dist < radius:
+                        is_known = wp.length_sq(best.other) > 0.0
+                        if is_known and wp.dot(face.normal, best.other) < ALIKE:
+                            best.is_mixed = True
+                        best.other = face.normal
+    return best
+
+
+@wp.func
+def look_at_edge(patch: Patch, a: int, b: int, c: int, d: int, best: Nearest) -> Nearest:
+    """Return what is nearest when the edge between two samples of a patch is known."""
+    start = wp.vec3(patch.x[a], patch.y[b], patch.z[a, b])
+    edge = wp.vec3(patch.x[c], patch.y[d], patch.z[c, d]) - start
+    point = start + wp.clamp(-wp.dot(start, edge) / wp.length_sq(edge), 0.0, 1.0) * edge
+    away_sq = wp.length_sq(point)
+    if wp.where(best.is_face, 1.0 + ON_EDGE, 1.0) * away_sq < best.away_sq:
+        best.point = point
+        best.away_sq = away_sq
+        best.is_face = False
+        best.dist = 0.0
+    return best
+
+
+@wp.func
+def look_at_edges(patch: Patch, best: Nearest) -> Nearest:
+    """Return what is nearest when a patch's edges are known."""
+    for a in range(3):
+        for b in range(2):
+            best = look_at_edge(patch, a, b, a, b + 1, best)
+            best = look_at_edge(patch, b, a, b + 1, a, best)
+    for a in range(2):
+        for b in range(2):
+            best = look_at_edge(patch, a, b, a + 1, b + 1, best)
+    return best
+
+
+@wp.func
+def distance_sq_to_patch(patch: Patch) -> float:
+    """Return the squared distance from the centre to a patch, filled up to its highest sample."""
+    top = patch.z[0, 0]
+    for a in range(3):
+        for b in range(3):
+            top = wp.max(top, patch.z[a, b])
+    x, y = wp.max(patch.x[0], -patch.x[2]), wp.max(patch.y[0], -patch.y[2])
+    return wp.length_sq(wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(-top, 0.0)))
 
 
 @wp.struct
 class Window:
-    """The cells of a map that a sphere may touch; their places are relative to its centre."""
+    """The patches of a map that a sphere may touch: the one around its centre, and if it is large, those around."""
 
-    first: wp.vec2i
-    last: wp.vec2i
-    start: wp.vec3  # from the centre to the place of height (0, 0), at z = 0
-
-
-@wp.func
-def half_of_cell(x: float, y: float) -> int:
-    """Return in which of a cell's two triangles a place in it is; the diagonal runs from corner (0, 0) to (1, 1)."""
-    return wp.where(x >= y, 0, 1)
+    middle: wp.vec2i  # the first samples of that one
+    first: wp.vec2i  # of the others
+    cols: wp.int32  # how many of them along y
+    count: wp.int32  # of all
 
 
 @wp.func
-def see_cell(surface: Surface, i: int, j: int, window: Window) -> Cell:
-    """Return a cell as seen from the centre of the window's sphere."""
-    rows, cols = surface.heights.shape[0], surface.heights.shape[1]
-    row, next_row = wp.clamp(i, 0, rows - 1), wp.clamp(i + 1, 0, rows - 1)
-    col, next_col = wp.clamp(j, 0, cols - 1), wp.clamp(j + 1, 0, cols - 1)
-    x, y = surface.scale * float(i - window.first[0]), surface.scale * float(j - window.first[1])
-    next_x, next_y = surface.scale * float(i + 1 - window.first[0]), surface.scale * float(j + 1 - window.first[1])
-    cell = Cell()
-    cell.low = window.start + wp.vec3(x, y, surface.heights[row, col])
-    cell.next_row = window.start + wp.vec3(next_x, y, surface.heights[next_row, col])
-    cell.next_col = window.start + wp.vec3(x, next_y, surface.heights[row, next_col])
-    cell.high = window.start + wp.vec3(next_x, next_y, surface.heights[next_row, next_col])
-    return cell
-
-
-@wp.func
-def see_triangle(cell: Cell, half: int) -> Triangle:
-    """Return one of the two triangles of a cell; where it is nearest, if not with its face, is not known yet."""
-    b, c = wp.where(half == 0, cell.next_row, cell.high), wp.where(half == 0, cell.high, cell.next_col)
-    a = cell.low
-    out = Triangle()
-    area = wp.cross(b - a, c - a)
-    out.normal = wp.normalize(area)
-    out.dist = -wp.dot(out.normal, a)
-    out.nearest = -out.dist * out.normal
-    ab, bc, ca = wp.dot(area, wp.cross(a, b)), wp.dot(area, wp.cross(b, c)), wp.dot(area, wp.cross(c, a))
-    out.is_face = wp.min(ab, wp.min(bc, ca)) >= -ON_EDGE * wp.dot(area, area)
-    return out
-
-
-@wp.func
-def nearest_on_edge(a: wp.vec3, b: wp.vec3) -> wp.vec3:
-    """Return the point between ``a`` and ``b`` that is nearest to the origin."""
-    edge = b - a
-    return a + wp.clamp(-wp.dot(a, edge) / wp.dot(edge, edge), 0.0, 1.0) * edge
-
-
-@wp.func
-def nearest_on_edges(cell: Cell, half: int) -> wp.vec3:
-    """Return the point of a triangle's edges that is nearest to the centre."""
-    b, c = wp.where(half == 0, cell.next_row, cell.high), wp.where(half == 0, cell.high, cell.next_col)
-    nearest = nearest_on_edge(cell.low, b)
-    other = nearest_on_edge(b, c)
-    if wp.length_sq(other) < wp.length_sq(nearest):
-        nearest = other
-    other = nearest_on_edge(c, cell.low)
-    if wp.length_sq(other) < wp.length_sq(nearest):
-        nearest = other
-    return nearest
-
-
-@wp.func
-def make_window(surface: Surface, centre: wp.vec3, reach: float) -> Window:
-    """Return the cells within a distance along x and y of a point.
-
-    Outside of the map all is flat outwards: a place further out is like one near the border.
-    """
+def make_window(surface: Surface, place: wp.vec3, reach: float) -> Window:
+    """Return the patches within a distance along x and y of a place on the map."""
     window = Window()
-    margin = reach + 2.0 * surface.scale
+    count = int(1)
     for k in range(2):
-        place = wp.clamp(
-            centre[k] - surface.corner[k], -margin, float(surface.heights.shape[k] - 1) * surface.scale + margin
-        )
-        window.first[k] = int(wp.floor((place - reach) / surface.scale))
-        window.last[k] = int(wp.floor((place + reach) / surface.scale))
-        window.start[k] = float(window.first[k]) * surface.scale - place
-    window.start[2] = -centre[2]
+        window.middle[k] = int(wp.floor(place[k] / surface.scale - 0.5))
+        window.first[k] = int(wp.floor((place[k] - reach) / surface.scale))
+        window.cols = (int(wp.floor((place[k] + reach) / surface.scale)) - window.first[k]) // 2 + 1
+        count *= window.cols
+    window.count = wp.where(reach > 0.5 * surface.scale, 1 + count, 1)
     return window
 
 
 @wp.func
-def triangle_under(surface: Surface, centre: wp.vec3) -> Triangle:
-    """Return the triangle that is vertically under, or above, a point."""
-    window = make_window(surface, centre, 0.0)
-    half = half_of_cell(-window.start[0], -window.start[1])
-    cell = see_cell(surface, window.first[0], window.first[1], window)
-    out = see_triangle(cell, half)
-    if not out.is_face:
-        out.nearest = nearest_on_edges(cell, half)
-    return out
+def patch_of_window(surface: Surface, place: wp.vec3, window: Window, k: int) -> Patch:
+    """Return one of a window's patches."""
+    i, j = window.middle[0], window.middle[1]
+    if k > 0:
+        i, j = window.first[0] + 2 * ((k - 1) // window.cols), window.first[1] + 2 * ((k - 1) % window.cols)
+    return see_patch(surface, place, i, j)
 
 
 @wp.func
-def distance_sq_to_cell(cell: Cell) -> float:
-    """Return the squared distance from the centre to a cell, filled up to its highest corner."""
-    top = wp.max(wp.max(cell.low[2], cell.next_row[2]), wp.max(cell.next_col[2], cell.high[2]))
-    x, y = wp.max(cell.low[0], -cell.high[0]), wp.max(cell.low[1], -cell.high[1])
-    away = wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(-top, 0.0))
-    return wp.length_sq(away)
+def find_nearest(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
+    """Return the point of the surface that is nearest to the centre of a sphere.
 
-
-@wp.func
-def farthest_along(cell: Cell, point: wp.vec3, direction: wp.vec3) -> float:
-    """Return how far a cell is in front of a point at most, times the length of the direction."""
-    first = wp.max(wp.dot(cell.low, direction), wp.dot(cell.next_row, direction))
-    second = wp.max(wp.dot(cell.next_col, direction), wp.dot(cell.high, direction))
-    return wp.max(first, second) - wp.dot(point, direction)
-
-
-@wp.func
-def is_clear(surface: Surface, centre: wp.vec3, radius: float) -> bool:
-    """Return whether a sphere is above all that is near, which is all that most spheres need to know."""
-    i = int(wp.clamp((centre[0] - surface.corner[0]) / surface.scale, 0.0, float(surface.ceiling.shape[0] - 1)))
-    j = int(wp.clamp((centre[1] - surface.corner[1]) / surface.scale, 0.0, float(surface.ceiling.shape[1] - 1)))
-    return radius <= surface.near and centre[2] - radius > surface.ceiling[i, j]
-
-
-@wp.func
-def nearest_triangle(surface: Surface, window: Window, reach: float, under: Triangle) -> Triangle:
-    """Return which triangle is nearest to the centre of the window's sphere; among equals, one with its face.
-
-    The one under the centre is where the search starts; others count within ``reach``.
+    The way out of the ground is as far as the centre is below it, vertically, or shorter.
     """
-    best = under
-    best_sq = wp.length_sq(best.nearest)
-    for i in range(window.first[0], window.last[0] + 1):
-        for j in range(window.first[1], window.last[1] + 1):
-            cell = see_cell(surface, i, j, window)
-            is_near = distance_sq_to_cell(cell) < (1.0 + ON_EDGE) * wp.min(best_sq, reach * reach)
-            if best.is_face and farthest_along(cell, best.nearest, -best.nearest) <= ON_EDGE * best_sq:
-                is_near = False  # all of it is behind that face
-            if is_near:
-                for half in range(2):
-                    other = see_triangle(cell, half)
-                    weight = float(1.0)
-                    if other.is_face != best.is_face:
-                        weight = wp.where(other.is_face, 1.0 - ON_EDGE, 1.0 + ON_EDGE)
-                    if weight * other.dist * other.dist < best_sq:  # its plane is near enough
-                        if not other.is_face:
-                            other.nearest = nearest_on_edges(cell, half)
-                        other_sq = wp.length_sq(other.nearest)
-                        if weight * other_sq < best_sq:
-                            best = other
-                            best_sq = other_sq
+    best = Nearest()
+    best.away_sq = FAR_AWAY
+    best.normal = wp.vec3(0.0, 0.0, 1.0)
+    window = make_window(surface, place, radius)
+    k = int(0)
+    while k < window.count:
+        patch = patch_of_window(surface, place, window, k)
+        if k == 0 or distance_sq_to_patch(patch) < (1.0 + ON_EDGE) * wp.max(best.away_sq, radius * radius):
+            best = look_at_faces(patch, radius, best)
+            best = look_at_edges(patch, best)
+        if k == 0 and -best.above > radius:
+            window = make_window(surface, place, wp.min(-best.above, MAX_REACH))
+        k += 1
     return best
 
 
 @wp.func
-def second_face(surface: Surface, window: Window, radius: float, point: wp.vec3, normal: wp.vec3) -> Triangle:
+def second_face(surface: Surface, place: wp.vec3, radius: float, point: wp.vec3, normal: wp.vec3) -> Face:
     """Return the deepest other face that a sphere touches at a concave edge, given where it touches the surface.
 
     Both points are in front of the other's face. One at the distance of the radius if there is none.
     """
-    best = Triangle()
+    best = Face()
     best.dist = radius
-    for i in range(window.first[0], window.last[0] + 1):
-        for j in range(window.first[1], window.last[1] + 1):
-            cell = see_cell(surface, i, j, window)
-            is_near = distance_sq_to_cell(cell) < radius * radius
-            if is_near and farthest_along(cell, point, normal) > 10.0 * MIN_DISTANCE:
+    window = make_window(surface, place, radius)
+    for k in range(window.count):
+        patch = patch_of_window(surface, place, window, k)
+        for a in range(2):
+            for b in range(2):
                 for half in range(2):
-                    other = see_triangle(cell, half)
-                    if other.is_face and other.dist < best.dist and wp.dot(normal, other.normal) < ALIKE:
+                    other = see_face(patch, a, b, half)
+                    if other.is_inside and other.dist < best.dist and wp.dot(normal, other.normal) < ALIKE:
                         way = other.nearest - point
                         if wp.min(wp.dot(way, normal), -wp.dot(way, other.normal)) > 10.0 * MIN_DISTANCE:
                             best = other
     return best
+
+
+@wp.func
+def is_clear(surface: Surface, centre: wp.vec3, lowest: float, radius: float) -> bool:
+    """Return whether what is within a radius along x and y of a point is above all that is near.
+
+    ``lowest`` is the height of its lowest point. That is all that most points and geoms need to know.
+    """
+    i = int(wp.clamp((centre[0] - surface.corner[0]) / surface.scale, 0.0, float(surface.ceiling.shape[0] - 1)))
+    j = int(wp.clamp((centre[1] - surface.corner[1]) / surface.scale, 0.0, float(surface.ceiling.shape[1] - 1)))
+    out = bool(False)
+    if radius <= surface.near:
+        out = lowest > surface.ceiling[i, j]
+    elif radius <= surface.far:
+        out = lowest > surface.far_ceiling[i // BLOCK, j // BLOCK]
+    return out
 
 
 @wp.func
@@ -262,23 +330,22 @@ def touch_map(surface: Surface, centre: wp.vec3, radius: float) -> Touch:
     triangles of one plane are never felt. Of a sphere whose centre is below the surface it is the shortest way out.
     """
     out = Touch()
-    under = triangle_under(surface, centre)
-    above = under.dist / under.normal[2]
-    reach = wp.max(radius, wp.min(-above, MAX_REACH))
-    window = make_window(surface, centre, reach)
-    nearest = nearest_triangle(surface, window, reach, under)
-    away = wp.length(nearest.nearest)
+    place = place_on_map(surface, centre, radius)
+    nearest = find_nearest(surface, place, radius)
+    away = wp.sqrt(nearest.away_sq)
     out.first = nearest.normal
     out.dist[0] = nearest.dist - radius
     if not nearest.is_face and away > MIN_DISTANCE:
-        side = wp.where(above < 0.0, 1.0, -1.0)
-        out.first = side * nearest.nearest / away
+        side = wp.where(nearest.above < 0.0, 1.0, -1.0)
+        out.first = side * nearest.point / away
         out.dist[0] = -side * away - radius
     if out.dist[0] < 0.0:
         out.count = 1
-        other = second_face(surface, window, radius, nearest.nearest, out.first)
-        if other.dist < radius:
-            out.count = 2
-            out.second = other.normal
-            out.dist[1] = other.dist - radius
+        is_other = wp.length_sq(nearest.other) > 0.0 and wp.dot(nearest.other, out.first) < ALIKE
+        if nearest.is_mixed or is_other:
+            other = second_face(surface, place, radius, nearest.point, out.first)
+            if other.dist < radius:
+                out.count = 2
+                out.second = other.normal
+                out.dist[1] = other.dist - radius
     return out
