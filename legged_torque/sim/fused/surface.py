@@ -29,8 +29,10 @@ FAR_AWAY = wp.constant(1.0e10)
 class Surface:
     """Heights on a square grid, continued at the borders with the heights there."""
 
-    heights: wp.array2d(dtype=wp.float32)  # in the world [m]. Shape: (rows, cols); rows along x, columns along y
+    heights: wp.array(dtype=wp.float32)  # in the world [m], row by row; rows along x, columns along y
+    shape: wp.vec2i  # rows and columns
     scale: wp.float32  # side of a cell [m]
+    density: wp.float32  # cells per metre
     corner: wp.vec2  # x and y of the first height [m]
     ceiling: wp.array2d(dtype=wp.float32)  # the greatest height near each cell [m]. Shape: (rows - 1, cols - 1)
     near: wp.float32  # how far around a cell that is [m]
@@ -43,8 +45,10 @@ def make_surface(height_map: HeightMap) -> Surface:
     heights, scale = np.asarray(height_map.heights, np.float32), height_map.horizontal_scale
     near, far = math.ceil(NEAR / scale), math.ceil(FAR / scale)
     surface = Surface()
-    surface.heights = wp.array(heights, dtype=wp.float32)
+    surface.heights = wp.array(heights.flatten(), dtype=wp.float32)
+    surface.shape = wp.vec2i(*heights.shape)
     surface.scale = scale
+    surface.density = 1.0 / scale
     surface.corner = wp.vec2(*height_map.corner)
     surface.ceiling = wp.array(_greatest(heights, 1, near), dtype=wp.float32)
     surface.near = near * scale
@@ -75,37 +79,36 @@ class Touch:
 
 @wp.struct
 class Patch:
-    """Four cells of a map as seen from the centre of a sphere: their nine samples."""
+    """Nine samples of a map, the corners of four cells, as seen from the centre of a sphere."""
 
-    x: wp.vec3  # of the three rows
+    x: wp.float32  # of the first row
     y: wp.vec3  # of the three columns
-    z: wp.mat33
-    scale: wp.float32  # side of a cell [m]
+    z: wp.float32  # of the centre, in the world
+    first: wp.vec3  # heights of the rows, in the world
+    second: wp.vec3
+    third: wp.vec3
 
 
 @wp.struct
 class Face:
     """A triangle as seen from the centre of a sphere."""
 
-    nearest: wp.vec3  # the point of its plane that is nearest to the centre
-    is_inside: wp.bool  # whether that is inside of the triangle
-    normal: wp.vec3  # upwards
-    above: wp.float32  # how far the centre is above its plane, vertically [m]
-    dist: wp.float32  # the same along the normal
+    falls: wp.vec2  # how much it falls along x and y, per metre
+    upright: wp.float32  # its upward unit normal is this times (falls, 1)
+    dist: wp.float32  # of the centre above its plane [m]
+    is_inside: wp.bool  # whether the point of its plane that is nearest to the centre is inside of it
 
 
 @wp.struct
 class Nearest:
-    """The point of the surface that is nearest to the centre of a sphere, as far as it has been looked at."""
+    """What is nearest to the centre of a sphere, as far as the surface has been looked at."""
 
-    point: wp.vec3  # from the centre
-    away_sq: wp.float32  # its squared distance from there
-    is_face: wp.bool  # whether it is inside of a triangle, not on an edge or at a vertex
-    normal: wp.vec3  # of a face, upwards: of this one if it is one
-    dist: wp.float32  # of the centre above that face, else 0
+    face: Face  # of the triangles, where it is inside of one
+    face_sq: wp.float32  # its squared distance
+    edge: wp.vec3  # of the edges, the point from the centre
+    edge_sq: wp.float32  # its squared distance
     above: wp.float32  # how far the centre is above the surface, vertically [m]
-    other: wp.vec3  # the normal of one of the faces that the sphere touches; 0 if there is none
-    is_mixed: wp.bool  # whether it touches faces that are not like that one
+    num_faces: wp.int32  # how many triangles the sphere touches inside of them
 
 
 @wp.func
@@ -117,170 +120,185 @@ def place_on_map(surface: Surface, centre: wp.vec3, radius: float) -> wp.vec3:
     place = centre
     margin = wp.max(radius, MAX_REACH) + 2.0 * surface.scale
     for k in range(2):
-        end = float(surface.heights.shape[k] - 1) * surface.scale
+        end = float(surface.shape[k] - 1) * surface.scale
         place[k] = wp.clamp(centre[k] - surface.corner[k], -margin, end + margin)
     return place
 
 
 @wp.func
+def see_row(surface: Surface, i: int, j: int) -> wp.vec3:
+    """Return the heights of three samples from (i, j) on."""
+    first = wp.clamp(i, 0, surface.shape[0] - 1) * surface.shape[1]
+    out = wp.vec3()
+    for b in range(3):
+        out[b] = surface.heights[first + wp.clamp(j + b, 0, surface.shape[1] - 1)]
+    return out
+
+
+@wp.func
 def see_patch(surface: Surface, place: wp.vec3, i: int, j: int) -> Patch:
     """Return the four cells between samples (i, j) and (i + 2, j + 2) as seen from a place on the map."""
-    last_row, last_col = surface.heights.shape[0] - 1, surface.heights.shape[1] - 1
-    x, y = float(i) * surface.scale - place[0], float(j) * surface.scale - place[1]
     patch = Patch()
-    patch.scale = surface.scale
-    for a in range(3):
-        patch.x[a] = x + float(a) * surface.scale
-        patch.y[a] = y + float(a) * surface.scale
-        for b in range(3):
-            patch.z[a, b] = surface.heights[wp.clamp(i + a, 0, last_row), wp.clamp(j + b, 0, last_col)] - place[2]
+    patch.x = float(i) * surface.scale - place[0]
+    patch.z = place[2]
+    y = float(j) * surface.scale - place[1]
+    patch.y = wp.vec3(y, y + surface.scale, y + 2.0 * surface.scale)
+    patch.first = see_row(surface, i, j)
+    patch.second = see_row(surface, i + 1, j)
+    patch.third = see_row(surface, i + 2, j)
     return patch
 
 
 @wp.func
-def see_face(patch: Patch, a: int, b: int, half: int) -> Face:
-    """Return one of the two triangles of a cell (a, b) of a patch.
+def next_row(patch: Patch, scale: float) -> Patch:
+    """Return a patch whose first row is another one's second."""
+    patch.x += scale
+    patch.first = patch.second
+    patch.second = patch.third
+    return patch
+
+
+@wp.func
+def see_face(surface: Surface, patch: Patch, b: int, half: int) -> Face:
+    """Return one of the two triangles of a cell of a patch's first two rows.
 
     The diagonal runs from a cell's corner (0, 0) to (1, 1); the half 0 has the corner (1, 0).
     """
-    falls = wp.vec2(patch.z[a, b] - patch.z[a + 1, b], patch.z[a + 1, b] - patch.z[a + 1, b + 1])
+    falls = wp.vec2(patch.first[b] - patch.second[b], patch.second[b] - patch.second[b + 1])
     if half == 1:
-        falls = wp.vec2(patch.z[a, b + 1] - patch.z[a + 1, b + 1], patch.z[a, b] - patch.z[a, b + 1])
-    falls = falls / patch.scale
+        falls = wp.vec2(patch.first[b + 1] - patch.second[b + 1], patch.first[b] - patch.first[b + 1])
     face = Face()
-    face.above = -(patch.z[a, b] + falls[0] * patch.x[a] + falls[1] * patch.y[b])
-    face.normal = inverse_sqrt(1.0 + wp.length_sq(falls)) * wp.vec3(falls[0], falls[1], 1.0)
-    face.dist = face.above * face.normal[2]
-    face.nearest = -face.dist * face.normal
-    u, v = face.nearest[0] - patch.x[a], face.nearest[1] - patch.y[b]
+    face.falls = surface.density * falls
+    face.upright = inverse_sqrt(1.0 + wp.length_sq(face.falls))
+    above = patch.z - patch.first[b] - (face.falls[0] * patch.x + face.falls[1] * patch.y[b])
+    face.dist = above * face.upright
+    sideways = -(face.dist * face.upright) * face.falls
+    u, v = sideways[0] - patch.x, sideways[1] - patch.y[b]
     long, short = wp.where(half == 0, u, v), wp.where(half == 0, v, u)
-    face.is_inside = wp.min(patch.scale - long, wp.min(long - short, short)) >= -ON_EDGE * patch.scale
+    face.is_inside = wp.min(surface.scale - long, wp.min(long - short, short)) >= -ON_EDGE * surface.scale
     return face
 
 
 @wp.func
-def is_under(patch: Patch, a: int, b: int, half: int) -> bool:
-    """Return whether the centre is vertically over, or under, a triangle of a patch."""
-    in_cell = patch.x[a] <= 0.0 and patch.x[a + 1] > 0.0 and patch.y[b] <= 0.0 and patch.y[b + 1] > 0.0
-    return in_cell and (half == 0) == (patch.x[a] <= patch.y[b])
+def normal_of(face: Face) -> wp.vec3:
+    """Return a triangle's upward unit normal."""
+    return face.upright * wp.vec3(face.falls[0], face.falls[1], 1.0)
 
 
 @wp.func
-def look_at_faces(patch: Patch, radius: float, best: Nearest) -> Nearest:
-    """Return what is nearest when a patch's triangles are known, without their edges; a face wins among equals."""
-    for a in range(2):
-        for b in range(2):
-            for half in range(2):
-                face = see_face(patch, a, b, half)
-                if is_under(patch, a, b, half):
-                    best.above = face.above
-                if face.is_inside:
-                    away_sq = face.dist * face.dist
-                    if wp.where(best.is_face, 1.0, 1.0 - ON_EDGE) * away_sq < best.away_sq:
-                        best.point = face.nearest
-                        best.away_sq = away_sq
-                        best.is_face = True
-                        best.normal = face.normal
-                        best.dist = face.dist
-                    if face.dist < radius:
-                        is_known = wp.length_sq(best.other) > 0.0
-                        if is_known and wp.dot(face.normal, best.other) < ALIKE:
-                            best.is_mixed = True
-                        best.other = face.normal
+def look_at_face(face: Face, radius: float, best: Nearest) -> Nearest:
+    """Return what is nearest when a triangle is known, without its edges."""
+    away_sq = wp.where(face.is_inside, face.dist * face.dist, FAR_AWAY)
+    if away_sq < best.face_sq:
+        best.face_sq = away_sq
+        best.face = face
+    best.num_faces += wp.where(wp.where(face.is_inside, face.dist, FAR_AWAY) < radius, 1, 0)
     return best
 
 
 @wp.func
-def look_at_edge(patch: Patch, a: int, b: int, c: int, d: int, best: Nearest) -> Nearest:
-    """Return what is nearest when the edge between two samples of a patch is known."""
-    start = wp.vec3(patch.x[a], patch.y[b], patch.z[a, b])
-    edge = wp.vec3(patch.x[c], patch.y[d], patch.z[c, d]) - start
+def look_at_edge(start: wp.vec3, edge: wp.vec3, best: Nearest) -> Nearest:
+    """Return what is nearest when an edge between two samples is known."""
     point = start + wp.clamp(-wp.dot(start, edge) / wp.length_sq(edge), 0.0, 1.0) * edge
     away_sq = wp.length_sq(point)
-    if wp.where(best.is_face, 1.0 + ON_EDGE, 1.0) * away_sq < best.away_sq:
-        best.point = point
-        best.away_sq = away_sq
-        best.is_face = False
-        best.dist = 0.0
+    if away_sq < best.edge_sq:
+        best.edge_sq = away_sq
+        best.edge = point
     return best
 
 
 @wp.func
-def look_at_edges(patch: Patch, best: Nearest) -> Nearest:
-    """Return what is nearest when a patch's edges are known."""
-    for a in range(3):
-        for b in range(2):
-            best = look_at_edge(patch, a, b, a, b + 1, best)
-            best = look_at_edge(patch, b, a, b + 1, a, best)
-    for a in range(2):
-        for b in range(2):
-            best = look_at_edge(patch, a, b, a + 1, b + 1, best)
+def look_at_row(surface: Surface, patch: Patch, radius: float, best: Nearest) -> Nearest:
+    """Return what is nearest when the two cells of a patch's first two rows are known.
+
+    Of each cell three edges: the other two are its neighbours'.
+    """
+    for b in range(2):
+        for half in range(2):
+            best = look_at_face(see_face(surface, patch, b, half), radius, best)
+        start, z = wp.vec3(patch.x, patch.y[b], patch.first[b] - patch.z), patch.first[b]
+        best = look_at_edge(start, wp.vec3(surface.scale, 0.0, patch.second[b] - z), best)
+        best = look_at_edge(start, wp.vec3(0.0, surface.scale, patch.first[b + 1] - z), best)
+        best = look_at_edge(start, wp.vec3(surface.scale, surface.scale, patch.second[b + 1] - z), best)
     return best
 
 
 @wp.func
-def distance_sq_to_patch(patch: Patch) -> float:
+def height_above(surface: Surface, patch: Patch) -> float:
+    """Return how far the centre of a sphere is above the surface, vertically, if it is over the patch [m]."""
+    if patch.x + surface.scale <= 0.0:
+        patch = next_row(patch, surface.scale)
+    is_second = patch.y[1] <= 0.0
+    low = wp.where(is_second, patch.first[1], patch.first[0])
+    along_x = wp.where(is_second, patch.second[1], patch.second[0])
+    along_y = wp.where(is_second, patch.first[2], patch.first[1])
+    high = wp.where(is_second, patch.second[2], patch.second[1])
+    x, y = -surface.density * patch.x, -surface.density * wp.where(is_second, patch.y[1], patch.y[0])
+    third = wp.where(x >= y, along_x, along_y)
+    return patch.z - low - (wp.max(x, y) * (third - low) + wp.min(x, y) * (high - third))
+
+
+@wp.func
+def distance_sq_to_patch(patch: Patch, scale: float) -> float:
     """Return the squared distance from the centre to a patch, filled up to its highest sample."""
-    top = patch.z[0, 0]
-    for a in range(3):
-        for b in range(3):
-            top = wp.max(top, patch.z[a, b])
-    x, y = wp.max(patch.x[0], -patch.x[2]), wp.max(patch.y[0], -patch.y[2])
-    return wp.length_sq(wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(-top, 0.0)))
+    top = wp.max(wp.max(wp.max(patch.first), wp.max(patch.second)), wp.max(patch.third))
+    x, y = wp.max(patch.x, -patch.x - 2.0 * scale), wp.max(patch.y[0], -patch.y[2])
+    return wp.length_sq(wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(patch.z - top, 0.0)))
 
 
 @wp.struct
 class Window:
-    """The patches of a map that a sphere may touch: the one around its centre, and if it is large, those around."""
+    """The patches of a map that a sphere may touch, by their first samples."""
 
-    middle: wp.vec2i  # the first samples of that one
-    first: wp.vec2i  # of the others
-    cols: wp.int32  # how many of them along y
-    count: wp.int32  # of all
+    first: wp.vec2i
+    last: wp.vec2i
 
 
 @wp.func
 def make_window(surface: Surface, place: wp.vec3, reach: float) -> Window:
-    """Return the patches within a distance along x and y of a place on the map."""
+    """Return the patches within a distance along x and y of a place on the map: one up to half a cell."""
+    cells = reach * surface.density
     window = Window()
-    count = int(1)
     for k in range(2):
-        window.middle[k] = int(wp.floor(place[k] / surface.scale - 0.5))
-        window.first[k] = int(wp.floor((place[k] - reach) / surface.scale))
-        window.cols = (int(wp.floor((place[k] + reach) / surface.scale)) - window.first[k]) // 2 + 1
-        count *= window.cols
-    window.count = wp.where(reach > 0.5 * surface.scale, 1 + count, 1)
+        at = place[k] * surface.density
+        window.first[k] = int(wp.floor(at - wp.max(cells, 0.5)))
+        window.last[k] = wp.where(cells > 0.5, int(wp.floor(at + cells)), window.first[k])
     return window
 
 
 @wp.func
-def patch_of_window(surface: Surface, place: wp.vec3, window: Window, k: int) -> Patch:
-    """Return one of a window's patches."""
-    i, j = window.middle[0], window.middle[1]
-    if k > 0:
-        i, j = window.first[0] + 2 * ((k - 1) // window.cols), window.first[1] + 2 * ((k - 1) % window.cols)
-    return see_patch(surface, place, i, j)
-
-
-@wp.func
 def find_nearest(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
-    """Return the point of the surface that is nearest to the centre of a sphere.
+    """Return what is nearest to the centre of a sphere.
 
-    The way out of the ground is as far as the centre is below it, vertically, or shorter.
+    The way out of the ground is as long as the centre is below it, vertically, or shorter.
     """
     best = Nearest()
-    best.away_sq = FAR_AWAY
-    best.normal = wp.vec3(0.0, 0.0, 1.0)
-    window = make_window(surface, place, radius)
-    k = int(0)
-    while k < window.count:
-        patch = patch_of_window(surface, place, window, k)
-        if k == 0 or distance_sq_to_patch(patch) < (1.0 + ON_EDGE) * wp.max(best.away_sq, radius * radius):
-            best = look_at_faces(patch, radius, best)
-            best = look_at_edges(patch, best)
-        if k == 0 and -best.above > radius:
-            window = make_window(surface, place, wp.min(-best.above, MAX_REACH))
-        k += 1
+    best.face_sq = FAR_AWAY
+    best.edge_sq = FAR_AWAY
+    window = make_window(surface, place, 0.0)
+    i, j = window.first[0], window.first[1]
+    is_first = bool(True)
+    while i <= window.last[0]:
+        patch = see_patch(surface, place, i, j)
+        reach = float(0.0)
+        if is_first:
+            best.above = height_above(surface, patch)
+            reach = wp.max(radius, wp.min(-best.above, MAX_REACH))
+        most_sq = wp.max(radius * radius, wp.min(best.face_sq, best.edge_sq))
+        rows = wp.where(distance_sq_to_patch(patch, surface.scale) <= (1.0 + ON_EDGE) * most_sq, 2, 0)
+        while rows > 0:  # not unrolled: a thread waits for instructions longer than it works on them
+            best = look_at_row(surface, patch, radius, best)
+            patch = next_row(patch, surface.scale)
+            rows -= 1
+        is_first = False
+        j += 2
+        if j > window.last[1]:
+            j = window.first[1]
+            i += 2
+        if reach > 0.5 * surface.scale:  # one patch is not enough
+            window = make_window(surface, place, reach)
+            i = window.first[0]
+            j = window.first[1]
     return best
 
 
@@ -293,16 +311,22 @@ def second_face(surface: Surface, place: wp.vec3, radius: float, point: wp.vec3,
     best = Face()
     best.dist = radius
     window = make_window(surface, place, radius)
-    for k in range(window.count):
-        patch = patch_of_window(surface, place, window, k)
-        for a in range(2):
-            for b in range(2):
-                for half in range(2):
-                    other = see_face(patch, a, b, half)
-                    if other.is_inside and other.dist < best.dist and wp.dot(normal, other.normal) < ALIKE:
-                        way = other.nearest - point
-                        if wp.min(wp.dot(way, normal), -wp.dot(way, other.normal)) > 10.0 * MIN_DISTANCE:
+    for i in range(window.first[0], window.last[0] + 1, 2):
+        for j in range(window.first[1], window.last[1] + 1, 2):
+            patch = see_patch(surface, place, i, j)
+            rows = int(2)
+            while rows > 0:
+                for b in range(2):
+                    for half in range(2):
+                        other = see_face(surface, patch, b, half)
+                        other_normal = normal_of(other)
+                        way = -other.dist * other_normal - point
+                        is_concave = wp.min(wp.dot(way, normal), -wp.dot(way, other_normal)) > 10.0 * MIN_DISTANCE
+                        is_new = is_concave and wp.dot(normal, other_normal) < ALIKE
+                        if is_new and other.is_inside and other.dist < best.dist:
                             best = other
+                patch = next_row(patch, surface.scale)
+                rows -= 1
     return best
 
 
@@ -312,8 +336,8 @@ def is_clear(surface: Surface, centre: wp.vec3, lowest: float, radius: float) ->
 
     ``lowest`` is the height of its lowest point. That is all that most points and geoms need to know.
     """
-    i = int(wp.clamp((centre[0] - surface.corner[0]) / surface.scale, 0.0, float(surface.ceiling.shape[0] - 1)))
-    j = int(wp.clamp((centre[1] - surface.corner[1]) / surface.scale, 0.0, float(surface.ceiling.shape[1] - 1)))
+    i = int(wp.clamp((centre[0] - surface.corner[0]) * surface.density, 0.0, float(surface.ceiling.shape[0] - 1)))
+    j = int(wp.clamp((centre[1] - surface.corner[1]) * surface.density, 0.0, float(surface.ceiling.shape[1] - 1)))
     out = bool(False)
     if radius <= surface.near:
         out = lowest > surface.ceiling[i, j]
@@ -332,20 +356,22 @@ def touch_map(surface: Surface, centre: wp.vec3, radius: float) -> Touch:
     out = Touch()
     place = place_on_map(surface, centre, radius)
     nearest = find_nearest(surface, place, radius)
-    away = wp.sqrt(nearest.away_sq)
-    out.first = nearest.normal
-    out.dist[0] = nearest.dist - radius
-    if not nearest.is_face and away > MIN_DISTANCE:
+    away = wp.sqrt(nearest.edge_sq)
+    is_face = wp.sqrt(nearest.face_sq) < away + MIN_DISTANCE  # of equals the face: it has the better normal
+    out.first = normal_of(nearest.face)
+    out.dist[0] = nearest.face.dist - radius
+    point = -nearest.face.dist * out.first
+    if not is_face:
+        point = nearest.edge
         side = wp.where(nearest.above < 0.0, 1.0, -1.0)
-        out.first = side * nearest.point / away
+        out.first = wp.where(away > MIN_DISTANCE, side / away * point, wp.vec3(0.0, 0.0, 1.0))
         out.dist[0] = -side * away - radius
     if out.dist[0] < 0.0:
         out.count = 1
-        is_other = wp.length_sq(nearest.other) > 0.0 and wp.dot(nearest.other, out.first) < ALIKE
-        if nearest.is_mixed or is_other:
-            other = second_face(surface, place, radius, nearest.point, out.first)
+        if nearest.num_faces > wp.where(is_face, 1, 0):
+            other = second_face(surface, place, radius, point, out.first)
             if other.dist < radius:
                 out.count = 2
-                out.second = other.normal
+                out.second = normal_of(other)
                 out.dist[1] = other.dist - radius
     return out
