@@ -77,9 +77,7 @@ class Point:
 
 
 @wp.func
-def see_geom(
-    tables: Tables, world: int, b: int, index: int, origin: wp.vec3, poses: Poses, surface: Surface
-) -> Point:
+def see_geom(tables: Tables, world: int, b: int, index: int, origin: wp.vec3, poses: Poses, surface: Surface) -> Point:
     """Return a point of a branch with all that it shares with the others of its geom."""
     out = Point()
     out.geom = tables.point_geom[b, index]
