@@ -29,11 +29,11 @@ def collision_geoms(spec: mujoco.MjSpec, floor: str = FLOOR) -> list[str]:
     return [name for name in geoms if name != floor]
 
 
-def indices_matching(names: list[str], parts: list[str]) -> list[int]:
-    """Return which names contain one of ``parts``; a UserError if a part matches no name."""
+def indices_matching(names: list[str], parts: list[str], kind: str = "collision geom") -> list[int]:
+    """Return which names contain one of ``parts``; a UserError if a part matches no name of this kind."""
     for part in parts:
         if not any(part in name for name in names):
-            raise unknown_name("collision geom (part of its name)", part, names)
+            raise unknown_name(f"{kind} (part of its name)", part, names)
     return [i for i, name in enumerate(names) if any(part in name for part in parts)]
 
 

@@ -30,7 +30,7 @@ class Asset:
     mj_model: mujoco.MjModel
     dof_names: list[str]  # of the joints, in the order of the MJCF
     geom_names: list[str]  # of the collision geoms; the lists below are places in this one
-    feet: list[int]  # in the order of ``foot_names``
+    feet: list[int]  # geoms of the feet, in the order of ``foot_names``
     penalized: list[int]  # geoms of the collision term
     terminating: list[int]  # geoms that end an episode
     notes: list[str]  # what a user should know of the robot, a line each
@@ -39,6 +39,12 @@ class Asset:
     def foot_names(self) -> list[str]:
         """Names of the geoms of the feet."""
         return [self.geom_names[place] for place in self.feet]
+
+    @property
+    def foot_of(self) -> list[int]:
+        """To which foot each geom of the feet belongs: those of one body are one foot."""
+        bodies = [int(self.mj_model.geom(name).bodyid[0]) for name in self.foot_names]
+        return [list(dict.fromkeys(bodies)).index(body) for body in bodies]
 
     def dof_axes(self) -> np.ndarray:
         """Return the axes of the joints in the trunk's frame, where all angles are 0. Shape: (num_dof, 3)."""

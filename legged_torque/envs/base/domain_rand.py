@@ -65,7 +65,7 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
     trunk = offset(cfg, "trunk_mass_offset") | scale(cfg, "trunk_mass_scale")
     inertia_per_mass = list(model.body_inertia[TRUNK] / model.body_mass[TRUNK])
     joint_values = symmetry.joints and symmetry.joints.unsigned()
-    foot_vectors = symmetry.feet and symmetry.feet.of_vectors(VECTOR)
+    foot_vectors = symmetry.foot_geoms and symmetry.foot_geoms.of_vectors(VECTOR)
 
     def of_joints(name: str, field: str, columns: Any) -> Parameter:
         return of_model(task, name, field, columns, may_keep=True, mirror=joint_values, **absolute(cfg, name))

@@ -188,6 +188,7 @@ class LeggedRobotCfg(BaseConfig):
         soft_dof_pos_limit: Fraction = 0.9  # share of a joint's range, beyond which dof_pos_limits acts
         base_height_target: NotNegative = 0.0  # [m] of the trunk above the ground, in the nominal pose
         feet_air_time_target: NotNegative = 0.5  # [s] swings are rewarded for what they last beyond this
+        held_joints: list[str] = []  # parts of the names of joints that dof_deviation holds
 
         class scales:  # weights of Table III; each times the control step and its factor of ``curriculum``
             tracking_lin_vel: float = 1.0  # following commanded v_x and v_y
@@ -204,6 +205,9 @@ class LeggedRobotCfg(BaseConfig):
             feet_air_time: float = 0.1  # long swings
             symmetry: float = -0.5  # right and left foot of a pair both in the air
             stumble: float = 0.0  # feet pushed against walls
+            single_stance: float = 0.0  # swings of one foot of a pair while the other stands
+            dof_deviation: float = 0.0  # rewards.held_joints away from the nominal pose
+            alive: float = 0.0  # every step
 
         class curriculum:  # factors on the scales: linear from start to end between two total step counts (eq. 1)
             class tracking_lin_vel(LinearChange):

@@ -24,11 +24,12 @@ def pose_problems(pose: Sequence[float], model: mujoco.MjModel) -> Iterator[str]
 
 
 def foot_notes(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
-    """Yield which legs have no foot, or several: a leg ends in a body without children."""
+    """Yield which legs have no foot, or a foot of other numbers of geoms: a leg ends in a body without children."""
     ends = set(range(2, model.nbody)) - set(model.body_parentid.tolist())
     bodies = [int(model.geom(name).bodyid[0]) for name in feet]
+    usual = min(bodies.count(body) for body in bodies)
     for body in sorted(ends.union(bodies)):
-        if bodies.count(body) != 1:
+        if bodies.count(body) != usual:
             has = f"the body '{model.body(body).name}' has {bodies.count(body)} feet"
             yield f"{has}; asset.foot_name chooses {', '.join(feet)}"
 
