@@ -73,6 +73,7 @@ class Tables:
     impratio: wp.float32
     cost_scale: wp.float32  # from the cost to MuJoCo's units for its decrease
     tolerance: wp.float32  # the solver stops when a step promises less decrease, in these units
+    joint_count: wp.array(dtype=wp.int32)  # (branch)
 
 
 FUSED_FIELDS = [
@@ -140,6 +141,7 @@ def make_tables(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Tab
     sensors[model.sensor_refid] = model.sensor_adr
     tables.geom_sensor = wp.array(sensors, dtype=wp.int32)
     actuator_of = {int(model.actuator_trnid[i, 0]): i for i in range(model.nu)}
+    tables.joint_count = wp.array((tree.joints >= 0).sum(axis=1), dtype=wp.int32)
     tables.branch_joint = wp.array(tree.joints, dtype=wp.int32)
     tables.branch_actuator = wp.array(np.vectorize(lambda j: actuator_of.get(j, -1))(tree.joints), dtype=wp.int32)
     padded = [points + [(0, 0, (0.0, 0.0, 0.0), 0.0)] * (tree.most_points - len(points)) for points in tree.points]
