@@ -40,10 +40,12 @@ def indices_matching(names: list[str], parts: list[str]) -> list[int]:
 def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = FLOOR) -> mujoco.MjModel:
     """Compile the model to simulate: without what is only there to be seen, and with contact sensors.
 
+    Bodies without joints become part of what they are fixed to, unless something refers to them.
+
     The contacts of each of ``contact_geoms`` with the floor are sensed, by a sensor each, in this order. They are the
     only sensors of the model.
     """
-    spec.compiler.discardvisual = True
+    spec.compiler.discardvisual = spec.compiler.fusestatic = True
     for sensor in list(spec.sensors):
         spec.delete(sensor)
     for name in contact_geoms:
@@ -57,6 +59,14 @@ def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = FLOO
             intprm=[_DATASPEC, _REDUCE_NETFORCE, 1],
         )
     return spec.compile()
+
+
+def use_known_options(model: mujoco.MjModel) -> None:
+    """Replace the options that MuJoCo Warp refuses although they change no motion: flags and the solver's method."""
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE | mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_FWDINV)
+    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
+        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON  # which finds the same minimum
 
 
 def max_contacts(model: mujoco.MjModel) -> int:

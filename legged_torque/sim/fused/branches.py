@@ -37,7 +37,8 @@ class Layout(NamedTuple):
     points: int  # most contacts of a branch with the floor
     lanes: int  # threads per world, a power of two; 1 on a CPU
     on_map: bool  # whether the ground is a height map, not a plane
-    alike: bool = True  # whether all branches have ``depth`` joints; else some have fewer
+    alike: bool  # whether all branches have ``depth`` joints; else some have fewer
+    cylinders: bool  # whether any of its geoms is one
 
     @classmethod
     def of(cls, tree: Tree, on_gpu: bool, on_map: bool = False) -> "Layout":
@@ -45,7 +46,7 @@ class Layout(NamedTuple):
         branches, depth = tree.joints.shape
         points = tree.most_points * (MAX_TOUCHES if on_map else 1)
         lanes = 1 << (branches - 1).bit_length() if on_gpu else 1
-        return cls(branches, depth, points, lanes, on_map, bool((tree.joints >= 0).all()))
+        return cls(branches, depth, points, lanes, on_map, bool((tree.joints >= 0).all()), tree.has_cylinders)
 
     @property
     def per_lane(self) -> int:
@@ -100,7 +101,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
 
     ``applied_forces`` says whether there are forces that a user applies, ``law`` what computes torques, if anything.
     """
-    branches, depth, points, lanes, on_map, _ = layout
+    branches, depth, points, lanes, on_map, _, cylinders = layout
     per_lane, place, num_joints = layout.per_lane, places(layout), joint_counter(layout)
     find = find_map_contacts if on_map else find_contacts
     Branch, make_links = branch_types(depth).Branch, links_maker(depth)
@@ -132,7 +133,9 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
         branch = make_equations(branch, links, tables, world, b, joints, trunk.rot)
         branch.rows = make_joint_rows(branch.rows, tables, worlds, world, b, joints)
         branch.first_contact = (world * wp.static(branches) + b) * wp.static(points)
-        branch.num_contacts = find(tables, world, b, trunk.pos, poses, contacts, branch.first_contact)
+        branch.num_contacts = find(
+            tables, world, b, trunk.pos, poses, contacts, branch.first_contact, wp.static(cylinders)
+        )
         for j in range(wp.static(depth)):
             if j < joints:
                 branch.acc[j] = worlds.qacc_warmstart[world, dof(tables.branch_joint[b, j])]

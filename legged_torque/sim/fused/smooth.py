@@ -172,9 +172,7 @@ def links_maker(n: int) -> wp.Function:
 
 
 @wp.func
-def make_equations(
-    branch: AnyBranch, links: AnyLinks, tables: Tables, world: int, b: int, joints: int, rot: wp.mat33
-):
+def make_equations(branch: AnyBranch, links: AnyLinks, tables: Tables, world: int, b: int, joints: int, rot: wp.mat33):
     """Return a branch with its equations of motion, added up from its last body to its first.
 
     Places of no joint get an equation of their own, whose solution is zero.
