@@ -1,5 +1,6 @@
 """The structure of a robot, if it is one that the fused step can simulate."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,18 +13,22 @@ from legged_torque.utils.mjcf import why_no_motor
 
 MAX_BRANCHES = 16  # threads of a world must fit into half a warp
 _CAPSULE_ENDS = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
-_ON_CIRCLES = [(1.0, 0.0, 1.0), (1.0, 0.0, -1.0), (-0.5, 0.75**0.5, 1.0), (-0.5, -(0.75**0.5), 1.0)]
+_LOWEST_ON_CIRCLES = [(1.0, 0.0, 1.0), (1.0, 0.0, -1.0), (-0.5, 0.75**0.5, 1.0), (-0.5, -(0.75**0.5), 1.0)]
+_AROUND_CIRCLES = [
+    (math.cos(angle), math.sin(angle), z) for z in (-1.0, 1.0) for angle in (math.pi / 4 * i for i in range(8))
+]
 _BOX_CORNERS = [(float(x), float(y), float(z)) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]
 _GEOM_POINTS = {
     mujoco.mjtGeom.mjGEOM_SPHERE: ([(0.0, 0.0, 0.0)], 1.0),
     mujoco.mjtGeom.mjGEOM_CAPSULE: (_CAPSULE_ENDS, 1.0),
-    mujoco.mjtGeom.mjGEOM_CYLINDER: (_ON_CIRCLES, 0.0),
+    mujoco.mjtGeom.mjGEOM_CYLINDER: (_LOWEST_ON_CIRCLES, 0.0),
     mujoco.mjtGeom.mjGEOM_BOX: (_BOX_CORNERS, 0.0),
 }
 """Where a geom can touch the ground: points in units of its half sizes, and how many radii it is thick around them.
 
 Those of a cylinder stand in axes that are turned about its own, see :func:`~.contact.turn_cylinder`: the lowest points
-of both end circles, and two more of the lower circle, which make a triangle.
+of both end circles, and two more of the lower circle, which make a triangle. On a height map such points could turn
+into walls: there it has points all around its end circles that turn with it.
 """
 
 FLOORS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
@@ -48,8 +53,8 @@ class Tree:
         return max(1, *(len(points) for points in self.points))
 
 
-def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:1]) -> Tree:
-    """Return the structure of a robot on a floor of one of some types.
+def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:1], on_map: bool = False) -> Tree:
+    """Return the structure of a robot on a floor of one of some types, which may stand for a height map.
 
     A UserError, which tells all of it, if it has something that the fused step does not simulate.
     """
@@ -71,6 +76,8 @@ def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:
         else:
             branch, depth = depths[model.geom_bodyid[geom]]
         offsets, radius = _GEOM_POINTS[mujoco.mjtGeom(model.geom_type[geom])]
+        if on_map and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            offsets = _AROUND_CIRCLES
         points[branch] += [(int(geom), depth, offset, radius) for offset in offsets]
     joints = np.full((len(chains), max(map(len, chains))), -1)
     for i, chain in enumerate(chains):
