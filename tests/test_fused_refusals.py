@@ -7,15 +7,16 @@ from test_fused import assert_alike, compiled, draw_states, make_a1, put, step_f
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.envs.base.domain_rand import of_model
+from legged_torque.envs.base.robot_checks import engine_notes
 from legged_torque.sim.fused.tree import read_tree
-from legged_torque.sim.model import build_model, read_spec
+from legged_torque.sim.model import build_model, max_constraints, read_spec
 from legged_torque.sim.simulator import ENGINES, Simulator
 from legged_torque.utils.errors import UserError
 
 GEOM, JOINT, TRN = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtTrn
 A1 = RESOURCES_DIR / "robots/a1/a1.xml"
 MOTOR = {"gear": [1, 0, 0, 0, 0, 0], "ctrlrange": (-9, 9), "forcerange": (-9, 9), "trntype": TRN.mjTRN_JOINT}
-HINGES = "each body but the trunk must have one hinge joint"
+HINGES = "each body but the trunk must have one hinge joint, unlike '"
 SPHERE = "type=GEOM.mjGEOM_SPHERE, size=(0.1, 0, 0)"
 SITE = "spec.body('FR_calf').add_site(name='site'); spec.add_actuator(name='x', trntype=TRN.mjTRN_SITE, target='site')"
 REFUSED = [
@@ -120,7 +121,7 @@ def test_refused(edit, reason):
         read_tree(model)
     message = str(error.value)
     assert message.startswith("sim.engine 'fused' cannot simulate this robot: ") and reason in message
-    assert message.endswith("; use sim.engine = 'mujoco_warp', without randomize_parameters")
+    assert message.endswith("; use sim.engine = 'mujoco_warp', about 30 times slower, without randomize_parameters")
 
 
 CALF_MEETS_THIGH = "spec.geom('FR_calf').contype = 2; spec.geom('FR_thigh').conaffinity |= 2"
@@ -163,6 +164,33 @@ def test_legs_that_meet_are_refused():
     exec(LEGS_MEET, globals(), {"spec": spec})
     with pytest.raises(UserError, match="parts of the robot collide with each other"):
         read_tree(compiled(spec))
+
+
+def test_engine_that_is_slower():
+    """Who takes MuJoCo Warp's own step is told how much slower it is, and whether it had to be."""
+    assert list(engine_notes(compiled(make_a1()), "fused")) == []
+    assert "which can simulate this robot" in next(engine_notes(compiled(make_a1()), "mujoco_warp"))
+    spec = make_a1()
+    for key in list(spec.keys):
+        spec.delete(key)
+    branch(spec.body("FL_thigh"))
+    (note,) = engine_notes(compiled(spec), "mujoco_warp")
+    assert note.startswith("sim.engine 'mujoco_warp' steps worlds, about 30 times slower than 'fused'")
+    assert note.endswith("which cannot simulate this robot: body 'FL_thigh' branches")
+
+
+def test_rows_of_closed_loops():
+    """MuJoCo Warp gets room for the constraint rows of closed loops, as many as MuJoCo makes."""
+    spec = make_a1()
+    for kind in ("CONNECT", "WELD"):
+        loop = spec.add_equality(type=getattr(mujoco.mjtEq, f"mjEQ_{kind}"), objtype=mujoco.mjtObj.mjOBJ_BODY)
+        loop.name1, loop.name2 = "FR_calf", "RR_calf"
+    spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1="FR_hip_joint", name2="FL_hip_joint")
+    model = compiled(spec)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    rows = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY).sum()
+    assert rows == 10 == max_constraints(model, 0) - max_constraints(compiled(make_a1()), 0)
 
 
 @pytest.mark.parametrize("name", ["geom_margin", "jnt_margin", "body_gravcomp", "actuator_gainprm", "geom_gap"])

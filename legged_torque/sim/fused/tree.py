@@ -31,6 +31,7 @@ of both end circles, and two more of the lower circle, which make a triangle. On
 into walls: there it has points all around its end circles that turn with it.
 """
 
+SLOWER = "about 30 times slower"  # on an H200, see docs/performance.md
 FLOORS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 """What robots stand on; the fused step knows planes only, its height maps are none of the model's geoms."""
 
@@ -58,13 +59,8 @@ def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:
 
     A UserError, which tells all of it, if it has something that the fused step does not simulate.
     """
-    reasons = [*_of_bodies(model), *_of_contacts(model, floors), *_of_motors(model), *_of_options(model)]
+    _refuse(reasons_against(model, floors))
     chains = _chains(model)
-    ends = [chain[-1] for chain in chains]
-    reasons += [f"body '{model.body(body).name}' branches" for body in ends if body in model.body_parentid]
-    if not 0 < len(chains) <= MAX_BRANCHES:
-        reasons.append(f"it has {len(chains)} legs, not 1 to {MAX_BRANCHES}")
-    _refuse(reasons)
     points: list[list] = [[] for _ in chains]
     depths = {body: (i, j + 1) for i, chain in enumerate(chains) for j, body in enumerate(chain)}
     trunk_geoms = 0
@@ -85,6 +81,17 @@ def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:
     return Tree(joints, points, mujoco.mjtGeom.mjGEOM_CYLINDER in model.geom_type[geoms])
 
 
+def reasons_against(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS) -> list[str]:
+    """Return why the fused step cannot simulate a robot on a floor of one of some types, nothing if it can."""
+    reasons = [*_of_bodies(model), *_of_contacts(model, floors), *_of_motors(model), *_of_options(model)]
+    chains = _chains(model)
+    ends = [chain[-1] for chain in chains]
+    reasons += [f"body '{model.body(body).name}' branches" for body in ends if body in model.body_parentid]
+    if not 0 < len(chains) <= MAX_BRANCHES:
+        reasons.append(f"it has {len(chains)} legs, not 1 to {MAX_BRANCHES}")
+    return reasons
+
+
 def find_floor(model: mujoco.MjModel) -> int:
     """Return the geom that an accepted robot stands on."""
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
@@ -101,8 +108,14 @@ def check_map(model: mujoco.MjModel) -> None:
 def _refuse(reasons: list[str]) -> None:
     """Raise a UserError with all reasons not to simulate a robot, if there are any."""
     if reasons:
-        advice = "use sim.engine = 'mujoco_warp', without randomize_parameters"
+        advice = f"use sim.engine = 'mujoco_warp', {SLOWER}, without randomize_parameters"
         raise UserError(f"sim.engine 'fused' cannot simulate this robot: {'; '.join(reasons)}; {advice}")
+
+
+def _of(part: Any, chosen: np.ndarray) -> str:
+    """Return the names of chosen parts of a model, of many the first three, given how to get one by its number."""
+    names = [f"'{part(i).name}'" for i in np.flatnonzero(chosen)]
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _broken(rules: dict[str, bool]) -> list[str]:
@@ -160,14 +173,15 @@ def _of_bodies(model: mujoco.MjModel) -> list[str]:
     """Return what the fused step does not simulate of bodies and joints."""
     hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
     is_free = model.njnt > 0 and model.jnt_type[0] == free and model.jnt_bodyid[0] == 1
-    hinges = (model.body_jntnum[1:] == 1).all() and (model.jnt_type[1:] == hinge).all()
+    has_hinge = (model.body_jntnum == 1) & (np.append(model.jnt_type, -1)[model.body_jntadr] == hinge)
+    odd = ~has_hinge & (np.arange(model.nbody) > 1)
     root = [model.dof_damping[:6], model.dof_armature[:6], model.dof_frictionloss[:6], model.jnt_stiffness[:1]]
     passive = is_free and any(values.any() for values in root)
     nonlinear = _any_of(model, "jnt_stiffnesspoly", "jnt_springyield", "dof_dampingpoly")
     return _broken(
         {
             "its trunk is not free": is_free,
-            "each body but the trunk must have one hinge joint": bool(hinges),
+            f"each body but the trunk must have one hinge joint, unlike {_of(model.body, odd)}": not odd.any(),
             "something beside the trunk hangs on the world": not (model.body_parentid[2:] == 0).any(),
             "bodies are compensated for gravity": not model.body_gravcomp.any(),
             "joint limits have margins": not model.jnt_margin.any(),
@@ -192,11 +206,10 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
     condims = _condims(model, floor[0])[touching] if alone else np.zeros(0)
     solrefs = np.concatenate([model.geom_solref[on_floor], model.jnt_solref, model.dof_solref])
     mixed = ~((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1))
-    names = ", ".join(f"'{model.geom(geom).name}'" for geom in np.flatnonzero(odd)[:3])
     return _broken(
         {
             "it needs one plane and no other obstacle": alone,
-            f"only spheres, capsules, cylinders and boxes may collide, unlike {names}": not odd.any(),
+            f"only spheres, capsules, cylinders and boxes may collide, unlike {_of(model.geom, odd)}": not odd.any(),
             "parts of the robot collide with each other": not (types[:, None] & affinities)[apart].any(),
             "condim of contacts with the floor must be 3": bool((condims == 3).all()),
             "geoms have margins or gaps": not (model.geom_margin[on_floor].any() or model.geom_gap[on_floor].any()),
