@@ -383,9 +383,10 @@ def test_unlike_sides_are_no_mirror_images(changed, make_task):
     assert "the axes of 'FR_hip_joint' and 'FL_hip_joint' are not mirror images" in error_of(lambda: task.mirror)
 
 
-def test_joints_without_range(changed, make_task):
+@pytest.mark.parametrize("engine", ENGINES)
+def test_joints_without_range(changed, make_task, engine):
     """They have no limits, neither for rewards nor for initial angles, instead of the range 0 to 0 of their fields."""
     free = joint("FL_hip_joint", limited="false")
-    task = make_task("a1_torque", 2, **{"asset.file": changed(free), "sim.engine": "mujoco_warp"})
+    task = make_task("a1_torque", 2, **{"asset.file": changed(free), "sim.engine": engine})
     assert task.dof_pos_limits[3].tolist() == [-np.inf, np.inf] and task.dof_pos_limits[0].isfinite().all()
     assert (task.dof_pos[:, 3] > 0.04).all() and task.rew_buf.isfinite().all()
