@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from legged_torque.sim.fused.contact import Contact, contact_normal, half_size, make_contact
+from legged_torque.sim.fused.contact import CYLINDER, Contact, contact_normal, half_size, make_contact
 from legged_torque.sim.fused.math import quat_to_matrix
 from legged_torque.sim.fused.smooth import Poses
 from legged_torque.sim.fused.surface import Surface, is_clear, make_surface, touch_map
@@ -77,17 +77,21 @@ class Point:
 
 
 @wp.func
-def see_geom(tables: Tables, world: int, b: int, index: int, origin: wp.vec3, poses: Poses, surface: Surface) -> Point:
+def see_geom(
+    tables: Tables, world: int, b: int, index: int, origin: wp.vec3, poses: Poses, surface: Surface, cylinders: bool
+) -> Point:
     """Return a point of a branch with all that it shares with the others of its geom."""
     out = Point()
     out.geom = tables.point_geom[b, index]
     out.depth = tables.point_depth[b, index]
-    out.half = half_size(tables, world, out.geom)
+    out.half = half_size(tables, world, out.geom, cylinders)
     out.radius = tables.point_radius[b, index] * of_world(tables.geom_size, world, out.geom)[0]
     pose = poses[out.depth]
     out.middle = pose.pos + pose.rot * of_world(tables.geom_pos, world, out.geom)
     out.turn = pose.rot * quat_to_matrix(of_world(tables.geom_quat, world, out.geom))
     half = wp.cw_mul(tables.point_offset[b, index], out.half)
+    if cylinders and tables.geom_type[out.geom] == CYLINDER:
+        half = out.half  # points around its ends are not corners of a box
     middle = origin + out.middle
     drop = wp.abs(out.turn[2, 0] * half[0]) + wp.abs(out.turn[2, 1] * half[1]) + wp.abs(out.turn[2, 2] * half[2])
     out.is_clear = is_clear(surface, middle, middle[2] - drop - out.radius, wp.length(half) + out.radius)
@@ -96,7 +100,14 @@ def see_geom(tables: Tables, world: int, b: int, index: int, origin: wp.vec3, po
 
 @wp.func
 def find_map_contacts(
-    tables: Tables, world: int, b: int, origin: wp.vec3, poses: Poses, contacts: MapContacts, first: int
+    tables: Tables,
+    world: int,
+    b: int,
+    origin: wp.vec3,
+    poses: Poses,
+    contacts: MapContacts,
+    first: int,
+    cylinders: bool,
 ) -> int:
     """Write the contacts of a branch with the height map from index ``first`` on and return how many there are.
 
@@ -113,7 +124,7 @@ def find_map_contacts(
         point.is_near = False
         while index < tables.point_count[b] and not point.is_near:
             if tables.point_geom[b, index] != point.geom:
-                point = see_geom(tables, world, b, index, origin, poses, surface)
+                point = see_geom(tables, world, b, index, origin, poses, surface, cylinders)
             if point.is_clear:
                 index = tables.point_next[b, index]
             else:
