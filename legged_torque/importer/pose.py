@@ -14,6 +14,7 @@ BANDWIDTH = 4.0  # [Hz] natural frequency of a joint under its gains, with the i
 DAMPING_RATIO = 0.5  # of the same
 SAG = 0.1  # [rad] by which a joint may give way under the robot's weight
 TIPPING = 2.0  # times the stiffness below which a robot with level trunk tips over its feet, shared by its legs
+MISSED = 0.02  # [m] by which a foot may miss its place
 CROUCH = {False: 0.75, True: 0.93}  # height of hips over feet in stance, of stretched legs'; with ankles and without
 BEND = {False: (0.8, -1.6), True: (-0.4, 0.8)}  # [rad] angles of thigh and knee about y to start from, likewise
 ARMATURE = 0.01 / 33.5  # [kg m^2 per N m] rotor's inertia per torque, that of the A1, where a file has none
@@ -42,14 +43,17 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
         source.notes.append("nominal pose: the keyframe of the file")
     else:
         angles = np.clip(np.zeros(len(source.joints)), ranges[:, 0], ranges[:, 1])
-        for leg in legs:
-            _bend(model, leg, angles, ranges)
+        missed = {leg.name: _bend(model, leg, angles, ranges) for leg in legs}
         share = CROUCH[legs[0].is_walking_on_soles]
         source.notes.append(f"nominal pose: inverse kinematics, feet below hips at {share:.0%} of the stretched legs")
+        far = ", ".join(f"{name} by {miss:.2f} m" for name, miss in missed.items() if miss > MISSED)
+        if far:
+            source.notes.append(f"within the limits of joints, feet do not get there: {far}")
     outside = [name for name, q, (low, high) in zip(source.joints, angles, ranges, strict=True) if not low <= q <= high]
     if outside:
         source.notes.append(f"the nominal pose was beyond the limits of {', '.join(outside)} and is moved inside")
-        angles = np.clip(angles, ranges[:, 0], ranges[:, 1])
+    low, high = np.ceil(1e3 * ranges[:, 0]) / 1e3, np.floor(1e3 * ranges[:, 1]) / 1e3
+    angles = np.clip(angles.round(3), low, high)  # as the settings have them, inside the limits
     data = zero_pose(model, angles)
     armature = model.dof_armature[6:].copy()
     bare = armature <= 0
@@ -71,14 +75,14 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
     return Stance(angles, height, armature, stiffness, damping, holding)
 
 
-def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarray) -> None:
-    """Bend a leg until its foot is below its hip; writes the angles of its joints."""
+def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarray) -> float:
+    """Bend a leg until its foot is below its hip; writes the angles of its joints, returns how far it missed [m]."""
     data = zero_pose(model)
     joints = np.array([model.body_jntadr[body] for body in leg.bodies])
     places = [*data.xanchor[joints], world_shape(data, leg.bodies[-1], leg.foot)]
     pitch = [i for i, joint in enumerate(joints) if abs(data.xaxis[joint][1]) > 0.7]
     if not pitch:
-        return
+        return 0.0
     reach = sum(float(np.linalg.norm(b - a)) for a, b in zip(places[pitch[0] :], places[pitch[0] + 1 :], strict=False))
     goal = places[pitch[0]] - np.array([0, 0, CROUCH[leg.is_walking_on_soles] * reach])
     goal[1] = places[-1][1] if leg.is_walking_on_soles else goal[1]
@@ -108,6 +112,7 @@ def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarra
         step = rows.T @ np.linalg.solve(rows @ rows.T + 1e-4 * np.eye(len(rows)), error)
         q = np.clip(q + np.clip(step, -0.2, 0.2), low, high)
     angles[joints - 1] = q
+    return float(np.linalg.norm(goal - foot))
 
 
 def _inertias(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:

@@ -87,6 +87,7 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
             f"joint damping up to {damped.max():g} N m s/rad is kept; it often stands for a servo's and is too much "
             "for torque control: set it to 0 if it is not friction that you measured"
         )
+    source.notes.append("contacts and options are those of this library's robots: friction 1, condim 3, steps of 5 ms")
     _name_shapes(source, legs, shapes)
     return Robot(name, source, legs, shapes, joints, kinds, ranges, torques, speed, mirrored, symmetric, stance)
 
@@ -120,7 +121,7 @@ def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None
     data = zero_pose(model, source.pose)
     lowest = min(world_shape(data, body, shape)[2] for body, found in shapes.items() for shape in found)
     enough = float(model.opt.gravity[2] * model.body_mass.sum() * lowest)
-    known = np.array([np.inf if limit is None else limit for limit in source.torque_limits])
+    known = source.torque_limits
     odd = [name for name, limit in zip(source.joints, known, strict=True) if not 0 < limit < IMPLAUSIBLE * enough]
     if odd:
         source.notes.append(
