@@ -203,6 +203,6 @@ def mirrored_legs(source: Source, legs: list[Leg]) -> list[list[str]]:
 
 
 def world_shape(data: mujoco.MjData, body: int, shape: Shape) -> np.ndarray:
-    """Return the lowest point of a shape in the world frame [m]. Shape: (3,)."""
+    """Return where in the world frame a shape's center is, at the height of its lowest point [m]. Shape: (3,)."""
     ends = shape.ends() @ data.xmat[body].reshape(3, 3).T + data.xpos[body]
-    return ends[np.argmin(ends[:, 2])] - np.array([0, 0, shape.radius])
+    return np.append(ends.mean(axis=0)[:2], ends[:, 2].min() - shape.radius)
