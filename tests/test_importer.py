@@ -133,6 +133,72 @@ def test_mjcf(written):
     check(model, cfg)
 
 
+SPRINGS = ('_calf" axis="0 1 0"', '_calf" axis="0.1 1 0" ref="-0.9" stiffness="3" springref="-1.2" damping="0.1"')
+
+
+def test_motion_stays(written, tmp_path):
+    """Mass matrix, forces and places at random states are those of plain MuJoCo with the source, springs included."""
+    source = as_mjcf("").replace(*SPRINGS).replace('<geom type="sphere"', '<geom quat="1 2 3 4" type="sphere"')
+    _, model, _ = written(source, "xml")
+    reference, random = mujoco.MjModel.from_xml_string(source), np.random.default_rng(0)
+    for _ in range(5):
+        turn, seen = random.normal(size=4), []
+        qpos = np.concatenate([random.normal(size=3), turn / np.linalg.norm(turn), random.uniform(-2.6, 3, 8)])
+        qvel = random.normal(size=14)
+        for each in (reference, model):
+            data, matrix = mujoco.MjData(each), np.zeros((14, 14))
+            data.qpos[:], data.qvel[:] = qpos, qvel
+            mujoco.mj_forward(each, data)
+            for row, unit in zip(matrix, np.eye(14), strict=True):
+                mujoco.mj_mulM(each, data, row, unit)
+            places = [data.body(f"{leg}_calf").xpos for leg in ("FL", "FR", "RL", "RR")]
+            seen.append([matrix - np.diag(each.dof_armature), data.qfrc_bias - data.qfrc_passive, places])
+        for expected, found in zip(*seen, strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert np.abs(model.qpos_spring[8] + 1.2) < 1e-9 and model.qpos0[8] == -0.9
+
+
+MOTOR = '<motor joint="FL_calf" ctrlrange="-3 3" gear="6" ctrllimited="true"/>'
+FILTER = '<general joint="FL_calf" ctrlrange="-9 18" ctrllimited="true" dyntype="filter" dynprm="0.05"/>'
+BALL = '<geom type="sphere" size="0.02" pos="0 0 -0.2" mass="0.05"/>'
+IN_PAIR = '<geom name="ball" type="sphere" size="0.02" pos="0 0 -0.2" mass="0.05" contype="0" conaffinity="0"/>'
+PAIR = '<contact><pair geom1="ball" geom2="ground"/></contact><actuator>'
+FRAME = '<link name="footprint"/><joint name="f" type="fixed"><parent link="footprint"/><child link="base"/>'
+TRAPS = {
+    "no gravity": (as_mjcf("").replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'), "contacts and options"),
+    "joint without motor": (as_mjcf("").replace(MOTOR, ""), "no actuator of the file drives FL_calf: given"),
+    "dynamics": (as_mjcf("").replace(MOTOR, FILTER), "the dynamics of actuators (filters, activations) are left out"),
+    "uneven": (as_mjcf("").replace(MOTOR, FILTER), "differ by direction are the smaller of both: FL_calf"),
+    "feet in pairs": (
+        as_mjcf("")
+        .replace(BALL, IN_PAIR, 1)
+        .replace("</worldbody>", '<geom name="ground" type="plane" size="0 0 1"/></worldbody>')
+        .replace("<actuator>", PAIR),
+        "contacts and options",
+    ),
+    "frame": (
+        urdf().replace('name="dog">', f'name="dog">{FRAME}<origin xyz="0 0 0.3"/></joint>'),
+        "no more than a frame",
+    ),
+    "faces along y": (
+        urdf().replace('"1 0 0"', '"X"').replace('"0 1 0"', '"1 0 0"').replace('"X"', '"0 1 0"'),
+        "turn the file, x is forwards",
+    ),
+    "pose at a limit": (urdf().replace('"-2.6" upper="-0.5"', '"-2.6" upper="-1.50049"'), "contacts and options"),
+    "two dashes": (urdf().replace("LF_KFE", "LF--KFE"), "contacts and options"),
+}
+
+
+@pytest.mark.parametrize(("source", "note"), TRAPS.values(), ids=TRAPS)
+def test_traps(written, source, note):
+    """Each is mended, with a line that says so, and the robot stands where it stood without it."""
+    robot, model, cfg = written(source, "urdf" if "<robot" in source else "xml")
+    assert any(note in told for told in robot.notes), robot.notes
+    assert cfg.rewards.base_height_target == pytest.approx(0.32, abs=0.01)
+    if "faces" not in note and "turn" not in note:
+        check(model, cfg)
+
+
 def test_feet_below_hips(written):
     """Without a keyframe, inverse kinematics puts level feet below the joints that swing the legs."""
     robot, model, _ = written(as_mjcf(""), "xml")
@@ -151,8 +217,19 @@ def test_feet_below_hips(written):
         (as_mjcf("").replace("<freejoint/>", ""), "its trunk"),
         (as_mjcf('<equality><joint joint1="FL_calf" joint2="FR_calf"/></equality>'), "equalities"),
         (as_mjcf("").replace('axis="0 1 0"', 'axis="1 0 0"'), "no joint turns about y"),
+        (as_mjcf("").replace('pos="0 0 -', 'pos="0 0 ').replace("0 -0.15", "0 0.15"), "z must point upwards"),
+        (urdf().replace("<robot", '<robot xmlns:xacro="http://ros.org"><xacro:leg/></robot><!--', 1) + "-->", "xacro"),
+        (
+            as_mjcf("")
+            .replace("/><worldbody>", '/><asset><mesh name="m" file="gone.stl"/></asset><worldbody>')
+            .replace('angle="radian"', 'angle="radian" inertiafromgeom="true"')
+            .replace(
+                BALL, f'{BALL}<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><geom type="mesh" mesh="m"/>', 1
+            ),
+            "the inertia of 'FL_calf' follows from the mesh 'gone.stl'",
+        ),
         ("<mujoco><worldbody/></mujoco>", "0 bodies with joints"),
-        ("<mujoco", "Error"),
+        ("<mujoco", "unclosed token"),
     ],
 )
 def test_refusals(tmp_path, text, reason):

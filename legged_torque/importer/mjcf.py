@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import mujoco
-import numpy as np
 
 from legged_torque.importer.robot import FOOT, Robot
 from legged_torque.importer.shapes import Shape

@@ -126,7 +126,9 @@ def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarra
             )
             rows, error = np.vstack([rows, 0.3 * jacr[:, joints + 5]]), np.concatenate([error, 0.3 * lean])
         step = rows.T @ np.linalg.solve(rows @ rows.T + 1e-4 * np.eye(len(rows)), error)
-        q = np.clip(q + step * 0.2 / max(0.2, np.abs(step).max()), low, high)
+        before, q = q, np.clip(q + step * 0.2 / max(0.2, np.abs(step).max()), low, high)
+        if np.abs(q - before).max() < 1e-5:
+            break
     angles[joints - 1] = q
     return float(np.linalg.norm(goal - foot))
 

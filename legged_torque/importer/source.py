@@ -51,11 +51,12 @@ def read_source(file: Path) -> Source:
         raise UserError(f"cannot import '{file}': there is no such file")
     with kept_warnings():
         try:
-            _refuse_macros(file)
+            root = ET.parse(file).getroot()
+            _refuse_macros(root, file)
             spec = mujoco.MjSpec.from_file(str(file))
-            notes = _prepare(spec, file)
+            notes = _prepare(spec, file, root.tag == "robot")
             model = _compile(spec, notes)
-        except (ValueError, mujoco.FatalError) as error:
+        except (ValueError, ET.ParseError, mujoco.FatalError) as error:
             raise UserError(f"cannot import '{file}': {' '.join(str(error).split())}") from None
     _check(model, file)
     sites: dict[int, list] = {}
@@ -64,19 +65,19 @@ def read_source(file: Path) -> Source:
         sites.setdefault(int(model.site_bodyid[site]), []).append((name, model.site_pos[site].copy()))
     pose = model.key_qpos[_home(model)][7:].copy() if model.nkey else None
     limits = _torque_limits(model, notes)
-    return Source(file, model, sites, pose, limits, _speed_limits(file), notes)
+    return Source(file, model, sites, pose, limits, _speed_limits(root), notes)
 
 
-def _prepare(spec: mujoco.MjSpec, file: Path) -> list[str]:
+def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
     """Make a file compile to one floating robot without anything else; return what was changed."""
-    notes = _find_meshes(spec, file)
+    notes = _find_meshes(spec, file, is_urdf)
     in_pairs = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     for part in [*spec.sensors, *spec.lights, *spec.cameras, *spec.sites, *spec.excludes, *spec.pairs]:
         spec.delete(part)
     switched_on = dict[str, None]()
     for geom in spec.geoms:
         geom.material = ""
-        if _is_urdf(file):
+        if is_urdf:
             geom.mass = 0.0  # links weigh what <inertial> says, those without it nothing
         if not (geom.contype or geom.conaffinity) and (geom.group == VISUAL_GROUP or geom.name in in_pairs):
             geom.conaffinity = 1
@@ -134,7 +135,7 @@ def _compile(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
         return spec.compile()
 
 
-def _find_meshes(spec: mujoco.MjSpec, file: Path) -> list[str]:
+def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
     """Point meshes to their files; leave those out that are nowhere near or that MuJoCo cannot read, and say so."""
     missing = {}
     for mesh in list(spec.meshes):
@@ -152,7 +153,7 @@ def _find_meshes(spec: mujoco.MjSpec, file: Path) -> list[str]:
         if geom.meshname in missing:
             collides = bool(geom.contype or geom.conaffinity)
             weighs = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-            if not _is_urdf(file) and (weighs or not geom.parent.explicitinertial):
+            if not is_urdf and (weighs or not geom.parent.explicitinertial):
                 raise UserError(
                     f"cannot import '{file}': the inertia of '{geom.parent.name}' follows from the mesh "
                     f"'{missing[geom.meshname].file}', which is missing or of a type other than {', '.join(MESH_TYPES)}"
@@ -239,18 +240,13 @@ def _torque_limits(model: mujoco.MjModel, notes: list[str]) -> np.ndarray:
     return np.array(limits)
 
 
-def _refuse_macros(file: Path) -> None:
+def _refuse_macros(root: ET.Element, file: Path) -> None:
     """Raise a UserError for a xacro, of which MuJoCo would read what is no macro and nothing else."""
-    if any("xacro" in part.tag for part in ET.parse(file).iter()):
+    if any("xacro" in part.tag for part in root.iter()):
         raise UserError(f"cannot import '{file}': it is a xacro; make a URDF of it: xacro {file} > robot.urdf")
 
 
-def _is_urdf(file: Path) -> bool:
-    """Return whether a file describes its robot as URDF."""
-    return ET.parse(file).getroot().tag == "robot"
-
-
-def _speed_limits(file: Path) -> list[float]:
+def _speed_limits(root: ET.Element) -> list[float]:
     """Return the speed limits [rad/s] of an URDF's joints, which MuJoCo does not read; none of a MJCF."""
-    limits = ET.parse(file).getroot().findall("joint/limit")
-    return [float(limit.get("velocity", 0)) for limit in limits if float(limit.get("velocity", 0)) > 0]
+    limits = [float(limit.get("velocity", 0)) for limit in root.findall("joint/limit")]
+    return [limit for limit in limits if limit > 0]
