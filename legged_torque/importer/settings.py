@@ -34,7 +34,7 @@ class {cls}Cfg(LeggedRobotCfg):
         damping = {damping}
         torque_scale = {torque_scale}
 
-{ranges}    class rewards:
+    class rewards:
         base_height_target = {height}
 
 
@@ -43,10 +43,6 @@ class {cls}CfgPPO(LeggedRobotCfgPPO):
 {symmetry}'''
 ENGINE = """    class sim:
         engine = "mujoco_warp"  # slower; the fused step cannot simulate this robot
-
-"""
-RANGES = """    class domain_rand:
-        foot_radius = [{low}, {high}]
 
 """
 SYMMETRY = """
@@ -67,8 +63,6 @@ def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
     ``path`` is that of its MJCF, as it is to be found; ``is_fused`` says whether the fused step can simulate it.
     """
     stance = robot.stance
-    feet = [leg.foot for leg in robot.legs]
-    radius = feet[0].size[0] if feet[0].kind == "sphere" else None
     kept = {shape.name for found in robot.shapes.values() for shape in found}
     return TEMPLATE.format(
         title=robot.name,
@@ -89,7 +83,6 @@ def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
         stiffness=_table(robot.by_kind(stance.stiffness)),
         damping=_table(robot.by_kind(stance.damping)),
         torque_scale=float(f"{0.12 * max(robot.torques):.2g}"),
-        ranges=RANGES.format(low=round(0.95 * radius, 4), high=round(1.05 * radius, 4)) if radius else "",
         height=round(stance.height, 3),
         symmetry=SYMMETRY if robot.symmetric else "",
     )
