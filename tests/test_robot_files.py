@@ -1,6 +1,7 @@
 """Files with a trap each, made from the A1's: read by name and transmission, or refused with all that is wrong."""
 
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -13,8 +14,10 @@ from legged_torque import RESOURCES_DIR
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.held_pose import standing_note
 from legged_torque.envs.robots.a1 import A1Cfg
-from legged_torque.sim.model import build_model, read_spec
+from legged_torque.sim.model import build_model
 from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.utils.mjcf import read_spec
+from legged_torque.viewer.ground import drawn_model
 
 A1 = RESOURCES_DIR / "robots/a1/a1.xml"
 POSE = A1Cfg.init_state.default_joint_angles
@@ -127,31 +130,49 @@ def test_motors_in_another_order(changed, engine):
 
 
 def test_the_same_robot_in_another_order(changed, make_task):
-    """Unitree's orders of joints and motors lead to the torques per joint and the rewards of ours."""
-    file = changed(unitree_order)
+    """Unitree's orders of joints and motors lead to the same torques per joint, rewards and observations as ours."""
+    ours = make_task("a1_torque_multihead", 2)
+    theirs = make_task("a1_torque_multihead", 2, **{"asset.file": changed(unitree_order)})
+    assert theirs.dof_names == list(POSE) and theirs.foot_names == ours.foot_names
+    drawn = drawn_model(Path(theirs.cfg.asset.file), None, theirs.dof_names)
+    assert [drawn.joint(i).name for i in range(1, 13)] == list(POSE)
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(12):
+        actions = 0.3 * torch.randn(2, 24, generator=generator)
+        ours.step(actions)
+        theirs.step(actions)
+        for name in ("torques", "rew_buf", "contacts"):
+            assert torch.equal(getattr(theirs, name), getattr(ours, name)), name
+        assert all(torch.equal(group, ours.obs_buf[name]) for name, group in theirs.obs_buf.items())
+    assert (ours.torques.abs() > 1.0).any() and ours.contacts.any()
+
+
+def test_policies_in_another_order(changed, make_task):
+    """Settings in Unitree's order, as of a policy trained on its file: it moves as in ours but for rounding."""
     names = [f"{leg}_{part}_joint" for leg in UNITREE_ORDER for part in ("hip", "thigh", "calf")]
     order = [list(POSE).index(name) for name in names]
-    pose = {name: POSE[name] for name in names}
-    ours = make_task("a1_torque_multihead", 2)
-    theirs = make_task("a1_torque_multihead", 2, **{"asset.file": file, "init_state.default_joint_angles": pose})
+    pose = {"init_state.default_joint_angles": {name: POSE[name] for name in names}}
+    ours, theirs = make_task("a1_torque_multihead", 2), make_task("a1_torque_multihead", 2, **pose)
     assert theirs.dof_names == names
-    qpos, qvel = ours.sim.qpos.clone(), ours.sim.qvel.clone()
     theirs.commands.copy_(ours.commands)
-    theirs.sim.qpos.copy_(torch.cat([qpos[:, :7], qpos[:, 7:][:, order]], dim=1))
-    theirs.sim.qvel.copy_(torch.cat([qvel[:, :6], qvel[:, 6:][:, order]], dim=1))
+    theirs.sim.qpos.copy_(torch.cat([ours.sim.qpos[:, :7], ours.sim.qpos[:, 7:][:, order]], dim=1))
+    theirs.sim.qvel.copy_(torch.cat([ours.sim.qvel[:, :6], ours.sim.qvel[:, 6:][:, order]], dim=1))
     generator = torch.Generator().manual_seed(1)
     for _ in range(12):
         actions = 0.3 * torch.randn(2, 2, 12, generator=generator)
         ours.step(actions.flatten(1))
         theirs.step(actions[:, :, order].flatten(1))
-        torch.testing.assert_close(theirs.torques, ours.torques[:, order], atol=2e-3, rtol=1e-3)
+        torch.testing.assert_close(theirs.torques, ours.torques[:, order], atol=1e-4, rtol=0)
         torch.testing.assert_close(theirs.rew_buf, ours.rew_buf, atol=1e-5, rtol=0)
     assert (ours.torques.abs() > 1.0).any() and ours.contacts.any()
 
 
-def test_pose_in_another_order_is_refused(changed):
+def test_orders_that_no_limb_leads_to(changed):
     """Policies see joints in the order of the settings, so that a file in another one cannot pass unseen."""
-    assert "must be in the order of the MJCF's joints" in error_of(load_asset, cfg_of(changed(unitree_order)))
+    cfg = cfg_of(changed())
+    first, second, *others = POSE.items()
+    cfg.init_state.default_joint_angles = dict([second, first, *others])
+    assert "joints cannot be put in the order of init_state.default_joint_angles" in error_of(load_asset, cfg)
 
 
 # --------------------------------------------------------------------------------------------------- motors

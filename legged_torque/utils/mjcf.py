@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Iterator
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import mujoco
@@ -40,6 +41,35 @@ def kept_warnings() -> Iterator[list[str]]:
         yield told
     finally:
         mujoco.set_mju_user_warning(before)
+
+
+def read_spec(file: Path, joints: Sequence[str] = ()) -> mujoco.MjSpec:
+    """Read a MJCF file, with its joints in the order of ``joints`` if moving whole limbs leads there; else as it is.
+
+    Keyframes are left out where limbs are moved, since they are in the file's order. A UserError if the file is missing
+    or cannot be read.
+    """
+    with loading(file):
+        spec = mujoco.MjSpec.from_file(str(file))
+        names = [joint.name for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
+        if names == list(joints) or sorted(names) != sorted(joints):
+            return spec
+        root = ElementTree.parse(file).getroot()
+        if root.find(".//include") is not None:
+            return spec
+        ranks = {name: rank for rank, name in enumerate(joints)}
+
+        def first_joint(part: ElementTree.Element) -> int:
+            below = part.iter("joint") if part.tag in ("body", "frame") else ()
+            return min((ranks.get(joint.get("name", ""), -1) for joint in below), default=-1)
+
+        for parent in root.findall("worldbody//*"):
+            parent[:] = sorted(parent, key=first_joint)
+        for keyframe in root.findall("keyframe"):
+            root.remove(keyframe)
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        spec.modelfiledir = str(Path(file).absolute().parent)
+        return spec
 
 
 def motors_of(model: mujoco.MjModel, joint: int) -> list[int]:
