@@ -16,7 +16,7 @@ from legged_torque.envs.base.held_pose import standing_note
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.sim.model import build_model
 from legged_torque.sim.simulator import ENGINES, Simulator
-from legged_torque.utils.mjcf import read_spec
+from legged_torque.utils.mjcf import read_spec, robot_notes
 from legged_torque.viewer.ground import drawn_model
 
 A1 = RESOURCES_DIR / "robots/a1/a1.xml"
@@ -287,6 +287,13 @@ def test_refused(changed, changes, reason):
     assert told.startswith(f"'{file}' cannot be simulated: ") and reason in told
 
 
+def test_feet_fall_through_the_floor(changed):
+    """Feet that the floor does not touch are told, for every engine."""
+    feet = setting(".//default[@class='foot_collision']/geom", contype="2", conaffinity="2")
+    told = error_of(load_asset, cfg_of(changed(feet)))
+    assert "contype and conaffinity let FR_foot, FL_foot, RR_foot, RL_foot through the geom 'floor'" in told
+
+
 def test_all_problems_at_once(changed):
     """A file with several traps is refused once, with a clause for each."""
     beyond, limits = joint("FL_calf_joint", range="-2.6 -1.6"), setting("actuator/motor[1]", ctrllimited="false")
@@ -345,10 +352,12 @@ def test_ranges_of_another_robot(changed, make_task, capsys):
 
 
 def test_nominal_pose_is_held(changed, make_task):
-    """The A1 stands; with weak gains its trunk falls to the ground, and without feet on one side it tilts over."""
+    """The A1 stands; with weak gains it sinks, and a part that ends episodes may not touch the ground."""
     assert standing_note(make_task("a1_torque", 1)) == ""
     weak = standing_note(make_task("a1_torque", 1, **{"control.stiffness": 3.0}))
-    assert "does not stand under PD control, after " in weak and "'trunk' touches the ground" in weak
+    assert "does not stand under PD control, after " in weak and "the trunk has sunk from 0.30 to 0.15 m" in weak
+    ending = {"asset.terminate_after_contacts_on": ["RL_foot"]}
+    assert "'RL_foot' touches the ground" in standing_note(make_task("a1_torque", 1, **ending))
     assert standing_note(make_task("a1_torque", 1, **{"control.stiffness": 0.0})) == "", "it is not held at all"
 
 
@@ -357,6 +366,16 @@ def test_training_says_that_the_robot_falls(tmp_path):
     words = ["--task=a1_torque", "--num_envs=2", "--max_iterations=1", "--device=cpu", "--set", "control.stiffness=3"]
     status, output, _ = run_here("train.py", *words, root=tmp_path)
     assert status == 0 and output.splitlines()[0].startswith("Note: the nominal pose does not stand under PD control")
+
+
+def test_another_robot_than_in_training(changed, tmp_path):
+    """A file with other axes or masses than that of the training is told; one in another order is the same robot."""
+    assert list(robot_notes(Path(changed(unitree_order, shuffle_motors)), A1)) == []
+    other = Path(changed(turn_left_hips, setting("worldbody/body/inertial", mass="5.713")))
+    axes, mass = robot_notes(other, A1)
+    assert "other axes than the robot of the training: FL_hip_joint, RL_hip_joint are seen and driven wrongly" in axes
+    assert mass == "asset.file has 13.453 kg, the robot of the training 12.453 kg"
+    assert "which is gone" in next(robot_notes(other, tmp_path / "gone.xml"))
 
 
 # --------------------------------------------------------------------------------------------------- symmetry

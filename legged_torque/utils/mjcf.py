@@ -124,6 +124,25 @@ def joint_axes(model: mujoco.MjModel) -> np.ndarray:
     return data.xaxis.copy()
 
 
+def robot_notes(file: Path, trained: Path) -> Iterator[str]:
+    """Yield what of a robot in a MJCF is otherwise than of that with which a policy was trained: axes and mass."""
+    if not trained.is_file():
+        yield f"asset.file is not compared with that of the training, '{trained}', which is gone"
+        return
+    models = []
+    for each in (file, trained):
+        with loading(each):
+            models.append(read_spec(each).compile())
+    ours, theirs = ({m.joint(i).name: axis for i, axis in enumerate(joint_axes(m))} for m in models)
+    turned = [name for name, axis in theirs.items() if name in ours and axis @ ours[name] < 0.999]
+    if turned:
+        names = ", ".join(turned)
+        yield f"asset.file has other axes than the robot of the training: {names} are seen and driven wrongly"
+    masses = [float(model.body_mass.sum()) for model in models]
+    if abs(masses[0] - masses[1]) > 1e-3 * masses[1]:
+        yield f"asset.file has {masses[0]:.3f} kg, the robot of the training {masses[1]:.3f} kg"
+
+
 def joint_limits(model: mujoco.MjModel) -> np.ndarray:
     """Return lowest and highest position of each joint, infinite without a range. Shape: (njnt, 2) [rad]."""
     return np.where(model.jnt_limited[:, np.newaxis] > 0, model.jnt_range, [-np.inf, np.inf])

@@ -10,7 +10,7 @@ import numpy as np
 
 from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.envs.base.robot_checks import foot_notes, pose_problems
+from legged_torque.envs.base.robot_checks import floor_problems, foot_notes, pose_problems
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching
 from legged_torque.sim.robot_file import (
     model_problems,
@@ -67,6 +67,8 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     with told_in(problems):
         problems += model_problems(model)
         problems += pose_problems(nominal_pose(cfg.init_state.default_joint_angles, dof_names), model)
+    if not problems:
+        problems += floor_problems(model, [geoms[place] for place in chosen[0]])
     refuse(problems, f"'{settings.file}' cannot be simulated")
     if use_plain_motors(spec, model):
         with loading(file):

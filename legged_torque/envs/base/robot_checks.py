@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import mujoco
 import numpy as np
 
+from legged_torque.sim.model import FLOOR
 from legged_torque.sim.randomization import Parameter
 from legged_torque.utils.mirroring import Mirroring
 from legged_torque.utils.mjcf import joint_limits
@@ -31,6 +32,14 @@ def foot_notes(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
         if bodies.count(body) != 1:
             has = f"the body '{model.body(body).name}' has {bodies.count(body)} feet"
             yield f"{has}; asset.foot_name chooses {', '.join(feet)}"
+
+
+def floor_problems(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
+    """Yield which feet the ground lets through, whichever engine simulates them."""
+    kinds, floor = (model.geom_contype, model.geom_conaffinity), model.geom(FLOOR).id
+    through = [f for f in feet if not any(a[floor] & b[model.geom(f).id] for a, b in (kinds, kinds[::-1]))]
+    if through:
+        yield f"contype and conaffinity let {', '.join(through)} through the geom '{FLOOR}'"
 
 
 def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, foot_names: Sequence[str]) -> str:
