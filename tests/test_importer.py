@@ -7,8 +7,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import torch
 
+from legged_torque.envs import task_registry
 from legged_torque.envs.base.asset import by_joint, load_asset
+from legged_torque.envs.base.held_pose import standing_note
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfgPPO
 from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import import_robot
 from legged_torque.importer.settings import settings
@@ -77,6 +82,61 @@ def as_mjcf(text):
     return f"{head}{body}</body></worldbody><actuator>{''.join(motors)}</actuator>{text}</mujoco>"
 
 
+def as_menagerie():
+    """A file in the manner of MuJoCo Menagerie.
+
+    It has default classes, visual and collision geoms in groups of their own, visual meshes that are not there, servos in
+    another order than joints, damping for those servos, excluded contacts, a site, sensors, and a keyframe.
+    """
+    legs, servos, excluded = [], [], []
+    for leg, x, y in (("FL", 0.19, 0.05), ("FR", 0.19, -0.05), ("RL", -0.19, 0.05), ("RR", -0.19, -0.05)):
+        side = 0.09 if y > 0 else -0.09
+        legs.append(f"""
+      <body name="{leg}_hip" pos="{x} {y} 0">
+        <inertial pos="0 0 0" mass="0.6" diaginertia="0.0007 0.0006 0.0004"/>
+        <joint class="abduction" name="{leg}_hip_joint"/>
+        <geom class="visual" mesh="hip"/>
+        <geom class="collision" size="0.045 0.02" pos="0 {side} 0" quat="1 1 0 0" type="cylinder"/>
+        <body name="{leg}_thigh" pos="0 {side} 0">
+          <inertial pos="0 0 -0.03" mass="1" diaginertia="0.005 0.005 0.0009"/>
+          <joint class="hip" name="{leg}_thigh_joint"/>
+          <geom class="collision" type="box" size="0.1 0.01 0.015" pos="0 0 -0.1" euler="0 1.5708 0"/>
+          <body name="{leg}_calf" pos="0 0 -0.21">
+            <inertial pos="0 0 -0.12" mass="0.2" diaginertia="0.0015 0.0015 0.00005"/>
+            <joint class="knee" name="{leg}_calf_joint"/>
+            <geom class="collision" size="0.012 0.07" pos="0 0 -0.09"/>
+            <geom name="{leg}" class="foot"/>
+            <site name="{leg}_toe" pos="0 0 -0.21"/>
+          </body>
+        </body>
+      </body>""")
+        servos.insert(0, "".join(f'<general class="{kind}" name="{leg}_{part}" joint="{leg}_{part}_joint"/>'
+                                 for kind, part in (("abduction", "hip"), ("hip", "thigh"), ("knee", "calf"))))  # fmt: skip
+        excluded.append(f'<exclude body1="base" body2="{leg}_thigh"/>')
+    return f"""<mujoco model="dog"><compiler angle="radian" meshdir="assets" autolimits="true"/>
+  <option cone="elliptic" impratio="100"/>
+  <default><default class="dog">
+    <geom friction="0.6" margin="0.001" condim="1"/>
+    <joint axis="0 1 0" damping="1" armature="0.01" frictionloss="0.2"/>
+    <general forcerange="-24 24" biastype="affine" gainprm="50 0 0" biasprm="0 -50 -0.5"/>
+    <default class="abduction"><joint axis="1 0 0" range="-0.9 0.9"/><general ctrlrange="-0.9 0.9"/></default>
+    <default class="hip"><joint range="-0.7 4.5"/><general ctrlrange="-0.7 4.5"/></default>
+    <default class="knee"><joint range="-2.8 -0.9"/><general ctrlrange="-2.8 -0.9" forcerange="-36 36"/></default>
+    <default class="visual"><geom type="mesh" contype="0" conaffinity="0" group="2"/></default>
+    <default class="collision"><geom group="3" type="capsule"/>
+      <default class="foot"><geom type="sphere" size="0.022" pos="0 0 -0.21" priority="1" condim="6"/></default></default>
+  </default></default>
+  <asset><mesh class="dog" file="hip.stl"/><material name="black"/></asset>
+  <worldbody><light name="spotlight" pos="0 0 3"/>
+    <body name="base" pos="0 0 0.45" childclass="dog"><freejoint/><camera name="tracking" pos="2 0 1"/>
+      <inertial pos="0.02 0 0" mass="5" diaginertia="0.07 0.06 0.02"/>
+      <geom class="collision" type="box" size="0.18 0.05 0.05"/><site name="imu"/>{"".join(legs)}
+    </body></worldbody>
+  <contact>{"".join(excluded)}</contact><actuator>{"".join(servos)}</actuator>
+  <sensor><gyro site="imu"/></sensor>
+  <keyframe><key name="home" qpos="0 0 0.27 1 0 0 0 {"0 0.9 -1.8 " * 4}" ctrl="{"0 0.9 -1.8 " * 4}"/></keyframe></mujoco>"""
+
+
 @pytest.fixture
 def written(tmp_path):
     """Import a text and write both files; returns the robot, its model and its settings."""
@@ -119,6 +179,41 @@ def test_urdf(written):
     np.testing.assert_allclose(foot.pos, [0, 0, -0.2], atol=1e-9)
     assert any("base" in note and "missing" in note for note in robot.notes)
     check(model, cfg)
+
+
+def test_menagerie(written):
+    """Its conventions go through: limits are those of forces, geoms keep their places, the pose is the keyframe."""
+    robot, model, cfg = written(as_menagerie(), "xml")
+    assert model.body_mass.sum() == pytest.approx(5 + 4 * 1.8)
+    assert robot.joints == [
+        f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")
+    ]
+    assert model.actuator_forcerange[:, 1].tolist() == [24, 24, 36] * 4
+    assert model.actuator_trnid[:, 0].tolist() == list(range(1, 13))
+    assert model.geom("RL_foot").size[0] == 0.022 and model.geom("FL_hip").type == mujoco.mjtGeom.mjGEOM_SPHERE
+    assert cfg.init_state.default_joint_angles["RR_calf_joint"] == -1.8
+    assert cfg.asset.mirrored_legs == [["FR", "FL"], ["RR", "RL"]]
+    assert any("joint damping up to 1 " in note for note in robot.notes)
+    assert any("12 position or velocity servos" in note for note in robot.notes)
+    check(model, cfg)
+
+
+@pytest.mark.parametrize("source", [urdf(), as_menagerie()], ids=["urdf", "menagerie"])
+def test_training(written, source):
+    """Imported robots train three iterations with everything random; nothing is said of another robot's ranges."""
+    _, _, cfg = written(source, "urdf" if "<robot" in source else "xml")
+    cfg.env.num_envs, cfg.domain_rand.randomize_parameters, cfg.noise.add_noise = 4, True, True
+    train_cfg = LeggedRobotCfgPPO()
+    train_cfg.algorithm.symmetry_cfg.use_data_augmentation = True
+    train_cfg.actor.hidden_dims, train_cfg.runner.num_steps_per_env, train_cfg.evaluation.interval = [8], 4, 0
+    task = LeggedRobot(cfg)
+    assert task.notes == [] and standing_note(task) == ""
+    runner, _ = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=None)
+    before = [parameter.clone() for parameter in runner.alg.actor.parameters()]
+    runner.learn(3)
+    after = list(runner.alg.actor.parameters())
+    assert all(bool(new.isfinite().all()) for new in after)
+    assert any(not torch.equal(new, old) for new, old in zip(after, before, strict=True))
 
 
 def test_mjcf(written):
