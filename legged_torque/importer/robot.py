@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from legged_torque.envs.base.symmetry import counterparts
 from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names, mirrored_legs, world_shape, zero_pose
 from legged_torque.importer.pose import Stance, find_stance
 from legged_torque.importer.shapes import Shape
 from legged_torque.importer.source import Source, read_source
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.mirroring import counterparts
 
 UNLIMITED = np.pi  # [rad] to both sides, of joints without a range
 IMPLAUSIBLE = 20.0  # times weight x height: torque limits beyond this are none
