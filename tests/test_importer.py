@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from legged_torque.envs import task_registry
+from legged_torque.envs import robots, task_registry, tasks
 from legged_torque.envs.base.asset import by_joint, load_asset
 from legged_torque.envs.base.held_pose import standing_note
 from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -284,6 +284,7 @@ TRAPS = {
         "turn the file, x is forwards",
     ),
     "pose at a limit": (urdf().replace('"-2.6" upper="-0.5"', '"-2.6" upper="-1.50049"'), "contacts and options"),
+    "no speed limits": (urdf().replace('velocity="15"', 'velocity="1000"'), "no speed limits that mean anything: 20"),
     "two dashes": (urdf().replace("LF_KFE", "LF--KFE"), "contacts and options"),
 }
 
@@ -348,8 +349,18 @@ def test_script(tmp_path, monkeypatch, capsys):
     (tmp_path / "dog.urdf").write_text(urdf())
     monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--out", "new"])
     runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
-    assert "sim.engine 'fused' simulates it" in capsys.readouterr().out
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["dog.py", "dog.xml"]
+    told = capsys.readouterr().out
+    assert "sim.engine 'fused' simulates it" in told
+    assert told.endswith("Train it: python scripts/train.py --task=dog_position\n")
+    helper = "from legged_torque.envs.robots.a1 import A1Cfg\ndef half(number):\n    return number / 2\n"
+    (tmp_path / "new" / "legs_of_many.py").write_text(helper)
+    monkeypatch.setattr(robots, "__path__", [*robots.__path__, str(tmp_path / "new")])
+    (found,) = [parts for parts in tasks.further_robots() if parts[0] in ("dog", "legs_of_many")]
+    assert [name for name, *_ in tasks.tasks_of(*found)][:2] == ["dog_position", "dog_torque"]
+    monkeypatch.chdir("/")
+    assert len(load_asset(found[1]()).feet) == 4
+    monkeypatch.chdir(tmp_path)
+    assert sorted(path.name for path in (tmp_path / "new").glob("dog.*")) == ["dog.py", "dog.xml"]
     with pytest.raises(SystemExit, match="2"):
         runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
     assert "exists" in capsys.readouterr().err

@@ -18,6 +18,7 @@ from legged_torque.utils.mirroring import counterparts
 UNLIMITED = np.pi  # [rad] to both sides, of joints without a range
 IMPLAUSIBLE = 20.0  # times weight x height: torque limits beyond this are none
 SPEED = 20.0  # [rad/s] of joints without a speed limit
+FASTEST = 100.0  # [rad/s] speed limits from here on are none
 FOOT, TRUNK = "foot", "trunk"  # in the names of the geoms of feet and trunk
 
 
@@ -73,9 +74,9 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     mirrored = mirrored_legs(source, legs)
     if torque_limit is not None:
         source.notes.append(f"torque limits: {torque_limit:g} N m, as given")
-    speed = max(source.speed_limits, default=SPEED)
-    if not source.speed_limits:
-        source.notes.append(f"the file has no speed limits: {SPEED:g} rad/s assumed, asset.max_dof_vel")
+    speed = max((limit for limit in source.speed_limits if limit < FASTEST), default=SPEED)
+    if speed not in source.speed_limits:
+        source.notes.append(f"no speed limits that mean anything: {SPEED:g} rad/s assumed, asset.max_dof_vel")
     stance = find_stance(source, legs, ranges, torques)
     joints = joint_names(source, legs, mirrored)
     prefixes = [leg.name + "_" for leg in legs]
