@@ -174,6 +174,8 @@ def test_urdf(written):
     assert model.jnt_range[1:4].tolist() == [[-0.8, 0.8], [-1.0, 3.0], [-2.6, -0.5]]
     assert (model.actuator_forcerange == [-20, 20]).all()
     assert cfg.asset.max_dof_vel == 15.0
+    torque = model.body_mass.sum() * cfg.rewards.base_height_target / (12.453 * 0.303)  # as many times that of an A1
+    assert cfg.rewards.scales.torques * torque**2 == pytest.approx(-2e-4, rel=0.03)
     assert cfg.asset.mirrored_legs == [["RF", "LF"], ["RH", "LH"]]
     foot = model.geom("RH_foot")
     assert foot.size[0] == 0.025

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from legged_torque.importer.legs import Leg, world_shape, zero_pose
-from legged_torque.importer.source import Source
+from legged_torque.importer.source import GRAVITY, Source
 
 BANDWIDTH = 4.0  # [Hz] natural frequency of a joint under its gains, with the inertia of the leg below it
 DAMPING_RATIO = 0.5  # of the same
@@ -76,7 +76,7 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
     inertia, holding = _inertias(model, data) + armature, _holding_torques(model, data, legs, lows)
     height = -float(np.mean([low[2] for low in lows]))
     stiffness = np.maximum((2 * np.pi * BANDWIDTH) ** 2 * inertia, np.abs(holding) / SAG)
-    weight = -float(model.opt.gravity[2] * model.body_mass.sum())
+    weight = GRAVITY * float(model.body_mass.sum())
     for leg in legs:
         joints = model.body_jntadr[leg.bodies] - 1
         stiffness[joints] = np.maximum(stiffness[joints], TIPPING * weight * height / len(legs))
@@ -147,7 +147,7 @@ def _holding_torques(model: mujoco.MjModel, data: mujoco.MjData, legs: list[Leg]
     mujoco.mj_comVel(model, data)
     mujoco.mj_rne(model, data, 0, data.qfrc_bias)
     torques = data.qfrc_bias.copy()
-    force = np.array([0, 0, -model.opt.gravity[2] * model.body_mass.sum() / len(legs)])
+    force = np.array([0, 0, GRAVITY * model.body_mass.sum() / len(legs)])
     for leg, low in zip(legs, lows, strict=True):
         jac = np.zeros((3, model.nv))
         mujoco.mj_jac(model, data, jac, None, low, leg.bodies[-1])

@@ -11,7 +11,7 @@ import numpy as np
 from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names, mirrored_legs, world_shape, zero_pose
 from legged_torque.importer.pose import Stance, find_stance
 from legged_torque.importer.shapes import Shape
-from legged_torque.importer.source import Source, read_source
+from legged_torque.importer.source import GRAVITY, Source, read_source
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import counterparts
 
@@ -50,6 +50,11 @@ class Robot:
         """Return stiffness [N m/rad] and damping [N m s/rad] as the settings have them. Shape: (2, joints)."""
         tables = self.by_kind(self.stance.stiffness), self.by_kind(self.stance.damping)
         return np.array([[table[kind] for kind in self.kinds] for table in tables])
+
+    @property
+    def weight(self) -> float:
+        """Its weight [N]."""
+        return GRAVITY * float(self.source.model.body_mass.sum())
 
     @property
     def notes(self) -> list[str]:
@@ -121,7 +126,7 @@ def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None
         return np.full(model.njnt - 1, given)
     data = zero_pose(model, source.pose)
     lowest = min(world_shape(data, body, shape)[2] for body, found in shapes.items() for shape in found)
-    enough = float(model.opt.gravity[2] * model.body_mass.sum() * lowest)
+    enough = float(-GRAVITY * model.body_mass.sum() * lowest)
     known = source.torque_limits
     odd = [name for name, limit in zip(source.joints, known, strict=True) if not 0 < limit < IMPLAUSIBLE * enough]
     if odd:

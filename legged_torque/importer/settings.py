@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.importer.pose import BANDWIDTH, DAMPING_RATIO, SAG
 from legged_torque.importer.robot import FOOT, TRUNK, Robot
+
+WEIGHT_TIMES_HEIGHT = 37.0  # [N m] of an A1 with its trunk at 0.303 m
 
 TEMPLATE = '''"""{title}: settings of ``{file}``, imported; each number is a proposal to look at."""
 
@@ -36,6 +39,9 @@ class {cls}Cfg(LeggedRobotCfg):
 
     class rewards:
         base_height_target = {height}
+
+        class scales:
+            torques = {torques:.2g}  # the A1's, as its squared torques are to this robot's: by weight times height
 
 
 class {cls}CfgPPO(LeggedRobotCfgPPO):
@@ -84,6 +90,7 @@ def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
         damping=_table(robot.by_kind(stance.damping)),
         torque_scale=float(f"{0.12 * max(robot.torques):.2g}"),
         height=round(stance.height, 3),
+        torques=LeggedRobotCfg.rewards.scales.torques * (WEIGHT_TIMES_HEIGHT / (robot.weight * stance.height)) ** 2,
         symmetry=SYMMETRY if robot.symmetric else "",
     )
 
