@@ -96,7 +96,7 @@ class LeggedRobotCfg(BaseConfig):
 
     class init_state:  # where episodes start, and the nominal pose
         pos: Place = [0.0, 0.0, 1.0]  # [m] of the trunk at a reset: high enough for stretched legs
-        default_joint_angles: dict[str, float] = {}  # [rad] q_nominal, by joint name, in the order of the MJCF
+        default_joint_angles: dict[str, float] = {}  # [rad] q_nominal, by joint name, in the order that policies see
 
     class domain_rand:
         """What is drawn at random: uniform ranges [lowest, highest]. See ``perturbations`` and ``parameter_ranges``.
