@@ -39,6 +39,31 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
     ``ranges`` [rad] and ``torques`` [N m] are the joints' limits. Shapes: (joints, 2), (joints,).
     """
     model = source.model
+    angles = _nominal_pose(source, legs, ranges)
+    data = zero_pose(model, angles)
+    armature = model.dof_armature[6:].copy()
+    bare = armature <= 0
+    armature[bare] = (ARMATURE * torques)[bare]
+    if bare.any():
+        source.notes.append(
+            f"{bare.sum()} joints without rotor inertia (armature): assumed 0.01 kg m^2 per 33.5 N m, as on the A1; "
+            "put the motor's own there if you know it"
+        )
+    lows = [world_shape(data, leg.bodies[-1], leg.foot) for leg in legs]
+    inertia, holding = _inertias(model, data) + armature, _holding_torques(model, data, legs, lows)
+    height = -float(np.mean([low[2] for low in lows]))
+    stiffness = np.maximum((2 * np.pi * BANDWIDTH) ** 2 * inertia, np.abs(holding) / SAG)
+    weight = GRAVITY * float(model.body_mass.sum())
+    for leg in legs:
+        joints = model.body_jntadr[leg.bodies] - 1
+        stiffness[joints] = np.maximum(stiffness[joints], TIPPING * weight * height / len(legs))
+    damping = 2 * DAMPING_RATIO * np.sqrt(stiffness * inertia)
+    return Stance(angles, height, armature, stiffness, damping, holding)
+
+
+def _nominal_pose(source: Source, legs: list[Leg], ranges: np.ndarray) -> np.ndarray:
+    """Return the angles [rad] of the file's keyframe, otherwise those that inverse kinematics finds. Adds notes."""
+    model = source.model
     if source.pose is not None:
         angles = source.pose
         source.notes.append("nominal pose: the keyframe of the file")
@@ -62,26 +87,7 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
     if outside:
         source.notes.append(f"the nominal pose was beyond the limits of {', '.join(outside)} and is moved inside")
     low, high = np.ceil(1e3 * ranges[:, 0]) / 1e3, np.floor(1e3 * ranges[:, 1]) / 1e3
-    angles = np.clip(angles.round(3), low, high)  # as the settings have them, inside the limits
-    data = zero_pose(model, angles)
-    armature = model.dof_armature[6:].copy()
-    bare = armature <= 0
-    armature[bare] = (ARMATURE * torques)[bare]
-    if bare.any():
-        source.notes.append(
-            f"{bare.sum()} joints without rotor inertia (armature): assumed 0.01 kg m^2 per 33.5 N m, as on the A1; "
-            "put the motor's own there if you know it"
-        )
-    lows = [world_shape(data, leg.bodies[-1], leg.foot) for leg in legs]
-    inertia, holding = _inertias(model, data) + armature, _holding_torques(model, data, legs, lows)
-    height = -float(np.mean([low[2] for low in lows]))
-    stiffness = np.maximum((2 * np.pi * BANDWIDTH) ** 2 * inertia, np.abs(holding) / SAG)
-    weight = GRAVITY * float(model.body_mass.sum())
-    for leg in legs:
-        joints = model.body_jntadr[leg.bodies] - 1
-        stiffness[joints] = np.maximum(stiffness[joints], TIPPING * weight * height / len(legs))
-    damping = 2 * DAMPING_RATIO * np.sqrt(stiffness * inertia)
-    return Stance(angles, height, armature, stiffness, damping, holding)
+    return np.clip(angles.round(3), low, high)  # as the settings have them, inside the limits
 
 
 def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarray, ahead: float) -> float:
