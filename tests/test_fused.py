@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from legged_torque import RESOURCES_DIR
-from legged_torque.sim.model import build_model, read_spec
+from legged_torque.sim.model import build_model
 from legged_torque.sim.simulator import Simulator
+from legged_torque.utils.mjcf import read_spec
 
 FIELDS = ("qpos", "qvel", "ctrl", "qacc_warmstart")
 AIR, FLOOR, DEEP = (1.0, 2.0), (0.05, 0.3), (-0.4, 0.1)

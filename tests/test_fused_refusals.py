@@ -9,9 +9,10 @@ from legged_torque import RESOURCES_DIR
 from legged_torque.envs.base.domain_rand import of_model
 from legged_torque.envs.base.robot_checks import engine_notes
 from legged_torque.sim.fused.tree import read_tree
-from legged_torque.sim.model import build_model, max_constraints, read_spec
+from legged_torque.sim.model import build_model, max_constraints
 from legged_torque.sim.simulator import ENGINES, Simulator
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.mjcf import read_spec
 
 GEOM, JOINT, TRN = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtTrn
 A1 = RESOURCES_DIR / "robots/a1/a1.xml"

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 
 from legged_torque.utils.errors import unknown_name
-from legged_torque.utils.mjcf import loading
 
 CONTACT_DATA = 4  # numbers per contact sensor: number of contacts, then the net force (x, y, z) in the world frame [N]
 
 FLOOR = "floor"  # name of the geom that robots stand on
 _DATASPEC = sum(1 << int(f) for f in (mujoco.mjtConDataField.mjCONDATA_FOUND, mujoco.mjtConDataField.mjCONDATA_FORCE))
 _REDUCE_NETFORCE = 3
-
-
-def read_spec(file: Path) -> mujoco.MjSpec:
-    """Read a MJCF file; a UserError if it is missing or cannot be read."""
-    with loading(file):
-        return mujoco.MjSpec.from_file(str(file))
 
 
 def collision_geoms(spec: mujoco.MjSpec, floor: str = FLOOR) -> list[str]:

@@ -338,7 +338,9 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.events = RandomEvents(cfg, self.sim, self.command_generator, self.init_angles, initial_state(self), drawn)
         self.randomization = self.events.parameters
         self.parameter_mirrors = mirrors(drawn, self.randomization.sizes)
-        self.notes = [*self.asset.notes, *(range_notes(drawn) if cfg.domain_rand.randomize_parameters else ())]
+        self.notes = list(self.asset.notes)
+        if cfg.domain_rand.randomize_parameters:
+            self.notes += range_notes(drawn, self.torque_limits[1].cpu().numpy())
         if cfg.domain_rand.randomize_parameters and changes_legs(drawn):
             self.sim.vary_legs()
 

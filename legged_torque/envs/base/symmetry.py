@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mirroring import AXIAL_VECTOR, Mirroring
+from legged_torque.utils.mirroring import AXIAL_VECTOR, Mirroring, counterparts
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -83,21 +83,6 @@ def _place(names: Names, leg: str) -> int:
         if name.startswith(leg):
             return place
     raise UserError(f"asset.mirrored_legs: no foot's name begins with '{leg}'; the feet are {', '.join(names)}")
-
-
-def counterparts(names: Names, mirrored_legs: Sequence[Names]) -> tuple[int, ...]:
-    """Return where each part's counterpart on the other side is: that of FR_hip is FL_hip; a UserError without it."""
-    other_leg = {leg: other for pair in mirrored_legs for leg, other in (pair, reversed(pair))}
-    result = []
-    for name in names:
-        leg = next((leg for leg in other_leg if name.startswith(leg)), None)
-        if leg is None:
-            raise UserError(f"'{name}' has no counterpart: asset.mirrored_legs, {mirrored_legs}, lacks its leg")
-        other = other_leg[leg] + name.removeprefix(leg)
-        if other not in names:
-            raise UserError(f"'{name}' has no counterpart '{other}' on the other side")
-        result.append(list(names).index(other))
-    return tuple(result)
 
 
 class Mirror:
