@@ -37,11 +37,11 @@ def indices_matching(names: list[str], parts: list[str]) -> list[int]:
     return [i for i, name in enumerate(names) if any(part in name for part in parts)]
 
 
-def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = FLOOR) -> mujoco.MjModel:
+def build_model(spec: mujoco.MjSpec, contact_geoms: list[str]) -> mujoco.MjModel:
     """Compile the model to simulate: without what is only there to be seen, and with contact sensors.
 
-    The contacts of each of ``contact_geoms`` with the floor are sensed, by a sensor each, in this order. They are the
-    only sensors of the model.
+    The contacts of each of ``contact_geoms``, with the floor or other parts of the robot, are sensed, by a sensor each,
+    in this order. They are the only sensors of the model.
     """
     spec.compiler.discardvisual = True
     for sensor in list(spec.sensors):
@@ -50,13 +50,30 @@ def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = FLOO
         spec.add_sensor(
             name=f"{name}_contact",
             type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_GEOM,
-            objname=floor,  # first, since the force is the one that the first geom exerts on the second
             reftype=mujoco.mjtObj.mjOBJ_GEOM,
-            refname=name,
+            refname=name,  # the second geom, since the force is the one that the first exerts on it, whichever that is
             intprm=[_DATASPEC, _REDUCE_NETFORCE, 1],
         )
     return spec.compile()
+
+
+def colliding_pairs(model: mujoco.MjModel) -> np.ndarray:
+    """Return the pairs of geoms that may touch, as MuJoCo filters them. Shape: (pairs, 2).
+
+    That is by ``contype`` and ``conaffinity``, but neither within a body, nor of bodies that are parent and child, nor
+    of those excluded; explicit pairs in any case.
+    """
+    first, second = np.triu_indices(model.ngeom, k=1)
+    bodies = model.geom_bodyid[[first, second]]
+    welds = model.body_weldid[bodies]  # bodies without joints are parts of those that they hang on
+    parents = model.body_weldid[model.body_parentid[welds]]
+    family = (welds[0] == welds[1]) | ((welds > 0).all(axis=0) & (welds == parents[::-1]).any(axis=0))
+    excluded = np.isin((bodies[0] << 16) + bodies[1], model.exclude_signature)
+    types, affinities = model.geom_contype, model.geom_conaffinity
+    meet = (types[first] & affinities[second]) | (types[second] & affinities[first])
+    chosen = np.stack([first, second], axis=1)[(meet != 0) & ~family & ~excluded]
+    named = np.sort(np.stack([model.pair_geom1, model.pair_geom2], axis=1), axis=1)
+    return np.unique(np.concatenate([chosen, named]), axis=0)
 
 
 def max_contacts(model: mujoco.MjModel) -> int:
@@ -67,9 +84,7 @@ def max_contacts(model: mujoco.MjModel) -> int:
     per_type = {int(mujoco.mjtGeom.mjGEOM_SPHERE): 1, int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2}
     if mujoco.mjtGeom.mjGEOM_HFIELD in model.geom_type:
         per_type = dict.fromkeys(map(int, model.geom_type), 4)
-    touches = (model.geom_contype[:, None] & model.geom_conaffinity) != 0
-    pairs = np.argwhere(np.triu(touches | touches.T, k=1))
-    return sum(min(per_type.get(int(kind), 8) for kind in model.geom_type[pair]) for pair in pairs)
+    return sum(min(per_type.get(int(kind), 8) for kind in model.geom_type[pair]) for pair in colliding_pairs(model))
 
 
 def max_constraints(model: mujoco.MjModel, contacts: int, any_friction: bool = False) -> int:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from legged_torque.sim.model import colliding_pairs
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import why_no_motor
 
@@ -77,6 +78,19 @@ def find_floor(model: mujoco.MjModel) -> int:
     """Return the geom that an accepted robot stands on."""
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     return int(np.flatnonzero(np.isin(model.geom_type, FLOORS) & collides)[0])
+
+
+def self_pairs(model: mujoco.MjModel) -> np.ndarray:
+    """Return the pairs of geoms on the robot that may touch each other, the simpler type first. Shape: (pairs, 2)."""
+    pairs = colliding_pairs(model)
+    pairs = pairs[(model.geom_bodyid[pairs] > 0).all(axis=1)]
+    return np.take_along_axis(pairs, model.geom_type[pairs].argsort(axis=1, kind="stable"), axis=1)
+
+
+def places_of_geoms(model: mujoco.MjModel, tree: Tree) -> np.ndarray:
+    """Return branch and depth of the body of each geom; 0 and 0 of the trunk's and the world's. Shape: (geoms, 2)."""
+    places = {model.jnt_bodyid[joint]: place for place, joint in np.ndenumerate(tree.joints)}
+    return np.array([places.get(body, (0, -1)) for body in model.body_weldid[model.geom_bodyid]]) + (0, 1)
 
 
 def check_map(model: mujoco.MjModel) -> None:
@@ -154,9 +168,8 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     floor = np.flatnonzero(np.isin(model.geom_type, floors) & collides)
     robot = collides & (model.geom_bodyid > 0)
-    types, affinities, bodies = model.geom_contype[robot], model.geom_conaffinity[robot], model.geom_bodyid[robot]
+    types, affinities = model.geom_contype[robot], model.geom_conaffinity[robot]
     kinds = {mujoco.mjtGeom(kind) for kind in model.geom_type[robot]}
-    apart = _may_collide(model)[np.ix_(bodies, bodies)]
     on_floor = [(types & model.geom_conaffinity[one]) | (affinities & model.geom_contype[one]) for one in floor]
     solrefs = np.concatenate([model.geom_solref[collides], model.jnt_solref, model.dof_solref])
     mixed = ~((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1))
@@ -164,7 +177,6 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
         {
             "it needs one plane and no other obstacle": len(floor) == 1 and (collides & ~robot).sum() == 1,
             "only spheres, capsules and boxes may collide": kinds <= set(_GEOM_POINTS),
-            "parts of the robot collide with each other": not (types[:, None] & affinities)[apart].any(),
             "the floor lets some of its geoms through": all((touch != 0).all() for touch in on_floor),
             "condim must be 3": bool((model.geom_condim[collides] == 3).all()),
             "geoms have margins or gaps": not (model.geom_margin[collides].any() or model.geom_gap[collides].any()),
@@ -177,15 +189,6 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
 def _excluded(model: mujoco.MjModel) -> np.ndarray:
     """Return pairs of bodies whose contacts are excluded. Shape: (pairs, 2)."""
     return np.stack([model.exclude_signature >> 16, model.exclude_signature & 0xFFFF], axis=1)
-
-
-def _may_collide(model: mujoco.MjModel) -> np.ndarray:
-    """Return which bodies can touch each other: not parent and child, not those excluded. Shape: (nbody, nbody)."""
-    apart = ~np.eye(model.nbody, dtype=bool)
-    children = np.arange(2, model.nbody)
-    pairs = np.concatenate([np.stack([model.body_parentid[children], children], axis=1), _excluded(model)])
-    apart[pairs[:, 0], pairs[:, 1]] = apart[pairs[:, 1], pairs[:, 0]] = False
-    return apart
 
 
 def _of_motors(model: mujoco.MjModel) -> list[str]:

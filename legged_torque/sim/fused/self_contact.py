@@ -1,0 +1,237 @@
+"""Contacts between parts of a robot: which may be, and where they are; see ``self_rows`` for what they do."""
+
+import functools
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+from mujoco_warp._src import collision_primitive_core as primitives
+
+from legged_torque.sim.fused.contact import BOX, CAPSULE, Contact, contact_tangent, mix_rows
+from legged_torque.sim.fused.math import group_sum, quat_to_matrix
+from legged_torque.sim.fused.smooth import Pose
+from legged_torque.sim.fused.tables import Tables, of_world
+from legged_torque.sim.fused.tree import Tree, places_of_geoms, self_pairs
+from legged_torque.sim.fused.types import vec4
+
+MAX_SELF_CONTACTS = wp.constant(24)
+"""Most contacts of a world between parts of its robot. Of more the first ones count, which ``overflow`` tells."""
+SPHERE = wp.constant(2)
+"""MuJoCo's mjGEOM_SPHERE."""
+OVERFLOW = wp.constant(int(mjw.OverflowType.NARROWPHASE))
+
+
+@wp.struct
+class SelfContacts:
+    """The pairs of geoms that may touch, and the contacts between them."""
+
+    pair: wp.array(dtype=wp.vec2i)  # its geoms, first that of the simpler type
+    geom_place: wp.array(dtype=wp.vec2i)  # of each geom: branch, and depth of its body; 0 is the trunk
+    poses: wp.array3d(dtype=Pose)  # (world, branch, depth)
+    found: wp.array(dtype=Contact)  # each world has room for MAX_SELF_CONTACTS; these four as in Contacts
+    residual: wp.array(dtype=vec4)
+    pushing: wp.array(dtype=vec4)
+    change: wp.array(dtype=vec4)
+    geoms: wp.array(dtype=wp.vec2i)  # of each contact
+    normal: wp.array(dtype=wp.vec3)  # of each contact, from the first geom to the second
+    jacobian: wp.array2d(dtype=wp.vec3)  # (contact, joint): motion of the second body less that of the first
+    joints: wp.array2d(dtype=wp.float32)  # (world, joint): accelerations, or a step
+    matrix: wp.array3d(dtype=wp.float32)  # (world, row, column): the whole Newton system, see ``self_rows``
+    overflow: wp.array(dtype=wp.int32)  # MuJoCo Warp's, of each world
+    first: wp.int32  # a thread's own: the contacts of its world, from the first one on
+    end: wp.int32
+    coupled: wp.bool  # likewise: whether one between two branches pushes
+
+
+def pair_kinds(model: mujoco.MjModel) -> tuple[tuple[int, int], ...]:
+    """Return the types of the geoms of pairs that may touch on a robot, the simpler one first; none without pairs."""
+    return tuple(sorted({(int(a), int(b)) for a, b in model.geom_type[self_pairs(model)]}))
+
+
+def make_self_contacts(model: mujoco.MjModel, tree: Tree, data: mjw.Data) -> SelfContacts:
+    """Return the pairs of a robot and room for their contacts, on the current device."""
+    (branches, depth), worlds, joints = tree.joints.shape, data.nworld, model.nv - 6
+    out = SelfContacts()
+    out.pair = wp.array(self_pairs(model), dtype=wp.vec2i)
+    out.geom_place = wp.array(places_of_geoms(model, tree), dtype=wp.vec2i)
+    out.poses = wp.empty((worlds, branches, depth + 1), dtype=Pose)
+    room = worlds * MAX_SELF_CONTACTS
+    out.found, out.geoms, out.normal = (wp.empty(room, dtype=dtype) for dtype in (Contact, wp.vec2i, wp.vec3))
+    out.residual, out.pushing, out.change = (wp.empty(room, dtype=vec4) for _ in range(3))
+    out.jacobian = wp.empty((room, joints), dtype=wp.vec3)
+    out.joints = wp.empty((worlds, joints), dtype=wp.float32)
+    out.matrix = wp.empty((worlds, model.nv + 1, model.nv), dtype=wp.float32)
+    out.overflow = data.overflow
+    return out
+
+
+@wp.struct
+class Shape:
+    """A geom in the world, from the trunk's origin."""
+
+    pos: wp.vec3
+    rot: wp.mat33
+    size: wp.vec3
+
+
+@wp.struct
+class Touch:
+    """The contacts of two geoms, the first ``count`` entries; what does not touch has no negative distance."""
+
+    count: wp.int32
+    dist: primitives.vec8f
+    pos: primitives.mat83f
+    normal: primitives.mat83f
+
+
+@wp.func
+def pose_of(selves: SelfContacts, world: int, geom: int) -> Pose:
+    """Return the pose of a geom's body."""
+    place = selves.geom_place[geom]
+    return selves.poses[world, place[0], place[1]]
+
+
+@wp.func
+def middle_of(tables: Tables, selves: SelfContacts, world: int, geom: int) -> wp.vec3:
+    """Return where a geom is."""
+    pose = pose_of(selves, world, geom)
+    return pose.pos + pose.rot * of_world(tables.geom_pos, world, geom)
+
+
+@wp.func
+def shape_of(tables: Tables, selves: SelfContacts, world: int, geom: int) -> Shape:
+    """Return a geom in the world."""
+    rot = pose_of(selves, world, geom).rot * quat_to_matrix(of_world(tables.geom_quat, world, geom))
+    return Shape(middle_of(tables, selves, world, geom), rot, of_world(tables.geom_size, world, geom))
+
+
+@wp.func
+def reach_of(tables: Tables, world: int, geom: int) -> float:
+    """Return the radius of a sphere around a geom [m]."""
+    size = of_world(tables.geom_size, world, geom)
+    reach = size[0]
+    if tables.geom_type[geom] == CAPSULE:
+        reach = size[0] + size[1]
+    if tables.geom_type[geom] == BOX:
+        reach = wp.length(size)
+    return reach
+
+
+@wp.func
+def add_touch(out: Touch, dist: float, pos: wp.vec3, normal: wp.vec3) -> Touch:
+    """Return contacts with one more, if it is one."""
+    if dist < 0.0:
+        out.dist[out.count] = dist
+        out.pos[out.count] = pos
+        out.normal[out.count] = normal
+        out.count += 1
+    return out
+
+
+@functools.cache
+def touch_function(kinds: tuple[tuple[int, int], ...]) -> wp.Function:
+    """Return ``touch_pair`` for pairs of some types of geoms; the functions of others are large and not compiled."""
+
+    @wp.func
+    def touch_pair(tables: Tables, selves: SelfContacts, world: int, geoms: wp.vec2i) -> Touch:
+        """Return the contacts of two geoms, as MuJoCo finds them."""
+        out = Touch()
+        apart = middle_of(tables, selves, world, geoms[1]) - middle_of(tables, selves, world, geoms[0])
+        reach = reach_of(tables, world, geoms[0]) + reach_of(tables, world, geoms[1])
+        if wp.length_sq(apart) > reach * reach:
+            return out
+        a, b = shape_of(tables, selves, world, geoms[0]), shape_of(tables, selves, world, geoms[1])
+        axis_a, axis_b = wp.vec3(a.rot[0, 2], a.rot[1, 2], a.rot[2, 2]), wp.vec3(b.rot[0, 2], b.rot[1, 2], b.rot[2, 2])
+        kind_a, kind_b = tables.geom_type[geoms[0]], tables.geom_type[geoms[1]]
+        if wp.static((SPHERE, SPHERE) in kinds):
+            if kind_a == SPHERE and kind_b == SPHERE:
+                dist, pos, normal = primitives.sphere_sphere(a.pos, a.size[0], b.pos, b.size[0])
+                out = add_touch(out, dist, pos, normal)
+        if wp.static((SPHERE, CAPSULE) in kinds):
+            if kind_a == SPHERE and kind_b == CAPSULE:
+                dist, pos, normal = primitives.sphere_capsule(a.pos, a.size[0], b.pos, axis_b, b.size[0], b.size[1])
+                out = add_touch(out, dist, pos, normal)
+        if wp.static((SPHERE, BOX) in kinds):
+            if kind_a == SPHERE and kind_b == BOX:
+                dist, pos, normal = primitives.sphere_box(a.pos, a.size[0], b.pos, b.rot, b.size)
+                out = add_touch(out, dist, pos, normal)
+        if wp.static((CAPSULE, CAPSULE) in kinds):
+            if kind_a == CAPSULE and kind_b == CAPSULE:
+                dists, places, normals = primitives.capsule_capsule(
+                    a.pos, axis_a, a.size[0], a.size[1], b.pos, axis_b, b.size[0], b.size[1]
+                )
+                for i in range(2):
+                    out = add_touch(out, dists[i], places[i], normals[i])
+        if wp.static((CAPSULE, BOX) in kinds):
+            if kind_a == CAPSULE and kind_b == BOX:
+                dists, places, normals = primitives.capsule_box(
+                    a.pos, axis_a, a.size[0], a.size[1], b.pos, b.rot, b.size
+                )
+                for i in range(2):
+                    out = add_touch(out, dists[i], places[i], normals[i])
+        if wp.static((BOX, BOX) in kinds):
+            if kind_a == BOX and kind_b == BOX:
+                count, all_dists, all_places, one_normal = primitives.box_box(
+                    a.pos, a.rot, a.size, b.pos, b.rot, b.size, 0.0
+                )
+                for i in range(count):
+                    out = add_touch(out, all_dists[i], all_places[i], one_normal)
+        return out
+
+    return touch_pair
+
+
+@wp.func
+def make_self_contact(
+    tables: Tables, selves: SelfContacts, world: int, geoms: wp.vec2i, dist: float, pos: wp.vec3, normal: wp.vec3
+) -> Contact:
+    """Return a contact between two geoms at a place [m], of a negative distance [m], with a normal to the second."""
+    contact = Contact()
+    contact.pos = pos
+    contact.tangent = contact_tangent(normal, wp.vec3(0.0), False)
+    first, second = pose_of(selves, world, geoms[0]), pose_of(selves, world, geoms[1])
+    velocity = second.lin_vel - first.lin_vel + wp.cross(second.ang_vel - first.ang_vel, pos)
+    return mix_rows(tables, world, geoms[0], geoms[1], dist, velocity, normal, contact)
+
+
+@functools.cache
+def finder(kinds: tuple[tuple[int, int], ...], lanes: int) -> wp.Function:
+    """Return ``find_self_contacts`` for pairs of some types of geoms and a number of threads per world."""
+    touch_pair = touch_function(kinds)
+
+    @wp.func
+    def find_self_contacts(tables: Tables, selves: SelfContacts, world: int, lane: int) -> SelfContacts:
+        """Write a world's contacts between parts of the robot, in the order of the pairs, and return where they are.
+
+        Each thread looks at a pair at a time; the poses must be there already.
+        """
+        selves.first = world * MAX_SELF_CONTACTS
+        last = selves.first + MAX_SELF_CONTACTS
+        end = selves.first + 0
+        for start in range(0, selves.pair.shape[0], wp.static(lanes)):
+            touch = Touch()
+            geoms = wp.vec2i(0, 0)
+            if start + lane < selves.pair.shape[0]:
+                geoms = selves.pair[start + lane]
+                touch = touch_pair(tables, selves, world, geoms)
+            new = int(group_sum(float(touch.count), wp.static(lanes)))
+            if new > 0:
+                place = end + 0
+                for other in range(wp.static(lanes - 1)):  # threads before this one write first
+                    found = group_sum(wp.where(lane == other, float(touch.count), 0.0), wp.static(lanes))
+                    place += wp.where(other < lane, int(found), 0)
+                for i in range(touch.count):
+                    if place + i < last:
+                        selves.geoms[place + i] = geoms
+                        selves.normal[place + i] = touch.normal[i]
+                        selves.found[place + i] = make_self_contact(
+                            tables, selves, world, geoms, touch.dist[i], touch.pos[i], touch.normal[i]
+                        )
+                end += new
+        if end > last and lane == 0:
+            selves.overflow[world] = selves.overflow[world] | OVERFLOW
+        selves.end = wp.min(end, last)
+        return selves
+
+    return find_self_contacts
