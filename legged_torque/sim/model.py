@@ -60,8 +60,8 @@ def build_model(spec: mujoco.MjSpec, contact_geoms: list[str]) -> mujoco.MjModel
 def colliding_pairs(model: mujoco.MjModel) -> np.ndarray:
     """Return the pairs of geoms that may touch, as MuJoCo filters them. Shape: (pairs, 2).
 
-    That is by ``contype`` and ``conaffinity``, but neither within a body, nor of bodies that are parent and child, nor
-    of those excluded; explicit pairs in any case.
+    They meet by ``contype`` and ``conaffinity`` and are neither of one body, nor of parent and child, nor of bodies that
+    are excluded; or they are a ``<pair>``.
     """
     first, second = np.triu_indices(model.ngeom, k=1)
     bodies = model.geom_bodyid[[first, second]]
@@ -74,6 +74,32 @@ def colliding_pairs(model: mujoco.MjModel) -> np.ndarray:
     chosen = np.stack([first, second], axis=1)[(meet != 0) & ~family & ~excluded]
     named = np.sort(np.stack([model.pair_geom1, model.pair_geom2], axis=1), axis=1)
     return np.unique(np.concatenate([chosen, named]), axis=0)
+
+
+def self_pairs(model: mujoco.MjModel) -> np.ndarray:
+    """Return those of :func:`colliding_pairs` whose geoms are both parts of the same robot. Shape: (pairs, 2)."""
+    pairs = colliding_pairs(model)
+    bodies = model.geom_bodyid[pairs]
+    roots, moving = model.body_rootid[bodies], model.body_weldid[bodies] > 0
+    return pairs[(roots[:, 0] == roots[:, 1]) & moving.all(axis=1)]
+
+
+def exclude_self_collisions(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
+    """Let no parts of a robot collide with each other, whatever its file says.
+
+    Returns whether anything has changed, so that ``model``, compiled from ``spec``, is out of date.
+    """
+    pairs = self_pairs(model)
+    bodies = {body.id: body for body in spec.bodies}
+    for first, second in np.unique(model.geom_bodyid[pairs], axis=0).tolist():
+        for body in (first, second):
+            bodies[body].name = bodies[body].name or f"body {body}"
+        spec.add_exclude(bodyname1=bodies[first].name, bodyname2=bodies[second].name)
+    unwanted = {frozenset(pair) for pair in pairs.tolist()}
+    for pair, geoms in zip(list(spec.pairs), zip(model.pair_geom1, model.pair_geom2, strict=True), strict=True):
+        if frozenset(geoms) in unwanted:
+            spec.delete(pair)
+    return len(pairs) > 0
 
 
 def max_contacts(model: mujoco.MjModel) -> int:

@@ -11,7 +11,15 @@ import numpy as np
 from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.robot_checks import foot_notes, pose_problems
-from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching, read_spec
+from legged_torque.sim.model import (
+    FLOOR,
+    build_model,
+    collision_geoms,
+    exclude_self_collisions,
+    indices_matching,
+    read_spec,
+    self_pairs,
+)
 from legged_torque.sim.robot_file import (
     model_problems,
     refuse,
@@ -68,7 +76,15 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
         problems += model_problems(model)
         problems += pose_problems(nominal_pose(cfg.init_state.default_joint_angles, dof_names), model)
     refuse(problems, f"'{settings.file}' cannot be simulated")
-    if use_plain_motors(spec, model):
+    is_changed = use_plain_motors(spec, model)
+    pairs = len(self_pairs(model))
+    if settings.self_collisions and not pairs:
+        why = "no two geoms of its moving parts have contype and conaffinity that meet, or are a <pair>"
+        raise UserError(f"asset.self_collisions is on, but in '{settings.file}' {why}")
+    if pairs and not settings.self_collisions:
+        is_changed = exclude_self_collisions(spec, model)
+        notes.append(f"{pairs} pairs of parts that could collide do not; asset.self_collisions=True lets them")
+    if is_changed:
         with loading(file):
             model = spec.compile()
     model.opt.timestep = cfg.sim.dt

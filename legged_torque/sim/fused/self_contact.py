@@ -12,8 +12,9 @@ from legged_torque.sim.fused.contact import BOX, CAPSULE, Contact, contact_tange
 from legged_torque.sim.fused.math import group_sum, quat_to_matrix
 from legged_torque.sim.fused.smooth import Pose
 from legged_torque.sim.fused.tables import Tables, of_world
-from legged_torque.sim.fused.tree import Tree, places_of_geoms, self_pairs
+from legged_torque.sim.fused.tree import Tree, places_of_geoms
 from legged_torque.sim.fused.types import vec4
+from legged_torque.sim.model import self_pairs
 
 MAX_SELF_CONTACTS = wp.constant(24)
 """Most contacts of a world between parts of its robot. Of more the first ones count, which ``overflow`` tells."""
@@ -44,16 +45,22 @@ class SelfContacts:
     coupled: wp.bool  # likewise: whether one between two branches pushes
 
 
+def ordered_pairs(model: mujoco.MjModel) -> np.ndarray:
+    """Return the pairs of geoms that may touch on a robot, in MuJoCo's order: the simpler type first. Shape: (n, 2)."""
+    pairs = self_pairs(model)
+    return np.take_along_axis(pairs, model.geom_type[pairs].argsort(axis=1, kind="stable"), axis=1)
+
+
 def pair_kinds(model: mujoco.MjModel) -> tuple[tuple[int, int], ...]:
-    """Return the types of the geoms of pairs that may touch on a robot, the simpler one first; none without pairs."""
-    return tuple(sorted({(int(a), int(b)) for a, b in model.geom_type[self_pairs(model)]}))
+    """Return the types of the geoms of these pairs, each once."""
+    return tuple(sorted({(int(a), int(b)) for a, b in model.geom_type[ordered_pairs(model)]}))
 
 
 def make_self_contacts(model: mujoco.MjModel, tree: Tree, data: mjw.Data) -> SelfContacts:
     """Return the pairs of a robot and room for their contacts, on the current device."""
     (branches, depth), worlds, joints = tree.joints.shape, data.nworld, model.nv - 6
     out = SelfContacts()
-    out.pair = wp.array(self_pairs(model), dtype=wp.vec2i)
+    out.pair = wp.array(ordered_pairs(model), dtype=wp.vec2i)
     out.geom_place = wp.array(places_of_geoms(model, tree), dtype=wp.vec2i)
     out.poses = wp.empty((worlds, branches, depth + 1), dtype=Pose)
     room = worlds * MAX_SELF_CONTACTS

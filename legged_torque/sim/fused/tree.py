@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged_torque.sim.model import colliding_pairs
+from legged_torque.sim.model import self_pairs
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import why_no_motor
 
@@ -19,6 +19,7 @@ _GEOM_POINTS = {
     mujoco.mjtGeom.mjGEOM_BOX: (_BOX_CORNERS, 0.0),
 }
 """Where a geom can touch the ground: points in units of its half sizes, and how many radii it is thick around them."""
+_SELF_KINDS = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX}
 
 
 FLOORS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
@@ -78,13 +79,6 @@ def find_floor(model: mujoco.MjModel) -> int:
     """Return the geom that an accepted robot stands on."""
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     return int(np.flatnonzero(np.isin(model.geom_type, FLOORS) & collides)[0])
-
-
-def self_pairs(model: mujoco.MjModel) -> np.ndarray:
-    """Return the pairs of geoms on the robot that may touch each other, the simpler type first. Shape: (pairs, 2)."""
-    pairs = colliding_pairs(model)
-    pairs = pairs[(model.geom_bodyid[pairs] > 0).all(axis=1)]
-    return np.take_along_axis(pairs, model.geom_type[pairs].argsort(axis=1, kind="stable"), axis=1)
 
 
 def places_of_geoms(model: mujoco.MjModel, tree: Tree) -> np.ndarray:
@@ -170,6 +164,7 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
     robot = collides & (model.geom_bodyid > 0)
     types, affinities = model.geom_contype[robot], model.geom_conaffinity[robot]
     kinds = {mujoco.mjtGeom(kind) for kind in model.geom_type[robot]}
+    own = {mujoco.mjtGeom(kind) for kind in model.geom_type[self_pairs(model)].flat}
     on_floor = [(types & model.geom_conaffinity[one]) | (affinities & model.geom_contype[one]) for one in floor]
     solrefs = np.concatenate([model.geom_solref[collides], model.jnt_solref, model.dof_solref])
     mixed = ~((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1))
@@ -178,6 +173,7 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
             "it needs one plane and no other obstacle": len(floor) == 1 and (collides & ~robot).sum() == 1,
             "only spheres, capsules and boxes may collide": kinds <= set(_GEOM_POINTS),
             "the floor lets some of its geoms through": all((touch != 0).all() for touch in on_floor),
+            "only spheres, capsules and boxes of the robot may collide with each other": own <= _SELF_KINDS,
             "condim must be 3": bool((model.geom_condim[collides] == 3).all()),
             "geoms have margins or gaps": not (model.geom_margin[collides].any() or model.geom_gap[collides].any()),
             "surfaces move or stick": not _any_of(model, "geom_surfacevel", "geom_adhesion"),
