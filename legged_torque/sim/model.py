@@ -40,10 +40,11 @@ def indices_matching(names: list[str], parts: list[str]) -> list[int]:
 def build_model(spec: mujoco.MjSpec, contact_geoms: list[str]) -> mujoco.MjModel:
     """Compile the model to simulate: without what is only there to be seen, and with contact sensors.
 
-    The contacts of each of ``contact_geoms``, with the floor or other parts of the robot, are sensed, by a sensor each,
-    in this order. They are the only sensors of the model.
+    Bodies without joints become part of what they are fixed to, unless something refers to them. The contacts of each
+    of ``contact_geoms``, with the floor or other parts of the robot, are sensed, by a sensor each, in this order. They
+    are the only sensors of the model.
     """
-    spec.compiler.discardvisual = True
+    spec.compiler.discardvisual = spec.compiler.fusestatic = True
     for sensor in list(spec.sensors):
         spec.delete(sensor)
     for name in contact_geoms:
@@ -100,6 +101,14 @@ def exclude_self_collisions(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
         if frozenset(geoms) in unwanted:
             spec.delete(pair)
     return len(pairs) > 0
+
+
+def use_known_options(model: mujoco.MjModel) -> None:
+    """Replace the options that MuJoCo Warp refuses although they change no motion: flags and the solver's method."""
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE | mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_FWDINV)
+    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
+        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON  # which finds the same minimum
 
 
 def max_contacts(model: mujoco.MjModel) -> int:

@@ -34,18 +34,21 @@ class Layout(NamedTuple):
     """What a kernel is made for: a robot's structure, and how its branches are spread over threads."""
 
     branches: int
-    depth: int  # joints per branch
+    depth: int  # most joints of a branch
     points: int  # most contacts of a branch with the floor
     lanes: int  # threads per world, a power of two; 1 on a CPU
     on_map: bool  # whether the ground is a height map, not a plane
-    self_kinds: tuple[tuple[int, int], ...] = ()  # types of geoms on the robot that may touch each other
+    alike: bool  # whether all branches have ``depth`` joints; else some have fewer
+    cylinders: bool  # whether any of its geoms is one
+    self_kinds: tuple[tuple[int, int], ...]  # types of pairs of geoms on the robot that may touch each other
 
     @classmethod
     def of(cls, tree: Tree, on_gpu: bool, on_map: bool, self_kinds: tuple[tuple[int, int], ...]) -> "Layout":
         """Return a robot's layout: on a GPU a thread per branch, rounded up to a power of two, else one per world."""
         branches, depth = tree.joints.shape
         points = tree.most_points * (MAX_TOUCHES if on_map else 1)
-        return cls(branches, depth, points, 1 << (branches - 1).bit_length() if on_gpu else 1, on_map, self_kinds)
+        lanes, alike = 1 << (branches - 1).bit_length() if on_gpu else 1, bool((tree.joints >= 0).all())
+        return cls(branches, depth, points, lanes, on_map, alike, tree.has_cylinders, self_kinds)
 
     @property
     def per_lane(self) -> int:
@@ -56,6 +59,20 @@ class Layout(NamedTuple):
     def Selves(self) -> Any:
         """Type of what a kernel is given for contacts between parts of a robot: a number if there are none."""
         return SelfContacts if self.self_kinds else wp.int32
+
+
+@functools.cache
+def joint_counter(layout: Layout) -> wp.Function:
+    """Return a function for the number of a branch's joints: a constant where all are alike, so that nothing masks."""
+    depth, alike = layout.depth, layout.alike
+
+    @wp.func
+    def num_joints(tables: Tables, b: int) -> int:
+        if wp.static(alike):
+            return wp.static(depth)
+        return tables.joint_count[b]
+
+    return num_joints
 
 
 @functools.cache
@@ -91,8 +108,8 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
 
     ``applied_forces`` says whether there are forces that a user applies, ``law`` what computes torques, if anything.
     """
-    branches, depth, points, lanes, on_map, self_kinds = layout
-    per_lane, place = layout.per_lane, places(layout)
+    branches, depth, points, lanes, on_map, _, cylinders, self_kinds = layout
+    per_lane, place, num_joints = layout.per_lane, places(layout), joint_counter(layout)
     find = find_map_contacts if on_map else find_contacts
     Branch, make_links = branch_types(depth).Branch, links_maker(depth)
     Kept, Selves, meets_itself = wp.array(dtype=Branch), layout.Selves, bool(self_kinds)
@@ -119,18 +136,22 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
     ) -> Branch:
         """Return a branch with its equations of motion, constraints and the accelerations to start from."""
         poses = wp.zeros(shape=wp.static(depth + 1), dtype=Pose)
-        branch, links = make_links(tables, worlds, world, b, trunk, poses)
+        joints = num_joints(tables, b)
+        branch, links = make_links(tables, worlds, world, b, joints, trunk, poses)
         if wp.static(applied_forces):
-            branch, links = apply_to_branch(branch, links, tables, worlds, world, b, poses)
-        branch = make_equations(branch, links, tables, world, b, trunk.rot)
-        branch.rows = make_joint_rows(branch.rows, tables, worlds, world, b)
+            branch, links = apply_to_branch(branch, links, tables, worlds, world, b, joints, poses)
+        branch = make_equations(branch, links, tables, world, b, joints, trunk.rot)
+        branch.rows = make_joint_rows(branch.rows, tables, worlds, world, b, joints)
         branch.first_contact = (world * wp.static(branches) + b) * wp.static(points)
-        branch.num_contacts = find(tables, world, b, trunk.pos, poses, contacts, branch.first_contact)
+        branch.num_contacts = find(
+            tables, world, b, trunk.pos, poses, contacts, branch.first_contact, wp.static(cylinders)
+        )
         for j in range(wp.static(depth)):
-            branch.acc[j] = worlds.qacc_warmstart[world, dof(tables.branch_joint[b, j])]
+            if j < joints:
+                branch.acc[j] = worlds.qacc_warmstart[world, dof(tables.branch_joint[b, j])]
         if wp.static(meets_itself):
             self_rows.keep_poses(selves, world, b, poses)
-            self_rows.keep_joints(tables, selves, world, b, branch.acc)
+            self_rows.keep_joints(tables, selves, world, b, joints, branch.acc)
         return branch
 
     @wp.func
@@ -167,7 +188,8 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
             for i in range(wp.static(per_lane)):
                 branch = place.take(kept, world, i, branch)
                 if place.has(lane, i):
-                    self_rows.keep_columns(tables, selves, world, lane + i * wp.static(lanes), branch)
+                    b = lane + i * wp.static(lanes)
+                    self_rows.keep_columns(tables, selves, world, b, num_joints(tables, b), branch)
             sync_group(wp.static(lanes))
             self_rows.start_rows(selves, world, lane, wp.static(lanes))
             sync_group(wp.static(lanes))
@@ -203,7 +225,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
             b = lane + i * wp.static(lanes)
             branch = place.take(kept, world, i, branch)
             if place.has(lane, i):
-                integrate_branch(tables, worlds, world, b, branch, damped)
+                integrate_branch(tables, worlds, world, b, num_joints(tables, b), branch, damped)
                 if sense:
                     sense_branch(tables, worlds, world, b, branch, contacts)
         if wp.static(meets_itself):
@@ -224,7 +246,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
     lanes, per_lane, place = layout.lanes, layout.per_lane, places(layout)
     Branch = branch_types(layout.depth).Branch
     Kept, Selves, meets_itself = wp.array(dtype=Branch), layout.Selves, bool(layout.self_kinds)
-    solve_system = self_rows.system_solver(lanes)
+    num_joints, solve_system = joint_counter(layout), self_rows.system_solver(lanes)
 
     @wp.func
     def assemble_all(
@@ -249,9 +271,10 @@ def in_solver(layout: Layout) -> SimpleNamespace:
             if place.has(lane, i):
                 branch, add = solver.assemble(branch, rot, acc, contacts)
                 if wp.static(meets_itself):
-                    branch = self_rows.push_branch(tables, selves, world, b, branch)
+                    joints = num_joints(tables, b)
+                    branch = self_rows.push_branch(tables, selves, world, b, joints, branch)
                     if selves.coupled:
-                        self_rows.keep_equations(tables, selves, world, b, branch)
+                        self_rows.keep_equations(tables, selves, world, b, joints, branch)
                         whole = solver.add_whole(branch, whole, add)
                 branch.factor = cholesky(branch.factor)
                 system = solver.eliminate(branch, system, add)
@@ -290,9 +313,10 @@ def in_solver(layout: Layout) -> SimpleNamespace:
             if place.has(lane, i):
                 branch.step = solver.branch_step(branch, step)
                 if wp.static(meets_itself):
+                    joints = num_joints(tables, b)
                     if selves.coupled:
-                        branch.step = self_rows.coupled_step(tables, selves, world, b, branch.step)
-                    self_rows.keep_joints(tables, selves, world, b, branch.step)
+                        branch.step = self_rows.coupled_step(tables, selves, world, b, joints, branch.step)
+                    self_rows.keep_joints(tables, selves, world, b, joints, branch.step)
                 branch, of_rows = solver.turn_to(branch, rot, step, contacts)
                 slopes += solver.slopes_at_start(branch, step, of_rows)
             place.keep(kept, world, i, branch)

@@ -34,15 +34,26 @@ def integrate_trunk(timestep: float, worlds: Worlds, world: int, trunk: Trunk, a
 
 
 @wp.func
-def integrate_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch: AnyBranch, damped: TrunkMotion):
+def integrate_branch(
+    tables: Tables, worlds: Worlds, world: int, b: int, joints: int, branch: AnyBranch, damped: TrunkMotion
+):
     """Write a branch's state after the step, given what implicit damping adds to the trunk's accelerations."""
     change = branch_step(branch, damped)
     for j in range(len(branch.acc)):
-        joint = tables.branch_joint[b, j]
-        vel = worlds.qvel[world, dof(joint)] + tables.timestep * (branch.acc[j] + change[j])
-        worlds.qacc_warmstart[world, dof(joint)] = branch.acc[j]
-        worlds.qvel[world, dof(joint)] = vel
-        worlds.qpos[world, qadr(joint)] = worlds.qpos[world, qadr(joint)] + tables.timestep * vel
+        if j < joints:
+            joint = tables.branch_joint[b, j]
+            vel = worlds.qvel[world, dof(joint)] + tables.timestep * (branch.acc[j] + change[j])
+            worlds.qacc_warmstart[world, dof(joint)] = branch.acc[j]
+            worlds.qvel[world, dof(joint)] = vel
+            worlds.qpos[world, qadr(joint)] = worlds.qpos[world, qadr(joint)] + tables.timestep * vel
+
+
+@wp.func
+def add_to_sensor(worlds: Worlds, world: int, address: int, force: wp.vec3):
+    """Add a contact and its force to a contact sensor."""
+    worlds.sensordata[world, address] = worlds.sensordata[world, address] + 1.0
+    for r in range(3):
+        worlds.sensordata[world, address + 1 + r] = worlds.sensordata[world, address + 1 + r] + force[r]
 
 
 @wp.func
@@ -59,20 +70,19 @@ def sense_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch: Any
             force = contact_force(
                 contacts.found[k], contact_normal(contacts, k), contacts.residual[k], contacts.pushing[k]
             )
-            worlds.sensordata[world, address] = worlds.sensordata[world, address] + 1.0
-            for r in range(3):
-                worlds.sensordata[world, address + 1 + r] = worlds.sensordata[world, address + 1 + r] + force[r]
+            add_to_sensor(worlds, world, address, force)
 
 
 @wp.func
 def sense_self_contacts(tables: Tables, worlds: Worlds, world: int, selves: SelfContacts):
     """Add contacts between parts of the robot to the sensors of both geoms, which those with the ground have set."""
+    for k in range(selves.airborne.shape[0]):
+        for r in range(4):
+            worlds.sensordata[world, selves.airborne[k] + r] = 0.0
     for k in range(selves.first, selves.end):
         force = contact_force(selves.found[k], selves.normal[k], selves.residual[k], selves.pushing[k])
         for side in range(2):
             address = tables.geom_sensor[selves.geoms[k][side]]
             if address >= 0:
                 sign = wp.where(side == 0, -1.0, 1.0)
-                worlds.sensordata[world, address] = worlds.sensordata[world, address] + 1.0
-                for r in range(3):
-                    worlds.sensordata[world, address + 1 + r] = worlds.sensordata[world, address + 1 + r] + sign * force[r]
+                add_to_sensor(worlds, world, address, sign * force)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from legged_torque.sim.fused.contact import Contact, contact_normal, half_size, make_contact
+from legged_torque.sim.fused.contact import CYLINDER, Contact, contact_normal, half_size, make_contact, turn_cylinder
 from legged_torque.sim.fused.math import quat_to_matrix
 from legged_torque.sim.fused.smooth import Poses
 from legged_torque.sim.fused.surface import Surface, is_clear, make_surface, touch_map
@@ -76,22 +76,31 @@ class Point:
 
 
 @wp.func
-def see_geom(tables: Tables, world: int, b: int, index: int, poses: Poses) -> Point:
+def see_geom(tables: Tables, world: int, b: int, index: int, poses: Poses, cylinders: bool) -> Point:
     """Return a point of a branch with all that it shares with the others of its geom."""
     out = Point()
     out.geom = tables.point_geom[b, index]
     out.depth = tables.point_depth[b, index]
-    out.half = half_size(tables, world, out.geom)
+    out.half = half_size(tables, world, out.geom, cylinders)
     out.radius = tables.point_radius[b, index] * of_world(tables.geom_size, world, out.geom)[0]
     pose = poses[out.depth]
     out.middle = pose.pos + pose.rot * of_world(tables.geom_pos, world, out.geom)
     out.turn = pose.rot * quat_to_matrix(of_world(tables.geom_quat, world, out.geom))
+    if cylinders and tables.geom_type[out.geom] == CYLINDER:
+        out.turn = turn_cylinder(out.turn, wp.vec3(0.0, 0.0, 1.0))  # whatever the slope
     return out
 
 
 @wp.func
 def find_map_contacts(
-    tables: Tables, world: int, b: int, origin: wp.vec3, poses: Poses, contacts: MapContacts, first: int
+    tables: Tables,
+    world: int,
+    b: int,
+    origin: wp.vec3,
+    poses: Poses,
+    contacts: MapContacts,
+    first: int,
+    cylinders: bool,
 ) -> int:
     """Write the contacts of a branch with the height map from index ``first`` on and return how many there are.
 
@@ -108,7 +117,7 @@ def find_map_contacts(
         point.is_near = False
         while index < tables.point_count[b] and not point.is_near:
             if tables.point_geom[b, index] != point.geom:
-                point = see_geom(tables, world, b, index, poses)
+                point = see_geom(tables, world, b, index, poses, cylinders)
             if origin[2] + point.middle[2] > surface.top + wp.length(point.half) + point.radius:
                 index = tables.point_next[b, index]  # the geom is above all of the map
             else:

@@ -29,6 +29,7 @@ class SelfContacts:
 
     pair: wp.array(dtype=wp.vec2i)  # its geoms, first that of the simpler type
     geom_place: wp.array(dtype=wp.vec2i)  # of each geom: branch, and depth of its body; 0 is the trunk
+    airborne: wp.array(dtype=wp.int32)  # addresses of the sensors of those geoms that the ground lets through
     poses: wp.array3d(dtype=Pose)  # (world, branch, depth)
     found: wp.array(dtype=Contact)  # each world has room for MAX_SELF_CONTACTS; these four as in Contacts
     residual: wp.array(dtype=vec4)
@@ -61,6 +62,9 @@ def make_self_contacts(model: mujoco.MjModel, tree: Tree, data: mjw.Data) -> Sel
     (branches, depth), worlds, joints = tree.joints.shape, data.nworld, model.nv - 6
     out = SelfContacts()
     out.pair = wp.array(ordered_pairs(model), dtype=wp.vec2i)
+    on_ground = [point[0] for points in tree.points for point in points]
+    airborne = np.setdiff1d(ordered_pairs(model), on_ground)
+    out.airborne = wp.array(model.sensor_adr[np.isin(model.sensor_refid, airborne)], dtype=wp.int32)
     out.geom_place = wp.array(places_of_geoms(model, tree), dtype=wp.vec2i)
     out.poses = wp.empty((worlds, branches, depth + 1), dtype=Pose)
     room = worlds * MAX_SELF_CONTACTS

@@ -32,23 +32,25 @@ def keep_poses(selves: SelfContacts, world: int, b: int, poses: Poses):
 
 
 @wp.func
-def keep_joints(tables: Tables, selves: SelfContacts, world: int, b: int, values: AnyVector):
+def keep_joints(tables: Tables, selves: SelfContacts, world: int, b: int, joints: int, values: AnyVector):
     """Show the accelerations of a branch's joints, or their step, to the other threads of its world."""
     for j in range(len(values)):
-        selves.joints[world, place_of(tables, b, j)] = values[j]
+        if j < joints:
+            selves.joints[world, place_of(tables, b, j)] = values[j]
 
 
 @wp.func
-def keep_columns(tables: Tables, selves: SelfContacts, world: int, b: int, branch: AnyBranch):
+def keep_columns(tables: Tables, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
     """Write the columns of a branch's joints in the Jacobians of all contacts of its world."""
     for k in range(selves.first, selves.end):
         geoms = selves.geoms[k]
         first, second = selves.geom_place[geoms[0]], selves.geom_place[geoms[1]]
         for j in range(len(branch.acc)):
-            motion = column(branch.smooth.lever, j) + wp.cross(column(branch.smooth.axis, j), selves.found[k].pos)
-            sign = wp.where(second[0] == b and j < second[1], 1.0, 0.0)
-            sign -= wp.where(first[0] == b and j < first[1], 1.0, 0.0)
-            selves.jacobian[k, place_of(tables, b, j)] = sign * motion
+            if j < joints:
+                motion = column(branch.smooth.lever, j) + wp.cross(column(branch.smooth.axis, j), selves.found[k].pos)
+                sign = wp.where(second[0] == b and j < second[1], 1.0, 0.0)
+                sign -= wp.where(first[0] == b and j < first[1], 1.0, 0.0)
+                selves.jacobian[k, place_of(tables, b, j)] = sign * motion
 
 
 @wp.func
@@ -92,61 +94,66 @@ def with_coupling(selves: SelfContacts) -> SelfContacts:
 
 
 @wp.func
-def push_branch(tables: Tables, selves: SelfContacts, world: int, b: int, branch: AnyBranch):
+def push_branch(tables: Tables, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
     """Return a branch with what the contacts add to its gradient and to its block of the Hessian."""
     for k in range(selves.first, selves.end):
         force = contact_force(selves.found[k], selves.normal[k], selves.residual[k], selves.pushing[k])
         stiffness = contact_stiffness(selves.found[k], selves.normal[k], selves.pushing[k])
         for j in range(len(branch.acc)):
-            motion = selves.jacobian[k, place_of(tables, b, j)]
-            branch.gradient[j] -= wp.dot(motion, force)
-            pushed = stiffness * motion
-            for i in range(len(branch.acc)):
-                branch.factor[i, j] += wp.dot(selves.jacobian[k, place_of(tables, b, i)], pushed)
+            if j < joints:
+                motion = selves.jacobian[k, place_of(tables, b, j)]
+                branch.gradient[j] -= wp.dot(motion, force)
+                pushed = stiffness * motion
+                for i in range(len(branch.acc)):
+                    if i < joints:
+                        branch.factor[i, j] += wp.dot(selves.jacobian[k, place_of(tables, b, i)], pushed)
     return branch
 
 
 @wp.func
-def keep_equations(tables: Tables, selves: SelfContacts, world: int, b: int, branch: AnyBranch):
+def keep_equations(tables: Tables, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
     """Write a branch's equations into the whole system: its rows, its columns in the trunk's, its right-hand side.
 
     The system has the joints first, then the trunk's translation and rotation; its last row is the right-hand side.
     """
-    joints = selves.joints.shape[1]
+    size = selves.matrix.shape[2]
     for j in range(len(branch.acc)):
-        row = place_of(tables, b, j)
-        for c in range(joints):
-            selves.matrix[world, row, c] = 0.0
-        for k in range(selves.first, selves.end):
-            stiffness = contact_stiffness(selves.found[k], selves.normal[k], selves.pushing[k])
-            pushed = stiffness * selves.jacobian[k, row]
-            for c in range(joints):
-                selves.matrix[world, row, c] = selves.matrix[world, row, c] + wp.dot(pushed, selves.jacobian[k, c])
-        for i in range(len(branch.acc)):
-            selves.matrix[world, row, place_of(tables, b, i)] = branch.factor[j, i]
-        for r in range(3):
-            selves.matrix[world, joints + r, row] = branch.coupling_lin[r, j]
-            selves.matrix[world, joints + 3 + r, row] = branch.coupling_ang[r, j]
-        selves.matrix[world, joints + 6, row] = -branch.gradient[j]
+        if j < joints:
+            row = place_of(tables, b, j)
+            for c in range(size - 6):
+                selves.matrix[world, row, c] = 0.0
+            for k in range(selves.first, selves.end):
+                stiffness = contact_stiffness(selves.found[k], selves.normal[k], selves.pushing[k])
+                pushed = stiffness * selves.jacobian[k, row]
+                for c in range(size - 6):
+                    selves.matrix[world, row, c] = selves.matrix[world, row, c] + wp.dot(pushed, selves.jacobian[k, c])
+            for i in range(len(branch.acc)):
+                if i < joints:
+                    selves.matrix[world, row, place_of(tables, b, i)] = branch.factor[j, i]
+            for r in range(3):
+                selves.matrix[world, size - 6 + r, row] = branch.coupling_lin[r, j]
+                selves.matrix[world, size - 3 + r, row] = branch.coupling_ang[r, j]
+            selves.matrix[world, size, row] = -branch.gradient[j]
 
 
 @wp.func
 def keep_trunk_equations(selves: SelfContacts, world: int, a: mat66, lin: wp.vec3, ang: wp.vec3):
     """Write the trunk's equations into the whole system, given its right-hand sides."""
-    joints = selves.joints.shape[1]
+    size = selves.matrix.shape[2]
     for i in range(6):
         for j in range(6):
-            selves.matrix[world, joints + i, joints + j] = a[i, j]
+            selves.matrix[world, size - 6 + i, size - 6 + j] = a[i, j]
     for i in range(3):
-        selves.matrix[world, joints + 6, joints + i] = lin[i]
-        selves.matrix[world, joints + 6, joints + 3 + i] = ang[i]
+        selves.matrix[world, size, size - 6 + i] = lin[i]
+        selves.matrix[world, size, size - 3 + i] = ang[i]
 
 
 @wp.func
-def coupled_step(tables: Tables, selves: SelfContacts, world: int, b: int, step: AnyVector):
+def coupled_step(tables: Tables, selves: SelfContacts, world: int, b: int, joints: int, step: AnyVector):
     """Return a branch's part of the step from the solution of the whole system."""
     for j in range(len(step)):
-        step[j] = selves.matrix[world, selves.matrix.shape[2], place_of(tables, b, j)]
+        if j < joints:
+            step[j] = selves.matrix[world, selves.matrix.shape[2], place_of(tables, b, j)]
     return step
 
 

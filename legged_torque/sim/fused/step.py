@@ -167,9 +167,7 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
                 if wp.static(meets_itself):
                     if selves.coupled:
                         step = solver.couple_all(world, lane, whole, residual, added, selves)
-                branch, slopes = solver.turn_all(
-                    tables, world, lane, branch, kept, trunk.rot, step, contacts, selves
-                )
+                branch, slopes = solver.turn_all(tables, world, lane, branch, kept, trunk.rot, step, contacts, selves)
                 start = slopes + trunk_slopes(whole, residual, step)
                 decrease = -start[0] * tables.cost_scale
                 if used > 1 and not (decrease > tables.tolerance):
