@@ -61,8 +61,8 @@ def build_model(spec: mujoco.MjSpec, contact_geoms: list[str]) -> mujoco.MjModel
 def colliding_pairs(model: mujoco.MjModel) -> np.ndarray:
     """Return the pairs of geoms that may touch, as MuJoCo filters them. Shape: (pairs, 2).
 
-    They meet by ``contype`` and ``conaffinity`` and are neither of one body, nor of parent and child, nor of bodies that
-    are excluded; or they are a ``<pair>``.
+    They meet by ``contype`` and ``conaffinity`` and are neither of one body, nor of parent and child, nor of bodies
+    that are excluded; or they are a ``<pair>``.
     """
     first, second = np.triu_indices(model.ngeom, k=1)
     bodies = model.geom_bodyid[[first, second]]
@@ -96,9 +96,9 @@ def exclude_self_collisions(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
         for body in (first, second):
             bodies[body].name = bodies[body].name or f"body {body}"
         spec.add_exclude(bodyname1=bodies[first].name, bodyname2=bodies[second].name)
-    unwanted = {frozenset(pair) for pair in pairs.tolist()}
-    for pair, geoms in zip(list(spec.pairs), zip(model.pair_geom1, model.pair_geom2, strict=True), strict=True):
-        if frozenset(geoms) in unwanted:
+    unwanted = {frozenset(model.geom(geom).name for geom in pair) for pair in pairs.tolist()}
+    for pair in list(spec.pairs):
+        if {pair.geomname1, pair.geomname2} in unwanted:
             spec.delete(pair)
     return len(pairs) > 0
 

@@ -56,7 +56,7 @@ class Layout(NamedTuple):
         return -(-self.branches // self.lanes)
 
     @property
-    def Selves(self) -> Any:
+    def selves_type(self) -> Any:
         """Type of what a kernel is given for contacts between parts of a robot: a number if there are none."""
         return SelfContacts if self.self_kinds else wp.int32
 
@@ -104,15 +104,16 @@ def places(layout: Layout) -> SimpleNamespace:
 
 @functools.cache
 def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None) -> SimpleNamespace:
-    """Return what comes before and after the solver: ``drive_all``, ``make_all``, ``meet_all``, ``damp_all``, ``integrate_all``.
+    """Return what comes before and after the solver, in this order: the functions with these names.
 
+    That is ``drive_all``, ``make_all``, ``meet_all``, ``damp_all`` and ``integrate_all``.
     ``applied_forces`` says whether there are forces that a user applies, ``law`` what computes torques, if anything.
     """
     branches, depth, points, lanes, on_map, _, cylinders, self_kinds = layout
     per_lane, place, num_joints = layout.per_lane, places(layout), joint_counter(layout)
     find = find_map_contacts if on_map else find_contacts
     Branch, make_links = branch_types(depth).Branch, links_maker(depth)
-    Kept, Selves, meets_itself = wp.array(dtype=Branch), layout.Selves, bool(self_kinds)
+    Kept, Selves, meets_itself = wp.array(dtype=Branch), layout.selves_type, bool(self_kinds)
     find_self_contacts = finder(self_kinds, lanes)
 
     @wp.func
@@ -245,7 +246,7 @@ def in_solver(layout: Layout) -> SimpleNamespace:
     """
     lanes, per_lane, place = layout.lanes, layout.per_lane, places(layout)
     Branch = branch_types(layout.depth).Branch
-    Kept, Selves, meets_itself = wp.array(dtype=Branch), layout.Selves, bool(layout.self_kinds)
+    Kept, Selves, meets_itself = wp.array(dtype=Branch), layout.selves_type, bool(layout.self_kinds)
     num_joints, solve_system = joint_counter(layout), self_rows.system_solver(lanes)
 
     @wp.func
@@ -283,15 +284,24 @@ def in_solver(layout: Layout) -> SimpleNamespace:
 
     @wp.func
     def couple_all(
-        world: int, lane: int, whole: WholeBody, residual: TrunkMotion, added: TrunkSystem, selves: Selves
+        world: int,
+        lane: int,
+        whole: WholeBody,
+        residual: TrunkMotion,
+        added: TrunkSystem,
+        step: TrunkMotion,
+        selves: Selves,
     ) -> TrunkMotion:
-        """Return the trunk's step of branches that are coupled, and keep theirs, given what they add."""
-        lin = group_sum3(added.rhs_lin, wp.static(lanes)) - residual.lin
-        ang = group_sum3(added.rhs_ang, wp.static(lanes)) - residual.ang
-        matrix = trunk_matrix(whole, added, wp.static(lanes))
-        if lane == 0:
-            self_rows.keep_trunk_equations(selves, world, matrix, lin, ang)
-        return solve_system(selves, world, lane)
+        """Return the trunk's step, another one if branches are coupled; then keep theirs, too. ``added`` is theirs."""
+        if wp.static(meets_itself):  # noqa: SIM102 - this decides what is compiled
+            if selves.coupled:
+                lin = group_sum3(added.rhs_lin, wp.static(lanes)) - residual.lin
+                ang = group_sum3(added.rhs_ang, wp.static(lanes)) - residual.ang
+                matrix = trunk_matrix(whole, added, wp.static(lanes))
+                if lane == 0:
+                    self_rows.keep_trunk_equations(selves, world, matrix, lin, ang)
+                step = solve_system(selves, world, lane)
+        return step
 
     @wp.func
     def turn_all(

@@ -118,6 +118,12 @@ def shape_of(tables: Tables, selves: SelfContacts, world: int, geom: int) -> Sha
 
 
 @wp.func
+def axis_of(shape: Shape) -> wp.vec3:
+    """Return the axis of a capsule."""
+    return wp.vec3(shape.rot[0, 2], shape.rot[1, 2], shape.rot[2, 2])
+
+
+@wp.func
 def reach_of(tables: Tables, world: int, geom: int) -> float:
     """Return the radius of a sphere around a geom [m]."""
     size = of_world(tables.geom_size, world, geom)
@@ -140,54 +146,97 @@ def add_touch(out: Touch, dist: float, pos: wp.vec3, normal: wp.vec3) -> Touch:
     return out
 
 
+@wp.func
+def no_touch(a: Shape, b: Shape) -> Touch:
+    """Return no contact: in the place of functions that a robot does not need, whose code is long."""
+    return Touch()
+
+
+@wp.func
+def sphere_sphere(a: Shape, b: Shape) -> Touch:
+    """Return the contact of two spheres."""
+    dist, pos, normal = primitives.sphere_sphere(a.pos, a.size[0], b.pos, b.size[0])
+    return add_touch(Touch(), dist, pos, normal)
+
+
+@wp.func
+def sphere_capsule(a: Shape, b: Shape) -> Touch:
+    """Return the contact of a sphere and a capsule."""
+    dist, pos, normal = primitives.sphere_capsule(a.pos, a.size[0], b.pos, axis_of(b), b.size[0], b.size[1])
+    return add_touch(Touch(), dist, pos, normal)
+
+
+@wp.func
+def sphere_box(a: Shape, b: Shape) -> Touch:
+    """Return the contact of a sphere and a box."""
+    dist, pos, normal = primitives.sphere_box(a.pos, a.size[0], b.pos, b.rot, b.size)
+    return add_touch(Touch(), dist, pos, normal)
+
+
+@wp.func
+def capsule_capsule(a: Shape, b: Shape) -> Touch:
+    """Return the contacts of two capsules, two if they are parallel."""
+    dist, pos, normal = primitives.capsule_capsule(
+        a.pos, axis_of(a), a.size[0], a.size[1], b.pos, axis_of(b), b.size[0], b.size[1]
+    )
+    return add_touch(add_touch(Touch(), dist[0], pos[0], normal[0]), dist[1], pos[1], normal[1])
+
+
+@wp.func
+def capsule_box(a: Shape, b: Shape) -> Touch:
+    """Return the contacts of a capsule and a box, two at most."""
+    dist, pos, normal = primitives.capsule_box(a.pos, axis_of(a), a.size[0], a.size[1], b.pos, b.rot, b.size)
+    return add_touch(add_touch(Touch(), dist[0], pos[0], normal[0]), dist[1], pos[1], normal[1])
+
+
+@wp.func
+def box_box(a: Shape, b: Shape) -> Touch:
+    """Return the contacts of two boxes, eight at most."""
+    out = Touch()
+    count, dist, pos, normal = primitives.box_box(a.pos, a.rot, a.size, b.pos, b.rot, b.size, 0.0)
+    for i in range(count):
+        out = add_touch(out, dist[i], pos[i], normal)
+    return out
+
+
+_TOUCH = {
+    (SPHERE, SPHERE): sphere_sphere,
+    (SPHERE, CAPSULE): sphere_capsule,
+    (SPHERE, BOX): sphere_box,
+    (CAPSULE, CAPSULE): capsule_capsule,
+    (CAPSULE, BOX): capsule_box,
+    (BOX, BOX): box_box,
+}
+
+
 @functools.cache
 def touch_function(kinds: tuple[tuple[int, int], ...]) -> wp.Function:
-    """Return ``touch_pair`` for pairs of some types of geoms; the functions of others are large and not compiled."""
+    """Return ``touch_pair`` for pairs of some types of geoms."""
+    functions = [function if kind in kinds else no_touch for kind, function in _TOUCH.items()]
+    two_spheres, on_capsule, on_box, two_capsules, capsule_on_box, two_boxes = functions
 
     @wp.func
     def touch_pair(tables: Tables, selves: SelfContacts, world: int, geoms: wp.vec2i) -> Touch:
         """Return the contacts of two geoms, as MuJoCo finds them."""
-        out = Touch()
         apart = middle_of(tables, selves, world, geoms[1]) - middle_of(tables, selves, world, geoms[0])
         reach = reach_of(tables, world, geoms[0]) + reach_of(tables, world, geoms[1])
         if wp.length_sq(apart) > reach * reach:
-            return out
+            return Touch()
         a, b = shape_of(tables, selves, world, geoms[0]), shape_of(tables, selves, world, geoms[1])
-        axis_a, axis_b = wp.vec3(a.rot[0, 2], a.rot[1, 2], a.rot[2, 2]), wp.vec3(b.rot[0, 2], b.rot[1, 2], b.rot[2, 2])
         kind_a, kind_b = tables.geom_type[geoms[0]], tables.geom_type[geoms[1]]
-        if wp.static((SPHERE, SPHERE) in kinds):
-            if kind_a == SPHERE and kind_b == SPHERE:
-                dist, pos, normal = primitives.sphere_sphere(a.pos, a.size[0], b.pos, b.size[0])
-                out = add_touch(out, dist, pos, normal)
-        if wp.static((SPHERE, CAPSULE) in kinds):
-            if kind_a == SPHERE and kind_b == CAPSULE:
-                dist, pos, normal = primitives.sphere_capsule(a.pos, a.size[0], b.pos, axis_b, b.size[0], b.size[1])
-                out = add_touch(out, dist, pos, normal)
-        if wp.static((SPHERE, BOX) in kinds):
-            if kind_a == SPHERE and kind_b == BOX:
-                dist, pos, normal = primitives.sphere_box(a.pos, a.size[0], b.pos, b.rot, b.size)
-                out = add_touch(out, dist, pos, normal)
-        if wp.static((CAPSULE, CAPSULE) in kinds):
-            if kind_a == CAPSULE and kind_b == CAPSULE:
-                dists, places, normals = primitives.capsule_capsule(
-                    a.pos, axis_a, a.size[0], a.size[1], b.pos, axis_b, b.size[0], b.size[1]
-                )
-                for i in range(2):
-                    out = add_touch(out, dists[i], places[i], normals[i])
-        if wp.static((CAPSULE, BOX) in kinds):
-            if kind_a == CAPSULE and kind_b == BOX:
-                dists, places, normals = primitives.capsule_box(
-                    a.pos, axis_a, a.size[0], a.size[1], b.pos, b.rot, b.size
-                )
-                for i in range(2):
-                    out = add_touch(out, dists[i], places[i], normals[i])
-        if wp.static((BOX, BOX) in kinds):
-            if kind_a == BOX and kind_b == BOX:
-                count, all_dists, all_places, one_normal = primitives.box_box(
-                    a.pos, a.rot, a.size, b.pos, b.rot, b.size, 0.0
-                )
-                for i in range(count):
-                    out = add_touch(out, all_dists[i], all_places[i], one_normal)
+        out = Touch()
+        if kind_a == SPHERE and kind_b == SPHERE:
+            out = two_spheres(a, b)
+        if kind_a == SPHERE and kind_b == CAPSULE:
+            out = on_capsule(a, b)
+        if kind_a == SPHERE and kind_b == BOX:
+            out = on_box(a, b)
+        if kind_a == CAPSULE and kind_b == CAPSULE:
+            out = two_capsules(a, b)
+        if kind_a == CAPSULE and kind_b == BOX:
+            out = capsule_on_box(a, b)
+        if kind_a == BOX and kind_b == BOX:
+            out = two_boxes(a, b)
         return out
 
     return touch_pair

@@ -102,7 +102,7 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
     """Return the kernel for a robot's structure, with or without forces that a user applies, and a law for torques."""
     around, solver, lanes = around_solver(layout, applied_forces, law), in_solver(layout), layout.lanes
     Reads = next(iter(law.input_types.values())) if law else wp.int32  # what the law reads: its first argument
-    Branch, Selves, meets_itself = branch_types(layout.depth).Branch, layout.Selves, bool(layout.self_kinds)
+    Branch, Selves, meets_itself = branch_types(layout.depth).Branch, layout.selves_type, bool(layout.self_kinds)
     GroundType = Ground if layout.on_map else wp.int32  # a plane is in the tables
     gather = map_contacts if layout.on_map else plane_contacts
 
@@ -164,9 +164,7 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
                 )
                 residual = trunk_residual(whole, acc)
                 step = solve_trunk(whole, residual, system, wp.static(lanes))
-                if wp.static(meets_itself):
-                    if selves.coupled:
-                        step = solver.couple_all(world, lane, whole, residual, added, selves)
+                step = solver.couple_all(world, lane, whole, residual, added, step, selves)
                 branch, slopes = solver.turn_all(tables, world, lane, branch, kept, trunk.rot, step, contacts, selves)
                 start = slopes + trunk_slopes(whole, residual, step)
                 decrease = -start[0] * tables.cost_scale

@@ -88,8 +88,9 @@ def find_floor(model: mujoco.MjModel) -> int:
 
 def places_of_geoms(model: mujoco.MjModel, tree: Tree) -> np.ndarray:
     """Return branch and depth of the body of each geom; 0 and 0 of the trunk's and the world's. Shape: (geoms, 2)."""
-    places = {model.jnt_bodyid[joint]: place for place, joint in np.ndenumerate(tree.joints) if joint >= 0}
-    return np.array([places.get(body, (0, -1)) for body in model.body_weldid[model.geom_bodyid]]) + (0, 1)
+    joints = ((b, j, joint) for (b, j), joint in np.ndenumerate(tree.joints) if joint >= 0)
+    places = {int(model.jnt_bodyid[joint]): (b, j + 1) for b, j, joint in joints}
+    return np.array([places.get(body, (0, 0)) for body in model.geom_bodyid.tolist()])
 
 
 def check_map(model: mujoco.MjModel) -> None:
