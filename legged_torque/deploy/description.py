@@ -22,7 +22,7 @@ FORMAT_VERSION = 1
 COMMENTS = {
     "format_version": "How to run policy.onnx on a robot; docs/deploy.md of legged_torque explains it.",
     "training": "total_steps: environment steps over all worlds",
-    "robot": "of the training; mass [kg] of all its parts; whether parts collided with each other",
+    "robot": "of the training; mass [kg] of all its parts; self_collisions: whether they collided with each other",
     "network": "one row of observations per robot in, one row of actions out; mean actions, normalization is inside",
     "joint_order": "order of joints in observations, actions and torques",
     "nominal_pose": "[rad]",

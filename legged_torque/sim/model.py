@@ -116,10 +116,10 @@ def max_contacts(model: mujoco.MjModel) -> int:
 
     On a height field, every geom has four at most: those that MuJoCo Warp keeps.
     """
+    on_hfield = int(mujoco.mjtGeom.mjGEOM_HFIELD)
     per_type = {int(mujoco.mjtGeom.mjGEOM_SPHERE): 1, int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2}
-    if mujoco.mjtGeom.mjGEOM_HFIELD in model.geom_type:
-        per_type = dict.fromkeys(map(int, model.geom_type), 4)
-    return sum(min(per_type.get(int(kind), 8) for kind in model.geom_type[pair]) for pair in colliding_pairs(model))
+    kinds = model.geom_type[colliding_pairs(model)].tolist()
+    return sum(4 if on_hfield in pair else min(per_type.get(kind, 8) for kind in pair) for pair in kinds)
 
 
 def max_constraints(model: mujoco.MjModel, contacts: int, any_friction: bool = False) -> int:
