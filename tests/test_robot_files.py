@@ -198,9 +198,10 @@ def test_servos_are_refused(changed, make_task, engine):
     """Every engine says which actuators are no motors, and what to do, in tasks and in simulators of a model."""
     file = changed(servo(3, 4))
     told = error_of(make_task, "a1_torque", 1, **{"asset.file": file, "sim.engine": engine})
-    assert "make a <motor> with a forcerange of what is a servo, whose control is a target (FL_hip, FL_thigh)" in told
+    advice = "a servo, whose control is a target: import_robot.py reads it as a motor (FL_hip, FL_thigh)"
+    assert f"make a <motor> with a forcerange of what is {advice}" in told
     model = build_model(read_spec(file), [])
-    assert "is a servo, whose control is a target (FL_hip, FL_thigh)" in error_of(Simulator, model, 1, "cpu", engine)
+    assert "reads it as a motor (FL_hip, FL_thigh)" in error_of(Simulator, model, 1, "cpu", engine)
 
 
 # --------------------------------------------------------------------------------------------------- what is refused

@@ -122,6 +122,9 @@ def max_contacts(model: mujoco.MjModel) -> int:
     return sum(4 if on_hfield in pair else min(per_type.get(kind, 8) for kind in pair) for pair in kinds)
 
 
+_EQUALITY_ROWS = {int(mujoco.mjtEq.mjEQ_CONNECT): 3, int(mujoco.mjtEq.mjEQ_WELD): 6}  # others have one
+
+
 def max_constraints(model: mujoco.MjModel, contacts: int, any_friction: bool = False) -> int:
     """Return the most constraint rows that one world can have (pyramidal friction cones).
 
@@ -129,4 +132,8 @@ def max_constraints(model: mujoco.MjModel, contacts: int, any_friction: bool = F
     """
     rows_per_contact = 2 * (int(model.geom_condim.max()) - 1)
     friction = model.nv if any_friction else int((model.dof_frictionloss > 0).sum())
-    return contacts * rows_per_contact + friction + int(model.jnt_limited.sum())
+    friction += int((model.tendon_frictionloss > 0).sum())
+    equalities = sum(_EQUALITY_ROWS.get(int(kind), 1) for kind in model.eq_type)
+    return (
+        contacts * rows_per_contact + friction + int(model.jnt_limited.sum() + model.tendon_limited.sum()) + equalities
+    )

@@ -55,7 +55,7 @@ def why_no_motor(model: mujoco.MjModel, actuator: int) -> str:
     if model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED:
         return "has a gain that is not fixed"
     if model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_NONE:
-        return "is a servo, whose control is a target"
+        return "is a servo, whose control is a target: import_robot.py reads it as a motor"
     if model.actuator_dyntype[actuator] != mujoco.mjtDyn.mjDYN_NONE:
         return "has dynamics of its own"
     if not torque_per_control(model, actuator):

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import mujoco
 import numpy as np
 
+from legged_torque.sim.fused.tree import SLOWER, reasons_against
 from legged_torque.sim.randomization import Parameter
 from legged_torque.utils.mirroring import Mirroring
 from legged_torque.utils.mjcf import joint_limits
@@ -31,6 +32,14 @@ def foot_notes(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
         if bodies.count(body) != 1:
             has = f"the body '{model.body(body).name}' has {bodies.count(body)} feet"
             yield f"{has}; asset.foot_name chooses {', '.join(feet)}"
+
+
+def engine_notes(model: mujoco.MjModel, engine: str) -> Iterator[str]:
+    """Yield how much slower the engine is than the fused step, and why that does not simulate the robot."""
+    if engine == "mujoco_warp":
+        reasons = "; ".join(reasons_against(model))
+        why = f"which cannot simulate this robot: {reasons}" if reasons else "which can simulate this robot"
+        yield f"sim.engine 'mujoco_warp' steps worlds, {SLOWER} than 'fused', {why}"
 
 
 def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, foot_names: Sequence[str]) -> str:

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from legged_torque.sim.fused.contact import CYLINDER, Contact, contact_normal, half_size, make_contact, turn_cylinder
+from legged_torque.sim.fused.contact import Contact, contact_normal, half_size, make_contact
 from legged_torque.sim.fused.math import quat_to_matrix
 from legged_torque.sim.fused.smooth import Poses
 from legged_torque.sim.fused.surface import Surface, is_clear, make_surface, touch_map
@@ -86,8 +86,6 @@ def see_geom(tables: Tables, world: int, b: int, index: int, poses: Poses, cylin
     pose = poses[out.depth]
     out.middle = pose.pos + pose.rot * of_world(tables.geom_pos, world, out.geom)
     out.turn = pose.rot * quat_to_matrix(of_world(tables.geom_quat, world, out.geom))
-    if cylinders and tables.geom_type[out.geom] == CYLINDER:
-        out.turn = turn_cylinder(out.turn, wp.vec3(0.0, 0.0, 1.0))  # whatever the slope
     return out
 
 

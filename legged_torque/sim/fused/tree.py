@@ -1,5 +1,6 @@
 """The structure of a robot, if it is one that the fused step can simulate."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,20 +15,25 @@ from legged_torque.utils.mjcf import why_no_motor
 MAX_BRANCHES = 16  # threads of a world must fit into half a warp
 _SELF_KINDS = [mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX]
 _CAPSULE_ENDS = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
-_ON_CIRCLES = [(1.0, 0.0, 1.0), (1.0, 0.0, -1.0), (-0.5, 0.75**0.5, 1.0), (-0.5, -(0.75**0.5), 1.0)]
+_LOWEST_ON_CIRCLES = [(1.0, 0.0, 1.0), (1.0, 0.0, -1.0), (-0.5, 0.75**0.5, 1.0), (-0.5, -(0.75**0.5), 1.0)]
+_AROUND_CIRCLES = [
+    (math.cos(angle), math.sin(angle), z) for z in (-1.0, 1.0) for angle in (math.pi / 4 * i for i in range(8))
+]
 _BOX_CORNERS = [(float(x), float(y), float(z)) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]
 _GEOM_POINTS = {
     mujoco.mjtGeom.mjGEOM_SPHERE: ([(0.0, 0.0, 0.0)], 1.0),
     mujoco.mjtGeom.mjGEOM_CAPSULE: (_CAPSULE_ENDS, 1.0),
-    mujoco.mjtGeom.mjGEOM_CYLINDER: (_ON_CIRCLES, 0.0),
+    mujoco.mjtGeom.mjGEOM_CYLINDER: (_LOWEST_ON_CIRCLES, 0.0),
     mujoco.mjtGeom.mjGEOM_BOX: (_BOX_CORNERS, 0.0),
 }
 """Where a geom can touch the ground: points in units of its half sizes, and how many radii it is thick around them.
 
 Those of a cylinder stand in axes that are turned about its own, see :func:`~.contact.turn_cylinder`: the lowest points
-of both end circles, and two more of the lower circle, which make a triangle.
+of both end circles, and two more of the lower circle, which make a triangle. On a height map such points could turn
+into walls: there it has points all around its end circles that turn with it.
 """
 
+SLOWER = "about 30 times slower"  # on an H200, see docs/performance.md
 FLOORS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 """What robots stand on; the fused step knows planes only, its height maps are none of the model's geoms."""
 
@@ -50,18 +56,13 @@ class Tree:
         return max(1, *(len(points) for points in self.points))
 
 
-def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:1]) -> Tree:
-    """Return the structure of a robot on a floor of one of some types.
+def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:1], on_map: bool = False) -> Tree:
+    """Return the structure of a robot on a floor of one of some types, which may stand for a height map.
 
     A UserError, which tells all of it, if it has something that the fused step does not simulate.
     """
-    reasons = [*_of_bodies(model), *_of_contacts(model, floors), *_of_motors(model), *_of_options(model)]
+    _refuse(reasons_against(model, floors))
     chains = _chains(model)
-    ends = [chain[-1] for chain in chains]
-    reasons += [f"body '{model.body(body).name}' branches" for body in ends if body in model.body_parentid]
-    if not 0 < len(chains) <= MAX_BRANCHES:
-        reasons.append(f"it has {len(chains)} legs, not 1 to {MAX_BRANCHES}")
-    _refuse(reasons)
     points: list[list] = [[] for _ in chains]
     depths = {body: (i, j + 1) for i, chain in enumerate(chains) for j, body in enumerate(chain)}
     trunk_geoms = 0
@@ -73,11 +74,24 @@ def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:
         else:
             branch, depth = depths[model.geom_bodyid[geom]]
         offsets, radius = _GEOM_POINTS[mujoco.mjtGeom(model.geom_type[geom])]
+        if on_map and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            offsets = _AROUND_CIRCLES
         points[branch] += [(int(geom), depth, offset, radius) for offset in offsets]
     joints = np.full((len(chains), max(map(len, chains))), -1)
     for i, chain in enumerate(chains):
         joints[i, : len(chain)] = model.body_jntadr[chain]
     return Tree(joints, points, mujoco.mjtGeom.mjGEOM_CYLINDER in model.geom_type[geoms])
+
+
+def reasons_against(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS) -> list[str]:
+    """Return why the fused step cannot simulate a robot on a floor of one of some types, nothing if it can."""
+    reasons = [*_of_bodies(model), *_of_contacts(model, floors), *_of_motors(model), *_of_options(model)]
+    chains = _chains(model)
+    ends = [chain[-1] for chain in chains]
+    reasons += [f"body '{model.body(body).name}' branches" for body in ends if body in model.body_parentid]
+    if not 0 < len(chains) <= MAX_BRANCHES:
+        reasons.append(f"it has {len(chains)} legs, not 1 to {MAX_BRANCHES}")
+    return reasons
 
 
 def find_floor(model: mujoco.MjModel) -> int:
@@ -103,8 +117,14 @@ def check_map(model: mujoco.MjModel) -> None:
 def _refuse(reasons: list[str]) -> None:
     """Raise a UserError with all reasons not to simulate a robot, if there are any."""
     if reasons:
-        advice = "use sim.engine = 'mujoco_warp', without randomize_parameters"
+        advice = f"use sim.engine = 'mujoco_warp', {SLOWER}, without randomize_parameters"
         raise UserError(f"sim.engine 'fused' cannot simulate this robot: {'; '.join(reasons)}; {advice}")
+
+
+def _of(part: Any, chosen: np.ndarray) -> str:
+    """Return the names of chosen parts of a model, of many the first three, given how to get one by its number."""
+    names = [f"'{part(i).name}'" for i in np.flatnonzero(chosen)]
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _broken(rules: dict[str, bool]) -> list[str]:
@@ -162,14 +182,15 @@ def _of_bodies(model: mujoco.MjModel) -> list[str]:
     """Return what the fused step does not simulate of bodies and joints."""
     hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
     is_free = model.njnt > 0 and model.jnt_type[0] == free and model.jnt_bodyid[0] == 1
-    hinges = (model.body_jntnum[1:] == 1).all() and (model.jnt_type[1:] == hinge).all()
+    has_hinge = (model.body_jntnum == 1) & (np.append(model.jnt_type, -1)[model.body_jntadr] == hinge)
+    odd = ~has_hinge & (np.arange(model.nbody) > 1)
     root = [model.dof_damping[:6], model.dof_armature[:6], model.dof_frictionloss[:6], model.jnt_stiffness[:1]]
     passive = is_free and any(values.any() for values in root)
     nonlinear = _any_of(model, "jnt_stiffnesspoly", "jnt_springyield", "dof_dampingpoly")
     return _broken(
         {
             "its trunk is not free": is_free,
-            "each body but the trunk must have one hinge joint": bool(hinges),
+            f"each body but the trunk must have one hinge joint, unlike {_of(model.body, odd)}": not odd.any(),
             "something beside the trunk hangs on the world": not (model.body_parentid[2:] == 0).any(),
             "bodies are compensated for gravity": not model.body_gravcomp.any(),
             "joint limits have margins": not model.jnt_margin.any(),
@@ -191,15 +212,15 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
     on_floor = np.stack(np.broadcast_arrays(floor[:1], np.flatnonzero(touching)), axis=1) if alone else own
     geoms = np.unique(np.concatenate([own.ravel(), on_floor.ravel(), floor]))
     odd = touching & ~np.isin(model.geom_type, list(_GEOM_POINTS))
-    odd_own = np.unique(own[~np.isin(model.geom_type[own], _SELF_KINDS)])
+    odd_own = np.isin(np.arange(model.ngeom), own) & ~np.isin(model.geom_type, _SELF_KINDS)
     solrefs = np.concatenate([model.geom_solref[geoms], model.jnt_solref, model.dof_solref])
     mixed = ~((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1))
-    names, own_names = (_names_of(model, found) for found in (np.flatnonzero(odd), odd_own))
+    unlike, own_unlike = _of(model.geom, odd), _of(model.geom, odd_own)
     return _broken(
         {
             "it needs one plane and no other obstacle": alone,
-            f"only spheres, capsules, cylinders and boxes may collide, unlike {names}": not odd.any(),
-            f"only its spheres, capsules and boxes may collide with each other, unlike {own_names}": not odd_own.size,
+            f"only spheres, capsules, cylinders and boxes may collide, unlike {unlike}": not odd.any(),
+            f"only spheres, capsules and boxes may collide with each other, unlike {own_unlike}": not odd_own.any(),
             "condim of contacts with the floor must be 3": bool((_condims(model, on_floor) == 3).all()),
             "condim of contacts between its parts must be 3": bool((_condims(model, own) == 3).all()),
             "geoms have margins or gaps": not (model.geom_margin[geoms].any() or model.geom_gap[geoms].any()),
@@ -222,11 +243,6 @@ def _condims(model: mujoco.MjModel, pairs: np.ndarray) -> np.ndarray:
     """Return the dimension of contacts of pairs of geoms: that of higher priority, else the higher one. Shape: (n,)."""
     priority, condim = model.geom_priority[pairs], model.geom_condim[pairs]
     return np.where(priority == priority.max(axis=1, keepdims=True), condim, 0).max(axis=1)
-
-
-def _names_of(model: mujoco.MjModel, geoms: np.ndarray) -> str:
-    """Return the names of the first three of some geoms."""
-    return ", ".join(f"'{model.geom(geom).name}'" for geom in geoms[:3])
 
 
 def _excluded(model: mujoco.MjModel) -> np.ndarray:
