@@ -43,7 +43,9 @@ class Layout(NamedTuple):
     self_kinds: tuple[tuple[int, int], ...]  # types of pairs of geoms on the robot that may touch each other
 
     @classmethod
-    def of(cls, tree: Tree, on_gpu: bool, on_map: bool, self_kinds: tuple[tuple[int, int], ...]) -> "Layout":
+    def of(
+        cls, tree: Tree, on_gpu: bool, on_map: bool = False, self_kinds: tuple[tuple[int, int], ...] = ()
+    ) -> "Layout":
         """Return a robot's layout: on a GPU a thread per branch, rounded up to a power of two, else one per world."""
         branches, depth = tree.joints.shape
         points = tree.most_points * (MAX_TOUCHES if on_map else 1)
