@@ -10,8 +10,9 @@ from test_fused import assert_alike, put, step_fused, step_mujoco
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.fused.self_contact import MAX_SELF_CONTACTS
-from legged_torque.sim.model import build_model, collision_geoms, self_pairs
+from legged_torque.sim.model import build_model, collision_geoms
 from legged_torque.sim.simulator import Simulator
+from legged_torque.utils.mjcf import self_pairs
 
 GEOM = mujoco.mjtGeom
 ROBOT = """<mujoco><compiler angle="radian" autolimits="true"/>

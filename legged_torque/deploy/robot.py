@@ -13,12 +13,13 @@ from legged_torque.deploy import hfield_contacts
 from legged_torque.deploy.differences import axis_signs, joint_notes, policy_limits
 from legged_torque.deploy.ground import ground_heights, place_ground
 from legged_torque.deploy.policy import State
-from legged_torque.sim.model import exclude_self_collisions, self_pairs
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.mjcf import (
     drawing_notes,
+    exclude_self_collisions,
     loading,
     motors_of,
+    self_pairs,
     torque_per_control,
     torque_range,
     why_no_motor,

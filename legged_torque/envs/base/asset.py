@@ -11,15 +11,7 @@ import numpy as np
 from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.robot_checks import engine_notes, foot_notes, pose_problems
-from legged_torque.sim.model import (
-    FLOOR,
-    build_model,
-    collision_geoms,
-    exclude_self_collisions,
-    indices_matching,
-    read_spec,
-    self_pairs,
-)
+from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching, read_spec
 from legged_torque.sim.robot_file import (
     model_problems,
     refuse,
@@ -28,7 +20,7 @@ from legged_torque.sim.robot_file import (
 )
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.errors import UserError, told_in, unknown_name
-from legged_torque.utils.mjcf import drawing_notes, joint_axes, loading
+from legged_torque.utils.mjcf import drawing_notes, exclude_self_collisions, joint_axes, loading, self_pairs
 
 
 @dataclass

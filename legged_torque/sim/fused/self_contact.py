@@ -14,7 +14,7 @@ from legged_torque.sim.fused.smooth import Pose
 from legged_torque.sim.fused.tables import Tables, of_world
 from legged_torque.sim.fused.tree import Tree, places_of_geoms
 from legged_torque.sim.fused.types import vec4
-from legged_torque.sim.model import self_pairs
+from legged_torque.utils.mjcf import self_pairs
 
 MAX_SELF_CONTACTS = wp.constant(24)
 """Most contacts of a world between parts of its robot. Of more the first ones count, which ``overflow`` tells."""

@@ -8,9 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from legged_torque.sim.model import self_pairs
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import why_no_motor
+from legged_torque.utils.mjcf import self_pairs, why_no_motor
 
 MAX_BRANCHES = 16  # threads of a world must fit into half a warp
 _SELF_KINDS = [mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX]
