@@ -25,13 +25,15 @@ ROBOT = """<mujoco><compiler angle="radian" autolimits="true"/>
  <geom name="head" type="sphere" size="0.05" pos="0.14 0 -0.02" mass="1" priority="1" friction="0.3"/>{legs}
  <body name="tail" pos="-0.14 0 0.02"><joint name="tail" axis="0 1 0.2"/>
   <geom name="tail" type="capsule" size="0.015" fromto="0 0 0 0.02 0 -0.15" mass="0.3" solimp="0.5 0.9 0.01 0.5 2"/>
- </body></body></worldbody><actuator>{motors}</actuator></mujoco>"""
+ </body></body></worldbody><actuator>{motors}</actuator><contact>{pairs}</contact></mujoco>"""
 LEG = """<body name="{s}thigh" pos="{x} 0 -0.05"><joint name="{s}1"/>
  <geom name="{s}thigh" type="capsule" size="0.02" fromto="0 0.01 0 0 -0.01 -0.12" mass="0.6" solref="-900 -60"/>
  <body name="{s}shin" pos="0 {y} -0.13"><joint name="{s}2" axis="1 0.4 0" range="-2.4 2.4"/>
   <geom name="{s}shin" type="box" size="0.03 0.02 0.05" pos="0 0 -0.05" mass="0.3" solmix="0.5" solref="0.01 1.2"/>
   <geom name="{s}foot" type="sphere" size="0.03" pos="0 0 -0.12" mass="0.2" friction="1.1" solref="-700 -50"/>
  </body></body>"""
+PAIR = '<pair geom1="{}" geom2="{}" condim="3" friction="0.4 0.4" solref="{}" solimp="0.6 0.9 0.02 0.5 2"/>'
+PAIRS = PAIR.format("hull", "Fshin", "-800 -50") + PAIR.format("Ffoot", "Rshin", "0.03 1.1")
 PARTS = (("F", 0.06, 0.02), ("R", -0.06, -0.02))
 LEGS = "".join(LEG.format(s=side, x=x, y=y) for side, x, y in PARTS)
 MOTORS = "".join(f'<motor joint="{joint}"/>' for joint in ("F1", "F2", "R1", "R2", "tail"))
@@ -39,7 +41,7 @@ MOTORS = "".join(f'<motor joint="{joint}"/>' for joint in ("F1", "F2", "R1", "R2
 
 def make_spec(edit=None):
     """The specification of a robot with two legs of two joints and a tail of one, all parts of which may collide."""
-    spec = mujoco.MjSpec.from_string(ROBOT.format(legs=LEGS, motors=MOTORS))
+    spec = mujoco.MjSpec.from_string(ROBOT.format(legs=LEGS, motors=MOTORS, pairs=PAIRS))
     if edit is not None:
         edit(spec)
     return spec
@@ -90,13 +92,15 @@ def thrown():
 
 
 def test_matches_plain_mujoco(thrown):
-    """All types of pairs, between legs, of legs with the trunk and of both at once, push as in plain MuJoCo."""
+    """All types of pairs, between legs and of legs with the trunk, push as in plain MuJoCo; a ``<pair>`` as it says."""
     model, states, touches = thrown
     pairs = [pair for found in touches for pair in found]
     kinds = [tuple(sorted(model.geom_type[list(pair)].tolist())) for pair in pairs]
     sphere, capsule, box = int(GEOM.mjGEOM_SPHERE), int(GEOM.mjGEOM_CAPSULE), int(GEOM.mjGEOM_BOX)
     for kind in ((sphere, sphere), (sphere, capsule), (sphere, box), (capsule, capsule), (capsule, box), (box, box)):
         assert kinds.count(kind) >= 4, kind
+    named = [frozenset(pair) for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)]
+    assert len(named) == 2 and all([frozenset(pair) for pair in pairs].count(pair) > 4 for pair in named)
     limbs = [{model.body(model.geom_bodyid[geom]).name[:2] for geom in pair} for pair in pairs]
     assert min(limbs.count({"tr", "Fs"}), limbs.count({"tr", "Rs"}), limbs.count({"Fs", "Rs"})) > 20
     expected, actual = step_mujoco(model, states), step_fused(model, states)
@@ -184,7 +188,14 @@ def test_option(tmp_path, thrown):
 def test_option_without_effect(tmp_path):
     """A file that lets no parts collide is told, when the settings want it."""
     file = tmp_path / "robot.xml"
-    file.write_text(make_spec(lambda spec: [setattr(geom, "contype", 0) for geom in spec.geoms[1:]]).to_xml())
+
+    def part(spec):
+        for geom in spec.geoms[1:]:
+            geom.contype = 0
+        for pair in list(spec.pairs):
+            spec.delete(pair)
+
+    file.write_text(make_spec(part).to_xml())
     assert "asset.self_collisions is on, but in" in error_of(load_asset, settings_of(file, True))
 
 
@@ -193,7 +204,7 @@ def test_pairs_are_mujocos(thrown):
     model, states, _ = thrown
     everywhere = {frozenset(pair) for pair in self_pairs(model).tolist()}
     some = compiled(lambda spec: spec.add_exclude(bodyname1="Fshin", bodyname2="Rshin"))
-    assert len(everywhere) - len(self_pairs(some)) == 4  # shin and foot of both
+    assert len(everywhere) - len(self_pairs(some)) == 3  # shin and foot of both, but for the <pair>
     for one, other in (("hull", "Fthigh"), ("Fthigh", "Fshin"), ("hull", "head"), ("Fshin", "Ffoot")):
         assert frozenset((model.geom(one).id, model.geom(other).id)) not in everywhere
     seen = {frozenset(pair) for found in touching(some, states) for pair in found}

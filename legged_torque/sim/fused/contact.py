@@ -6,7 +6,7 @@ from legged_torque.sim.fused.constraint import MIN_VALUE, constraint_mass, refer
 from legged_torque.sim.fused.math import quat_to_matrix
 from legged_torque.sim.fused.smooth import Pose, Poses
 from legged_torque.sim.fused.tables import Tables, of_world
-from legged_torque.sim.fused.types import vec4
+from legged_torque.sim.fused.types import vec4, vec5
 
 MIN_FRICTION = wp.constant(1.0e-5)
 """MuJoCo's mjMINMU."""
@@ -94,21 +94,18 @@ def contact_tangent(normal: wp.vec3, axis: wp.vec3, is_capsule: bool) -> wp.vec3
     return tangent
 
 
-@wp.func
-def mix_rows(
-    tables: Tables,
-    world: int,
-    first: int,
-    second: int,
-    dist: float,
-    velocity: wp.vec3,
-    normal: wp.vec3,
-    contact: Contact,
-) -> Contact:
-    """Return a contact with friction, mass and references of its rows, mixed from two geoms as MuJoCo does.
+@wp.struct
+class Feel:
+    """How a contact of two geoms feels."""
 
-    Velocity is that of the second geom as the first one sees it, to which the normal points.
-    """
+    friction: wp.float32
+    solref: wp.vec2
+    solimp: vec5
+
+
+@wp.func
+def mix_feel(tables: Tables, world: int, first: int, second: int) -> Feel:
+    """Return friction, solref and solimp of a contact of two geoms, mixed as MuJoCo does."""
     weight_first, weight_second = (
         of_world(tables.geom_solmix, world, first),
         of_world(tables.geom_solmix, world, second),
@@ -136,8 +133,27 @@ def mix_rows(
         of_world(tables.geom_solimp, world, second),
     )
     solimp = mix * solimp_second + (1.0 - mix) * solimp_first
-    params = reference_dynamics(solref, solimp, dist, tables.timestep)
-    friction = wp.max(friction, MIN_FRICTION)
+    return Feel(friction, solref, solimp)
+
+
+@wp.func
+def set_rows(
+    tables: Tables,
+    world: int,
+    first: int,
+    second: int,
+    feel: Feel,
+    dist: float,
+    velocity: wp.vec3,
+    normal: wp.vec3,
+    contact: Contact,
+) -> Contact:
+    """Return a contact of two geoms with friction, mass and references of its rows.
+
+    Velocity is that of the second geom as the first one sees it, to which the normal points.
+    """
+    params = reference_dynamics(feel.solref, feel.solimp, dist, tables.timestep)
+    friction = wp.max(feel.friction, MIN_FRICTION)
     invweight = of_world(tables.body_invweight0, world, tables.geom_bodyid[first])[0]  # the world's is 0
     invweight += of_world(tables.body_invweight0, world, tables.geom_bodyid[second])[0]
     regularized = invweight * (1.0 + friction * friction) * 2.0 * friction * friction / tables.impratio
@@ -238,7 +254,8 @@ def make_contact(
     is_capsule = tables.geom_type[geom] == CAPSULE
     contact.tangent = contact_tangent(normal, wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2]), is_capsule)
     velocity = pose.lin_vel + wp.cross(pose.ang_vel, contact.pos)
-    return mix_rows(tables, world, tables.floor, geom, dist, velocity, normal, contact)
+    feel = mix_feel(tables, world, tables.floor, geom)
+    return set_rows(tables, world, tables.floor, geom, feel, dist, velocity, normal, contact)
 
 
 @wp.func

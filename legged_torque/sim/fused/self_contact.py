@@ -8,12 +8,12 @@ import numpy as np
 import warp as wp
 from mujoco_warp._src import collision_primitive_core as primitives
 
-from legged_torque.sim.fused.contact import BOX, CAPSULE, Contact, contact_tangent, mix_rows
+from legged_torque.sim.fused.contact import BOX, CAPSULE, Contact, Feel, contact_tangent, mix_feel, set_rows
 from legged_torque.sim.fused.math import group_sum, quat_to_matrix
 from legged_torque.sim.fused.smooth import Pose
 from legged_torque.sim.fused.tables import Tables, of_world
 from legged_torque.sim.fused.tree import Tree, places_of_geoms
-from legged_torque.sim.fused.types import vec4
+from legged_torque.sim.fused.types import vec4, vec5
 from legged_torque.utils.mjcf import self_pairs
 
 MAX_SELF_CONTACTS = wp.constant(24)
@@ -28,6 +28,10 @@ class SelfContacts:
     """The pairs of geoms that may touch, and the contacts between them."""
 
     pair: wp.array(dtype=wp.vec2i)  # its geoms, first that of the simpler type
+    named: wp.array(dtype=wp.int32)  # of each pair: number of the MJCF's <pair>, -1 of others
+    pair_friction: wp.array2d(dtype=vec5)  # of each <pair>, fields of MuJoCo Warp's model
+    pair_solref: wp.array2d(dtype=wp.vec2)
+    pair_solimp: wp.array2d(dtype=vec5)
     geom_place: wp.array(dtype=wp.vec2i)  # of each geom: branch, and depth of its body; 0 is the trunk
     airborne: wp.array(dtype=wp.int32)  # addresses of the sensors of those geoms that the ground lets through
     poses: wp.array3d(dtype=Pose)  # (world, branch, depth)
@@ -57,11 +61,15 @@ def pair_kinds(model: mujoco.MjModel) -> tuple[tuple[int, int], ...]:
     return tuple(sorted({(int(a), int(b)) for a, b in model.geom_type[ordered_pairs(model)]}))
 
 
-def make_self_contacts(model: mujoco.MjModel, tree: Tree, data: mjw.Data) -> SelfContacts:
+def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree, data: mjw.Data) -> SelfContacts:
     """Return the pairs of a robot and room for their contacts, on the current device."""
     (branches, depth), worlds, joints = tree.joints.shape, data.nworld, model.nv - 6
     out = SelfContacts()
     out.pair = wp.array(ordered_pairs(model), dtype=wp.vec2i)
+    named = {frozenset(pair): i for i, pair in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))}
+    out.named = wp.array([named.get(frozenset(pair), -1) for pair in ordered_pairs(model).tolist()], dtype=wp.int32)
+    for name in ("pair_friction", "pair_solref", "pair_solimp"):
+        setattr(out, name, getattr(warp_model, name))
     on_ground = [point[0] for points in tree.points for point in points]
     airborne = np.setdiff1d(ordered_pairs(model), on_ground)
     out.airborne = wp.array(model.sensor_adr[np.isin(model.sensor_refid, airborne)], dtype=wp.int32)
@@ -244,15 +252,22 @@ def touch_function(kinds: tuple[tuple[int, int], ...]) -> wp.Function:
 
 @wp.func
 def make_self_contact(
-    tables: Tables, selves: SelfContacts, world: int, geoms: wp.vec2i, dist: float, pos: wp.vec3, normal: wp.vec3
+    tables: Tables, selves: SelfContacts, world: int, pair: int, dist: float, pos: wp.vec3, normal: wp.vec3
 ) -> Contact:
-    """Return a contact between two geoms at a place [m], of a negative distance [m], with a normal to the second."""
+    """Return a contact of a pair at a place [m], of a negative distance [m], with a normal to the second geom."""
+    geoms = selves.pair[pair]
     contact = Contact()
     contact.pos = pos
     contact.tangent = contact_tangent(normal, wp.vec3(0.0), False)
     first, second = pose_of(selves, world, geoms[0]), pose_of(selves, world, geoms[1])
     velocity = second.lin_vel - first.lin_vel + wp.cross(second.ang_vel - first.ang_vel, pos)
-    return mix_rows(tables, world, geoms[0], geoms[1], dist, velocity, normal, contact)
+    feel = mix_feel(tables, world, geoms[0], geoms[1])
+    named = selves.named[pair]
+    if named >= 0:
+        friction = of_world(selves.pair_friction, world, named)[0]
+        solref, solimp = of_world(selves.pair_solref, world, named), of_world(selves.pair_solimp, world, named)
+        feel = Feel(friction, solref, solimp)
+    return set_rows(tables, world, geoms[0], geoms[1], feel, dist, velocity, normal, contact)
 
 
 @functools.cache
@@ -286,7 +301,7 @@ def finder(kinds: tuple[tuple[int, int], ...], lanes: int) -> wp.Function:
                         selves.geoms[place + i] = geoms
                         selves.normal[place + i] = touch.normal[i]
                         selves.found[place + i] = make_self_contact(
-                            tables, selves, world, geoms, touch.dist[i], touch.pos[i], touch.normal[i]
+                            tables, selves, world, start + lane, touch.dist[i], touch.pos[i], touch.normal[i]
                         )
                 end += new
         if end > last and lane == 0:

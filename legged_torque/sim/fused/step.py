@@ -69,7 +69,7 @@ class FusedStep:
             waiting = room if layout.per_lane > 1 else 1  # a GPU's threads have one branch each
             self._scratch.append(wp.empty(waiting, dtype=branch_types(layout.depth).Branch))
             ground = make_ground(height_map, room * layout.points) if height_map is not None else 0
-            self._scratch.append(make_self_contacts(mj_model, tree, data) if layout.self_kinds else 0)
+            self._scratch.append(make_self_contacts(mj_model, model, tree, data) if layout.self_kinds else 0)
         self._model = [tables, ground, mj_model.opt.iterations, mj_model.opt.ls_iterations]
         self._data = [data.ctrl, data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, data.solver_niter]
         self._data += [data.xfrc_applied, data.qfrc_applied]

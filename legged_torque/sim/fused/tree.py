@@ -161,7 +161,7 @@ def _of_options(model: mujoco.MjModel) -> list[str]:
     if option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         disabled = [flag for flag in disabled if flag != "eulerdamp"]
     enabled = _names(mujoco.mjtEnableBit, option.enableflags, _HARMLESS_ENABLED)
-    others = model.eq_active0.any() or model.ntendon or model.npair or model.nmocap
+    others = model.eq_active0.any() or model.ntendon or model.nmocap
     return _broken(
         {
             "the friction cone must be pyramidal": option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL,
@@ -171,10 +171,24 @@ def _of_options(model: mujoco.MjModel) -> list[str]:
             "it disables groups of actuators": not option.disableactuator,
             "it has noslip iterations": not option.noslip_iterations,
             "it moves through a fluid": not (option.density or option.viscosity),
-            "equalities, tendons, pairs or mocap": not others,
+            "equalities, tendons or mocap": not others,
+            "a <pair> with the ground, or other than condim 3, one friction and no margin": _plain_pairs(model),
             "some contacts are excluded": not (_excluded(model) == 0).any(),
         }
     )
+
+
+def _plain_pairs(model: mujoco.MjModel) -> bool:
+    """Return whether each <pair> is of two parts of the robot and feels as a pair of geoms may."""
+    grounded = (model.geom_bodyid[[model.pair_geom1, model.pair_geom2]] == 0).any()
+    odd = _any_of(model, "pair_margin", "pair_gap", "pair_solreffriction", "pair_adhesion") or grounded
+    same = (model.pair_friction[:, 0] == model.pair_friction[:, 1]).all()
+    return not odd and bool(same and (model.pair_dim == 3).all() and not _mixed(model.pair_solref).any())
+
+
+def _mixed(solrefs: np.ndarray) -> np.ndarray:
+    """Return which solrefs mix their two formats. Shapes: (n, 2), (n,)."""
+    return ~((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1))
 
 
 def _of_bodies(model: mujoco.MjModel) -> list[str]:
@@ -213,7 +227,6 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
     odd = touching & ~np.isin(model.geom_type, list(_GEOM_POINTS))
     odd_own = np.isin(np.arange(model.ngeom), own) & ~np.isin(model.geom_type, _SELF_KINDS)
     solrefs = np.concatenate([model.geom_solref[geoms], model.jnt_solref, model.dof_solref])
-    mixed = ~((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1))
     unlike, own_unlike = _of(model.geom, odd), _of(model.geom, odd_own)
     return _broken(
         {
@@ -224,7 +237,7 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
             "condim of contacts between its parts must be 3": bool((_condims(model, own) == 3).all()),
             "geoms have margins or gaps": not (model.geom_margin[geoms].any() or model.geom_gap[geoms].any()),
             "surfaces move or stick": not _any_of(model, "geom_surfacevel", "geom_adhesion"),
-            "a solref mixes its two formats": not mixed.any(),
+            "a solref mixes its two formats": not _mixed(solrefs).any(),
         }
     )
 
