@@ -20,6 +20,8 @@ MOTOR = {"gear": [1, 0, 0, 0, 0, 0], "ctrlrange": (-9, 9), "forcerange": (-9, 9)
 HINGES = "each body but the trunk must have one hinge joint, unlike '"
 SPHERE = "type=GEOM.mjGEOM_SPHERE, size=(0.1, 0, 0)"
 SITE = "spec.body('FR_calf').add_site(name='site'); spec.add_actuator(name='x', trntype=TRN.mjTRN_SITE, target='site')"
+LEGS_MEET = "spec.geom('FR_calf').contype = 2; spec.geom('FL_calf').conaffinity |= 2; "
+AIRBORNE = f"spec.body('FL_calf').add_geom({SPHERE}, contype=0, conaffinity=2, condim=3)"
 REFUSED = [
     ("spec.delete(spec.joint('root'))", "its trunk is not free"),
     ("spec.joint('root').type = JOINT.mjJNT_HINGE", "its trunk is not free"),
@@ -36,7 +38,10 @@ REFUSED = [
         "spec.geom('FR_hip').type = GEOM.mjGEOM_ELLIPSOID; spec.geom('FR_hip').size = (0.1, 0.1, 0.2)",
         "only spheres, capsules, cylinders and boxes may collide, unlike 'FR_hip'",
     ),
-    ("spec.geom('FR_foot').contype = 1", "parts of the robot collide with each other"),
+    (f"spec.geom('FR_calf').type = GEOM.mjGEOM_CYLINDER; {LEGS_MEET}", "unlike 'FR_calf'"),
+    (f"spec.geom('FR_calf').contype = 2; {AIRBORNE}.condim = 4", "condim of contacts between its parts must be 3"),
+    (f"spec.geom('FR_calf').contype = 2; {AIRBORNE}.margin = 0.1", "geoms have margins or gaps"),
+    (f"spec.geom('FR_calf').contype = 2; {AIRBORNE}.solref = (-9, 0.7)", "a solref mixes its two formats"),
     ("spec.geom('RR_foot').condim = 4", "condim of contacts with the floor must be 3"),
     ("spec.geom('RR_foot').condim = 1", "condim of contacts with the floor must be 3"),
     ("spec.geom('RR_foot').margin = 0.01", "geoms have margins or gaps"),
@@ -50,9 +55,10 @@ REFUSED = [
         "it disables frictionloss, eulerdamp",
     ),
     ("spec.option.enableflags = mujoco.mjtEnableBit.mjENBL_OVERRIDE", "it enables override"),
-    ("spec.add_equality(type=2, name1='FR_hip_joint', name2='FL_hip_joint')", "equalities, tendons, pairs or mocap"),
-    ("spec.add_tendon(name='t').wrap_joint('FR_hip_joint', 1.0)", "equalities, tendons, pairs or mocap"),
-    ("spec.add_pair(geomname1='floor', geomname2='FR_foot')", "equalities, tendons, pairs or mocap"),
+    ("spec.add_equality(type=2, name1='FR_hip_joint', name2='FL_hip_joint')", "equalities, tendons or mocap"),
+    ("spec.add_tendon(name='t').wrap_joint('FR_hip_joint', 1.0)", "equalities, tendons or mocap"),
+    ("spec.add_pair(geomname1='floor', geomname2='FR_foot')", "a <pair> with the ground"),
+    ("spec.add_pair(geomname1='FL_foot', geomname2='FR_foot', condim=1)", "other than condim 3"),
     ("spec.option.density = 1.2", "it moves through a fluid"),
     ("spec.option.viscosity = 1.2", "it moves through a fluid"),
     ("spec.option.wind = (1, 0, 0); spec.option.density = 1.2", "it moves through a fluid"),
@@ -126,7 +132,6 @@ def test_refused(edit, reason):
 
 
 CALF_MEETS_THIGH = "spec.geom('FR_calf').contype = 2; spec.geom('FR_thigh').conaffinity |= 2"
-LEGS_MEET = "spec.geom('FR_calf').contype = 2; spec.geom('FL_calf').conaffinity |= 2; "
 ACCEPTED = [
     CALF_MEETS_THIGH,
     LEGS_MEET + "spec.add_exclude(bodyname1='FL_calf', bodyname2='FR_calf')",
@@ -157,14 +162,6 @@ def test_solver_of_the_file():
     assert_alike(
         compiled(make_a1()), states, step_fused(compiled(spec), states), step_mujoco(compiled(make_a1()), states)
     )
-
-
-def test_legs_that_meet_are_refused():
-    """Without the exclude, the same collision bits are refused."""
-    spec = make_a1()
-    exec(LEGS_MEET, globals(), {"spec": spec})
-    with pytest.raises(UserError, match="parts of the robot collide with each other"):
-        read_tree(compiled(spec))
 
 
 def test_engine_that_is_slower():

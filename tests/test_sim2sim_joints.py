@@ -105,3 +105,22 @@ def test_all_problems_are_told(policy, changed):
     motors = [setting(f".//motor[@joint='{leg}_calf_joint']", joint=f"{leg}_knee") for leg in ("RR", "RL")]
     told = error_of(MujocoRobot, changed(*renamed, *motors), policy.description)
     assert "'RR_calf_joint'" in told and "'RL_calf_joint'" in told
+
+
+def test_self_collision(policy, changed):
+    """Parts of the robot collide if they did in training, whatever the file says, and then end episodes as well."""
+    file = changed(setting(".//default[@class='collision']/geom", contype="2", conaffinity="3"))
+    pose, said, fallen, forces = policy.nominal_pose.copy(), [], [], []
+    pose[:3] = 0.7, 1.4, -1.3  # the thigh in the trunk
+    for trained in (False, True):
+        with_option = policy.description["robot"] | {"self_collisions": trained}
+        robot = MujocoRobot(file, policy.description | {"robot": with_option})
+        robot.reset(np.array([0.0, 0.0, 1.0]), STATE[1], pose, (np.zeros(3), np.zeros(3), np.zeros(12)))
+        robot.step(np.zeros(12))
+        said.append(robot.notes)
+        fallen.append(robot.has_fallen())
+        forces.append(robot.contact_force())
+    assert said == [["116 pairs of parts that the MJCF lets collide do not, as in training"], []]
+    assert fallen == [False, True] and forces[0] == 0.0 and forces[1] > 10.0
+    (note,) = MujocoRobot(changed(), policy.description | {"robot": with_option}).notes
+    assert note == "parts of the robot collided with each other in training, those of the MJCF do not"

@@ -22,7 +22,7 @@ FORMAT_VERSION = 1
 COMMENTS = {
     "format_version": "How to run policy.onnx on a robot; docs/deploy.md of legged_torque explains it.",
     "training": "total_steps: environment steps over all worlds",
-    "robot": "of the training; mass [kg] of all its parts",
+    "robot": "of the training; mass [kg] of all its parts; self_collisions: whether they collided with each other",
     "network": "one row of observations per robot in, one row of actions out; mean actions, normalization is inside",
     "joint_order": "order of joints in observations, actions and torques",
     "nominal_pose": "[rad]",
@@ -47,7 +47,7 @@ COMMENTS = {
     "initial_state": "of an episode in training, drawn uniformly: [m], [rad], [m/s], [rad/s];\n"
     "trunk_place is added to x and y of trunk_position;\n"
     "joint positions are nominal_pose times joint_position_scale, then inside the joint limits",
-    "episode": "length [s]; parts of names of geoms whose contact with the ground ends an episode",
+    "episode": "length [s]; parts of names of geoms whose contact ends an episode",
     "terrain": "ground of the training, from which its map follows",
 }
 """Comment above each section of the file."""

@@ -149,7 +149,7 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
         "format_version": FORMAT_VERSION,
         "task": name,
         "robot": {"name": file.stem, "file": file.as_posix(), "trunk": model.body(1).name}
-        | {"mass": round(float(model.body_mass.sum()), 6)},
+        | {"mass": round(float(model.body_mass.sum()), 6), "self_collisions": asset.self_collisions},
         "versions": package_versions() | {"legged_torque": __version__},
         "training": training,
         "network": {"file": NETWORK_FILE, "torchscript": TORCHSCRIPT_FILE, "input": "obs", "output": "actions"}

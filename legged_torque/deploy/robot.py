@@ -16,8 +16,10 @@ from legged_torque.deploy.policy import State
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.mjcf import (
     drawing_notes,
+    exclude_self_collisions,
     loading,
     motors_of,
+    self_pairs,
     torque_per_control,
     torque_range,
     why_no_motor,
@@ -62,6 +64,8 @@ class MujocoRobot:
         self.notes += joint_notes(self.model, self._joint_ids, description)
         self._find_motors(description)
         self._find_geoms(description["episode"]["ends_on_contact_of"])
+        collides = description["robot"].get("self_collisions", False)
+        self._is_felt = self._is_ground | (collides & (self.model.body_rootid[self.model.geom_bodyid] == self.trunk))
         self.weight = float(self.model.body_mass.sum() * np.linalg.norm(self.model.opt.gravity))
 
     # ---- sensors and motors ------------------------------------------------------------------------------------------
@@ -122,29 +126,33 @@ class MujocoRobot:
     # ---- contacts ----------------------------------------------------------------------------------------------------
 
     def has_fallen(self) -> bool:
-        """Return whether a geom that ends an episode touched the ground in the last step, or the state diverged.
+        """Return whether a geom that ends an episode touched something in the last step, or the state diverged.
 
-        A robot that has left the ground's edge has fallen, too.
+        That is the ground or another part of the robot. A robot that has left the ground's edge has fallen, too.
         """
         if any(self.data.warning[kind].number for kind in _WARNINGS) or math.isinf(self.height()):
             return True
-        return any(self._is_ending[geom] for _, geom, _ in self._ground_contacts())
+        return any(self._is_ending[geom] for _, geom, _ in self._contacts())
 
     def contact_force(self) -> float:
-        """Return the sum over geoms of the norm of the ground's net force in the last physics step [N]."""
+        """Return the sum over geoms of the norm of the net contact force on them in the last physics step [N]."""
         forces, force = np.zeros((self.model.ngeom, 3)), np.zeros(6)
-        for number, geom, sign in self._ground_contacts():
+        for number, geom, sign in self._contacts():
             mujoco.mj_contactForce(self.model, self.data, number, force)
             forces[geom] += sign * self.data.contact[number].frame.reshape(3, 3).T @ force[:3]
         return float(np.linalg.norm(forces, axis=1).sum())
 
-    def _ground_contacts(self) -> list[tuple[int, int, float]]:
-        """Return number, geom of the robot, and the force's sign on it, of each contact with the ground."""
+    def _contacts(self) -> list[tuple[int, int, float]]:
+        """Return number, geom of the robot, and the force's sign on it, of each contact with the ground.
+
+        Those between parts of the robot are there as well, twice each, if these collided in training.
+        """
         result = []
         for number, contact in enumerate(self.data.contact):
             first, second = contact.geom
-            if contact.exclude == 0 and self._is_ground[first] != self._is_ground[second]:
-                result.append((number, second, 1.0) if self._is_ground[first] else (number, first, -1.0))
+            for geom, other, sign in ((first, second, -1.0), (second, first, 1.0)):
+                if contact.exclude == 0 and not self._is_ground[geom] and self._is_felt[other]:
+                    result.append((number, geom, sign))
         return result
 
     # ---- reading the MJCF --------------------------------------------------------------------------------------------
@@ -155,7 +163,15 @@ class MujocoRobot:
             spec = mujoco.MjSpec.from_file(str(file))
             self.notes += drawing_notes(spec)
             origins = place_ground(spec, description, self.notes)
-            return spec.compile(), origins
+            model = spec.compile()
+            collided, pairs = description["robot"].get("self_collisions", True), len(self_pairs(model))
+            if pairs and not collided:
+                exclude_self_collisions(spec, model)
+                model = spec.compile()
+                self.notes.append(f"{pairs} pairs of parts that the MJCF lets collide do not, as in training")
+            if "self_collisions" in description["robot"] and collided and not pairs:
+                self.notes.append("parts of the robot collided with each other in training, those of the MJCF do not")
+            return model, origins
 
     def _find_root(self) -> None:
         """Find the free joint of the trunk."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import mujoco
-import numpy as np
 
 from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.mjcf import colliding_pairs
 
 CONTACT_DATA = 4  # numbers per contact sensor: number of contacts, then the net force (x, y, z) in the world frame [N]
 
@@ -28,13 +28,12 @@ def indices_matching(names: list[str], parts: list[str], kind: str = "collision 
     return [i for i, name in enumerate(names) if any(part in name for part in parts)]
 
 
-def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = FLOOR) -> mujoco.MjModel:
+def build_model(spec: mujoco.MjSpec, contact_geoms: list[str]) -> mujoco.MjModel:
     """Compile the model to simulate: without what is only there to be seen, and with contact sensors.
 
-    Bodies without joints become part of what they are fixed to, unless something refers to them.
-
-    The contacts of each of ``contact_geoms`` with the floor are sensed, by a sensor each, in this order. They are the
-    only sensors of the model.
+    Bodies without joints become part of what they are fixed to, unless something refers to them. The contacts of each
+    of ``contact_geoms``, with the floor or other parts of the robot, are sensed, by a sensor each, in this order. They
+    are the only sensors of the model.
     """
     spec.compiler.discardvisual = spec.compiler.fusestatic = True
     for sensor in list(spec.sensors):
@@ -43,10 +42,8 @@ def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = FLOO
         spec.add_sensor(
             name=f"{name}_contact",
             type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_GEOM,
-            objname=floor,  # first, since the force is the one that the first geom exerts on the second
             reftype=mujoco.mjtObj.mjOBJ_GEOM,
-            refname=name,
+            refname=name,  # the second geom, since the force is the one that the first exerts on it, whichever that is
             intprm=[_DATASPEC, _REDUCE_NETFORCE, 1],
         )
     return spec.compile()
@@ -65,12 +62,10 @@ def max_contacts(model: mujoco.MjModel) -> int:
 
     On a height field, every geom has four at most: those that MuJoCo Warp keeps.
     """
+    on_hfield = int(mujoco.mjtGeom.mjGEOM_HFIELD)
     per_type = {int(mujoco.mjtGeom.mjGEOM_SPHERE): 1, int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2}
-    if mujoco.mjtGeom.mjGEOM_HFIELD in model.geom_type:
-        per_type = dict.fromkeys(map(int, model.geom_type), 4)
-    touches = (model.geom_contype[:, None] & model.geom_conaffinity) != 0
-    pairs = np.argwhere(np.triu(touches | touches.T, k=1))
-    return sum(min(per_type.get(int(kind), 8) for kind in model.geom_type[pair]) for pair in pairs)
+    kinds = model.geom_type[colliding_pairs(model)].tolist()
+    return sum(4 if on_hfield in pair else min(per_type.get(kind, 8) for kind in pair) for pair in kinds)
 
 
 _EQUALITY_ROWS = {int(mujoco.mjtEq.mjEQ_CONNECT): 3, int(mujoco.mjtEq.mjEQ_WELD): 6}  # others have one

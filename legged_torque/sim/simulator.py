@@ -44,8 +44,9 @@ class Simulator:
         qacc_warmstart: Accelerations from which the constraint solver starts. Shape: (num_envs, nv).
         ctrl: Torques of the motors [N m] in the model's order, which is that of the joints for robots of tasks; times
             gear, if a motor has one. Shape: (num_envs, nu).
-        contact_found: Number of contacts of each sensed geom with the floor, as of the start of the last physics step;
-            after one that does not sense, it is what it was ("fused") or 0 ("mujoco_warp"). Shape: (num_envs, geoms).
+        contact_found: Number of contacts of each sensed geom with the floor or other parts of the robot, as of the
+            start of the last physics step; after one that does not sense, it is what it was ("fused") or 0
+            ("mujoco_warp"). Shape: (num_envs, geoms).
         contact_force: Net contact force on each sensed geom in the world frame [N], likewise.
             Shape: (num_envs, geoms, 3).
         diverged: Worlds whose state was seen to be not finite or absurdly large since the last :meth:`clear_diverged`.

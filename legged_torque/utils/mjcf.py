@@ -154,3 +154,48 @@ def drawing_notes(spec: mujoco.MjSpec) -> Iterator[str]:
     if robot and not any(geom.group in DRAWN_GROUPS for geom in robot):
         groups = ", ".join(sorted({str(geom.group) for geom in robot}))
         yield f"no view draws the robot: its geoms are in group {groups}; put those to be seen into group 0, 1 or 2"
+
+
+def colliding_pairs(model: mujoco.MjModel) -> np.ndarray:
+    """Return the pairs of geoms that may touch, as MuJoCo filters them. Shape: (pairs, 2).
+
+    They meet by ``contype`` and ``conaffinity`` and are neither of one body, nor of parent and child, nor of bodies
+    that are excluded; or they are a ``<pair>``.
+    """
+    first, second = np.triu_indices(model.ngeom, k=1)
+    bodies = model.geom_bodyid[[first, second]]
+    welds = model.body_weldid[bodies]  # bodies without joints are parts of those that they hang on
+    parents = model.body_weldid[model.body_parentid[welds]]
+    family = (welds[0] == welds[1]) | ((welds > 0).all(axis=0) & (welds == parents[::-1]).any(axis=0))
+    excluded = np.isin((bodies[0] << 16) + bodies[1], model.exclude_signature)
+    types, affinities = model.geom_contype, model.geom_conaffinity
+    meet = (types[first] & affinities[second]) | (types[second] & affinities[first])
+    chosen = np.stack([first, second], axis=1)[(meet != 0) & ~family & ~excluded]
+    named = np.sort(np.stack([model.pair_geom1, model.pair_geom2], axis=1), axis=1)
+    return np.unique(np.concatenate([chosen, named]), axis=0)
+
+
+def self_pairs(model: mujoco.MjModel) -> np.ndarray:
+    """Return those of :func:`colliding_pairs` whose geoms are both parts of the same robot. Shape: (pairs, 2)."""
+    pairs = colliding_pairs(model)
+    bodies = model.geom_bodyid[pairs]
+    roots, moving = model.body_rootid[bodies], model.body_weldid[bodies] > 0
+    return pairs[(roots[:, 0] == roots[:, 1]) & moving.all(axis=1)]
+
+
+def exclude_self_collisions(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
+    """Let no parts of a robot collide with each other, whatever its file says.
+
+    Returns whether anything has changed, so that ``model``, compiled from ``spec``, is out of date.
+    """
+    pairs = self_pairs(model)
+    bodies = {body.id: body for body in spec.bodies}
+    for first, second in np.unique(model.geom_bodyid[pairs], axis=0).tolist():
+        for body in (first, second):
+            bodies[body].name = bodies[body].name or f"body {body}"
+        spec.add_exclude(bodyname1=bodies[first].name, bodyname2=bodies[second].name)
+    unwanted = {frozenset(model.geom(geom).name for geom in pair) for pair in pairs.tolist()}
+    for pair in list(spec.pairs):
+        if {pair.geomname1, pair.geomname2} in unwanted:
+            spec.delete(pair)
+    return len(pairs) > 0

@@ -20,7 +20,14 @@ from legged_torque.sim.robot_file import (
 )
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.errors import UserError, told_in, unknown_name
-from legged_torque.utils.mjcf import drawing_notes, joint_axes, loading, read_spec
+from legged_torque.utils.mjcf import (
+    drawing_notes,
+    exclude_self_collisions,
+    joint_axes,
+    loading,
+    read_spec,
+    self_pairs,
+)
 
 
 @dataclass
@@ -76,13 +83,31 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     if not problems:
         problems += floor_problems(model, [geoms[place] for place in chosen[0]])
     refuse(problems, f"'{settings.file}' cannot be simulated")
-    if use_plain_motors(spec, model):
+    is_changed = use_plain_motors(spec, model)
+    if _choose_self_collisions(settings, spec, model, notes) or is_changed:
         with loading(file):
             model = spec.compile()
     model.opt.timestep = cfg.sim.dt
     feet, penalized, terminating = chosen
     notes += [*foot_notes(model, [geoms[place] for place in feet]), *engine_notes(model, cfg.sim.engine)]
     return Asset(model, dof_names, geoms, feet, penalized, terminating, notes)
+
+
+def _choose_self_collisions(
+    settings: type[LeggedRobotCfg.asset], spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]
+) -> bool:
+    """Exclude the robot's contacts with itself unless ``asset.self_collisions`` asks for them, and note that.
+
+    Returns whether ``model`` is out of date. A UserError if the file has none that were asked for.
+    """
+    pairs = len(self_pairs(model))
+    if settings.self_collisions and not pairs:
+        why = "no two geoms of its moving parts have contype and conaffinity that meet, or are a <pair>"
+        raise UserError(f"asset.self_collisions is on, but in '{settings.file}' {why}")
+    if settings.self_collisions or not pairs:
+        return False
+    notes.append(f"{pairs} pairs of parts that could collide do not; asset.self_collisions=True lets them")
+    return exclude_self_collisions(spec, model)
 
 
 def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:

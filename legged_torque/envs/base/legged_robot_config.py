@@ -54,6 +54,7 @@ class LeggedRobotCfg(BaseConfig):
         terminate_after_contacts_on: list[str] = []  # likewise: those that end an episode
         mirrored_legs: list[list[str]] = []  # pairs [right, left] of names of legs, with which names of parts begin
         max_dof_vel: NotNegative = 0.0  # [rad/s] highest speed of the joints
+        self_collisions: bool = False  # whether parts of the robot collide with each other, where its file lets them
 
     class sim:  # physics
         dt: Annotated[float, Limits(above=0, highest=0.1)] = 0.005  # [s] physics step

@@ -10,17 +10,18 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from legged_torque.sim.fused import solver
+from legged_torque.sim.fused import self_rows, solver
 from legged_torque.sim.fused.applied import apply_to_branch
 from legged_torque.sim.fused.constraint import make_joint_rows
 from legged_torque.sim.fused.contact import find_contacts
-from legged_torque.sim.fused.integrate import integrate_branch, sense_branch
+from legged_torque.sim.fused.integrate import integrate_branch, sense_branch, sense_self_contacts
 from legged_torque.sim.fused.map_contact import MAX_TOUCHES, find_map_contacts
-from legged_torque.sim.fused.math import group_sum, group_sum3
+from legged_torque.sim.fused.math import cholesky, group_sum, group_sum3, sync_group
+from legged_torque.sim.fused.self_contact import SelfContacts, finder
 from legged_torque.sim.fused.smooth import Pose, add_bodies, links_maker, make_equations
 from legged_torque.sim.fused.tables import Tables, Worlds, dof, qadr
 from legged_torque.sim.fused.tree import Tree
-from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem
+from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem, WholeBody, trunk_matrix
 from legged_torque.sim.fused.types import AnyBranch, AnyContacts, Body, Trunk, branch_types
 
 LINE_SEARCH_TOLERANCE = wp.constant(0.1)
@@ -39,19 +40,27 @@ class Layout(NamedTuple):
     on_map: bool  # whether the ground is a height map, not a plane
     alike: bool  # whether all branches have ``depth`` joints; else some have fewer
     cylinders: bool  # whether any of its geoms is one
+    self_kinds: tuple[tuple[int, int], ...]  # types of pairs of geoms on the robot that may touch each other
 
     @classmethod
-    def of(cls, tree: Tree, on_gpu: bool, on_map: bool = False) -> "Layout":
+    def of(
+        cls, tree: Tree, on_gpu: bool, on_map: bool = False, self_kinds: tuple[tuple[int, int], ...] = ()
+    ) -> "Layout":
         """Return a robot's layout: on a GPU a thread per branch, rounded up to a power of two, else one per world."""
         branches, depth = tree.joints.shape
         points = tree.most_points * (MAX_TOUCHES if on_map else 1)
-        lanes = 1 << (branches - 1).bit_length() if on_gpu else 1
-        return cls(branches, depth, points, lanes, on_map, bool((tree.joints >= 0).all()), tree.has_cylinders)
+        lanes, alike = 1 << (branches - 1).bit_length() if on_gpu else 1, bool((tree.joints >= 0).all())
+        return cls(branches, depth, points, lanes, on_map, alike, tree.has_cylinders, self_kinds)
 
     @property
     def per_lane(self) -> int:
         """Most branches of a thread."""
         return -(-self.branches // self.lanes)
+
+    @property
+    def selves_type(self) -> Any:
+        """Type of what a kernel is given for contacts between parts of a robot: a number if there are none."""
+        return SelfContacts if self.self_kinds else wp.int32
 
 
 @functools.cache
@@ -97,15 +106,17 @@ def places(layout: Layout) -> SimpleNamespace:
 
 @functools.cache
 def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None) -> SimpleNamespace:
-    """Return what comes before and after the solver: ``drive_all``, ``make_all``, ``damp_all`` and ``integrate_all``.
+    """Return what comes before and after the solver, in this order: the functions with these names.
 
+    That is ``drive_all``, ``make_all``, ``meet_all``, ``damp_all`` and ``integrate_all``.
     ``applied_forces`` says whether there are forces that a user applies, ``law`` what computes torques, if anything.
     """
-    branches, depth, points, lanes, on_map, _, cylinders = layout
+    branches, depth, points, lanes, on_map, _, cylinders, self_kinds = layout
     per_lane, place, num_joints = layout.per_lane, places(layout), joint_counter(layout)
     find = find_map_contacts if on_map else find_contacts
     Branch, make_links = branch_types(depth).Branch, links_maker(depth)
-    Kept = wp.array(dtype=Branch)
+    Kept, Selves, meets_itself = wp.array(dtype=Branch), layout.selves_type, bool(self_kinds)
+    find_self_contacts = finder(self_kinds, lanes)
 
     @wp.func
     def drive_all(tables: Tables, worlds: Worlds, world: int, lane: int, step: int, reads: Any):
@@ -123,7 +134,9 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
                             worlds.ctrl[world, motor] = law(reads, world, motor, step, pos, vel)
 
     @wp.func
-    def make_branch(tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, contacts: AnyContacts) -> Branch:
+    def make_branch(
+        tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, contacts: AnyContacts, selves: Selves
+    ) -> Branch:
         """Return a branch with its equations of motion, constraints and the accelerations to start from."""
         poses = wp.zeros(shape=wp.static(depth + 1), dtype=Pose)
         joints = num_joints(tables, b)
@@ -139,6 +152,9 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
         for j in range(wp.static(depth)):
             if j < joints:
                 branch.acc[j] = worlds.qacc_warmstart[world, dof(tables.branch_joint[b, j])]
+        if wp.static(meets_itself):
+            self_rows.keep_poses(selves, world, b, poses)
+            self_rows.keep_joints(tables, selves, world, b, joints, branch.acc)
         return branch
 
     @wp.func
@@ -151,6 +167,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
         acc: TrunkMotion,
         contacts: AnyContacts,
         kept: Kept,
+        selves: Selves,
     ):
         """Build the branches; return (the last of) them and the sum of their inertias and wrenches."""
         branch = Branch()
@@ -158,11 +175,28 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
         for i in range(wp.static(per_lane)):
             b = lane + i * wp.static(lanes)
             if place.has(lane, i):
-                branch = make_branch(tables, worlds, world, b, trunk, contacts)
+                branch = make_branch(tables, worlds, world, b, trunk, contacts, selves)
                 branch = solver.start(branch, trunk.rot, acc, contacts)
                 total = add_bodies(total, branch.smooth.total)
             place.keep(kept, world, i, branch)
         return branch, total
+
+    @wp.func
+    def meet_all(tables: Tables, world: int, lane: int, branch: Branch, kept: Kept, selves: Selves) -> Selves:
+        """Return the contacts between parts of the robot, with the residuals of the accelerations to start from."""
+        if wp.static(meets_itself):
+            sync_group(wp.static(lanes))
+            selves = find_self_contacts(tables, selves, world, lane)
+            sync_group(wp.static(lanes))
+            for i in range(wp.static(per_lane)):
+                branch = place.take(kept, world, i, branch)
+                if place.has(lane, i):
+                    b = lane + i * wp.static(lanes)
+                    self_rows.keep_columns(tables, selves, world, b, num_joints(tables, b), branch)
+            sync_group(wp.static(lanes))
+            self_rows.start_rows(selves, world, lane, wp.static(lanes))
+            sync_group(wp.static(lanes))
+        return selves
 
     @wp.func
     def damp_all(timestep: float, world: int, lane: int, branch: Branch, kept: Kept):
@@ -186,6 +220,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
         kept: Kept,
         damped: TrunkMotion,
         contacts: AnyContacts,
+        selves: Selves,
         sense: bool,
     ):
         """Write the branches' state after the step, and their contact sensors."""
@@ -196,43 +231,110 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
                 integrate_branch(tables, worlds, world, b, num_joints(tables, b), branch, damped)
                 if sense:
                     sense_branch(tables, worlds, world, b, branch, contacts)
+        if wp.static(meets_itself):
+            sync_group(wp.static(lanes))
+            if sense and lane == 0:
+                sense_self_contacts(tables, worlds, world, selves)
 
-    return SimpleNamespace(drive_all=drive_all, make_all=make_all, damp_all=damp_all, integrate_all=integrate_all)
+    parts = (drive_all, make_all, meet_all, damp_all, integrate_all)
+    return SimpleNamespace(**{part.func.__name__: part for part in parts})
 
 
 @functools.cache
 def in_solver(layout: Layout) -> SimpleNamespace:
-    """Return the parts of a solver iteration: ``assemble_all``, ``turn_all``, ``line_search`` and ``move_all``."""
+    """Return the parts of a solver iteration.
+
+    These are ``assemble_all``, ``couple_all``, ``turn_all``, ``line_search`` and ``move_all``.
+    """
     lanes, per_lane, place = layout.lanes, layout.per_lane, places(layout)
     Branch = branch_types(layout.depth).Branch
-    Kept = wp.array(dtype=Branch)
+    Kept, Selves, meets_itself = wp.array(dtype=Branch), layout.selves_type, bool(layout.self_kinds)
+    num_joints, solve_system = joint_counter(layout), self_rows.system_solver(lanes)
 
     @wp.func
     def assemble_all(
-        world: int, lane: int, branch: Branch, kept: Kept, rot: wp.mat33, acc: TrunkMotion, contacts: AnyContacts
+        tables: Tables,
+        world: int,
+        lane: int,
+        branch: Branch,
+        kept: Kept,
+        rot: wp.mat33,
+        acc: TrunkMotion,
+        contacts: AnyContacts,
+        selves: Selves,
     ):
-        """Assemble and eliminate the branches' Newton equations; return also what is left for the trunk."""
-        system = TrunkSystem()
+        """Assemble and eliminate the branches' Newton equations.
+
+        Return also what is left for the trunk, and what they add to the trunk's equations before the elimination.
+        """
+        system, whole = TrunkSystem(), TrunkSystem()
         for i in range(wp.static(per_lane)):
+            b = lane + i * wp.static(lanes)
             branch = place.take(kept, world, i, branch)
             if place.has(lane, i):
                 branch, add = solver.assemble(branch, rot, acc, contacts)
+                if wp.static(meets_itself):
+                    joints = num_joints(tables, b)
+                    branch = self_rows.push_branch(tables, selves, world, b, joints, branch)
+                    if selves.coupled:
+                        self_rows.keep_equations(tables, selves, world, b, joints, branch)
+                        whole = solver.add_whole(branch, whole, add)
+                branch.factor = cholesky(branch.factor)
                 system = solver.eliminate(branch, system, add)
             place.keep(kept, world, i, branch)
-        return branch, system
+        return branch, system, whole
+
+    @wp.func
+    def couple_all(
+        world: int,
+        lane: int,
+        whole: WholeBody,
+        residual: TrunkMotion,
+        added: TrunkSystem,
+        step: TrunkMotion,
+        selves: Selves,
+    ) -> TrunkMotion:
+        """Return the trunk's step, another one if branches are coupled; then keep theirs, too. ``added`` is theirs."""
+        if wp.static(meets_itself):  # noqa: SIM102 - this decides what is compiled
+            if selves.coupled:
+                lin = group_sum3(added.rhs_lin, wp.static(lanes)) - residual.lin
+                ang = group_sum3(added.rhs_ang, wp.static(lanes)) - residual.ang
+                matrix = trunk_matrix(whole, added, wp.static(lanes))
+                if lane == 0:
+                    self_rows.keep_trunk_equations(selves, world, matrix, lin, ang)
+                step = solve_system(selves, world, lane)
+        return step
 
     @wp.func
     def turn_all(
-        world: int, lane: int, branch: Branch, kept: Kept, rot: wp.mat33, step: TrunkMotion, contacts: AnyContacts
+        tables: Tables,
+        world: int,
+        lane: int,
+        branch: Branch,
+        kept: Kept,
+        rot: wp.mat33,
+        step: TrunkMotion,
+        contacts: AnyContacts,
+        selves: Selves,
     ):
         """Find the branches' parts of the step; return also their slopes of the cost along it."""
         slopes = wp.vec3(0.0)
         for i in range(wp.static(per_lane)):
+            b = lane + i * wp.static(lanes)
             branch = place.take(kept, world, i, branch)
             if place.has(lane, i):
+                branch.step = solver.branch_step(branch, step)
+                if wp.static(meets_itself):
+                    joints = num_joints(tables, b)
+                    if selves.coupled:
+                        branch.step = self_rows.coupled_step(tables, selves, world, b, joints, branch.step)
+                    self_rows.keep_joints(tables, selves, world, b, joints, branch.step)
                 branch, of_rows = solver.turn_to(branch, rot, step, contacts)
                 slopes += solver.slopes_at_start(branch, step, of_rows)
             place.keep(kept, world, i, branch)
+        if wp.static(meets_itself):
+            sync_group(wp.static(lanes))
+            slopes[1] -= self_rows.turn_rows(selves, world, lane, wp.static(lanes))
         return branch, group_sum3(slopes, wp.static(lanes))
 
     @wp.func
@@ -240,10 +342,12 @@ def in_solver(layout: Layout) -> SimpleNamespace:
         tolerance: float,
         iterations: int,
         world: int,
+        lane: int,
         branch: Branch,
         kept: Kept,
         at_start: wp.vec3,
         contacts: AnyContacts,
+        selves: Selves,
     ) -> float:
         """Return the share of the step at which the cost is least: Newton's method, kept between bounds."""
         alpha = float(1.0)
@@ -254,6 +358,9 @@ def in_solver(layout: Layout) -> SimpleNamespace:
             for i in range(wp.static(per_lane)):
                 branch = place.take(kept, world, i, branch)
                 slopes += solver.row_slopes(branch, contacts, alpha)
+            if wp.static(meets_itself):
+                for k in range(selves.first + lane, selves.end, wp.static(lanes)):
+                    slopes = solver.add_contact_slopes(slopes, selves, k, alpha)
             slope = at_start[1] + alpha * at_start[2] + group_sum(slopes[0], wp.static(lanes))
             curvature = at_start[2] + group_sum(slopes[1], wp.static(lanes))
             if wp.abs(slope) <= tolerance * wp.abs(at_start[0]):
@@ -268,7 +375,9 @@ def in_solver(layout: Layout) -> SimpleNamespace:
         return alpha
 
     @wp.func
-    def move_all(world: int, branch: Branch, kept: Kept, contacts: AnyContacts, alpha: float):
+    def move_all(
+        world: int, lane: int, branch: Branch, kept: Kept, contacts: AnyContacts, selves: Selves, alpha: float
+    ):
         """Move the branches along the step; return also how many rows of the world changed their state."""
         flips = float(0.0)
         for i in range(wp.static(per_lane)):
@@ -276,6 +385,11 @@ def in_solver(layout: Layout) -> SimpleNamespace:
             branch, changed = solver.move(branch, contacts, alpha)
             flips += changed
             place.keep(kept, world, i, branch)
+        if wp.static(meets_itself):
+            for k in range(selves.first + lane, selves.end, wp.static(lanes)):
+                flips += solver.move_contact(selves, k, alpha)
+            sync_group(wp.static(lanes))
         return branch, group_sum(flips, wp.static(lanes))
 
-    return SimpleNamespace(assemble_all=assemble_all, turn_all=turn_all, line_search=line_search, move_all=move_all)
+    parts = (assemble_all, couple_all, turn_all, line_search, move_all)
+    return SimpleNamespace(**{part.func.__name__: part for part in parts})

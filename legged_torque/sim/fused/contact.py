@@ -6,7 +6,7 @@ from legged_torque.sim.fused.constraint import MIN_VALUE, constraint_mass, refer
 from legged_torque.sim.fused.math import quat_to_matrix
 from legged_torque.sim.fused.smooth import Pose, Poses
 from legged_torque.sim.fused.tables import Tables, of_world
-from legged_torque.sim.fused.types import vec4
+from legged_torque.sim.fused.types import vec4, vec5
 
 MIN_FRICTION = wp.constant(1.0e-5)
 """MuJoCo's mjMINMU."""
@@ -94,35 +94,68 @@ def contact_tangent(normal: wp.vec3, axis: wp.vec3, is_capsule: bool) -> wp.vec3
     return tangent
 
 
+@wp.struct
+class Feel:
+    """How a contact of two geoms feels."""
+
+    friction: wp.float32
+    solref: wp.vec2
+    solimp: vec5
+
+
 @wp.func
-def set_contact_rows(
-    tables: Tables, world: int, geom: int, dist: float, velocity: wp.vec3, normal: wp.vec3, contact: Contact
-) -> Contact:
-    """Return a contact with friction, mass and references of its rows, mixed from geom and floor as MuJoCo does."""
-    floor = tables.floor
-    weight_floor, weight_geom = of_world(tables.geom_solmix, world, floor), of_world(tables.geom_solmix, world, geom)
+def mix_feel(tables: Tables, world: int, first: int, second: int) -> Feel:
+    """Return friction, solref and solimp of a contact of two geoms, mixed as MuJoCo does."""
+    weight_first, weight_second = (
+        of_world(tables.geom_solmix, world, first),
+        of_world(tables.geom_solmix, world, second),
+    )
     mix = float(0.5)
-    if weight_floor + weight_geom > 2.0 * MIN_VALUE:
-        mix = weight_geom / (weight_floor + weight_geom)
-    ref_floor, ref_geom = of_world(tables.geom_solref, world, floor), of_world(tables.geom_solref, world, geom)
-    solref = wp.min(ref_floor, ref_geom)
-    if ref_floor[0] > 0.0 and ref_geom[0] > 0.0:
-        solref = mix * ref_geom + (1.0 - mix) * ref_floor
-    friction_floor = of_world(tables.geom_friction, world, floor)[0]
-    friction_geom = of_world(tables.geom_friction, world, geom)[0]
-    friction = wp.max(friction_floor, friction_geom)
-    if tables.geom_priority[geom] > tables.geom_priority[floor]:
+    if weight_first + weight_second > 2.0 * MIN_VALUE:
+        mix = weight_second / (weight_first + weight_second)
+    ref_first, ref_second = of_world(tables.geom_solref, world, first), of_world(tables.geom_solref, world, second)
+    solref = wp.min(ref_first, ref_second)
+    if ref_first[0] > 0.0 and ref_second[0] > 0.0:
+        solref = mix * ref_second + (1.0 - mix) * ref_first
+    friction_first = of_world(tables.geom_friction, world, first)[0]
+    friction_second = of_world(tables.geom_friction, world, second)[0]
+    friction = wp.max(friction_first, friction_second)
+    if tables.geom_priority[second] > tables.geom_priority[first]:
         mix = 1.0
-        solref = 1.0 * ref_geom
-        friction = 1.0 * friction_geom
-    if tables.geom_priority[geom] < tables.geom_priority[floor]:
+        solref = 1.0 * ref_second
+        friction = 1.0 * friction_second
+    if tables.geom_priority[second] < tables.geom_priority[first]:
         mix = 0.0
-        solref = 1.0 * ref_floor
-        friction = 1.0 * friction_floor
-    solimp = mix * of_world(tables.geom_solimp, world, geom) + (1.0 - mix) * of_world(tables.geom_solimp, world, floor)
-    params = reference_dynamics(solref, solimp, dist, tables.timestep)
-    friction = wp.max(friction, MIN_FRICTION)
-    invweight = of_world(tables.body_invweight0, world, tables.geom_bodyid[geom])[0]
+        solref = 1.0 * ref_first
+        friction = 1.0 * friction_first
+    solimp_first, solimp_second = (
+        of_world(tables.geom_solimp, world, first),
+        of_world(tables.geom_solimp, world, second),
+    )
+    solimp = mix * solimp_second + (1.0 - mix) * solimp_first
+    return Feel(friction, solref, solimp)
+
+
+@wp.func
+def set_rows(
+    tables: Tables,
+    world: int,
+    first: int,
+    second: int,
+    feel: Feel,
+    dist: float,
+    velocity: wp.vec3,
+    normal: wp.vec3,
+    contact: Contact,
+) -> Contact:
+    """Return a contact of two geoms with friction, mass and references of its rows.
+
+    Velocity is that of the second geom as the first one sees it, to which the normal points.
+    """
+    params = reference_dynamics(feel.solref, feel.solimp, dist, tables.timestep)
+    friction = wp.max(feel.friction, MIN_FRICTION)
+    invweight = of_world(tables.body_invweight0, world, tables.geom_bodyid[first])[0]  # the world's is 0
+    invweight += of_world(tables.body_invweight0, world, tables.geom_bodyid[second])[0]
     regularized = invweight * (1.0 + friction * friction) * 2.0 * friction * friction / tables.impratio
     contact.friction = friction
     contact.mass = wp.min(constraint_mass(regularized, params[2]), MAX_CONTACT_MASS / wp.max(invweight, MIN_VALUE))
@@ -221,7 +254,8 @@ def make_contact(
     is_capsule = tables.geom_type[geom] == CAPSULE
     contact.tangent = contact_tangent(normal, wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2]), is_capsule)
     velocity = pose.lin_vel + wp.cross(pose.ang_vel, contact.pos)
-    return set_contact_rows(tables, world, geom, dist, velocity, normal, contact)
+    feel = mix_feel(tables, world, tables.floor, geom)
+    return set_rows(tables, world, tables.floor, geom, feel, dist, velocity, normal, contact)
 
 
 @wp.func

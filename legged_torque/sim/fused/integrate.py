@@ -4,6 +4,7 @@ import warp as wp
 
 from legged_torque.sim.fused.contact import contact_force, contact_normal
 from legged_torque.sim.fused.math import quat_multiply, quat_rotation
+from legged_torque.sim.fused.self_contact import SelfContacts
 from legged_torque.sim.fused.solver import branch_step
 from legged_torque.sim.fused.tables import Tables, Worlds, dof, qadr
 from legged_torque.sim.fused.trunk import TrunkMotion
@@ -48,6 +49,14 @@ def integrate_branch(
 
 
 @wp.func
+def add_to_sensor(worlds: Worlds, world: int, address: int, force: wp.vec3):
+    """Add a contact and its force to a contact sensor."""
+    worlds.sensordata[world, address] = worlds.sensordata[world, address] + 1.0
+    for r in range(3):
+        worlds.sensordata[world, address + 1 + r] = worlds.sensordata[world, address + 1 + r] + force[r]
+
+
+@wp.func
 def sense_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch: AnyBranch, contacts: AnyContacts):
     """Write the contact sensors of a branch's geoms: number of contacts, and the sum of their forces."""
     for k in range(tables.point_count[b]):
@@ -61,6 +70,19 @@ def sense_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch: Any
             force = contact_force(
                 contacts.found[k], contact_normal(contacts, k), contacts.residual[k], contacts.pushing[k]
             )
-            worlds.sensordata[world, address] = worlds.sensordata[world, address] + 1.0
-            for r in range(3):
-                worlds.sensordata[world, address + 1 + r] = worlds.sensordata[world, address + 1 + r] + force[r]
+            add_to_sensor(worlds, world, address, force)
+
+
+@wp.func
+def sense_self_contacts(tables: Tables, worlds: Worlds, world: int, selves: SelfContacts):
+    """Add contacts between parts of the robot to the sensors of both geoms, which those with the ground have set."""
+    for k in range(selves.airborne.shape[0]):
+        for r in range(4):
+            worlds.sensordata[world, selves.airborne[k] + r] = 0.0
+    for k in range(selves.first, selves.end):
+        force = contact_force(selves.found[k], selves.normal[k], selves.residual[k], selves.pushing[k])
+        for side in range(2):
+            address = tables.geom_sensor[selves.geoms[k][side]]
+            if address >= 0:
+                sign = wp.where(side == 0, -1.0, 1.0)
+                add_to_sensor(worlds, world, address, sign * force)

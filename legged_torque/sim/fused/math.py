@@ -21,6 +21,17 @@ def group_sum(value: float, lanes: int) -> float:
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned first = (threadIdx.x & 31u) & ~(unsigned(lanes) - 1u);
+    __syncwarp(((1u << lanes) - 1u) << first);
+#endif
+""")
+def sync_group(lanes: int):
+    """Let the threads of a world wait for each other, and see what the others have written to memory."""
+    ...
+
+
 @wp.func
 def group_sum3(value: wp.vec3, lanes: int) -> wp.vec3:
     """Return the sum of a vector over the threads of a world."""

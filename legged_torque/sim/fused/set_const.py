@@ -201,7 +201,7 @@ def make_derive(layout: Layout) -> wp.Kernel:
     threads per body of a branch and kind of weight, which all factorize its equations and then take their own rows.
     All of them run the same loop, which is short, since code that runs once must first be fetched.
     """
-    branches, depth, _, lanes, _, alike, _ = layout
+    branches, depth, _, lanes, _, alike, *_ = layout
     per_lane, num_joints, (Branch, _, Smooth) = layout.per_lane, joint_counter(layout), branch_types(depth)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})

@@ -67,7 +67,10 @@ def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: An
 
 @wp.func
 def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: AnyContacts):
-    """Return a branch with gradient and Hessian of the cost, and what its contacts add for the trunk."""
+    """Return a branch with gradient and Hessian of the cost, not factored yet, and what its contacts add for the trunk.
+
+    Those with the ground, that is; see ``self_rows`` for others.
+    """
     add = TrunkSystem()
     hessian = 1.0 * branch.smooth.mass
     coupling_lin = 1.0 * branch.smooth.mass_lin
@@ -106,7 +109,7 @@ def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts:
         add.lin += stiffness
         add.coupling += stiffness * lever
         add.ang += wp.transpose(lever) * stiffness * lever
-    branch.factor = cholesky(hessian)
+    branch.factor = hessian
     branch.coupling_lin = coupling_lin
     branch.coupling_ang = coupling_ang
     branch.gradient = gradient
@@ -153,6 +156,17 @@ def eliminate(branch: AnyBranch, system: TrunkSystem, add: TrunkSystem) -> Trunk
 
 
 @wp.func
+def add_whole(branch: AnyBranch, system: TrunkSystem, add: TrunkSystem) -> TrunkSystem:
+    """Add to the trunk's equations what a branch and its contacts add to them before anything is eliminated."""
+    system.rhs_lin = system.rhs_lin - branch.trunk_gradient_lin
+    system.rhs_ang = system.rhs_ang - branch.trunk_gradient_ang
+    system.lin = system.lin + add.lin
+    system.coupling = system.coupling + add.coupling
+    system.ang = system.ang + add.ang
+    return system
+
+
+@wp.func
 def branch_step(branch: AnyBranch, trunk_step: TrunkMotion):
     """Return a branch's part of the step."""
     rhs = branch.gradient + wp.transpose(branch.coupling_lin) * trunk_step.lin
@@ -162,11 +176,7 @@ def branch_step(branch: AnyBranch, trunk_step: TrunkMotion):
 
 @wp.func
 def turn_to(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts: AnyContacts):
-    """Return a branch with its part of the Newton step and the changes of its residuals along it.
-
-    Return also the slope of its rows' cost along the step.
-    """
-    branch.step = branch_step(branch, trunk_step)
+    """Return a branch with the changes of its residuals along its step, and the slope of its rows' cost along it."""
     branch.change = joint_rows_times(branch, branch.step)
     slope = float(0.0)
     for j in range(len(branch.acc)):
@@ -181,6 +191,19 @@ def turn_to(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts:
         slope += contact.mass * wp.dot(wp.cw_mul(contacts.pushing[k], contacts.residual[k]), change)
         contacts.change[k] = change
     return branch, slope
+
+
+@wp.func
+def add_contact_slopes(slopes: wp.vec2, contacts: AnyContacts, k: int, alpha: float) -> wp.vec2:
+    """Return first and second derivative of the rows' cost along the step with those of a contact's rows."""
+    mass = contacts.found[k].mass
+    along = contacts.change[k]
+    values = contacts.residual[k] + alpha * along
+    for r in range(4):
+        if values[r] < 0.0:
+            slopes[0] += mass * values[r] * along[r]
+            slopes[1] += mass * along[r] * along[r]
+    return slopes
 
 
 @wp.func
@@ -199,15 +222,10 @@ def row_slopes(branch: AnyBranch, contacts: AnyContacts, alpha: float) -> wp.vec
         if value < 0.0:
             slope += branch.rows.limit_mass[j] * value * along
             curvature += branch.rows.limit_mass[j] * along * along
+    slopes = wp.vec2(slope, curvature)
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
-        mass = contacts.found[k].mass
-        along4 = contacts.change[k]
-        values = contacts.residual[k] + alpha * along4
-        for r in range(4):
-            if values[r] < 0.0:
-                slope += mass * values[r] * along4[r]
-                curvature += mass * along4[r] * along4[r]
-    return wp.vec2(slope, curvature)
+        slopes = add_contact_slopes(slopes, contacts, k, alpha)
+    return slopes
 
 
 @wp.func
@@ -219,6 +237,16 @@ def slopes_at_start(branch: AnyBranch, trunk_step: TrunkMotion, of_rows: float) 
     curvature += 2.0 * wp.dot(branch.smooth.mass_lin * branch.step, trunk_step.lin)
     curvature += 2.0 * wp.dot(branch.smooth.mass_ang * branch.step, trunk_step.ang)
     return wp.vec3(slope, slope - of_rows, curvature)
+
+
+@wp.func
+def move_contact(contacts: AnyContacts, k: int, alpha: float) -> float:
+    """Move a contact by a share of the step and return how many of its rows changed their state on the way."""
+    before = contacts.pushing[k]
+    contacts.residual[k] = contacts.residual[k] + alpha * contacts.change[k]
+    after = pushing_rows(contacts.residual[k])
+    contacts.pushing[k] = after
+    return wp.length_sq(after - before)
 
 
 @wp.func
@@ -235,9 +263,5 @@ def move(branch: AnyBranch, contacts: AnyContacts, alpha: float):
     branch.residuals.friction = branch.residuals.friction + alpha * branch.change.friction
     branch.residuals.limit = branch.residuals.limit + alpha * branch.change.limit
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
-        before = contacts.pushing[k]
-        contacts.residual[k] = contacts.residual[k] + alpha * contacts.change[k]
-        after = pushing_rows(contacts.residual[k])
-        contacts.pushing[k] = after
-        flips += wp.length_sq(after - before)
+        flips += move_contact(contacts, k, alpha)
     return branch, flips

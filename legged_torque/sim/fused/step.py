@@ -19,6 +19,8 @@ from legged_torque.sim.fused.branches import FIRST_TOLERANCE, LINE_SEARCH_TOLERA
 from legged_torque.sim.fused.contact import Contact, plane_contacts
 from legged_torque.sim.fused.integrate import integrate_trunk
 from legged_torque.sim.fused.map_contact import Ground, make_ground, map_contacts
+from legged_torque.sim.fused.self_contact import make_self_contacts, pair_kinds
+from legged_torque.sim.fused.self_rows import with_coupling
 from legged_torque.sim.fused.smooth import make_trunk, trunk_pose
 from legged_torque.sim.fused.tables import Tables, Worlds, make_tables
 from legged_torque.sim.fused.tree import check_map, read_tree
@@ -59,7 +61,7 @@ class FusedStep:
         self._device = data.qpos.device
         if height_map is not None:
             check_map(mj_model)
-        layout = Layout.of(tree, self._device.is_cuda, height_map is not None)
+        layout = Layout.of(tree, self._device.is_cuda, height_map is not None, pair_kinds(mj_model))
         room = data.nworld * layout.branches
         with wp.ScopedDevice(self._device):
             tables = make_tables(mj_model, model, tree)
@@ -67,6 +69,7 @@ class FusedStep:
             waiting = room if layout.per_lane > 1 else 1  # a GPU's threads have one branch each
             self._scratch.append(wp.empty(waiting, dtype=branch_types(layout.depth).Branch))
             ground = make_ground(height_map, room * layout.points) if height_map is not None else 0
+            self._scratch.append(make_self_contacts(mj_model, model, tree, data) if layout.self_kinds else 0)
         self._model = [tables, ground, mj_model.opt.iterations, mj_model.opt.ls_iterations]
         self._data = [data.ctrl, data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, data.solver_niter]
         self._data += [data.xfrc_applied, data.qfrc_applied]
@@ -99,7 +102,7 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
     """Return the kernel for a robot's structure, with or without forces that a user applies, and a law for torques."""
     around, solver, lanes = around_solver(layout, applied_forces, law), in_solver(layout), layout.lanes
     Reads = next(iter(law.input_types.values())) if law else wp.int32  # what the law reads: its first argument
-    Branch = branch_types(layout.depth).Branch
+    Branch, Selves, meets_itself = branch_types(layout.depth).Branch, layout.selves_type, bool(layout.self_kinds)
     GroundType = Ground if layout.on_map else wp.int32  # a plane is in the tables
     gather = map_contacts if layout.on_map else plane_contacts
 
@@ -134,6 +137,7 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
         pushing: wp.array(dtype=vec4),
         changes: wp.array(dtype=vec4),
         kept: wp.array(dtype=Branch),
+        pairs: Selves,
     ):
         place, lane = wp.tid()
         world = first_world + place
@@ -147,30 +151,36 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
             acc.lin = wp.vec3(qacc_warmstart[world, 0], qacc_warmstart[world, 1], qacc_warmstart[world, 2])
             acc.ang = wp.vec3(qacc_warmstart[world, 3], qacc_warmstart[world, 4], qacc_warmstart[world, 5])
             around.drive_all(tables, worlds, world, lane, i, reads)
-            branch, total = around.make_all(tables, worlds, world, lane, trunk, acc, contacts, kept)
+            branch, total = around.make_all(tables, worlds, world, lane, trunk, acc, contacts, kept, pairs)
+            selves = around.meet_all(tables, world, lane, branch, kept, pairs)
             whole = whole_body(trunk, total, wp.static(lanes))
             used = int(0)
             for _iteration in range(iterations):
                 used += 1
-                branch, system = solver.assemble_all(world, lane, branch, kept, trunk.rot, acc, contacts)
+                if wp.static(meets_itself):
+                    selves = with_coupling(selves)
+                branch, system, added = solver.assemble_all(
+                    tables, world, lane, branch, kept, trunk.rot, acc, contacts, selves
+                )
                 residual = trunk_residual(whole, acc)
                 step = solve_trunk(whole, residual, system, wp.static(lanes))
-                branch, slopes = solver.turn_all(world, lane, branch, kept, trunk.rot, step, contacts)
+                step = solver.couple_all(world, lane, whole, residual, added, step, selves)
+                branch, slopes = solver.turn_all(tables, world, lane, branch, kept, trunk.rot, step, contacts, selves)
                 start = slopes + trunk_slopes(whole, residual, step)
                 decrease = -start[0] * tables.cost_scale
                 if used > 1 and not (decrease > tables.tolerance):
                     break
                 share = wp.where(used > 1, LINE_SEARCH_TOLERANCE, FIRST_TOLERANCE)
-                alpha = solver.line_search(share, ls_iterations, world, branch, kept, start, contacts)
+                alpha = solver.line_search(share, ls_iterations, world, lane, branch, kept, start, contacts, selves)
                 acc.lin = acc.lin + alpha * step.lin
                 acc.ang = acc.ang + alpha * step.ang
-                branch, flips = solver.move_all(world, branch, kept, contacts, alpha)
+                branch, flips = solver.move_all(world, lane, branch, kept, contacts, selves, alpha)
                 if alpha == 1.0 and flips == 0.0 and decrease < EXACT_STEP:
                     break  # the whole step stayed in one piece of the piecewise quadratic cost: this is its minimum
             branch, system = around.damp_all(tables.timestep, world, lane, branch, kept)
             damped = solve_trunk(whole, TrunkMotion(), system, wp.static(lanes))
             around.integrate_all(
-                tables, worlds, world, lane, branch, kept, damped, contacts, sense and i == end_step - 1
+                tables, worlds, world, lane, branch, kept, damped, contacts, selves, sense and i == end_step - 1
             )
             if lane == 0:
                 integrate_trunk(tables.timestep, worlds, world, trunk, acc, damped)

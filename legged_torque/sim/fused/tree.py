@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import why_no_motor
+from legged_torque.utils.mjcf import self_pairs, why_no_motor
 
 MAX_BRANCHES = 16  # threads of a world must fit into half a warp
+_SELF_KINDS = [mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX]
 _CAPSULE_ENDS = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
 _LOWEST_ON_CIRCLES = [(1.0, 0.0, 1.0), (1.0, 0.0, -1.0), (-0.5, 0.75**0.5, 1.0), (-0.5, -(0.75**0.5), 1.0)]
 _AROUND_CIRCLES = [
@@ -98,6 +99,13 @@ def find_floor(model: mujoco.MjModel) -> int:
     return int(np.flatnonzero(np.isin(model.geom_type, FLOORS) & collides)[0])
 
 
+def places_of_geoms(model: mujoco.MjModel, tree: Tree) -> np.ndarray:
+    """Return branch and depth of the body of each geom; 0 and 0 of the trunk's and the world's. Shape: (geoms, 2)."""
+    joints = ((b, j, joint) for (b, j), joint in np.ndenumerate(tree.joints) if joint >= 0)
+    places = {int(model.jnt_bodyid[joint]): (b, j + 1) for b, j, joint in joints}
+    return np.array([places.get(body, (0, 0)) for body in model.geom_bodyid.tolist()])
+
+
 def check_map(model: mujoco.MjModel) -> None:
     """Raise a UserError if the floor of an accepted robot cannot become a height map, whose heights are the world's."""
     floor = find_floor(model)
@@ -153,7 +161,7 @@ def _of_options(model: mujoco.MjModel) -> list[str]:
     if option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         disabled = [flag for flag in disabled if flag != "eulerdamp"]
     enabled = _names(mujoco.mjtEnableBit, option.enableflags, _HARMLESS_ENABLED)
-    others = model.eq_active0.any() or model.ntendon or model.npair or model.nmocap
+    others = model.eq_active0.any() or model.ntendon or model.nmocap
     return _broken(
         {
             "the friction cone must be pyramidal": option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL,
@@ -163,10 +171,24 @@ def _of_options(model: mujoco.MjModel) -> list[str]:
             "it disables groups of actuators": not option.disableactuator,
             "it has noslip iterations": not option.noslip_iterations,
             "it moves through a fluid": not (option.density or option.viscosity),
-            "equalities, tendons, pairs or mocap": not others,
+            "equalities, tendons or mocap": not others,
+            "a <pair> with the ground, or other than condim 3, one friction and no margin": _plain_pairs(model),
             "some contacts are excluded": not (_excluded(model) == 0).any(),
         }
     )
+
+
+def _plain_pairs(model: mujoco.MjModel) -> bool:
+    """Return whether each <pair> is of two parts of the robot and feels as a pair of geoms may."""
+    grounded = (model.geom_bodyid[[model.pair_geom1, model.pair_geom2]] == 0).any()
+    odd = _any_of(model, "pair_margin", "pair_gap", "pair_solreffriction", "pair_adhesion") or grounded
+    same = (model.pair_friction[:, 0] == model.pair_friction[:, 1]).all()
+    return not odd and bool(same and (model.pair_dim == 3).all() and not _mixed(model.pair_solref).any())
+
+
+def _mixed(solrefs: np.ndarray) -> np.ndarray:
+    """Return which solrefs mix their two formats. Shapes: (n, 2), (n,)."""
+    return ~((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1))
 
 
 def _of_bodies(model: mujoco.MjModel) -> list[str]:
@@ -197,24 +219,25 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     floor = np.flatnonzero(np.isin(model.geom_type, floors) & collides)
     robot = collides & (model.geom_bodyid > 0)
-    types, affinities, bodies = model.geom_contype[robot], model.geom_conaffinity[robot], model.geom_bodyid[robot]
-    apart = _may_collide(model)[np.ix_(bodies, bodies)]
+    own = self_pairs(model)
     alone = len(floor) == 1 and (collides & ~robot).sum() == 1
     touching = _touching(model, floor[0]) if alone else robot
-    on_floor = np.append(np.flatnonzero(touching), floor)
+    on_floor = np.stack(np.broadcast_arrays(floor[:1], np.flatnonzero(touching)), axis=1) if alone else own
+    geoms = np.unique(np.concatenate([own.ravel(), on_floor.ravel(), floor]))
     odd = touching & ~np.isin(model.geom_type, list(_GEOM_POINTS))
-    condims = _condims(model, floor[0])[touching] if alone else np.zeros(0)
-    solrefs = np.concatenate([model.geom_solref[on_floor], model.jnt_solref, model.dof_solref])
-    mixed = ~((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1))
+    odd_own = np.isin(np.arange(model.ngeom), own) & ~np.isin(model.geom_type, _SELF_KINDS)
+    solrefs = np.concatenate([model.geom_solref[geoms], model.jnt_solref, model.dof_solref])
+    unlike, own_unlike = _of(model.geom, odd), _of(model.geom, odd_own)
     return _broken(
         {
             "it needs one plane and no other obstacle": alone,
-            f"only spheres, capsules, cylinders and boxes may collide, unlike {_of(model.geom, odd)}": not odd.any(),
-            "parts of the robot collide with each other": not (types[:, None] & affinities)[apart].any(),
-            "condim of contacts with the floor must be 3": bool((condims == 3).all()),
-            "geoms have margins or gaps": not (model.geom_margin[on_floor].any() or model.geom_gap[on_floor].any()),
+            f"only spheres, capsules, cylinders and boxes may collide, unlike {unlike}": not odd.any(),
+            f"only spheres, capsules and boxes may collide with each other, unlike {own_unlike}": not odd_own.any(),
+            "condim of contacts with the floor must be 3": bool((_condims(model, on_floor) == 3).all()),
+            "condim of contacts between its parts must be 3": bool((_condims(model, own) == 3).all()),
+            "geoms have margins or gaps": not (model.geom_margin[geoms].any() or model.geom_gap[geoms].any()),
             "surfaces move or stick": not _any_of(model, "geom_surfacevel", "geom_adhesion"),
-            "a solref mixes its two formats": not mixed.any(),
+            "a solref mixes its two formats": not _mixed(solrefs).any(),
         }
     )
 
@@ -228,26 +251,15 @@ def _touching(model: mujoco.MjModel, floor: int) -> np.ndarray:
     return ((by_type | by_affinity) != 0) & (model.geom_bodyid > 0)
 
 
-def _condims(model: mujoco.MjModel, floor: int) -> np.ndarray:
-    """Return the dimension of each geom's contacts with the floor: that of higher priority, else the higher one."""
-    priority, condim = model.geom_priority, model.geom_condim
-    equal = np.maximum(condim, condim[floor])
-    higher = np.where(priority > priority[floor], condim, condim[floor])
-    return np.where(priority == priority[floor], equal, higher)
+def _condims(model: mujoco.MjModel, pairs: np.ndarray) -> np.ndarray:
+    """Return the dimension of contacts of pairs of geoms: that of higher priority, else the higher one. Shape: (n,)."""
+    priority, condim = model.geom_priority[pairs], model.geom_condim[pairs]
+    return np.where(priority == priority.max(axis=1, keepdims=True), condim, 0).max(axis=1)
 
 
 def _excluded(model: mujoco.MjModel) -> np.ndarray:
     """Return pairs of bodies whose contacts are excluded. Shape: (pairs, 2)."""
     return np.stack([model.exclude_signature >> 16, model.exclude_signature & 0xFFFF], axis=1)
-
-
-def _may_collide(model: mujoco.MjModel) -> np.ndarray:
-    """Return which bodies can touch each other: not parent and child, not those excluded. Shape: (nbody, nbody)."""
-    apart = ~np.eye(model.nbody, dtype=bool)
-    children = np.arange(2, model.nbody)
-    pairs = np.concatenate([np.stack([model.body_parentid[children], children], axis=1), _excluded(model)])
-    apart[pairs[:, 0], pairs[:, 1]] = apart[pairs[:, 1], pairs[:, 0]] = False
-    return apart
 
 
 def _of_motors(model: mujoco.MjModel) -> list[str]:

@@ -1,0 +1,312 @@
+"""Contacts between parts of a robot: which may be, and where they are; see ``self_rows`` for what they do."""
+
+import functools
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+from mujoco_warp._src import collision_primitive_core as primitives
+
+from legged_torque.sim.fused.contact import BOX, CAPSULE, Contact, Feel, contact_tangent, mix_feel, set_rows
+from legged_torque.sim.fused.math import group_sum, quat_to_matrix
+from legged_torque.sim.fused.smooth import Pose
+from legged_torque.sim.fused.tables import Tables, of_world
+from legged_torque.sim.fused.tree import Tree, places_of_geoms
+from legged_torque.sim.fused.types import vec4, vec5
+from legged_torque.utils.mjcf import self_pairs
+
+MAX_SELF_CONTACTS = wp.constant(24)
+"""Most contacts of a world between parts of its robot. Of more the first ones count, which ``overflow`` tells."""
+SPHERE = wp.constant(2)
+"""MuJoCo's mjGEOM_SPHERE."""
+OVERFLOW = wp.constant(int(mjw.OverflowType.NARROWPHASE))
+
+
+@wp.struct
+class SelfContacts:
+    """The pairs of geoms that may touch, and the contacts between them."""
+
+    pair: wp.array(dtype=wp.vec2i)  # its geoms, first that of the simpler type
+    named: wp.array(dtype=wp.int32)  # of each pair: number of the MJCF's <pair>, -1 of others
+    pair_friction: wp.array2d(dtype=vec5)  # of each <pair>, fields of MuJoCo Warp's model
+    pair_solref: wp.array2d(dtype=wp.vec2)
+    pair_solimp: wp.array2d(dtype=vec5)
+    geom_place: wp.array(dtype=wp.vec2i)  # of each geom: branch, and depth of its body; 0 is the trunk
+    airborne: wp.array(dtype=wp.int32)  # addresses of the sensors of those geoms that the ground lets through
+    poses: wp.array3d(dtype=Pose)  # (world, branch, depth)
+    found: wp.array(dtype=Contact)  # each world has room for MAX_SELF_CONTACTS; these four as in Contacts
+    residual: wp.array(dtype=vec4)
+    pushing: wp.array(dtype=vec4)
+    change: wp.array(dtype=vec4)
+    geoms: wp.array(dtype=wp.vec2i)  # of each contact
+    normal: wp.array(dtype=wp.vec3)  # of each contact, from the first geom to the second
+    jacobian: wp.array2d(dtype=wp.vec3)  # (contact, joint): motion of the second body less that of the first
+    joints: wp.array2d(dtype=wp.float32)  # (world, joint): accelerations, or a step
+    matrix: wp.array3d(dtype=wp.float32)  # (world, row, column): the whole Newton system, see ``self_rows``
+    overflow: wp.array(dtype=wp.int32)  # MuJoCo Warp's, of each world
+    first: wp.int32  # a thread's own: the contacts of its world, from the first one on
+    end: wp.int32
+    coupled: wp.bool  # likewise: whether one between two branches pushes
+
+
+def ordered_pairs(model: mujoco.MjModel) -> np.ndarray:
+    """Return the pairs of geoms that may touch on a robot, in MuJoCo's order: the simpler type first. Shape: (n, 2)."""
+    pairs = self_pairs(model)
+    return np.take_along_axis(pairs, model.geom_type[pairs].argsort(axis=1, kind="stable"), axis=1)
+
+
+def pair_kinds(model: mujoco.MjModel) -> tuple[tuple[int, int], ...]:
+    """Return the types of the geoms of these pairs, each once."""
+    return tuple(sorted({(int(a), int(b)) for a, b in model.geom_type[ordered_pairs(model)]}))
+
+
+def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree, data: mjw.Data) -> SelfContacts:
+    """Return the pairs of a robot and room for their contacts, on the current device."""
+    (branches, depth), worlds, joints = tree.joints.shape, data.nworld, model.nv - 6
+    out = SelfContacts()
+    out.pair = wp.array(ordered_pairs(model), dtype=wp.vec2i)
+    named = {frozenset(pair): i for i, pair in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))}
+    out.named = wp.array([named.get(frozenset(pair), -1) for pair in ordered_pairs(model).tolist()], dtype=wp.int32)
+    for name in ("pair_friction", "pair_solref", "pair_solimp"):
+        setattr(out, name, getattr(warp_model, name))
+    on_ground = [point[0] for points in tree.points for point in points]
+    airborne = np.setdiff1d(ordered_pairs(model), on_ground)
+    out.airborne = wp.array(model.sensor_adr[np.isin(model.sensor_refid, airborne)], dtype=wp.int32)
+    out.geom_place = wp.array(places_of_geoms(model, tree), dtype=wp.vec2i)
+    out.poses = wp.empty((worlds, branches, depth + 1), dtype=Pose)
+    room = worlds * MAX_SELF_CONTACTS
+    out.found, out.geoms, out.normal = (wp.empty(room, dtype=dtype) for dtype in (Contact, wp.vec2i, wp.vec3))
+    out.residual, out.pushing, out.change = (wp.empty(room, dtype=vec4) for _ in range(3))
+    out.jacobian = wp.empty((room, joints), dtype=wp.vec3)
+    out.joints = wp.empty((worlds, joints), dtype=wp.float32)
+    out.matrix = wp.empty((worlds, model.nv + 1, model.nv), dtype=wp.float32)
+    out.overflow = data.overflow
+    return out
+
+
+@wp.struct
+class Shape:
+    """A geom in the world, from the trunk's origin."""
+
+    pos: wp.vec3
+    rot: wp.mat33
+    size: wp.vec3
+
+
+@wp.struct
+class Touch:
+    """The contacts of two geoms, the first ``count`` entries; what does not touch has no negative distance."""
+
+    count: wp.int32
+    dist: primitives.vec8f
+    pos: primitives.mat83f
+    normal: primitives.mat83f
+
+
+@wp.func
+def pose_of(selves: SelfContacts, world: int, geom: int) -> Pose:
+    """Return the pose of a geom's body."""
+    place = selves.geom_place[geom]
+    return selves.poses[world, place[0], place[1]]
+
+
+@wp.func
+def middle_of(tables: Tables, selves: SelfContacts, world: int, geom: int) -> wp.vec3:
+    """Return where a geom is."""
+    pose = pose_of(selves, world, geom)
+    return pose.pos + pose.rot * of_world(tables.geom_pos, world, geom)
+
+
+@wp.func
+def shape_of(tables: Tables, selves: SelfContacts, world: int, geom: int) -> Shape:
+    """Return a geom in the world."""
+    rot = pose_of(selves, world, geom).rot * quat_to_matrix(of_world(tables.geom_quat, world, geom))
+    return Shape(middle_of(tables, selves, world, geom), rot, of_world(tables.geom_size, world, geom))
+
+
+@wp.func
+def axis_of(shape: Shape) -> wp.vec3:
+    """Return the axis of a capsule."""
+    return wp.vec3(shape.rot[0, 2], shape.rot[1, 2], shape.rot[2, 2])
+
+
+@wp.func
+def reach_of(tables: Tables, world: int, geom: int) -> float:
+    """Return the radius of a sphere around a geom [m]."""
+    size = of_world(tables.geom_size, world, geom)
+    reach = size[0]
+    if tables.geom_type[geom] == CAPSULE:
+        reach = size[0] + size[1]
+    if tables.geom_type[geom] == BOX:
+        reach = wp.length(size)
+    return reach
+
+
+@wp.func
+def add_touch(out: Touch, dist: float, pos: wp.vec3, normal: wp.vec3) -> Touch:
+    """Return contacts with one more, if it is one."""
+    if dist < 0.0:
+        out.dist[out.count] = dist
+        out.pos[out.count] = pos
+        out.normal[out.count] = normal
+        out.count += 1
+    return out
+
+
+@wp.func
+def no_touch(a: Shape, b: Shape) -> Touch:
+    """Return no contact: in the place of functions that a robot does not need, whose code is long."""
+    return Touch()
+
+
+@wp.func
+def sphere_sphere(a: Shape, b: Shape) -> Touch:
+    """Return the contact of two spheres."""
+    dist, pos, normal = primitives.sphere_sphere(a.pos, a.size[0], b.pos, b.size[0])
+    return add_touch(Touch(), dist, pos, normal)
+
+
+@wp.func
+def sphere_capsule(a: Shape, b: Shape) -> Touch:
+    """Return the contact of a sphere and a capsule."""
+    dist, pos, normal = primitives.sphere_capsule(a.pos, a.size[0], b.pos, axis_of(b), b.size[0], b.size[1])
+    return add_touch(Touch(), dist, pos, normal)
+
+
+@wp.func
+def sphere_box(a: Shape, b: Shape) -> Touch:
+    """Return the contact of a sphere and a box."""
+    dist, pos, normal = primitives.sphere_box(a.pos, a.size[0], b.pos, b.rot, b.size)
+    return add_touch(Touch(), dist, pos, normal)
+
+
+@wp.func
+def capsule_capsule(a: Shape, b: Shape) -> Touch:
+    """Return the contacts of two capsules, two if they are parallel."""
+    dist, pos, normal = primitives.capsule_capsule(
+        a.pos, axis_of(a), a.size[0], a.size[1], b.pos, axis_of(b), b.size[0], b.size[1]
+    )
+    return add_touch(add_touch(Touch(), dist[0], pos[0], normal[0]), dist[1], pos[1], normal[1])
+
+
+@wp.func
+def capsule_box(a: Shape, b: Shape) -> Touch:
+    """Return the contacts of a capsule and a box, two at most."""
+    dist, pos, normal = primitives.capsule_box(a.pos, axis_of(a), a.size[0], a.size[1], b.pos, b.rot, b.size)
+    return add_touch(add_touch(Touch(), dist[0], pos[0], normal[0]), dist[1], pos[1], normal[1])
+
+
+@wp.func
+def box_box(a: Shape, b: Shape) -> Touch:
+    """Return the contacts of two boxes, eight at most."""
+    out = Touch()
+    count, dist, pos, normal = primitives.box_box(a.pos, a.rot, a.size, b.pos, b.rot, b.size, 0.0)
+    for i in range(count):
+        out = add_touch(out, dist[i], pos[i], normal)
+    return out
+
+
+_TOUCH = {
+    (SPHERE, SPHERE): sphere_sphere,
+    (SPHERE, CAPSULE): sphere_capsule,
+    (SPHERE, BOX): sphere_box,
+    (CAPSULE, CAPSULE): capsule_capsule,
+    (CAPSULE, BOX): capsule_box,
+    (BOX, BOX): box_box,
+}
+
+
+@functools.cache
+def touch_function(kinds: tuple[tuple[int, int], ...]) -> wp.Function:
+    """Return ``touch_pair`` for pairs of some types of geoms."""
+    functions = [function if kind in kinds else no_touch for kind, function in _TOUCH.items()]
+    two_spheres, on_capsule, on_box, two_capsules, capsule_on_box, two_boxes = functions
+
+    @wp.func
+    def touch_pair(tables: Tables, selves: SelfContacts, world: int, geoms: wp.vec2i) -> Touch:
+        """Return the contacts of two geoms, as MuJoCo finds them."""
+        apart = middle_of(tables, selves, world, geoms[1]) - middle_of(tables, selves, world, geoms[0])
+        reach = reach_of(tables, world, geoms[0]) + reach_of(tables, world, geoms[1])
+        if wp.length_sq(apart) > reach * reach:
+            return Touch()
+        a, b = shape_of(tables, selves, world, geoms[0]), shape_of(tables, selves, world, geoms[1])
+        kind_a, kind_b = tables.geom_type[geoms[0]], tables.geom_type[geoms[1]]
+        out = Touch()
+        if kind_a == SPHERE and kind_b == SPHERE:
+            out = two_spheres(a, b)
+        if kind_a == SPHERE and kind_b == CAPSULE:
+            out = on_capsule(a, b)
+        if kind_a == SPHERE and kind_b == BOX:
+            out = on_box(a, b)
+        if kind_a == CAPSULE and kind_b == CAPSULE:
+            out = two_capsules(a, b)
+        if kind_a == CAPSULE and kind_b == BOX:
+            out = capsule_on_box(a, b)
+        if kind_a == BOX and kind_b == BOX:
+            out = two_boxes(a, b)
+        return out
+
+    return touch_pair
+
+
+@wp.func
+def make_self_contact(
+    tables: Tables, selves: SelfContacts, world: int, pair: int, dist: float, pos: wp.vec3, normal: wp.vec3
+) -> Contact:
+    """Return a contact of a pair at a place [m], of a negative distance [m], with a normal to the second geom."""
+    geoms = selves.pair[pair]
+    contact = Contact()
+    contact.pos = pos
+    contact.tangent = contact_tangent(normal, wp.vec3(0.0), False)
+    first, second = pose_of(selves, world, geoms[0]), pose_of(selves, world, geoms[1])
+    velocity = second.lin_vel - first.lin_vel + wp.cross(second.ang_vel - first.ang_vel, pos)
+    feel = mix_feel(tables, world, geoms[0], geoms[1])
+    named = selves.named[pair]
+    if named >= 0:
+        friction = of_world(selves.pair_friction, world, named)[0]
+        solref, solimp = of_world(selves.pair_solref, world, named), of_world(selves.pair_solimp, world, named)
+        feel = Feel(friction, solref, solimp)
+    return set_rows(tables, world, geoms[0], geoms[1], feel, dist, velocity, normal, contact)
+
+
+@functools.cache
+def finder(kinds: tuple[tuple[int, int], ...], lanes: int) -> wp.Function:
+    """Return ``find_self_contacts`` for pairs of some types of geoms and a number of threads per world."""
+    touch_pair = touch_function(kinds)
+
+    @wp.func
+    def find_self_contacts(tables: Tables, selves: SelfContacts, world: int, lane: int) -> SelfContacts:
+        """Write a world's contacts between parts of the robot, in the order of the pairs, and return where they are.
+
+        Each thread looks at a pair at a time; the poses must be there already.
+        """
+        selves.first = world * MAX_SELF_CONTACTS
+        last = selves.first + MAX_SELF_CONTACTS
+        end = selves.first + 0
+        for start in range(0, selves.pair.shape[0], wp.static(lanes)):
+            touch = Touch()
+            geoms = wp.vec2i(0, 0)
+            if start + lane < selves.pair.shape[0]:
+                geoms = selves.pair[start + lane]
+                touch = touch_pair(tables, selves, world, geoms)
+            new = int(group_sum(float(touch.count), wp.static(lanes)))
+            if new > 0:
+                place = end + 0
+                for other in range(wp.static(lanes - 1)):  # threads before this one write first
+                    found = group_sum(wp.where(lane == other, float(touch.count), 0.0), wp.static(lanes))
+                    place += wp.where(other < lane, int(found), 0)
+                for i in range(touch.count):
+                    if place + i < last:
+                        selves.geoms[place + i] = geoms
+                        selves.normal[place + i] = touch.normal[i]
+                        selves.found[place + i] = make_self_contact(
+                            tables, selves, world, start + lane, touch.dist[i], touch.pos[i], touch.normal[i]
+                        )
+                end += new
+        if end > last and lane == 0:
+            selves.overflow[world] = selves.overflow[world] | OVERFLOW
+        selves.end = wp.min(end, last)
+        return selves
+
+    return find_self_contacts

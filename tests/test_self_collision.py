@@ -1,0 +1,211 @@
+"""Contacts between parts of a robot, against plain MuJoCo."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from settings import error_of
+from test_fused import assert_alike, put, step_fused, step_mujoco
+
+from legged_torque.envs.base.asset import load_asset
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.sim.fused.self_contact import MAX_SELF_CONTACTS
+from legged_torque.sim.model import build_model, collision_geoms
+from legged_torque.sim.simulator import Simulator
+from legged_torque.utils.mjcf import self_pairs
+
+GEOM = mujoco.mjtGeom
+ROBOT = """<mujoco><compiler angle="radian" autolimits="true"/>
+<option cone="pyramidal" integrator="implicitfast" impratio="10" timestep="0.004"/>
+<default><joint axis="0 1 0" armature="0.02" frictionloss="0.1" damping="0.3" range="-1.5 1.5"/>
+<geom contype="2" conaffinity="3" friction="0.6"/><motor ctrlrange="-20 20" forcerange="-15 15"/></default>
+<worldbody><geom name="floor" type="plane" size="0 0 1" contype="1" conaffinity="0" friction="0.7"/>
+<body name="trunk" pos="0 0 0.3"><freejoint/>
+ <geom name="hull" type="box" size="0.12 0.05 0.03" mass="4" solref="0.03 0.9" solmix="3"/>
+ <geom name="head" type="sphere" size="0.05" pos="0.14 0 -0.02" mass="1" priority="1" friction="0.3"/>{legs}
+ <body name="tail" pos="-0.14 0 0.02"><joint name="tail" axis="0 1 0.2"/>
+  <geom name="tail" type="capsule" size="0.015" fromto="0 0 0 0.02 0 -0.15" mass="0.3" solimp="0.5 0.9 0.01 0.5 2"/>
+ </body></body></worldbody><actuator>{motors}</actuator><contact>{pairs}</contact></mujoco>"""
+LEG = """<body name="{s}thigh" pos="{x} 0 -0.05"><joint name="{s}1"/>
+ <geom name="{s}thigh" type="capsule" size="0.02" fromto="0 0.01 0 0 -0.01 -0.12" mass="0.6" solref="-900 -60"/>
+ <body name="{s}shin" pos="0 {y} -0.13"><joint name="{s}2" axis="1 0.4 0" range="-2.4 2.4"/>
+  <geom name="{s}shin" type="box" size="0.03 0.02 0.05" pos="0 0 -0.05" mass="0.3" solmix="0.5" solref="0.01 1.2"/>
+  <geom name="{s}foot" type="sphere" size="0.03" pos="0 0 -0.12" mass="0.2" friction="1.1" solref="-700 -50"/>
+ </body></body>"""
+PAIR = '<pair geom1="{}" geom2="{}" condim="3" friction="0.4 0.4" solref="{}" solimp="0.6 0.9 0.02 0.5 2"/>'
+PAIRS = PAIR.format("hull", "Fshin", "-800 -50") + PAIR.format("Ffoot", "Rshin", "0.03 1.1")
+PARTS = (("F", 0.06, 0.02), ("R", -0.06, -0.02))
+LEGS = "".join(LEG.format(s=side, x=x, y=y) for side, x, y in PARTS)
+MOTORS = "".join(f'<motor joint="{joint}"/>' for joint in ("F1", "F2", "R1", "R2", "tail"))
+
+
+def make_spec(edit=None):
+    """The specification of a robot with two legs of two joints and a tail of one, all parts of which may collide."""
+    spec = mujoco.MjSpec.from_string(ROBOT.format(legs=LEGS, motors=MOTORS, pairs=PAIRS))
+    if edit is not None:
+        edit(spec)
+    return spec
+
+
+def compiled(edit=None):
+    """Its model, with a contact sensor on every geom and a solver that converges."""
+    spec = make_spec(edit)
+    model = build_model(spec, collision_geoms(spec))
+    model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
+    return model
+
+
+def draw_states(model, num, seed=0):
+    """States with joints anywhere in their ranges, moving, under torques."""
+    rng = np.random.default_rng(seed)
+    qpos = np.tile(model.qpos0, (num, 1))
+    qpos[:, 2] = rng.uniform(0.15, 0.5, num)
+    qpos[:, 3:7] += rng.normal(0.0, 0.3, (num, 4))
+    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    qpos[:, 7:] = rng.uniform(*model.jnt_range[1:].T, (num, model.nq - 7))
+    states = {
+        "qpos": qpos,
+        "qvel": rng.normal(0.0, 1.0, (num, model.nv)),
+        "ctrl": rng.normal(0.0, 10.0, (num, model.nu)),
+    }
+    states["qacc_warmstart"] = rng.normal(0.0, 30.0, (num, model.nv))
+    return {name: values.astype(np.float32).astype(float) for name, values in states.items()}
+
+
+def touching(model, states):
+    """Pairs of geoms of the robot that touch in each state, as plain MuJoCo says."""
+    data, found = mujoco.MjData(model), []
+    for world in range(len(states["qpos"])):
+        data.qpos[:] = states["qpos"][world]
+        mujoco.mj_fwdPosition(model, data)
+        pairs = data.contact.geom.reshape(-1, 2)
+        found.append([tuple(pair) for pair in pairs[(model.geom_bodyid[pairs] > 0).all(axis=1)].tolist()])
+    return found
+
+
+@pytest.fixture(scope="module")
+def thrown():
+    """The model, states, and what touches in them."""
+    model = compiled()
+    states = draw_states(model, 400)
+    return model, states, touching(model, states)
+
+
+def test_matches_plain_mujoco(thrown):
+    """All types of pairs, between legs and of legs with the trunk, push as in plain MuJoCo; a ``<pair>`` as it says."""
+    model, states, touches = thrown
+    pairs = [pair for found in touches for pair in found]
+    kinds = [tuple(sorted(model.geom_type[list(pair)].tolist())) for pair in pairs]
+    sphere, capsule, box = int(GEOM.mjGEOM_SPHERE), int(GEOM.mjGEOM_CAPSULE), int(GEOM.mjGEOM_BOX)
+    for kind in ((sphere, sphere), (sphere, capsule), (sphere, box), (capsule, capsule), (capsule, box), (box, box)):
+        assert kinds.count(kind) >= 4, kind
+    named = [frozenset(pair) for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)]
+    assert len(named) == 2 and all([frozenset(pair) for pair in pairs].count(pair) > 4 for pair in named)
+    limbs = [{model.body(model.geom_bodyid[geom]).name[:2] for geom in pair} for pair in pairs]
+    assert min(limbs.count({"tr", "Fs"}), limbs.count({"tr", "Rs"}), limbs.count({"Fs", "Rs"})) > 20
+    expected, actual = step_mujoco(model, states), step_fused(model, states)
+    alike = (actual[2] == expected[2]).all(axis=1)  # single contacts only just touch
+    assert alike.mean() > 0.99
+    error = np.abs(actual[0] - expected[0]).max(axis=1)[alike]
+    assert np.median(error) < 5e-6 and np.quantile(error, 0.99) < 5e-4 and error.max() < 2e-3
+    chosen = {name: values[alike] for name, values in states.items()}
+    assert_alike(model, chosen, *([values[alike] for values in result] for result in (actual, expected)))
+    without = compiled(lambda spec: [setattr(geom, "contype", 0) for geom in spec.geoms if geom.name != "floor"])
+    touched = np.array([bool(found) for found in touches])
+    assert (np.abs(step_mujoco(without, states)[0] - expected[0]).max(axis=1)[touched] > 0.1).mean() > 0.9
+
+
+def add_beads(number):
+    """Add spheres to the front shin that touch only each other's like on the rear shin, not the floor."""
+
+    def add(spec):
+        for body, count in (("Fshin", number), ("Rshin", 1)):
+            for i in range(count):
+                bead = spec.body(body).add_geom(name=f"{body}{i}", type=GEOM.mjGEOM_SPHERE, size=(0.2, 0, 0), mass=0.01)
+                bead.contype, bead.conaffinity, bead.pos = 4, 4, (0.003 * i, 0.0, -0.05)
+
+    return add
+
+
+def test_geoms_that_the_floor_lets_through():
+    """They touch and feel each other as well."""
+    model = compiled(add_beads(3))
+    states = draw_states(model, 40, seed=1)
+    expected = step_mujoco(model, states)
+    beads = [i - 1 for i in range(model.ngeom) if model.geom_contype[i] == 4]
+    assert (expected[2][:, beads].sum(axis=1) >= 6).mean() > 0.9
+    assert_alike(model, states, step_fused(model, states), expected)
+
+
+def test_too_many_contacts_are_told():
+    """Of more contacts than there is room for the first ones count, and a warning says so."""
+    for number, warning in ((1, None), (MAX_SELF_CONTACTS + 1, "NARROWPHASE")):
+        model = compiled(add_beads(number))
+        sim = Simulator(model, 8, "cpu", "fused", 100, 50)
+        put(sim, draw_states(model, 8, seed=1))
+        sim.step()
+        sim.flag_diverged()
+        assert torch.isfinite(sim.qvel).all()
+        said = sim.check_buffers()
+        assert said is None if warning is None else warning in said
+
+
+def test_worlds_do_not_see_each_other(thrown):
+    """A world moves alone as among others, to the bit, and the same again in a second run."""
+    model, states, touches = thrown
+    most = int(np.argmax([len(found) for found in touches]))
+    together = step_fused(model, states)
+    alone = step_fused(model, {name: values[most : most + 1] for name, values in states.items()})
+    for ours, again, single in zip(together, step_fused(model, states), alone, strict=True):
+        np.testing.assert_array_equal(ours, again)
+        np.testing.assert_array_equal(ours[most], single[0])
+
+
+# ------------------------------------------------------------------------------------------------------ the option
+
+
+def settings_of(file, on):
+    """Settings of a task with this robot."""
+    cfg = LeggedRobotCfg()
+    cfg.asset.file, cfg.asset.self_collisions = str(file), on
+    cfg.init_state.default_joint_angles = dict.fromkeys(("F1", "F2", "R1", "R2", "tail"), 0.0)
+    return cfg
+
+
+def test_option(tmp_path, thrown):
+    """Whatever the file lets collide, parts of the robot touch each other only if the settings want it."""
+    (tmp_path / "robot.xml").write_text(make_spec(lambda spec: setattr(spec.body("tail"), "name", "")).to_xml())
+    on, off = (load_asset(settings_of(tmp_path / "robot.xml", value)) for value in (True, False))
+    assert on.notes == [note for note in on.notes if "asset.self_collisions" not in note]
+    pairs = len(self_pairs(on.mj_model))
+    assert f"{pairs} pairs of parts that could collide do not; asset.self_collisions=True lets them" in off.notes
+    _, states, touches = thrown
+    assert pairs > 20 and touching(on.mj_model, states) == touches and not any(touching(off.mj_model, states))
+    floor = [step_mujoco(asset.mj_model, states)[2] for asset in (on, off)]
+    assert (floor[1] > 0).any() and floor[0].sum() > floor[1].sum() and not (floor[0] < floor[1]).any()
+
+
+def test_option_without_effect(tmp_path):
+    """A file that lets no parts collide is told, when the settings want it."""
+    file = tmp_path / "robot.xml"
+
+    def part(spec):
+        for geom in spec.geoms[1:]:
+            geom.contype = 0
+        for pair in list(spec.pairs):
+            spec.delete(pair)
+
+    file.write_text(make_spec(part).to_xml())
+    assert "asset.self_collisions is on, but in" in error_of(load_asset, settings_of(file, True))
+
+
+def test_pairs_are_mujocos(thrown):
+    """Pairs of bodies that a file excludes, parents with their children, and parts of one body are none."""
+    model, states, _ = thrown
+    everywhere = {frozenset(pair) for pair in self_pairs(model).tolist()}
+    some = compiled(lambda spec: spec.add_exclude(bodyname1="Fshin", bodyname2="Rshin"))
+    assert len(everywhere) - len(self_pairs(some)) == 3  # shin and foot of both, but for the <pair>
+    for one, other in (("hull", "Fthigh"), ("Fthigh", "Fshin"), ("hull", "head"), ("Fshin", "Ffoot")):
+        assert frozenset((model.geom(one).id, model.geom(other).id)) not in everywhere
+    seen = {frozenset(pair) for found in touching(some, states) for pair in found}
+    assert len(seen) > 10 and seen <= {frozenset(pair) for pair in self_pairs(some).tolist()}
