@@ -13,7 +13,7 @@ ROUGH = [f"a1_rough_{name[3:]}{scan}" for name in TASKS + COMBINATIONS for scan 
 APPROACHES = ["position", "torque", "torque_gravity", "torque_curriculum", "torque_multihead", "multihead"]
 APPROACHES += ["torque_curriculum_multihead", "multihead_two_rates"]  # those that combine with every robot
 OTHER_ROBOTS = []  # their tasks, in the order of their registration
-for robot in ("go1", "go2"):
+for robot in ("anymal_c", "g1", "go1", "go2"):
     OTHER_ROBOTS += [f"{robot}_{approach}" for approach in APPROACHES]
     OTHER_ROBOTS += [f"{robot}_rough_{approach}{scan}" for approach in APPROACHES for scan in ("", "_scan")]
 

@@ -23,7 +23,7 @@ def generator():
 def flat(values, path=""):
     """Dotted paths of nested settings; dictionaries of joints are one setting."""
     for key, value in values.items():
-        is_section = isinstance(value, dict) and key != "default_joint_angles"
+        is_section = isinstance(value, dict) and key not in ("default_joint_angles", "stiffness", "damping")
         yield from flat(value, f"{path}{key}.") if is_section else [f"{path}{key}"]
 
 

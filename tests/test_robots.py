@@ -9,8 +9,10 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from settings import error_of
 
 from legged_torque import resource_path
+from legged_torque.control.gravity_pretraining import make_controller
 from legged_torque.envs import task_registry
 from legged_torque.utils.options import Options
 
@@ -249,15 +251,85 @@ def test_nominal_pose(name):
     assert cfg.rewards.base_height_target == data.qpos[2]
 
 
+@pytest.fixture(scope="module")
+def tasks():
+    """Each robot's task of position control, made once."""
+    made = {}
+
+    def get(name):
+        if name not in made:
+            settings = ["domain_rand.init_roll=[0, 0]", "domain_rand.init_pitch=[0, 0]"]
+            options = Options(device="cpu", num_envs=4, set=settings, perturbation="none")
+            made[name] = task_registry.make_env(f"{name}_position", options)[0]
+        return made[name]
+
+    return get
+
+
 @pytest.mark.parametrize("name", MASSES)
-def test_holding(name):
-    """Robots held at their nominal pose for half a second do not fall; they are the same left and right."""
-    settings = ["domain_rand.init_roll=[0, 0]", "domain_rand.init_pitch=[0, 0]"]
-    task = task_registry.make_env(f"{name}_position", Options(device="cpu", num_envs=2, set=settings))[0]
+def test_holding(tasks, name):
+    """Robots held at their nominal pose for half a second do not fall; feet of several geoms are one foot each."""
+    task = tasks(name)
     assert task.sim.is_fused and not task.symmetry.problem
-    assert task.feet_contact.shape == (2, len(LEGS[name]))
+    assert task.feet_contact.shape == (4, len(LEGS[name]))
     task.reset()
     for _ in range(25):
-        done = task.step(torch.zeros(2, task.num_actions))[2]
+        done = task.step(torch.zeros(4, task.num_actions))[2]
         assert not done.any()
     assert (task.feet_contact.mean(dim=1) >= 0.5).all()
+    touched = task.sim.contact_found[:, task.feet_indices].unflatten(1, (len(LEGS[name]), -1)) > 0
+    assert torch.equal(task.feet_contact > 0, touched.any(dim=2))
+
+
+@pytest.mark.parametrize("name", MASSES)
+def test_mirrored_worlds(tasks, name):
+    """Two worlds that are mirror images by hand are seen as such, and after a step with mirrored actions still are."""
+    task = tasks(name)
+    task.reset()
+    generator = torch.Generator().manual_seed(0)
+    half, joints = len(LEGS[name]) // 2, len(PARTS[name])
+    order = {"go1": [1, 0, 3, 2], "go2": [1, 0, 3, 2], "anymal_c": [1, 0, 3, 2], "g1": [1, 0]}[name]
+    across = (
+        {"hip", "HAA", "hip_roll", "hip_yaw", "ankle_roll"} if name != "g1" else {"hip_roll", "hip_yaw", "ankle_roll"}
+    )
+    signs = torch.tensor([-1.0 if part in across else 1.0 for part in PARTS[name]])
+    assert len(order) == 2 * half
+
+    def image(values):
+        return (values.unflatten(1, (-1, len(order), joints))[:, :, order] * signs).flatten(1)
+
+    pose = task.default_dof_pos + 0.2 * torch.rand(2, task.num_dof, generator=generator)
+    speed = torch.randn(2, task.num_dof, generator=generator)
+    qpos, qvel = task.sim.qpos.clone(), torch.zeros_like(task.sim.qvel)
+    qpos[:, :2], qpos[:, 2], qpos[:, 3:7] = 0.0, task.cfg.rewards.base_height_target, torch.tensor([1.0, 0.0, 0.0, 0.0])
+    qpos[:, 7:], qvel[:, 6:] = torch.cat([pose, image(pose)]), torch.cat([speed, image(speed)])
+    task.commands[:] = torch.tensor([[0.4, 0.3, 0.2]] * 2 + [[0.4, -0.3, -0.2]] * 2)
+    task.set_state(qpos, qvel)
+    actions = torch.randn(2, task.num_actions, generator=generator)
+    rewards = task.step(torch.cat([actions, image(actions)]))[1]
+    torch.testing.assert_close(task.dof_pos[2:], image(task.dof_pos[:2]), rtol=0, atol=2e-3)
+    torch.testing.assert_close(rewards[2:], rewards[:2], rtol=0, atol=1e-3)
+    for group, seen in task.get_observations().items():
+        torch.testing.assert_close(task.mirror(group, seen[:2]), seen[2:], rtol=0, atol=5e-2)
+
+
+def test_rewards_of_two_feet(tasks):
+    """Swings of up to 0.4 s beside a foot on the ground, held joints away from the nominal pose, and being alive."""
+    task = tasks("g1")
+    task.commands[:] = torch.tensor([0.3, 0.0, 0.0])
+    task.commands[3] = 0.0
+    task.feet_contact[:] = torch.tensor([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
+    task.feet_air_time[:] = torch.tensor([[0.0, 0.1], [0.0, 0.41], [0.1, 0.1], [0.1, 0.0]])
+    torch.testing.assert_close(task._reward_single_stance(), torch.tensor([0.25, 0.0, 0.0, 0.0]))
+    task.commands[3, 2] = -0.2
+    assert task._reward_single_stance()[3].item() == pytest.approx(0.25)
+    task.dof_pos[:] = task.default_dof_pos
+    task.dof_pos[1] += torch.tensor([0.5, 0.1, -0.2, 0.5, 0.5, 0.5] * 2)
+    torch.testing.assert_close(task._reward_dof_deviation(), torch.tensor([0.0, 0.6, 0.0, 0.0]))
+    assert task._reward_alive().tolist() == [1.0] * 4
+
+
+def test_gravity_pretraining_refuses_feet_of_several_geoms():
+    """By name, before anything is simulated."""
+    task = task_registry.make_env("g1_torque_gravity", Options(device="cpu", num_envs=1))[0]
+    assert "'resources/robots/g1/g1.xml' has 8 for 2 feet" in error_of(make_controller, task)

@@ -19,7 +19,7 @@ os.environ["MUJOCO_GL"] = "disable"
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs.approaches import multi_head_config, torque_config, torque_curriculum_config, torque_gravity
 from legged_torque.envs.base import legged_robot_config
-from legged_torque.envs.robots import a1, go1, go2
+from legged_torque.envs.robots import a1, anymal_c, g1, go1, go2
 from legged_torque.utils.limits import describe, types_of
 
 HERE = Path(__file__).parent
@@ -29,6 +29,8 @@ CONFIGS = (
     (legged_robot_config, "LeggedRobotCfgPPO"),
     (a1, "A1Cfg"),
     (a1, "A1CfgPPO"),
+    (anymal_c, "AnymalCCfg"),
+    (g1, "G1Cfg"),
     (go1, "Go1Cfg"),
     (go2, "Go2Cfg"),
     (torque_config, "TorqueCfgPPO"),

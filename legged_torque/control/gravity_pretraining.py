@@ -164,7 +164,7 @@ def follow(
         upright = torch.ones_like(task.reset_buf)
         steps = []
         for _ in range(num_steps):
-            decided = controller(task.sim.qpos, task.sim.qvel, points_on_ground(task))
+            decided = controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0)
             observations = task.get_observations()["policy"]
             actions, residuals = actions_for(task, decided.total), residual_share(controller, decided)
             steps.append([observations, actions, decided.total.abs().mean(dim=1), residuals, upright])
@@ -265,8 +265,14 @@ def exchange(observations: Tensor, columns: list[int]) -> Tensor:
 def make_controller(task: LeggedRobot, settings: WholeBodySettings | None = None) -> WholeBodyController:
     """Return the whole-body controller for the worlds of a task; without settings, with its own defaults.
 
-    Its height is the task's, and one contact may always carry the robot.
+    Its height is the task's, and one contact may always carry the robot. A UserError if a foot has several geoms: the
+    forces on them are not determined.
     """
+    points, feet = len(task.foot_names), len(task.foot_geoms)
+    if points != feet:
+        raise UserError(
+            f"gravity pre-training needs a point per foot; '{task.cfg.asset.file}' has {points} for {feet} feet"
+        )
     dynamics = RobotDynamics(task.sim.mj_model, task.num_envs, task.device, task.foot_names)
     settings, model = settings or WholeBodySettings(), task.sim.mj_model
     weight = float(model.body_mass.sum()) * abs(float(model.opt.gravity[2]))
@@ -275,14 +281,9 @@ def make_controller(task: LeggedRobot, settings: WholeBodySettings | None = None
     return WholeBodyController(dynamics, task.default_dof_pos.tolist(), settings)
 
 
-def points_on_ground(task: LeggedRobot) -> Tensor:
-    """Return which geoms of the feet touch the ground, each a point of contact. Shape: (num_envs, k), bool."""
-    return task.contacts[:, task.feet_indices] > 0
-
-
 def act_by_controller(controller: WholeBodyController) -> Act:
     """Return the function that asks the controller for the torques of a task's state, and gives them."""
-    return lambda task: actions_for(task, controller(task.sim.qpos, task.sim.qvel, points_on_ground(task)).total)
+    return lambda task: actions_for(task, controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0).total)
 
 
 def act_by_policy(actor: MLPModel) -> Act:

@@ -28,8 +28,9 @@ class TrainingError(Exception):
 def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
     """Return the error for a name that does not exist; ``kind`` is what it stands for, e.g. "task"."""
     allowed = sorted(allowed)
-    match = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
-    hint = f" did you mean '{match[0]}'?" if match else ""
+    by_lower_case = {name.lower(): name for name in allowed}
+    match = difflib.get_close_matches(given.lower(), by_lower_case, n=1, cutoff=0.5)
+    hint = f" did you mean '{by_lower_case[match[0]]}'?" if match else ""
     return UserError(f"unknown {kind} '{given}';{hint} allowed: {', '.join(allowed)}")
 
 

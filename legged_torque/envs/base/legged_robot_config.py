@@ -49,7 +49,7 @@ class LeggedRobotCfg(BaseConfig):
 
     class asset:  # the robot, and which of its geoms mean what
         file: str = ""  # MJCF, absolute or below resources/
-        foot_name: str = "foot"  # collision geoms whose name contains this are feet
+        foot_name: str = "foot"  # collision geoms whose name contains this are feet, those of one body a single one
         penalize_contacts_on: list[str] = []  # likewise: those of the collision term
         terminate_after_contacts_on: list[str] = []  # likewise: those that end an episode
         mirrored_legs: list[list[str]] = []  # pairs [right, left] of names of legs, with which names of parts begin
@@ -108,8 +108,8 @@ class LeggedRobotCfg(BaseConfig):
 
         # initial state, at every reset
         init_place: Annotated[list[float], Limits(-1, 1, ordered=True)] = [0.0, 0.0]  # [m] of the trunk, on x and y
-        init_roll: Interval = [-0.19635, 0.19635]  # [rad] +-pi/16
-        init_pitch: Interval = [-0.19635, 0.19635]  # [rad] +-pi/16
+        init_roll: Interval = [-0.19635, 0.19635]  # [rad]
+        init_pitch: Interval = [-0.19635, 0.19635]  # [rad]
         init_yaw: Interval = [-3.14159, 3.14159]  # [rad]
         init_dof_pos_scale: Interval = [0.5, 1.5]  # times q_nominal, then inside the joint limits
         init_dof_vel: Interval = [0.0, 0.0]  # [rad/s]
@@ -194,7 +194,7 @@ class LeggedRobotCfg(BaseConfig):
         tracking_temperature: Positive = 4.0  # gamma of both tracking terms
         soft_dof_pos_limit: Fraction = 0.9  # share of a joint's range, beyond which dof_pos_limits acts
         base_height_target: NotNegative = 0.0  # [m] of the trunk above the ground, in the nominal pose
-        feet_air_time_target: NotNegative = 0.5  # [s] swings are rewarded for what they last beyond this
+        feet_air_time_target: NotNegative = 0.5  # [s] feet_air_time rewards swings beyond it, single_stance up to it
         held_joints: list[str] = []  # parts of the names of joints that dof_deviation holds
 
         class scales:  # weights of Table III; each times the control step and its factor of ``curriculum``

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 
-_LEG = {"hip_pitch": -0.1, "hip_roll": 0.0, "hip_yaw": 0.0, "knee": 0.3, "ankle_pitch": -0.2, "ankle_roll": 0.0}
-
 
 class G1Cfg(LeggedRobotCfg):
     """Settings of the G1; alone, of position control on a plane: task ``g1_position``."""
@@ -20,7 +18,12 @@ class G1Cfg(LeggedRobotCfg):
 
     class init_state:
         pos = [0.0, 0.0, 0.82]
-        default_joint_angles = {f"{leg}_{joint}_joint": _LEG[joint] for leg in ("left", "right") for joint in _LEG}
+        default_joint_angles = (
+            {"left_hip_pitch_joint": -0.1, "left_hip_roll_joint": 0.0, "left_hip_yaw_joint": 0.0}
+            | {"left_knee_joint": 0.3, "left_ankle_pitch_joint": -0.2, "left_ankle_roll_joint": 0.0}
+            | {"right_hip_pitch_joint": -0.1, "right_hip_roll_joint": 0.0, "right_hip_yaw_joint": 0.0}
+            | {"right_knee_joint": 0.3, "right_ankle_pitch_joint": -0.2, "right_ankle_roll_joint": 0.0}
+        )
 
     class control:
         stiffness = {"hip": 100.0, "knee": 150.0, "ankle": 40.0}
@@ -48,7 +51,6 @@ class G1Cfg(LeggedRobotCfg):
         held_joints = ["hip_roll", "hip_yaw"]
 
         class scales:
-            ang_vel_xy = -0.05
             orientation = -2.0
             dof_pos_limits = -5.0
             dof_acc = -1e-7
@@ -60,6 +62,13 @@ class G1Cfg(LeggedRobotCfg):
             single_stance = 1.0
             dof_deviation = -0.2
             alive = 0.2
+
+    def perturbations(self) -> dict[str, dict]:
+        """Return the perturbations, with joints at the start of an episode that two legs can catch."""
+        named = super().perturbations()
+        for name in named.keys() - {"none"}:
+            named[name]["domain_rand"]["init_dof_vel"] = [-1.0, 1.0]
+        return named
 
 
 class G1CfgPPO(LeggedRobotCfgPPO):
