@@ -225,8 +225,8 @@ def arm_beside(root):
 
 
 def post_before(root):
-    """A body that stands still, before the trunk."""
-    root.find("worldbody").insert(0, ElementTree.Element("body", name="post"))
+    """A body that does not become a part of the world, before the trunk."""
+    root.find("worldbody").insert(0, ElementTree.Element("body", name="post", mocap="true"))
 
 
 REFUSED = {
@@ -272,24 +272,24 @@ def test_all_problems_at_once(changed):
     beyond, limits = joint("FL_calf_joint", range="-2.6 -1.6"), setting("actuator/motor[1]", ctrllimited="false")
     none = setting("actuator/motor[1]", forcelimited="false")
     told = error_of(load_asset, cfg_of(changed(servo(11), beyond, limits, none)))
-    for part in ("a target (RL_calf)", "a forcerange (FR_hip_joint,", "has -1.5 for 'FL_calf_joint'"):
+    for part in ("as a motor (RL_calf)", "a forcerange (FR_hip_joint,", "has -1.5 for 'FL_calf_joint'"):
         assert part in told
     unnamed, floor = setting(".//geom[@name='RL_calf']", name=None), setting(".//geom[@name='floor']", name="ground")
     told = error_of(
         load_asset, cfg_of(changed(unnamed, floor, setting(".//geom[@name='trunk']", name="base"), servo(11)))
     )
-    for part in ("those of 'RL_calf'", "a geom 'floor'", "geom (part of its name) 'trunk'", "a target (RL_calf)"):
+    for part in ("those of 'RL_calf'", "a geom 'floor'", "geom (part of its name) 'trunk'", "as a motor (RL_calf)"):
         assert part in told
 
 
 def test_fused_tells_all(changed, make_task):
     """Whatever the fused step cannot simulate of a robot is told together."""
     file = changed(
-        setting("option", integrator="Euler", cone="elliptic"),
-        setting(".//geom[@name='FL_hip']", type="cylinder", size="0.04 0.04"),
+        setting("option", integrator="RK4", cone="elliptic"),
+        setting(".//geom[@name='FL_hip']", type="ellipsoid", size="0.04 0.04 0.02"),
     )
     told = error_of(make_task, "a1_torque", 1, **{"asset.file": file})
-    for reason in ("integrator must be implicitfast", "cone must be pyramidal", "only spheres, capsules and boxes"):
+    for reason in ("integrator must be implicitfast", "cone must be pyramidal", "boxes may collide, unlike 'FL_hip'"):
         assert reason in told
 
 
@@ -383,9 +383,10 @@ def test_unlike_sides_are_no_mirror_images(changed, make_task):
     assert "the axes of 'FR_hip_joint' and 'FL_hip_joint' are not mirror images" in error_of(lambda: task.mirror)
 
 
-def test_joints_without_range(changed, make_task):
+@pytest.mark.parametrize("engine", ENGINES)
+def test_joints_without_range(changed, make_task, engine):
     """They have no limits, neither for rewards nor for initial angles, instead of the range 0 to 0 of their fields."""
     free = joint("FL_hip_joint", limited="false")
-    task = make_task("a1_torque", 2, **{"asset.file": changed(free), "sim.engine": "mujoco_warp"})
+    task = make_task("a1_torque", 2, **{"asset.file": changed(free), "sim.engine": engine})
     assert task.dof_pos_limits[3].tolist() == [-np.inf, np.inf] and task.dof_pos_limits[0].isfinite().all()
     assert (task.dof_pos[:, 3] > 0.04).all() and task.rew_buf.isfinite().all()
