@@ -130,7 +130,7 @@ class RewardTerms(ABC):
 
     def _reward_alive(self) -> Tensor:
         """1 at every step."""
-        return torch.ones_like(self.base_height)
+        return torch.ones_like(self.base_lin_vel[:, 0])
 
     def _reward_stumble(self) -> Tensor:
         """1 if a foot is pushed against a wall: see :data:`STUMBLING`."""
