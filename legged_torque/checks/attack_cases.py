@@ -35,7 +35,7 @@ READERS = {
     fixtures.PRETRAINED: ("check_standing.py", "train.py"),
     fixtures.DESCRIPTION: ("sim2sim.py",),
     fixtures.NETWORK: ("sim2sim.py",),
-    fixtures.ROBOT: ("sim2sim.py", "train.py"),
+    fixtures.ROBOT: ("import_robot.py", "sim2sim.py", "train.py"),
     fixtures.PLAN: ("experiment.py",),
     fixtures.CURVE: ("plot_curves.py",),
     fixtures.EVALUATIONS: ("plot_curves.py",),
