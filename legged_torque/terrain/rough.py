@@ -81,7 +81,7 @@ class RoughGround(Terrain):
         down = ~up & (distance < 0.5 * episode_length_s * commands[:, :2].norm(dim=1))
         levels = (self.levels + up.long() - down.long()).clamp(min=0)
         num_rows = self.layout.num_rows
-        levels = torch.where(levels < num_rows, levels, torch.randint_like(levels, num_rows))
+        levels = torch.where(levels < num_rows, levels, torch.randint_like(self.levels, num_rows))
         self.levels.copy_(torch.where(mask, levels, self.levels))
 
     def curriculum_values(self) -> dict[str, Tensor]:
