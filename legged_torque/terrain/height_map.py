@@ -62,8 +62,8 @@ class HeightMap(HeightGrid):
     def _along(self, place: Tensor, start: float, count: int) -> tuple[Tensor, Tensor]:
         """Return in which cell of an axis places are, and where in it, from 0 to 1."""
         cells = ((place.nan_to_num() - start) / self.horizontal_scale).clamp(0.0, count - 1.0)
-        cell = cells.long().clamp(0, count - 2)  # clamped as integers, so that torch's compiler need not test indices
-        return cell, cells - cell
+        cell = cells.floor().clamp(max=count - 2.0)
+        return cell.long(), cells - cell
 
     def _sample(self, index: Tensor, like: Tensor) -> Tensor:
         """Return samples with the precision of another tensor."""

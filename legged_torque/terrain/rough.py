@@ -15,8 +15,9 @@ from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.errors import UserError
 
-COPIES, BYTES = 3, 4
-"""Of a map on the device: for rewards and scans, for contacts, and what is greatest near each cell; in float32."""
+COPIES, BYTES = 3.25, 4
+"""Of a map on the device: for rewards and scans, for contacts, and what is greatest near each cell, and near each block
+of four; in float32."""
 
 
 class RoughGround(Terrain):
