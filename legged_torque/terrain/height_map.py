@@ -37,7 +37,7 @@ class HeightMap(HeightGrid):
         return self.height_at(points[..., 0], points[..., 1])
 
     def height_at(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return the same for x and y that are not in one tensor: a GPU need not write them for that. Shapes: (...,)."""
+        """Return the same for x and y by themselves, which a GPU need not write for that [m]. Shapes: (...,)."""
         low, slope_x, slope_y, x, y = self._triangle(x, y)
         return low + slope_x * x + slope_y * y
 
