@@ -19,7 +19,7 @@ _FAR = 10.0  # farther than any part is from the floor [m]
 def standing_note(task: LeggedRobot) -> str:
     """Return how the robot falls that is put on a plane in its nominal pose, held by PD control; empty if it stands.
 
-    One robot is simulated for :data:`STANDING_TIME`, with the task's gains and limits, which takes 0.1 s. Nothing is
+    One robot is simulated for :data:`STANDING_TIME`, with the task's gains and limits. Nothing is
     told of a task without gains. A UserError if the simulation diverges.
     """
     asset = load_asset(task.cfg)
