@@ -307,7 +307,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         if not log:
             return
         numbers = {**self.logger.ep_extras[-1], **log["loss_dict"], "learning_rate": log["learning_rate"]}
-        numbers["noise"] = float(log["action_std"].mean())
+        numbers["noise"] = log["action_std"].mean().item()
         try:
             with contextlib.redirect_stdout(io.StringIO()) as block:
                 self.logger.log(**log)

@@ -106,7 +106,8 @@ class TrainingDisplay(Display):
         else:
             tables = [table(columns), table([self._of_run()])]
         notices = [Text(text, "bold yellow") for text in (self.activity, self.notice) if text]
-        progress = bar(WHAT, self._pace, time.monotonic() - self.start)
+        pace = self._pace
+        progress = bar(WHAT, pace.done, pace.total, time.monotonic() - self.start, pace.left())
         content = Group(progress, *tables, *notices)
         return Panel(content, title=Text(self._title, "bold"), title_align="left", border_style="dim")
 
@@ -150,9 +151,10 @@ class TrainingDisplay(Display):
         numbers, column = self._state.numbers.items(), Column()
         curricula = [f"{name[len(_CURRICULUM) :]} {number:.3g}" for name, number in numbers if _CURRICULUM in name]
         if curricula:
-            column.append(("curricula", ", ".join(curricula)))
+            column.append(("curricula", Text(", ".join(curricula), no_wrap=False)))
         if self.warnings:
-            column.append(("warnings", Text(f"{len(self.warnings)}, last: {self.warnings[-1]}", "yellow")))
+            text = f"{len(self.warnings)}, last: {self.warnings[-1]}"
+            column.append(("warnings", Text(text, "yellow", no_wrap=False)))
         room = self.width - NAMES - 6  # beside borders and gaps
         folder = self._folder if len(self._folder) <= room else f"...{self._folder[3 - room :]}"
         return [*column, ("run", folder)]
@@ -165,7 +167,7 @@ def updates(numbers: Mapping[str, float]) -> Column:
 
 
 def table(columns: Sequence[Column]) -> Table:
-    """Return columns side by side, with lines that are cut off where they do not fit."""
+    """Return columns side by side; lines that do not fit are cut off, unless they may wrap."""
     grid = Table.grid(padding=(0, 2), expand=True)
     for _ in columns:
         grid.add_column(style="dim", no_wrap=True, width=NAMES)

@@ -111,13 +111,16 @@ class Display:
         """Whether the terminal has no other characters than those of ASCII."""
         return self._live is not None and self._live.console.options.ascii_only
 
+    def is_due(self) -> bool:
+        """Return whether there is a picture, and it is time to redraw it."""
+        return self._live is not None and time.monotonic() - self._drawn >= REDRAW_EVERY
+
     def update(self, line_every: float = LINE_EVERY) -> None:
         """Show the present state, if the last one was shown long enough ago [s]."""
         now, self._is_new = time.monotonic(), True
-        if self._live is not None:
-            if now - self._drawn >= REDRAW_EVERY:
-                self._draw()
-        elif now - self._printed >= line_every:
+        if self.is_due():
+            self._draw()
+        elif self._live is None and now - self._printed >= line_every:
             self._printed = math.inf  # nothing more if this fails: nobody reads
             print(self.line(), file=self._stream, flush=True)
             self._printed, self._is_new = now, False
@@ -172,7 +175,10 @@ class Counter(Display):
         """Return the bar."""
         seconds = time.monotonic() - self.start
         further = filter(None, (self._detail, self.activity, self.notice))
-        return Group(bar(self._what, self._pace, seconds), *(Text(text, style="dim") for text in further))
+        pace = self._pace
+        return Group(
+            bar(self._what, pace.done, pace.total, seconds, pace.left()), *(Text(text, style="dim") for text in further)
+        )
 
     def line(self) -> str:
         """Return how far the work is."""
@@ -212,15 +218,15 @@ class Pace:
         return rest / rate if rate else None if rest else 0.0
 
 
-def bar(what: str, pace: Pace, seconds: float) -> Table:
-    """Return a line with what is counted, a bar, and the time spent [s] and left."""
+def bar(what: str, done: float, total: int, seconds: float, left: float | None) -> Table:
+    """Return a line with what is counted, a bar, and the time spent [s] and left [s], None if that is unknown."""
     grid = Table.grid(padding=(0, 1), expand=True)
     grid.add_column(no_wrap=True)
     grid.add_column(ratio=1)
     for _ in range(2):
         grid.add_column(no_wrap=True)
-    share, times = pace.done / max(pace.total, 1), f"{duration(seconds)}, {time_left_text(pace.left())}"
-    grid.add_row(f"{what} {pace.done} of {pace.total}", ProgressBar(pace.total, pace.done), f"{share:4.0%}", times)
+    share, times = done / max(total, 1), f"{duration(seconds)}, {time_left_text(left)}"
+    grid.add_row(f"{what} {int(done)} of {total}", ProgressBar(total, done), f"{share:4.0%}", times)
     return grid
 
 
