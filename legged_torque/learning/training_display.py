@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, zip_longest
 from statistics import fmean
+from typing import TYPE_CHECKING
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
@@ -17,12 +18,15 @@ from rich.text import Text
 
 from legged_torque.utils.display import LINE_EVERY, Display, Pace, bar, progress_text
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 WHAT = "iteration"
 LINE_AFTER_EVALUATION = 2.0  # seconds between two plain lines if there is a new evaluation
 TREND = 10  # evaluations with whose mean the last one is compared
-CELLS = 16  # characters of the curve of the tracking
+CELLS = 12  # characters of the curve of the tracking
 NAMES = 15  # width of names [characters]
-TWO_COLUMNS = 76  # width of a terminal from which on numbers stand in two columns [characters]
+TWO_COLUMNS = 76  # width of the panel from which on numbers stand in two columns [characters]
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _CURRICULUM, _EVALUATION = "Curriculum/", "Evaluation"
 _TRACK, _FALLS = f"{_EVALUATION}/track_percentage", f"{_EVALUATION}/falls_per_minute"
@@ -41,7 +45,6 @@ class State:
     numbers: Mapping[str, float] = field(default_factory=dict)  # of the last iteration, by their names in the logs
     measured: Mapping[str, float] = field(default_factory=dict)  # the last evaluations, likewise
     tracking: tuple[float, ...] = ()  # of the evaluations in this process
-    best: tuple[float, int] | None = None  # the highest of them, and after how many iterations
     diverged: int = 0  # worlds, in this process
     skipped: int = 0  # updates, in this process
 
@@ -55,7 +58,7 @@ class TrainingDisplay(Display):
         self._title, self._folder, self._pace, self._steps = title, folder, pace, steps_per_iteration
         self._is_quiet, self._state = is_quiet, State()
 
-    def __enter__(self) -> TrainingDisplay:
+    def __enter__(self) -> Self:
         """Begin to show; the first line follows the first iteration."""
         if not self._is_quiet:
             super().__enter__()
@@ -70,14 +73,12 @@ class TrainingDisplay(Display):
         """
         old, now = self._state, numbers.get(_TRACK, math.nan)
         measured = {name: number for name, number in numbers.items() if name.startswith(_EVALUATION)}
-        is_best = now > old.best[0] if old.best else not math.isnan(now)
         self._pace.add(done)
         self._state = State(
             steps,
             numbers,
             {**old.measured, **measured},
             old.tracking if math.isnan(now) else (*old.tracking, now),
-            (now, done) if is_best else old.best,
             old.diverged + int(numbers.get("Health/diverged_worlds", 0.0)),
             old.skipped + int(numbers["skipped_updates"]),
         )
@@ -91,9 +92,9 @@ class TrainingDisplay(Display):
         parts.append(f"{state.steps:,} steps, {self._speed()}")
         if "reward" in numbers:
             parts.append(f"reward {numbers['reward']:.2f}, episodes {numbers['length']:.1f} s")
-        if state.best:
-            falls = state.measured[_FALLS]
-            parts.append(f"tracking {state.tracking[-1]:.3f} (best {state.best[0]:.3f}), {falls:.1f} falls/min")
+        if state.tracking:
+            tracking = f"tracking {state.tracking[-1]:.3f} (best {max(state.tracking):.3f})"
+            parts.append(f"{tracking}, {state.measured[_FALLS]:.1f} falls/min")
         parts.append(", ".join(f"{name} {text}" for name, text in updates(numbers)))
         bad = {"diverged worlds": state.diverged, "skipped updates": state.skipped}
         return "; ".join([*parts, *(f"{count} {name}" for name, count in bad.items() if count)])
@@ -106,8 +107,8 @@ class TrainingDisplay(Display):
         else:
             tables = [table(columns), table([self._of_run()])]
         notices = [Text(text, "bold yellow") for text in (self.activity, self.notice) if text]
-        pace = self._pace
-        progress = bar(WHAT, pace.done, pace.total, time.monotonic() - self.start, pace.left())
+        seconds, left = time.monotonic() - self.start, self._pace.left()
+        progress = bar(f"{WHAT} {self._pace}", self._pace.share, seconds, left)
         content = Group(progress, *tables, *notices)
         return Panel(content, title=Text(self._title, "bold"), title_align="left", border_style="dim")
 
@@ -129,12 +130,10 @@ class TrainingDisplay(Display):
     def _of_evaluations(self) -> Column:
         """Return what was measured last, and whether numbers were bad."""
         state, column = self._state, Column()
-        if state.best:
-            now, before = state.tracking[-1], state.tracking[-1 - TREND : -1]
-            change = f"  {now - fmean(before):+.3f}" if before else ""
-            curve = "" if self.is_ascii else f"  {blocks(state.tracking)}"
-            column.append(("tracking", Text.assemble((f"{now:.3f}", "bold"), change, (curve, "green"))))
-            column.append(("best", f"{state.best[0]:.3f} in {WHAT} {state.best[1]}"))
+        if state.tracking:
+            now, before = state.tracking[-1], state.tracking[-1 - TREND : -1] or state.tracking
+            column.append(("tracking", Text.assemble((f"{now:.3f}", "bold"), f", best {max(state.tracking):.3f}")))
+            column.append(("trend", Text.assemble(f"{now - fmean(before):+.3f} ", (blocks(state.tracking), "green"))))
             column.append(("falls", f"{state.measured[_FALLS]:.1f} per minute"))
         else:
             column.append(("tracking", "not measured yet"))

@@ -12,15 +12,19 @@ import time
 from collections import deque
 from datetime import timedelta
 from types import TracebackType
-from typing import ClassVar, TextIO
+from typing import TYPE_CHECKING, ClassVar, TextIO
 
 from rich.console import Console, Group, RenderableType
+from rich.constrain import Constrain
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
 from legged_torque.utils.interrupt import write_error
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 REDRAW_EVERY = 0.5  # seconds between two pictures while the work goes on
 REDRAW_WAITING = 1.0  # seconds between two pictures during a long part of the work, so that the clock goes on
@@ -69,7 +73,7 @@ class Display:
         """Return the line that is printed elsewhere."""
         raise NotImplementedError
 
-    def __enter__(self) -> Display:
+    def __enter__(self) -> Self:
         """Begin to show."""
         self._printed = self.start = time.monotonic()
         if is_terminal(self._stream) and Display.shown is None:
@@ -81,7 +85,7 @@ class Display:
                 transient=not self._stays,
                 redirect_stdout=is_terminal(sys.stdout),
                 redirect_stderr=is_terminal(sys.stderr),
-                get_renderable=self.picture,
+                get_renderable=lambda: Constrain(self.picture(), self.width),
             )
             self._live.start()
             self._draw()
@@ -95,21 +99,17 @@ class Display:
         if self._live is not None:
             self._end.set()
             self._thread.join()
-            Display.shown, live, self._live = None, self._live, None
+            Display.shown = None
             with contextlib.suppress(OSError):  # the terminal is gone
-                live.stop()
+                self._live.stop()
+            self._live = None
         elif self._stays and self._is_new and kind is None:
             self.update(line_every=0.0)
 
     @property
     def width(self) -> int:
-        """Width of the terminal [characters]."""
-        return self._live.console.width if self._live is not None else 80
-
-    @property
-    def is_ascii(self) -> bool:
-        """Whether the terminal has no other characters than those of ASCII."""
-        return self._live is not None and self._live.console.options.ascii_only
+        """Width of pictures [characters]: that of the terminal, but for the two that show Ctrl-C."""
+        return self._live.console.width - 2 if self._live is not None else 80
 
     def is_due(self) -> bool:
         """Return whether there is a picture, and it is time to redraw it."""
@@ -158,11 +158,6 @@ class Counter(Display):
         super().__init__(sys.stderr)
         self._what, self._pace, self._detail = what, Pace(total), ""
 
-    def __enter__(self) -> Counter:
-        """Begin to show."""
-        super().__enter__()
-        return self
-
     def add(self, detail: str = "") -> None:
         """Count one more, and keep what is to be said about it."""
         if self._pace.done == 0:
@@ -174,11 +169,9 @@ class Counter(Display):
     def picture(self) -> RenderableType:
         """Return the bar."""
         seconds = time.monotonic() - self.start
+        progress = bar(f"{self._what} {self._pace}", self._pace.share, seconds, self._pace.left())
         further = filter(None, (self._detail, self.activity, self.notice))
-        pace = self._pace
-        return Group(
-            bar(self._what, pace.done, pace.total, seconds, pace.left()), *(Text(text, style="dim") for text in further)
-        )
+        return Group(progress, *(Text(text, style="dim") for text in further))
 
     def line(self) -> str:
         """Return how far the work is."""
@@ -199,6 +192,15 @@ class Pace:
         self.total, self.done = total, done
         self._moments: deque[tuple[float, int]] = deque(maxlen=100)
 
+    def __str__(self) -> str:
+        """Say how many are done."""
+        return f"{self.done} of {self.total}"
+
+    @property
+    def share(self) -> float:
+        """Share of all that is done, 0 to 1."""
+        return self.done / max(self.total, 1)
+
     def add(self, done: int) -> None:
         """Note that so many are done now."""
         self.done, now = done, time.monotonic()
@@ -218,21 +220,21 @@ class Pace:
         return rest / rate if rate else None if rest else 0.0
 
 
-def bar(what: str, done: float, total: int, seconds: float, left: float | None) -> Table:
-    """Return a line with what is counted, a bar, and the time spent [s] and left [s], None if that is unknown."""
+def bar(text: str, share: float, seconds: float, left: float | None) -> Table:
+    """Return a line with a text, a bar for the share that is done, and the time spent [s] and left [s], if known."""
     grid = Table.grid(padding=(0, 1), expand=True)
     grid.add_column(no_wrap=True)
     grid.add_column(ratio=1)
     for _ in range(2):
         grid.add_column(no_wrap=True)
-    share, times = done / max(total, 1), f"{duration(seconds)}, {time_left_text(left)}"
-    grid.add_row(f"{what} {int(done)} of {total}", ProgressBar(total, done), f"{share:4.0%}", times)
+    times = f"{duration(seconds)}, {time_left_text(left)}"
+    grid.add_row(text, ProgressBar(1.0, share), f"{math.floor(100.0 * share):3}%", times)
     return grid
 
 
 def progress_text(what: str, pace: Pace, seconds: float) -> str:
     """Return how far something is and the time spent [s] and left: "iteration 5 of 20, 0:00:01, 0:00:03 left"."""
-    return f"{what} {pace.done} of {pace.total}, {duration(seconds)}, {time_left_text(pace.left())}"
+    return f"{what} {pace}, {duration(seconds)}, {time_left_text(pace.left())}"
 
 
 def time_left_text(left: float | None) -> str:
@@ -259,5 +261,6 @@ def warn(text: str) -> None:
 
 
 def is_terminal(stream: TextIO) -> bool:
-    """Return whether a stream is a terminal on which lines can be rewritten."""
-    return stream.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
+    """Return whether a stream is a terminal on which pictures can be drawn: one that knows Unicode and no dumb one."""
+    has_unicode = (stream.encoding or "utf-8").lower().startswith("utf")
+    return stream.isatty() and has_unicode and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
