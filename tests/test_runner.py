@@ -198,7 +198,7 @@ def test_mixing_weights_change_between_rollouts_only(make_runner):
 
 @pytest.mark.parametrize("interval", [1, 2, 5])
 def test_checkpoints_are_saved_at_every_interval(make_runner, tmp_path, interval):
-    """Checkpoints carry the number of finished iterations; first and last are always there, and nothing half-written."""
+    """They carry the number of finished iterations; first and last are always there, and nothing half-written."""
     runner = make_runner(log_root=tmp_path, **{"runner.save_interval": interval, "runner.logger": "none"})
     runner.learn(3)
     files = {path.name for path in tmp_path.glob("*/*") if path.is_file()}
