@@ -182,7 +182,7 @@ def test_stop(stage, tmp_path, number):
 
     def stop():
         """Send the signal when the training is under way."""
-        wait_for(lambda: any("iteration 2/4" in log.read_text() for log in out.glob("*/train.log")))
+        wait_for(lambda: any("iteration 3 of 4" in log.read_text() for log in out.glob("*/train.log")))
         os.kill(os.getpid(), number)
 
     thread = threading.Thread(target=stop)

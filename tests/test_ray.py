@@ -128,7 +128,7 @@ def test_stop(here, stage, tmp_path):
 
     def stop():
         """Ask to stop when both are under way."""
-        wait_for(lambda: all(log.is_file() and "iteration 2/4" in log.read_text() for log in logs), 30)
+        wait_for(lambda: all(log.is_file() and "iteration 3 of 4" in log.read_text() for log in logs), 30)
         os.kill(os.getpid(), signal.SIGTERM)
 
     thread = during(stage, stop)

@@ -92,7 +92,7 @@ def root(tmp_path_factory):
     checkpoint = (run / "model_2.pt").read_bytes()
     for name, content in {"text": b"this is no checkpoint\n", "half": checkpoint[: len(checkpoint) // 2]}.items():
         copy = shutil.copytree(run, root / "logs" / f"{name}_checkpoint" / run.name)
-        for number in (1, 2):
+        for number in (0, 1, 2):
             (copy / f"model_{number}.pt").write_bytes(content)
     return root
 
@@ -126,7 +126,7 @@ MISTAKES = [
     ("--num_envs=few", "argument --num_envs: invalid int value: 'few'"),
     ("--max_iterations=0", "--max_iterations must be at least 1, not 0"),
     ("--resume --load_run=2026", "unknown run '2026'"),
-    ("--resume --checkpoint=7", "unknown checkpoint '7'; allowed: 1, 2"),
+    ("--resume --checkpoint=7", "unknown checkpoint '7'; allowed: 0, 1, 2"),
     ("--resume --checkpoint=last", "argument --checkpoint: invalid int value: 'last'"),
     ("--resume --experiment_name=nothing", "there is no run with a checkpoint in"),
     ("--resume", "the run has 2 iterations already; raise --max_iterations"),
@@ -198,7 +198,7 @@ def test_mistakes_when_training(root, words, message):
     [
         ("play.py", "--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
         ("play.py", "--load_run=2026", "unknown run '2026'"),
-        ("play.py", "--checkpoint=7", "unknown checkpoint '7'; allowed: 1, 2"),
+        ("play.py", "--checkpoint=7", "unknown checkpoint '7'; allowed: 0, 1, 2"),
         ("play.py", "--experiment_name=not_yaml", "config.yaml' is not valid YAML"),
         ("play.py", "--experiment_name=text_checkpoint", "model_2.pt' is not a readable checkpoint"),
         (

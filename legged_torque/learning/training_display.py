@@ -89,7 +89,7 @@ class TrainingDisplay(Display):
         """Return the state in a line."""
         state, numbers = self._state, self._state.numbers
         parts = [progress_text(WHAT, self._pace, time.monotonic() - self.start)]
-        parts.append(f"{state.steps:,} steps, {self._speed()}")
+        parts.append(", ".join(filter(None, (f"{state.steps:,} steps", self._speed()))))
         if "reward" in numbers:
             parts.append(f"reward {numbers['reward']:.2f}, episodes {numbers['length']:.1f} s")
         if state.tracking:
@@ -113,9 +113,9 @@ class TrainingDisplay(Display):
         return Panel(content, title=Text(self._title, "bold"), title_align="left", border_style="dim")
 
     def _speed(self) -> str:
-        """Return the steps per second."""
+        """Return the steps per second; empty if they are not known yet."""
         rate = self._pace.per_second()
-        return "? steps/s" if rate is None else f"{rate * self._steps:,.0f} steps/s"
+        return "" if rate is None else f"{rate * self._steps:,.0f} steps/s"
 
     def _of_training(self) -> Column:
         """Return what the training itself tells."""

@@ -31,7 +31,7 @@ REDRAW_WAITING = 1.0  # seconds between two pictures during a long part of the w
 LINE_EVERY = 10.0  # seconds between two plain lines
 _POLL = 0.25
 _UNKNOWN = "time left unknown"
-_PROGRESS = re.compile(rf"([\w ]+?) (\d+) of (\d+), (?:\d+ days?, )?[\d:]+, (?:{_UNKNOWN}|(\S.*?) left)")
+_PROGRESS = re.compile(rf"([\w, ]+?) (\d+) of (\d+), (?:\d+ days?, )?[\d:]+, (?:{_UNKNOWN}|(\S.*?) left)")
 
 
 class Display:
