@@ -342,9 +342,9 @@ def test_learning_curve(root, tmp_path):
     file = tmp_path / "new" / "curve.json"
     words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--steps=3", f"--json={file}"]
     status, output, error = run_here("learning_curve.py", *words, root=root)
-    assert (status, error) == (0, "") and len(output.splitlines()) == 2
+    assert (status, error) == (0, "") and len(output.splitlines()) == 3
     curve = json.loads(file.read_text())
-    assert [point["steps"] for point in curve["points"]] == [8, 16]
+    assert [point["steps"] for point in curve["points"]] == [0, 8, 16]
     assert all(math.isfinite(value) for point in curve["points"] for value in point.values())
 
 
