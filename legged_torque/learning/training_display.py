@@ -154,7 +154,7 @@ class TrainingDisplay(Display):
         if self.warnings:
             text = f"{len(self.warnings)}, last: {self.warnings[-1]}"
             column.append(("warnings", Text(text, "yellow", no_wrap=False)))
-        room = self.width - NAMES - 6  # beside borders and gaps
+        room = self.width - NAMES - 8  # beside borders and gaps
         folder = self._folder if len(self._folder) <= room else f"...{self._folder[3 - room :]}"
         return [*column, ("run", folder)]
 
