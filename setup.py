@@ -42,6 +42,7 @@ setup(
         "tensordict",
         "numpy",
         "pyyaml",
+        "rich>=13.7,<16",
     ],
     extras_require={
         "video": VIDEO,

@@ -86,6 +86,7 @@ def main() -> None:
         from legged_torque.deploy.robot import MujocoRobot
         from legged_torque.deploy.simulation import Events, Simulation
         from legged_torque.envs import LeggedRobotCfg
+        from legged_torque.utils.display import Counter
         from legged_torque.utils.metrics import UNITS, estimates, ratios
         from legged_torque.viewer.native import simulation_window
         from legged_torque.viewer.video import SimulationRecorder
@@ -103,9 +104,11 @@ def main() -> None:
         print(f"{policy.description['task']}, {training['checkpoint']} of {training['run']}, in MuJoCo with '{xml}':")
         for note in robot.notes:
             print(f"  note: {note}")
-        for number in range(args.robots):
-            record = recorder.add_step if recorder and number == 0 else lambda: None
-            sums.append(simulation.run(args.steps, [args.seed, number], lambda record=record: (record(), show())))
+        with Counter("simulating, step", args.robots * args.steps) as counter:
+            for number in range(args.robots):
+                record = recorder.add_step if recorder and number == 0 else lambda: None
+                after = (record, show, counter.add)
+                sums.append(simulation.run(args.steps, [args.seed, number], lambda after=after: [do() for do in after]))
     control_step = 1.0 / policy.description["timing"]["control_frequency"]
     metrics = estimates(ratios(np.array(sums).T, robot.weight, control_step))
     print(f"  {args.robots} robots x {args.steps} steps of {control_step:g} s")

@@ -85,6 +85,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
     runner, _ = task_registry.make_alg_runner(env, options.task, options, train_cfg)
     if starts_pretrained:
         start_from(runner, pretrained)  # the other processes get the networks of the first one
+    runner.verbose = options.verbose
     total = options.max_iterations or num_iterations(env, train_cfg)
     settings = {"env": to_dict(env_cfg), "train": to_dict(train_cfg), "version": package_versions()}
     distributed.check_same(flat({**settings, "task": options.task, "max_iterations": total}))

@@ -11,7 +11,7 @@ from legged_torque.utils.options import Options
 
 _SETTINGS = ("task", "seed", "perturbation", "ranges", "device", "set")
 _RUNS = ("log_root", "experiment_name", "load_run", "checkpoint")
-_TRAINING = ("max_iterations", "resume", "run_name", "preset", "logger")
+_TRAINING = ("max_iterations", "resume", "run_name", "preset", "logger", "verbose")
 
 
 def add_settings_args(parser: Parser) -> None:

@@ -50,6 +50,7 @@ class Options:
     load_run: str | None = _option("run to load: name of its folder or a path; default: the last one")
     checkpoint: Number | None = _option("checkpoint to load; default: the last one", type=int)
     resume: bool = _option("continue a run, with its settings", False, action="store_true")
+    verbose: bool = _option("print rsl_rl's block of numbers after every iteration", False, action="store_true")
     max_iterations: Count | None = _option("iterations in all; default: 110e6 environment steps", type=int)
 
 

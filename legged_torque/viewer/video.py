@@ -15,6 +15,7 @@ from legged_torque import resource_path
 from legged_torque.deploy.simulation import Simulation
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.layout import Layout
+from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.rendering import INSTALL_HINT
 from legged_torque.viewer.ground import Ground, Smooth, drawn_model, ground_of
@@ -141,8 +142,9 @@ def write_video(
     file.parent.mkdir(parents=True, exist_ok=True)
     writer = imageio.get_writer(file, fps=round(0.5 / control_step), macro_block_size=1)
     cameras = [Camera(ground) for _ in steps[0]]
-    with renderer, writer:
-        for number, moments in list(enumerate(steps, start=1))[::2]:
+    shown = list(enumerate(steps, start=1))[::2]
+    with renderer, writer, Counter("rendering, frame", len(shown)) as counter:
+        for number, moments in shown:
             tiles = []
             for moment, camera in zip(moments, cameras, strict=True):
                 image = _draw(renderer, data, trunk, moment, camera)
@@ -150,6 +152,7 @@ def write_video(
                 tiles.append(add_overlay(image, rows))
             rows_of_tiles = [np.hstack(tiles[i : i + side]) for i in range(0, len(tiles), side)]
             writer.append_data(np.vstack(rows_of_tiles))
+            counter.add()
 
 
 class Camera:
