@@ -128,7 +128,7 @@ def test_without_matplotlib(made, tmp_path, monkeypatch):
     """The extra that is missing is named."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     result, picture = plot(made[2], tmp_path)
-    assert_told_in_one_line(result, "pip install -e .[plots]")
+    assert_told_in_one_line(result, "pip install 'legged_torque[plots]'")
     assert not picture.exists()
 
 
