@@ -31,14 +31,13 @@ def import_task_files(tasks: dict[str, Any], files: Iterable[str | Path]) -> Non
         name, path = file.stem, file.resolve()
         if not path.is_file() or path.suffix != ".py" or not name.isidentifier():
             raise UserError(f"--task_file takes a Python file with the name of a module, not '{file}'")
-        before = sys.modules.get(name)
-        if before is not None and Path(getattr(before, "__file__", None) or "").resolve() == path:
-            continue
-        if before is not None or importlib.util.find_spec(name) is not None:
+        other = importlib.util.find_spec(name)
+        if other is not None and Path(other.origin or "").resolve() != path:
             raise UserError(f"'{file}' cannot be imported: there is another module '{name}'; rename the file")
-        sys.path.insert(0, str(path.parent))
-        with _adding_tasks(tasks, f"'{file}'"):
-            importlib.import_module(name)
+        if name not in sys.modules:
+            sys.path.insert(0, str(path.parent))
+            with _adding_tasks(tasks, f"'{file}'"):
+                importlib.import_module(name)
 
 
 def import_installed_tasks(tasks: dict[str, Any]) -> None:
@@ -47,12 +46,12 @@ def import_installed_tasks(tasks: dict[str, Any]) -> None:
     One that is broken does not take the others with it: what is wrong is told, and its tasks are missing.
     """
     for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        source = f"the entry point '{point.name} = {point.value}'"
-        try:
-            with _adding_tasks(tasks, source):
-                point.load()
-        except UserError as error:
-            print(f"Note: {error}", file=sys.stderr)
+        if point.module not in sys.modules:
+            try:
+                with _adding_tasks(tasks, f"the entry point '{point.name} = {point.value}'"):
+                    point.load()
+            except UserError as error:
+                print(f"Note: {error}", file=sys.stderr)
 
 
 @contextlib.contextmanager
