@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 from legged_torque.envs import task_registry
 from legged_torque.utils import distributed
 from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of, task_file_words
+from legged_torque.utils.busy_cores import BusyCores
 from legged_torque.utils.cli import check_output, importing, run_script, script_command
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.devices import device_name, resolve_device
@@ -44,6 +45,7 @@ def main() -> None:
     add_train_args(parser)
     parser.add_argument("--list", action="store_true", help="print all tasks and exit")
     args = parser.parse_args()
+    cores = BusyCores()
     options = options_of(args)
     if args.list:
         print("\n".join(task_registry.names()))
@@ -74,11 +76,13 @@ def main() -> None:
         from legged_torque.utils.progress import CompileProgress
     set_seed(train_cfg.seed)
     with CompileProgress():
-        train(options, env_cfg, train_cfg)
+        train(options, env_cfg, train_cfg, cores)
 
 
-def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
+def train(options: Options, env_cfg: Any, train_cfg: Any, cores: BusyCores) -> None:
     """Build the task and train it, from a pre-trained policy if the task has one."""
+    import torch
+
     from legged_torque.envs.base.held_pose import standing_note
     from legged_torque.envs.base.legged_robot import LeggedRobot
     from legged_torque.learning.pretrained import find_pretrained, pretrained_file, start_from
@@ -101,6 +105,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
     if remaining < 1:
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
     if is_first:
+        print_notes(filter(None, [cores.note(torch.get_num_threads()) if env.device == "cpu" else None]))
         announce(runner, options, env_cfg, train_cfg, total)
     try:
         runner.learn(remaining, init_at_random_ep_len=True)
