@@ -6,12 +6,14 @@ import runpy
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
-import yaml
+from packaging.requirements import Requirement
 from settings import error_of, get_cfgs, parse
 from test_scripts import ROOT, assert_told_in_one_line, run_here
 
+from legged_torque.checks.installation import extras, gpus
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.commands import UniformCommands, fix_command
 from legged_torque.utils.args import Parser, add_task_args, task_file_words
@@ -112,7 +114,10 @@ def test_names_of_the_device():
     parser = Parser("test")
     add_task_args(parser)
     told = error_of(parser.parse_args, ["--sim_device=cuda:0", "--rl_device=cpu"])
-    assert told == "--rl_device is cpu, but an option that means the same is cuda:0"
+    assert told == "these options mean the same, but differ: --sim_device=cuda:0, --rl_device=cpu"
+    parser = Parser("test")
+    add_task_args(parser)
+    assert parser.parse_args(["--device=cpu", "--device=cuda"]).device == "cuda"
 
 
 @pytest.mark.parametrize(
@@ -159,12 +164,32 @@ def test_words_for_task_files():
     assert task_file_words(["a.py", "b c.py"]) == ["--task_file=a.py", "--task_file=b c.py"]
 
 
-def test_resume_says_from_where(tmp_path):
-    """The checkpoint and its iterations."""
-    small = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--set=runner.num_steps_per_env=4", "--logger=none"]
-    for words in (["--max_iterations=1"], ["--max_iterations=2", "--resume", "--load_run=-1", "--checkpoint=-1"]):
-        status, output, error = run_here("train.py", *small, *words, root=tmp_path)
-        assert (status, error) == (0, "")
-    first, second = sorted((tmp_path / "logs" / "a1_position").iterdir())
-    assert f"Resuming from {first.relative_to(tmp_path) / 'model_1.pt'}, after 1 iterations." in output
-    assert yaml.safe_load((second / "config.yaml").read_text())["max_iterations"] == 2
+# ---- what is installed -----------------------------------------------------------------------------------------------
+
+
+def test_info(tmp_path):
+    """Versions, device, the folder of kernels, and renderers; nothing is written."""
+    status, output, _ = run_here("info.py", root=tmp_path)
+    assert status == 0 and f"  torch          {torch.__version__}\n" in output and "compiled kernels: " in output
+    for title in ("versions", "machine", "GPU", "caches", "extras", "rendering"):
+        assert f"\n{title}\n  " in output
+    assert not list(tmp_path.iterdir())
+
+
+def test_missing_extras():
+    """What is missing, or too old, is named with the command that installs it."""
+    of_extras = {"video": "no-such-package>=2", "export": "numpy>=99", "viewer": "numpy"}
+    texts = ["numpy", *(f"{need}; extra == '{extra}'" for extra, need in of_extras.items())]
+    lines = {line.split()[0]: line for line in extras([Requirement(text) for text in texts])}
+    assert "missing no-such-package: pip install 'legged_torque[video]'" in lines["video"]
+    assert "missing numpy>=99" in lines["export"] and f"(here {np.__version__})" in lines["export"]
+    assert lines["viewer"].split()[1] == lines["plots"].split()[1] == "ok"
+    assert extras(None) == ["unknown, as the package is not installed: pip install -e ."]
+
+
+def test_gpus_that_cannot_be_used(monkeypatch):
+    """A driver beside a torch for the CPU is told."""
+    monkeypatch.setattr(torch.version, "cuda", None)
+    told = gpus(["NVIDIA H200, 580.1, 143771 MiB"])
+    assert told[0].startswith("NVIDIA H200, 580.1") and "install one for CUDA to use the GPU" in told[1]
+    assert gpus([]) == ["none with a driver of NVIDIA", "torch is a build for the CPU"]

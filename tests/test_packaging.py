@@ -83,6 +83,18 @@ def test_contents(installed):
     assert {path.name for path in installed.iterdir() if path.suffix != ".dist-info"} == {"legged_torque"}
 
 
+def test_command_and_experiments(installed, tmp_path):
+    """The console command is there, and finds the experiments that come with the package."""
+    (points,) = installed.glob("*.dist-info/entry_points.txt")
+    assert "legged-torque = legged_torque.utils.command:main" in points.read_text()
+    code = "import legged_torque as l; print(*map(l.experiment_path, ('experiments/smoke.yaml', 'mine.yaml')))"
+    environment = os.environ | {"PYTHONPATH": str(installed)}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    smoke, mine = done.stdout.split()
+    assert Path(smoke).read_text() == (ROOT / "experiments" / "smoke.yaml").read_text()
+    assert smoke.startswith(str(installed)) and mine == "mine.yaml"
+
+
 def test_scripts_from_another_directory(installed, tmp_path):
     """Train, play, export, let the exported policy walk, run an experiment: all files land in the current directory."""
     (tmp_path / "tiny.yaml").write_text(EXPERIMENT)

@@ -97,4 +97,4 @@ def lacking(need: Requirement) -> str:
         version = importlib.metadata.version(need.name)
     except importlib.metadata.PackageNotFoundError:
         return need.name
-    return "" if need.specifier.contains(version, prereleases=True) else f"{need} (here {version})"
+    return "" if need.specifier.contains(version, prereleases=True) else f"{need.name}{need.specifier} (here {version})"

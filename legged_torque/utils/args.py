@@ -61,15 +61,14 @@ def add_options(parser: Parser, *names: str) -> None:
 
 
 class _OneValue(argparse.Action):
-    """What several options of a command line may give, if they agree."""
-
-    _given: Any = None
+    """What several options of a command line may give if they agree; of one that is repeated, the last counts."""
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
         """Keep the value of an option; a UserError if another one has given another value."""
-        if self._given not in (None, values):
-            raise UserError(f"{option_string} is {values}, but an option that means the same is {self._given}")
-        self._given = values
+        self.given = {**getattr(self, "given", {}), option_string: values}
+        if len(set(self.given.values())) > 1:
+            told = ", ".join(f"{option}={value}" for option, value in self.given.items())
+            raise UserError(f"these options mean the same, but differ: {told}")
         setattr(namespace, self.dest, values)
 
 
