@@ -60,7 +60,7 @@ def test_standing_of_a_missing_policy(tmp_path):
     """It is told in one line where the policy should be; nothing is made."""
     result = run_here("check_standing.py", *SMALL, root=tmp_path)
     assert_told_in_one_line(
-        result, f"no pre-trained policy 'logs/pretrained/{TASK}.pt'; run scripts/pretrain_gravity.py"
+        result, f"no pre-trained policy 'logs/pretrained/{TASK}.pt'; make it first: python scripts/pretrain_gravity.py"
     )
     assert result[1] == "" and not list(tmp_path.iterdir())
 
