@@ -1,7 +1,7 @@
 """Make a robot of this library out of a MJCF or URDF: ``python scripts/import_robot.py go2.urdf --name go2 --check``.
 
-Writes resources/robots/NAME/NAME.xml and legged_torque/envs/robots/NAME.py, or both into the folder --out, and prints
-what was changed and why.
+Writes resources/robots/NAME/NAME.xml and legged_torque/envs/robots/NAME.py, which is all that NAME_position and its
+other tasks need, or both into the folder --out; prints what was changed and why.
 """
 
 from pathlib import Path
@@ -39,7 +39,7 @@ def main() -> None:
         check_output(file)
         if file.exists() and not args.force:
             raise UserError(f"'{file}' exists; --force writes over it, --name and --out write elsewhere")
-    path = str(model_file) if args.out else f"resources/robots/{robot.name}/{robot.name}.xml"
+    path = str(model_file.absolute()) if args.out else f"resources/robots/{robot.name}/{robot.name}.xml"
     text = mjcf(robot)
     model = parse(text, args.file)
     problem = fused_problem(model)
@@ -59,6 +59,9 @@ def main() -> None:
         else:
             draw(model, data, folder / f"{robot.name}.png")
             print(f"wrote {folder / robot.name}.png")
+    if args.out:
+        print(f"To have its tasks, put {code_file.name} into {Path(package).parent / 'envs' / 'robots'}")
+    print(f"Train it: python scripts/train.py --task={robot.name}_position")
 
 
 if __name__ == "__main__":

@@ -48,8 +48,8 @@ def main() -> None:
         )
         from legged_torque.checks.planes import PlanePerFoot
         from legged_torque.envs.base.asset import load_asset
-        from legged_torque.sim.model import read_spec
         from legged_torque.sim.simulator import ENGINES, Simulator
+        from legged_torque.utils.mjcf import read_spec
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options)
     policy = runner.get_inference_policy(env.device)
@@ -66,7 +66,8 @@ def main() -> None:
         model = open_motors(load_asset(env.cfg, None if height_map else env.terrain).mj_model)
         sims[engine] = Simulator(model, args.worlds, env.device, engine, *limits, height_map=height_map)
     if ground:
-        planes = PlanePerFoot(read_spec(resource_path(env.cfg.asset.file)), env.foot_names, ground)
+        spec = read_spec(resource_path(env.cfg.asset.file), env.dof_names)
+        planes = PlanePerFoot(spec, env.foot_names, ground)
         model, pose = open_motors(planes.model), planes.pose
         model.opt.timestep = env.cfg.sim.dt
     print(f"{args.task} on {device_name(env.device)}: errors of the velocities after one step [m/s, rad/s]")

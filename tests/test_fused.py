@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from legged_torque import RESOURCES_DIR
-from legged_torque.sim.model import build_model, read_spec
+from legged_torque.sim.model import build_model
 from legged_torque.sim.simulator import Simulator
+from legged_torque.utils.mjcf import read_spec
 
 FIELDS = ("qpos", "qvel", "ctrl", "qacc_warmstart")
 AIR, FLOOR, DEEP = (1.0, 2.0), (0.05, 0.3), (-0.4, 0.1)
@@ -32,14 +33,35 @@ WALKER_LEG = """<body pos="0 {y} -0.05" quat="1 0.2 0 {y}">
    <body pos="0 0 -0.12" quat="1 0 0.2 0.1"><joint name="{s}4" axis="0.3 1 0.5" frictionloss="0" pos="0 0 -0.01"/>
     <geom name="{s}foot" type="box" size="0.05 0.03 0.015" pos="0.02 0 -0.01" quat="1 0.1 0 0" mass="0.3"/>
  </body></body></body></body>"""
-INSECT = """<mujoco><compiler angle="radian" autolimits="true"/>
-<option cone="pyramidal" integrator="implicitfast" timestep="0.003"/>
-<default><geom contype="0" conaffinity="1"/></default>
-<worldbody><geom name="floor" type="plane" size="0 0 1" contype="1" conaffinity="0" solref="0.015 0.9"/>
-<body name="trunk" pos="0 0 0.1"><freejoint/><geom name="box" type="box" size="0.15 0.06 0.02" mass="2"/>
- <geom name="top" type="box" size="0.05 0.03 0.03" pos="0.02 0 0.04" mass="1"/>{legs}</body></worldbody></mujoco>"""
-INSECT_LEG = """<body pos="{x} {y} 0" euler="0 0 {a}"><joint axis="0.2 -1 0" pos="0.01 0 0" range="-0.7 0.9"/>
-<geom name="leg{a}" type="{kind}" size="0.015 0.05" pos="0.08 0 -0.05" mass="0.2"/></body>"""
+CRAB = """<mujoco><compiler angle="radian" autolimits="true"/>
+<option cone="pyramidal" integrator="Euler" impratio="10" timestep="0.004">
+ <flag midphase="disable" autoreset="disable" fwdinv="enable" invdiscrete="enable"/></option>
+<default><joint armature="0.01" frictionloss="0.1" damping="0.5" range="-0.8 0.6"/><motor ctrlrange="-9 9"/>
+ <geom contype="0" conaffinity="1" condim="1"/></default>
+<worldbody><geom name="floor" type="plane" size="0 0 1" contype="1" conaffinity="0" condim="3" solref="0.015 0.9"/>
+<body name="trunk" pos="0 0 0.3"><freejoint/><geom name="drum" type="cylinder" size="0.1 0.04" mass="3"/>
+ <geom name="box" type="box" size="0.15 0.06 0.02" mass="1"/>
+ <body name="head" pos="0.1 0 0.05" euler="0 0.4 0">
+  <geom name="head" type="cylinder" size="0.03 0.05" mass="0.5"/></body>
+ <body name="wheel" pos="0.1 0.1 -0.05"><joint axis="0 1 0.1" name="wheel" limited="false"/>
+  <geom name="tyre" type="cylinder" size="0.07 0.02" euler="1.57 0.1 0" mass="0.6"/></body>
+ <body name="tail" pos="-0.1 0 0" euler="0 0 0.3"><joint axis="0 1 0"/>
+  <geom name="tail" type="capsule" size="0.02" fromto="0 0 0 -0.1 0 0" mass="0.3"/>
+  <body pos="-0.1 0 0"><joint axis="0 0.2 1" limited="false" damping="0"/>
+   <geom name="tip" type="box" size="0.03 0.02 0.01" pos="-0.04 0 0" mass="0.2"/></body></body>
+ <body pos="0.05 -0.1 -0.02"><joint name="leg1" axis="1 0 0"/>
+  <geom name="ghost" size="0.2" conaffinity="4" condim="6" margin="0.1" mass="0.3"/>
+  <body pos="0 -0.02 -0.03"><joint name="leg2" axis="0 1 0.1"/>
+   <geom name="thigh" type="capsule" size="0.02" fromto="0 0 0 0.02 0 -0.12" mass="0.4"/>
+   <body name="ankle" pos="0.02 0 -0.12" euler="0.2 0 0.1">
+    <body pos="0 0 -0.02"><joint name="leg3" axis="0 1 0"/><geom name="shin" size="0.02" mass="0.2"/>
+     <body name="foot" pos="0 0 -0.08" euler="0 0.1 0.2">
+      <geom name="foot" type="cylinder" size="0.04 0.01" mass="0.1"/></body>
+ </body></body></body></body>{legs}</body></worldbody><actuator>
+ <motor joint="leg2" ctrllimited="false"/><motor joint="wheel" forcerange="-3 2"/><motor joint="leg3"/>
+ <motor joint="leg1" gear="2"/></actuator></mujoco>"""
+CRAB_LEG = """<body pos="{x} 0.1 0" euler="0 0 {x}"><joint axis="0.2 -1 0" pos="0.01 0 0"/>
+<geom name="leg{x}" type="capsule" size="0.015 0.05" pos="0.08 0 -0.05" mass="0.2"/></body>"""
 
 
 def make_a1(edit=None):
@@ -57,16 +79,15 @@ def make_walker():
     return mujoco.MjSpec.from_string(WALKER.format(legs=legs, motors=motors))
 
 
-def make_insect():
-    """Six legs with one joint each and no motors; the trunk has two boxes."""
-    places = [
-        (x, y, a) for x, a in ((-0.1, 0.4), (0.0, 0.0), (0.1, -0.4)) for y, a in ((-0.06, a - 1.57), (0.06, 1.57 - a))
-    ]
-    legs = [INSECT_LEG.format(x=x, y=y, a=a, kind=("sphere", "capsule")[i % 2]) for i, (x, y, a) in enumerate(places)]
-    return mujoco.MjSpec.from_string(INSECT.format(legs="".join(legs)))
+def make_crab():
+    """Five branches of one, two and three joints, some without motors or ranges; cylinders and fixed bodies on both.
+
+    Its settings differ from those of the fused step, but change no motion, and one geom passes through the floor.
+    """
+    return mujoco.MjSpec.from_string(CRAB.format(legs="".join(CRAB_LEG.format(x=x) for x in (-0.1, 0.0))))
 
 
-ROBOTS = {"a1": make_a1, "walker": make_walker, "insect": make_insect}
+ROBOTS = {"a1": make_a1, "walker": make_walker, "crab": make_crab}
 
 
 def compiled(spec):

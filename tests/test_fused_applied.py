@@ -23,7 +23,7 @@ def step_mujoco(model, states, xfrc, qfrc):
 
 @pytest.mark.parametrize(
     ("engine", "robot", "heights"),
-    [("fused", "a1", AIR), ("fused", "a1", FLOOR), ("mujoco_warp", "a1", AIR)],
+    [("fused", "crab", AIR), ("fused", "crab", FLOOR), ("mujoco_warp", "a1", AIR)],
 )
 def test_applied_forces(engine, robot, heights):
     """Wrenches on all bodies and forces on all degrees of freedom act as in MuJoCo, and each of them acts."""

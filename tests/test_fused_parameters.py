@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from test_fused import FIELDS, assert_alike, compiled, draw_states, make_a1, random, step_fused, step_mujoco
+from test_fused import FIELDS, assert_alike, compiled, draw_states, make_a1, make_crab, random, step_fused, step_mujoco
 
 from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.simulator import Simulator
@@ -146,6 +146,21 @@ def test_parameters_per_world():
         assert np.abs(np.diff(data.qvel.numpy(), axis=0)).max(axis=1).min() > 0.1
         tables["dof_damping"] *= 0.5
         wp.to_torch(warp_model.dof_damping).mul_(0.5)
+
+
+def test_derived_constants_of_unlike_legs():
+    """Inverse weights of a robot whose branches have unlike numbers of joints are those of mj_setConst."""
+    model = compiled(make_crab())
+    sim = Simulator(model, 2, "cpu", per_world=["body_mass", "dof_armature"])
+    sim.vary_legs()
+    sim.field("body_mass")[1, 1:] *= torch.tensor(random(model.nbody - 1, 0.5, 2.0))
+    sim.field("dof_armature")[1, 6:] += torch.tensor(random(model.nv - 6, 0.0, 0.1))
+    sim.update_constants(torch.tensor([True, True]))
+    for world in range(2):
+        model.body_mass[:], model.dof_armature[:] = sim.field("body_mass")[world], sim.field("dof_armature")[world]
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        np.testing.assert_allclose(sim.field("body_invweight0")[world], model.body_invweight0, rtol=2e-5)
+        np.testing.assert_allclose(sim.field("dof_invweight0")[world], model.dof_invweight0, rtol=2e-5)
 
 
 def test_derived_constants_on_a_hfield():

@@ -1,5 +1,6 @@
 """Contacts of the fused step with a height map: against planes of plain MuJoCo, and what must hold on any ground."""
 
+import functools
 from typing import NamedTuple
 
 import mujoco
@@ -22,7 +23,7 @@ BALL = """<mujoco><compiler angle="radian" autolimits="true"/>
  <body><joint axis="1 0 0" range="-9 9" damping="0.01"/><inertial pos="0 0 0" mass="0.01" diaginertia="1e-3 1e-3 1e-3"/>
  </body></body></worldbody></mujoco>"""
 # Tiny spheres in the middle make up for the points of other kinds, so that one kernel simulates all of them:
-POINTS = {"sphere": 1, "capsule": 2, "box": 8}
+POINTS = {"sphere": 1, "capsule": 2, "box": 8, "cylinder": 16}
 FILL = '<geom size="1e-3" mass="0" contype="1" conaffinity="15" condim="3"/>'
 FLAT = '<geom name="floor" type="plane" size="0 0 1" contype="15" conaffinity="1" friction="{friction}"/>'
 
@@ -57,7 +58,7 @@ def ball(friction=1e-5, kind="sphere", size="0.1", planes=()):
         for quat in planes
     )
     floors = posed or FLAT.format(friction=friction)
-    fill = FILL * (8 - POINTS[kind])
+    fill = FILL * max(0, 8 - POINTS[kind])
     spec = mujoco.MjSpec.from_string(BALL.format(floors=floors, kind=kind, size=size, fill=fill))
     if not planes:
         return compiled(spec)
@@ -329,8 +330,46 @@ def heights_under(height_map, points):
     return np.where(x >= y, a + (b - a) * x + (d - b) * y, a + (c - a) * y + (d - c) * x)
 
 
+def circle_point(radius, eighth):
+    """A point of a circle around the origin."""
+    return radius * np.cos(np.pi / 4 * eighth), radius * np.sin(np.pi / 4 * eighth)
+
+
+def test_cylinders_on_a_level_map():
+    """Cylinders that lean on one of their points, or lie on two, move on a level map as plain MuJoCo's on a plane."""
+    model, rng = ball(0.6, "cylinder", "0.06 0.05"), np.random.default_rng(3)
+    states = draw_states(model, 80, seed=2)
+    lean, eighth, yaw = np.where(np.arange(80) % 2, np.pi / 2, rng.uniform(0.5, 1.4, 80)), rng.integers(8, size=80), 0.7
+    for qpos, angle, turn in zip(states["qpos"], lean, eighth * np.pi / 4, strict=True):
+        turns = ((yaw, 2), (angle, 1), (turn, 2))
+        qpos[3:7] = functools.reduce(quat_product, [about_axis(*each) for each in turns])
+        qpos[2] = 0.06 * np.sin(angle) + 0.05 * abs(np.cos(angle)) - rng.uniform(-0.001, 0.004)
+    expected = step_mujoco(model, states)
+    assert set(expected[2][:, 0]) == {0, 1, 2}
+    sim = Simulator(model, 80, "cpu", "fused", 100, 50, height_map=make_map(lambda x, y: 0.0 * x))
+    put(sim, states)
+    sim.step()
+    found = (sim.qvel, sim.qpos, sim.contact_found, sim.contact_force)
+    assert_alike(model, states, [values.double().numpy() for values in found], expected)
+
+
+def about_axis(angle, axis):
+    """The quaternion of a turn about one of the axes."""
+    return np.array([np.cos(angle / 2), *np.sin(angle / 2) * np.eye(3)[axis]])
+
+
+def quat_product(a, b):
+    """The product of two quaternions."""
+    out = np.zeros(4)
+    mujoco.mju_mulQuat(out, a, b)
+    return out
+
+
 @pytest.mark.parametrize("ground", [stairs, pits, rough])
-@pytest.mark.parametrize(("kind", "size"), [("sphere", "0.02"), ("capsule", "0.03 0.1"), ("box", "0.1 0.06 0.04")])
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [("sphere", "0.02"), ("capsule", "0.03 0.1"), ("cylinder", "0.06 0.05"), ("box", "0.1 0.06 0.04")],
+)
 def test_nothing_falls_through(kind, size, ground):
     """What hits stairs, pits and rough ground at 5 m/s, straight or aslant, comes to lie on it and wins no energy."""
     rng = np.random.default_rng(4)
@@ -342,8 +381,10 @@ def test_nothing_falls_through(kind, size, ground):
     sim.qvel[:, 3:6] = torch.tensor(rng.normal(0.0, 3.0, (100, 3)))
     data, start = mujoco.MjData(model), None
     sizes = model.geom("ball").size
-    half = {"sphere": np.zeros(3), "capsule": sizes[1] * np.array([0.0, 0.0, 1.0]), "box": sizes}[kind]
+    half = {"sphere": np.zeros(3), "box": sizes}.get(kind, sizes[1] * np.array([0.0, 0.0, 1.0]))
     corners = half * np.array(list(np.ndindex(2, 2, 2))) * 2.0 - half
+    if kind == "cylinder":
+        corners = np.array([(*circle_point(sizes[0], i), z) for i in range(8) for z in (-sizes[1], sizes[1])])
     for _ in range(9):
         energies, points = [], []
         for data.qpos[:], data.qvel[:] in zip(sim.qpos, sim.qvel, strict=True):
@@ -354,7 +395,7 @@ def test_nothing_falls_through(kind, size, ground):
         for _ in range(50):
             sim.step()
     above = np.array(points)[..., 2] - heights_under(height_map, np.array(points))
-    assert above.min() > (-0.02 if kind == "box" else 0.0)  # under a riser's edge: 5 mm from its face
+    assert above.min() > (-0.02 if kind in ("box", "cylinder") else 0.0)  # under a riser's edge: 5 mm from its face
     assert np.mean(above.min(axis=1) < 0.1) > 0.9
 
 

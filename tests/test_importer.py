@@ -7,8 +7,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import torch
 
+from legged_torque.envs import robots, task_registry, tasks
 from legged_torque.envs.base.asset import by_joint, load_asset
+from legged_torque.envs.base.held_pose import standing_note
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfgPPO
 from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import import_robot
 from legged_torque.importer.settings import settings
@@ -77,6 +82,62 @@ def as_mjcf(text):
     return f"{head}{body}</body></worldbody><actuator>{''.join(motors)}</actuator>{text}</mujoco>"
 
 
+def as_menagerie():
+    """A file in the manner of MuJoCo Menagerie.
+
+    It has default classes, visual and collision geoms in groups of their own, visual meshes that are not there, servos
+    in another order than joints, damping for those servos, excluded contacts, a site, sensors, and a keyframe.
+    """
+    legs, servos, excluded, pose = [], [], [], "0 0.9 -1.8 " * 4
+    for leg, x, y in (("FL", 0.19, 0.05), ("FR", 0.19, -0.05), ("RL", -0.19, 0.05), ("RR", -0.19, -0.05)):
+        side = 0.09 if y > 0 else -0.09
+        legs.append(f"""
+      <body name="{leg}_hip" pos="{x} {y} 0">
+        <inertial pos="0 0 0" mass="0.6" diaginertia="0.0007 0.0006 0.0004"/>
+        <joint class="abduction" name="{leg}_hip_joint"/>
+        <geom class="visual" mesh="hip"/>
+        <geom class="collision" size="0.045 0.02" pos="0 {side} 0" quat="1 1 0 0" type="cylinder"/>
+        <body name="{leg}_thigh" pos="0 {side} 0">
+          <inertial pos="0 0 -0.03" mass="1" diaginertia="0.005 0.005 0.0009"/>
+          <joint class="hip" name="{leg}_thigh_joint"/>
+          <geom class="collision" size="0.015 0.09" pos="0 0 -0.1"/>
+          <body name="{leg}_calf" pos="0 0 -0.21">
+            <inertial pos="0 0 -0.12" mass="0.2" diaginertia="0.0015 0.0015 0.00005"/>
+            <joint class="knee" name="{leg}_calf_joint"/>
+            <geom class="collision" size="0.012 0.07" pos="0 0 -0.09"/>
+            <geom name="{leg}" class="foot"/>
+            <site name="{leg}_toe" pos="0 0 -0.21"/>
+          </body>
+        </body>
+      </body>""")
+        for kind, part in (("knee", "calf"), ("hip", "thigh"), ("abduction", "hip")):
+            servos.insert(0, f'<general class="{kind}" name="{leg}_{part}" joint="{leg}_{part}_joint"/>')
+        excluded.append(f'<exclude body1="base" body2="{leg}_thigh"/>')
+    return f"""<mujoco model="dog"><compiler angle="radian" meshdir="assets" autolimits="true"/>
+  <option cone="elliptic" impratio="100"/>
+  <default><default class="dog">
+    <geom friction="0.6" margin="0.001" condim="1"/>
+    <joint axis="0 1 0" damping="1" armature="0.01" frictionloss="0.2"/>
+    <general forcerange="-24 24" biastype="affine" gainprm="50 0 0" biasprm="0 -50 -0.5"/>
+    <default class="abduction"><joint axis="1 0 0" range="-0.9 0.9"/><general ctrlrange="-0.9 0.9"/></default>
+    <default class="hip"><joint range="-0.7 4.5"/><general ctrlrange="-0.7 4.5"/></default>
+    <default class="knee"><joint range="-2.8 -0.9"/><general ctrlrange="-2.8 -0.9" forcerange="-36 36"/></default>
+    <default class="visual"><geom type="mesh" contype="0" conaffinity="0" group="2"/></default>
+    <default class="collision"><geom group="3" type="capsule"/>
+      <default class="foot"><geom type="sphere" size="0.022" pos="0 0 -0.21" priority="1" condim="6"/></default>
+    </default>
+  </default></default>
+  <asset><mesh class="dog" file="hip.stl"/><material name="black"/></asset>
+  <worldbody><light name="spotlight" pos="0 0 3"/>
+    <body name="base" pos="0 0 0.45" childclass="dog"><freejoint/><camera name="tracking" pos="2 0 1"/>
+      <inertial pos="0.02 0 0" mass="5" diaginertia="0.07 0.06 0.02"/>
+      <geom class="collision" type="box" size="0.18 0.05 0.05"/><site name="imu"/>{"".join(legs)}
+    </body></worldbody>
+  <contact>{"".join(excluded)}</contact><actuator>{"".join(servos)}</actuator>
+  <sensor><gyro site="imu"/></sensor>
+  <keyframe><key name="home" qpos="0 0 0.27 1 0 0 0 {pose}" ctrl="{pose}"/></keyframe></mujoco>"""
+
+
 @pytest.fixture
 def written(tmp_path):
     """Import a text and write both files; returns the robot, its model and its settings."""
@@ -113,12 +174,52 @@ def test_urdf(written):
     assert model.jnt_range[1:4].tolist() == [[-0.8, 0.8], [-1.0, 3.0], [-2.6, -0.5]]
     assert (model.actuator_forcerange == [-20, 20]).all()
     assert cfg.asset.max_dof_vel == 15.0
+    torque = model.body_mass.sum() * cfg.rewards.base_height_target / (12.453 * 0.303)  # as many times that of an A1
+    assert cfg.rewards.scales.torques * torque**2 == pytest.approx(-2e-4, rel=0.03)
     assert cfg.asset.mirrored_legs == [["RF", "LF"], ["RH", "LH"]]
     foot = model.geom("RH_foot")
     assert foot.size[0] == 0.025
     np.testing.assert_allclose(foot.pos, [0, 0, -0.2], atol=1e-9)
     assert any("base" in note and "missing" in note for note in robot.notes)
     check(model, cfg)
+
+
+def test_menagerie(written):
+    """Its conventions go through: limits are those of forces, geoms keep their places, the pose is the keyframe."""
+    robot, model, cfg = written(as_menagerie(), "xml")
+    assert model.body_mass.sum() == pytest.approx(5 + 4 * 1.8)
+    assert robot.joints == [
+        f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")
+    ]
+    assert model.actuator_forcerange[:, 1].tolist() == [24, 24, 36] * 4
+    assert model.actuator_trnid[:, 0].tolist() == list(range(1, 13))
+    assert model.geom("RL_foot").size[0] == 0.022 and model.geom("FL_hip").type == mujoco.mjtGeom.mjGEOM_SPHERE
+    assert cfg.init_state.default_joint_angles["RR_calf_joint"] == -1.8
+    assert cfg.asset.mirrored_legs == [["FR", "FL"], ["RR", "RL"]]
+    assert any("joint damping up to 1 " in note for note in robot.notes)
+    assert any("12 position or velocity servos" in note for note in robot.notes)
+    check(model, cfg)
+
+
+@pytest.mark.parametrize("source", [urdf(), as_menagerie()], ids=["urdf", "menagerie"])
+def test_training(written, source):
+    """Imported robots train three iterations with random parameters; nothing is said of another robot's ranges.
+
+    Their branches have as many points as the A1's, so that kernels are shared.
+    """
+    _, _, cfg = written(source, "urdf" if "<robot" in source else "xml")
+    cfg.env.num_envs, cfg.domain_rand.randomize_parameters, cfg.noise.add_noise = 4, True, True
+    train_cfg = LeggedRobotCfgPPO()
+    train_cfg.algorithm.symmetry_cfg.use_data_augmentation = True
+    train_cfg.actor.hidden_dims, train_cfg.runner.num_steps_per_env, train_cfg.evaluation.interval = [8], 4, 0
+    task = LeggedRobot(cfg)
+    assert task.notes == [] and standing_note(task) == ""
+    runner, _ = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=None)
+    before = [parameter.clone() for parameter in runner.alg.actor.parameters()]
+    runner.learn(3)
+    after = list(runner.alg.actor.parameters())
+    assert all(bool(new.isfinite().all()) for new in after)
+    assert any(not torch.equal(new, old) for new, old in zip(after, before, strict=True))
 
 
 def test_mjcf(written):
@@ -131,6 +232,73 @@ def test_mjcf(written):
     assert cfg.rewards.base_height_target == pytest.approx(2 * 0.2 * np.cos(0.7) + 0.02, abs=1e-3)
     assert any("servos became motors" in note for note in robot.notes)
     check(model, cfg)
+
+
+SPRINGS = ('_calf" axis="0 1 0"', '_calf" axis="0.1 1 0" ref="-0.9" stiffness="3" springref="-1.2" damping="0.1"')
+
+
+def test_motion_stays(written, tmp_path):
+    """Mass matrix, forces and places at random states are those of plain MuJoCo with the source, springs included."""
+    source = as_mjcf("").replace(*SPRINGS).replace('<geom type="sphere"', '<geom quat="1 2 3 4" type="sphere"')
+    _, model, _ = written(source, "xml")
+    reference, random = mujoco.MjModel.from_xml_string(source), np.random.default_rng(0)
+    for _ in range(5):
+        turn, seen = random.normal(size=4), []
+        qpos = np.concatenate([random.normal(size=3), turn / np.linalg.norm(turn), random.uniform(-2.6, 3, 8)])
+        qvel = random.normal(size=14)
+        for each in (reference, model):
+            data, matrix = mujoco.MjData(each), np.zeros((14, 14))
+            data.qpos[:], data.qvel[:] = qpos, qvel
+            mujoco.mj_forward(each, data)
+            for row, unit in zip(matrix, np.eye(14), strict=True):
+                mujoco.mj_mulM(each, data, row, unit)
+            places = [data.body(f"{leg}_calf").xpos for leg in ("FL", "FR", "RL", "RR")]
+            seen.append([matrix - np.diag(each.dof_armature), data.qfrc_bias - data.qfrc_passive, places])
+        for expected, found in zip(*seen, strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert np.abs(model.qpos_spring[8] + 1.2) < 1e-9 and model.qpos0[8] == -0.9
+
+
+MOTOR = '<motor joint="FL_calf" ctrlrange="-3 3" gear="6" ctrllimited="true"/>'
+FILTER = '<general joint="FL_calf" ctrlrange="-9 18" ctrllimited="true" dyntype="filter" dynprm="0.05"/>'
+BALL = '<geom type="sphere" size="0.02" pos="0 0 -0.2" mass="0.05"/>'
+IN_PAIR = '<geom name="ball" type="sphere" size="0.02" pos="0 0 -0.2" mass="0.05" contype="0" conaffinity="0"/>'
+PAIR = '<contact><pair geom1="ball" geom2="ground"/></contact><actuator>'
+FRAME = '<link name="footprint"/><joint name="f" type="fixed"><parent link="footprint"/><child link="base"/>'
+TRAPS = {
+    "no gravity": (as_mjcf("").replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'), "contacts and options"),
+    "joint without motor": (as_mjcf("").replace(MOTOR, ""), "no actuator of the file drives FL_calf: given"),
+    "dynamics": (as_mjcf("").replace(MOTOR, FILTER), "the dynamics of actuators (filters, activations) are left out"),
+    "uneven": (as_mjcf("").replace(MOTOR, FILTER), "differ by direction are the smaller of both: FL_calf"),
+    "feet in pairs": (
+        as_mjcf("")
+        .replace(BALL, IN_PAIR, 1)
+        .replace("</worldbody>", '<geom name="ground" type="plane" size="0 0 1"/></worldbody>')
+        .replace("<actuator>", PAIR),
+        "contacts and options",
+    ),
+    "frame": (
+        urdf().replace('name="dog">', f'name="dog">{FRAME}<origin xyz="0 0 0.3"/></joint>'),
+        "no more than a frame",
+    ),
+    "faces along y": (
+        urdf().replace('"1 0 0"', '"X"').replace('"0 1 0"', '"1 0 0"').replace('"X"', '"0 1 0"'),
+        "turn the file, x is forwards",
+    ),
+    "pose at a limit": (urdf().replace('"-2.6" upper="-0.5"', '"-2.6" upper="-1.50049"'), "contacts and options"),
+    "no speed limits": (urdf().replace('velocity="15"', 'velocity="1000"'), "no speed limits that mean anything: 20"),
+    "two dashes": (urdf().replace("LF_KFE", "LF--KFE"), "contacts and options"),
+}
+
+
+@pytest.mark.parametrize(("source", "note"), TRAPS.values(), ids=TRAPS)
+def test_traps(written, source, note):
+    """Each is mended, with a line that says so, and the robot stands where it stood without it."""
+    robot, model, cfg = written(source, "urdf" if "<robot" in source else "xml")
+    assert any(note in told for told in robot.notes), robot.notes
+    assert cfg.rewards.base_height_target == pytest.approx(0.32, abs=0.01)
+    if "faces" not in note and "turn" not in note:
+        check(model, cfg)
 
 
 def test_feet_below_hips(written):
@@ -151,8 +319,19 @@ def test_feet_below_hips(written):
         (as_mjcf("").replace("<freejoint/>", ""), "its trunk"),
         (as_mjcf('<equality><joint joint1="FL_calf" joint2="FR_calf"/></equality>'), "equalities"),
         (as_mjcf("").replace('axis="0 1 0"', 'axis="1 0 0"'), "no joint turns about y"),
+        (as_mjcf("").replace('pos="0 0 -', 'pos="0 0 ').replace("0 -0.15", "0 0.15"), "z must point upwards"),
+        (urdf().replace("<robot", '<robot xmlns:xacro="http://ros.org"><xacro:leg/></robot><!--', 1) + "-->", "xacro"),
+        (
+            as_mjcf("")
+            .replace("/><worldbody>", '/><asset><mesh name="m" file="gone.stl"/></asset><worldbody>')
+            .replace('angle="radian"', 'angle="radian" inertiafromgeom="true"')
+            .replace(
+                BALL, f'{BALL}<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><geom type="mesh" mesh="m"/>', 1
+            ),
+            "the inertia of 'FL_calf' follows from the mesh 'gone.stl'",
+        ),
         ("<mujoco><worldbody/></mujoco>", "0 bodies with joints"),
-        ("<mujoco", "Error"),
+        ("<mujoco", "unclosed token"),
     ],
 )
 def test_refusals(tmp_path, text, reason):
@@ -172,8 +351,18 @@ def test_script(tmp_path, monkeypatch, capsys):
     (tmp_path / "dog.urdf").write_text(urdf())
     monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--out", "new"])
     runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
-    assert "sim.engine 'fused' simulates it" in capsys.readouterr().out
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["dog.py", "dog.xml"]
+    told = capsys.readouterr().out
+    assert "sim.engine 'fused' simulates it" in told
+    assert told.endswith("Train it: python scripts/train.py --task=dog_position\n")
+    helper = "from legged_torque.envs.robots.a1 import A1Cfg\ndef half(number):\n    return number / 2\n"
+    (tmp_path / "new" / "legs_of_many.py").write_text(helper)
+    monkeypatch.setattr(robots, "__path__", [*robots.__path__, str(tmp_path / "new")])
+    (found,) = [parts for parts in tasks.further_robots() if parts[0] in ("dog", "legs_of_many")]
+    assert [name for name, *_ in tasks.tasks_of(*found)][:2] == ["dog_position", "dog_torque"]
+    monkeypatch.chdir("/")
+    assert len(load_asset(found[1]()).feet) == 4
+    monkeypatch.chdir(tmp_path)
+    assert sorted(path.name for path in (tmp_path / "new").glob("dog.*")) == ["dog.py", "dog.xml"]
     with pytest.raises(SystemExit, match="2"):
         runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
     assert "exists" in capsys.readouterr().err

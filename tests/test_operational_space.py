@@ -10,8 +10,9 @@ import torch
 from legged_torque import RESOURCES_DIR
 from legged_torque.control import operational_space as osc
 from legged_torque.control.dynamics import RobotDynamics
-from legged_torque.sim.model import build_model, collision_geoms, read_spec
+from legged_torque.sim.model import build_model, collision_geoms
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.mjcf import read_spec
 
 FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
 MASKS = [(1, 1, 1, 1), (1, 1, 0, 1), (0, 1, 1, 0), (0, 0, 1, 0), (0, 0, 0, 0)]

@@ -2,15 +2,20 @@
 
 import math
 
+import numpy as np
 import pytest
 from settings import error_of, get_cfgs
 
-from legged_torque.utils.config import to_dict
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.robots.a1 import A1Cfg
+from legged_torque.utils.config import set_by_path, to_dict
 from legged_torque.utils.errors import UserError
 
 FACTORS = ("motor_strength", "stiffness_scale", "damping_scale")
 ON = {"domain_rand.randomize_parameters": True}
-NEW_SETTINGS = ("motor_strength_per_joint", "stiffness_scale_per_joint", "damping_scale_per_joint", "push_set_factor")
+JOINT_RANGES = ("dof_damping", "dof_armature", "dof_stiffness", "dof_frictionloss")
+SHARES = tuple(f"{name}_share" for name in ("foot_radius", *JOINT_RANGES))
+NEW_SETTINGS = ("motor_strength_per_joint", "stiffness_scale_per_joint", "damping_scale_per_joint", *SHARES)
 
 
 @pytest.mark.parametrize(
@@ -105,12 +110,60 @@ def test_ranges(words, ranges, errors):
 def test_older_runs_keep_their_ranges():
     """A run from before factors per joint and on pushes has none of them."""
     env = to_dict(get_cfgs("--perturbation=low")[0])
-    for name in NEW_SETTINGS:
+    for name in (*NEW_SETTINGS, "push_set_factor"):
         del env["domain_rand"][name]
     env["domain_rand"]["ground_friction"] = [0.001, 2.0]
     rand = get_cfgs(run_config={"env": env, "train": {}})[0].domain_rand
-    assert [getattr(rand, name) for name in NEW_SETTINGS] == [None, None, None, 1.0]
+    assert {getattr(rand, name) for name in NEW_SETTINGS} == {None} and rand.push_set_factor == 1.0
     assert rand.ground_friction == [0.001, 2.0]
+
+
+def test_shares_of_the_robot(make_task):
+    """Where a robot has no ranges of its own, they follow from its radii, armatures, gains and torque limits."""
+    without = {f"domain_rand.{name}": None for name in ("foot_radius", *JOINT_RANGES)}
+    cfg = A1Cfg()
+    for path, value in {**ON, **without, "env.num_envs": 300}.items():
+        set_by_path(cfg, path, value)
+    cfg.control.stiffness, cfg.control.damping = {"hip": 10.0, "joint": 30.0}, {"calf": 1.0, "joint": 0.5}
+    task = LeggedRobot(cfg)
+    model, sim, joints = task.sim.mj_model, task.sim, slice(6, None)
+    part, torque = np.array([name.split("_")[1] for name in task.dof_names]), model.actuator_forcerange[:, 1]
+    damping, frictionloss = model.dof_damping[joints], model.dof_frictionloss[joints]
+    stiffest = 0.01 * np.where(part == "hip", 10.0, 30.0)
+    expected = {
+        "dof_damping": (damping, damping + 0.4 * np.where(part == "calf", 1.0, 0.5)),
+        "dof_armature": (0.8 * model.dof_armature[joints], 2.0 * model.dof_armature[joints]),
+        "jnt_stiffness": (0.0 * stiffest, stiffest),
+        "dof_frictionloss": (frictionloss, frictionloss + 0.012 * torque),
+    }
+    for field, (low, high) in expected.items():
+        values = sim.field(field).numpy()[:, -12:]
+        slack = 0.03 * (high - low) + 1e-6
+        assert (np.abs(values.min(axis=0) - low) < slack).all() and (np.abs(values.max(axis=0) - high) < slack).all()
+    radii = sim.field("geom_size")[:, model.geom(task.foot_names[0]).id, 0]
+    assert 0.019 <= radii.min() < 0.0191 and 0.0209 < radii.max() <= 0.021001
+    fixed = {"domain_rand.keep_fixed": ["dof_damping", "foot_radius", "dof_armature_share"]}
+    kept = make_task("a1_position", 2, **ON, **without, **fixed, **{"domain_rand.dof_stiffness_share": None}).sim
+    for field in ("dof_damping", "geom_size", "dof_armature", "jnt_stiffness"):
+        assert (kept.field(field).numpy() == np.float32(getattr(model, field))).all(), field
+    assert (kept.field("dof_frictionloss").numpy() != model.dof_frictionloss).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "limits", "note"),
+    [
+        ("trunk_mass_offset", [-1.0, 2.4], "trunk_mass changes a mass of 4.713 kg by 2.4 kg"),
+        ("dof_frictionloss", [0.0, 3.5], "dof_frictionloss draws up to 3.5 N m, but a motor has 33.5 N m"),
+        ("dof_armature", [0.1, 0.2], "dof_armature draws 0.1 to 0.2, but the robot's own value is 0.01"),
+    ],
+)
+def test_ranges_of_another_robot(make_task, name, limits, note):
+    """A line says which ranges do not fit the robot; the A1's own do, the hard ones as well."""
+    (told,) = make_task("a1_position", 1, **ON, **{f"domain_rand.{name}": limits}).notes
+    assert told == f"domain_rand.{note}: is it the range of another robot?"
+    hard = get_cfgs("--ranges=hard")[0].parameter_ranges()["hard"]["domain_rand"]
+    ranges = {f"domain_rand.{key}": value for key, value in hard.items()}
+    assert make_task("a1_position", 1, **ON, **ranges).notes == []
 
 
 @pytest.mark.parametrize("option", ["--perturbation=hih", "--ranges=defalt"])

@@ -1,6 +1,7 @@
 """Files with a trap each, made from the A1's: read by name and transmission, or refused with all that is wrong."""
 
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -13,8 +14,10 @@ from legged_torque import RESOURCES_DIR
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.held_pose import standing_note
 from legged_torque.envs.robots.a1 import A1Cfg
-from legged_torque.sim.model import build_model, read_spec
+from legged_torque.sim.model import build_model
 from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.utils.mjcf import read_spec, robot_notes
+from legged_torque.viewer.ground import drawn_model
 
 A1 = RESOURCES_DIR / "robots/a1/a1.xml"
 POSE = A1Cfg.init_state.default_joint_angles
@@ -127,31 +130,49 @@ def test_motors_in_another_order(changed, engine):
 
 
 def test_the_same_robot_in_another_order(changed, make_task):
-    """Unitree's orders of joints and motors lead to the torques per joint and the rewards of ours."""
-    file = changed(unitree_order)
+    """Unitree's orders of joints and motors lead to the same torques per joint, rewards and observations as ours."""
+    ours = make_task("a1_torque_multihead", 2)
+    theirs = make_task("a1_torque_multihead", 2, **{"asset.file": changed(unitree_order)})
+    assert theirs.dof_names == list(POSE) and theirs.foot_names == ours.foot_names
+    drawn = drawn_model(Path(theirs.cfg.asset.file), None, theirs.dof_names)
+    assert [drawn.joint(i).name for i in range(1, 13)] == list(POSE)
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(12):
+        actions = 0.3 * torch.randn(2, 24, generator=generator)
+        ours.step(actions)
+        theirs.step(actions)
+        for name in ("torques", "rew_buf", "contacts"):
+            assert torch.equal(getattr(theirs, name), getattr(ours, name)), name
+        assert all(torch.equal(group, ours.obs_buf[name]) for name, group in theirs.obs_buf.items())
+    assert (ours.torques.abs() > 1.0).any() and ours.contacts.any()
+
+
+def test_policies_in_another_order(changed, make_task):
+    """Settings in Unitree's order, as of a policy trained on its file: it moves as in ours but for rounding."""
     names = [f"{leg}_{part}_joint" for leg in UNITREE_ORDER for part in ("hip", "thigh", "calf")]
     order = [list(POSE).index(name) for name in names]
-    pose = {name: POSE[name] for name in names}
-    ours = make_task("a1_torque_multihead", 2)
-    theirs = make_task("a1_torque_multihead", 2, **{"asset.file": file, "init_state.default_joint_angles": pose})
+    pose = {"init_state.default_joint_angles": {name: POSE[name] for name in names}}
+    ours, theirs = make_task("a1_torque_multihead", 2), make_task("a1_torque_multihead", 2, **pose)
     assert theirs.dof_names == names
-    qpos, qvel = ours.sim.qpos.clone(), ours.sim.qvel.clone()
     theirs.commands.copy_(ours.commands)
-    theirs.sim.qpos.copy_(torch.cat([qpos[:, :7], qpos[:, 7:][:, order]], dim=1))
-    theirs.sim.qvel.copy_(torch.cat([qvel[:, :6], qvel[:, 6:][:, order]], dim=1))
+    theirs.sim.qpos.copy_(torch.cat([ours.sim.qpos[:, :7], ours.sim.qpos[:, 7:][:, order]], dim=1))
+    theirs.sim.qvel.copy_(torch.cat([ours.sim.qvel[:, :6], ours.sim.qvel[:, 6:][:, order]], dim=1))
     generator = torch.Generator().manual_seed(1)
     for _ in range(12):
         actions = 0.3 * torch.randn(2, 2, 12, generator=generator)
         ours.step(actions.flatten(1))
         theirs.step(actions[:, :, order].flatten(1))
-        torch.testing.assert_close(theirs.torques, ours.torques[:, order], atol=2e-3, rtol=1e-3)
+        torch.testing.assert_close(theirs.torques, ours.torques[:, order], atol=1e-4, rtol=0)
         torch.testing.assert_close(theirs.rew_buf, ours.rew_buf, atol=1e-5, rtol=0)
     assert (ours.torques.abs() > 1.0).any() and ours.contacts.any()
 
 
-def test_pose_in_another_order_is_refused(changed):
+def test_orders_that_no_limb_leads_to(changed):
     """Policies see joints in the order of the settings, so that a file in another one cannot pass unseen."""
-    assert "must be in the order of the MJCF's joints" in error_of(load_asset, cfg_of(changed(unitree_order)))
+    cfg = cfg_of(changed())
+    first, second, *others = POSE.items()
+    cfg.init_state.default_joint_angles = dict([second, first, *others])
+    assert "joints cannot be put in the order of init_state.default_joint_angles" in error_of(load_asset, cfg)
 
 
 # --------------------------------------------------------------------------------------------------- motors
@@ -198,9 +219,10 @@ def test_servos_are_refused(changed, make_task, engine):
     """Every engine says which actuators are no motors, and what to do, in tasks and in simulators of a model."""
     file = changed(servo(3, 4))
     told = error_of(make_task, "a1_torque", 1, **{"asset.file": file, "sim.engine": engine})
-    assert "make a <motor> with a forcerange of what is a servo, whose control is a target (FL_hip, FL_thigh)" in told
+    advice = "a servo, whose control is a target: import_robot.py reads it as a motor (FL_hip, FL_thigh)"
+    assert f"make a <motor> with a forcerange of what is {advice}" in told
     model = build_model(read_spec(file), [])
-    assert "is a servo, whose control is a target (FL_hip, FL_thigh)" in error_of(Simulator, model, 1, "cpu", engine)
+    assert "reads it as a motor (FL_hip, FL_thigh)" in error_of(Simulator, model, 1, "cpu", engine)
 
 
 # --------------------------------------------------------------------------------------------------- what is refused
@@ -224,8 +246,8 @@ def arm_beside(root):
 
 
 def post_before(root):
-    """A body that stands still, before the trunk."""
-    root.find("worldbody").insert(0, ElementTree.Element("body", name="post"))
+    """A body that does not become a part of the world, before the trunk."""
+    root.find("worldbody").insert(0, ElementTree.Element("body", name="post", mocap="true"))
 
 
 REFUSED = {
@@ -266,29 +288,36 @@ def test_refused(changed, changes, reason):
     assert told.startswith(f"'{file}' cannot be simulated: ") and reason in told
 
 
+def test_feet_fall_through_the_floor(changed):
+    """Feet that the floor does not touch are told, for every engine."""
+    feet = setting(".//default[@class='foot_collision']/geom", contype="2", conaffinity="2")
+    told = error_of(load_asset, cfg_of(changed(feet)))
+    assert "contype and conaffinity let FR_foot, FL_foot, RR_foot, RL_foot through the geom 'floor'" in told
+
+
 def test_all_problems_at_once(changed):
     """A file with several traps is refused once, with a clause for each."""
     beyond, limits = joint("FL_calf_joint", range="-2.6 -1.6"), setting("actuator/motor[1]", ctrllimited="false")
     none = setting("actuator/motor[1]", forcelimited="false")
     told = error_of(load_asset, cfg_of(changed(servo(11), beyond, limits, none)))
-    for part in ("a target (RL_calf)", "a forcerange (FR_hip_joint,", "has -1.5 for 'FL_calf_joint'"):
+    for part in ("as a motor (RL_calf)", "a forcerange (FR_hip_joint,", "has -1.5 for 'FL_calf_joint'"):
         assert part in told
     unnamed, floor = setting(".//geom[@name='RL_calf']", name=None), setting(".//geom[@name='floor']", name="ground")
     told = error_of(
         load_asset, cfg_of(changed(unnamed, floor, setting(".//geom[@name='trunk']", name="base"), servo(11)))
     )
-    for part in ("those of 'RL_calf'", "a geom 'floor'", "geom (part of its name) 'trunk'", "a target (RL_calf)"):
+    for part in ("those of 'RL_calf'", "a geom 'floor'", "geom (part of its name) 'trunk'", "as a motor (RL_calf)"):
         assert part in told
 
 
 def test_fused_tells_all(changed, make_task):
     """Whatever the fused step cannot simulate of a robot is told together."""
     file = changed(
-        setting("option", integrator="Euler", cone="elliptic"),
-        setting(".//geom[@name='FL_hip']", type="cylinder", size="0.04 0.04"),
+        setting("option", integrator="RK4", cone="elliptic"),
+        setting(".//geom[@name='FL_hip']", type="ellipsoid", size="0.04 0.04 0.02"),
     )
     told = error_of(make_task, "a1_torque", 1, **{"asset.file": file})
-    for reason in ("integrator must be implicitfast", "cone must be pyramidal", "only spheres, capsules and boxes"):
+    for reason in ("integrator must be implicitfast", "cone must be pyramidal", "boxes may collide, unlike 'FL_hip'"):
         assert reason in told
 
 
@@ -324,10 +353,12 @@ def test_ranges_of_another_robot(changed, make_task, capsys):
 
 
 def test_nominal_pose_is_held(changed, make_task):
-    """The A1 stands; with weak gains its trunk falls to the ground, and without feet on one side it tilts over."""
+    """The A1 stands; with weak gains it sinks, and a part that ends episodes may not touch the ground."""
     assert standing_note(make_task("a1_torque", 1)) == ""
     weak = standing_note(make_task("a1_torque", 1, **{"control.stiffness": 3.0}))
-    assert "does not stand under PD control, after " in weak and "'trunk' touches the ground" in weak
+    assert "does not stand under PD control, after " in weak and "the trunk has sunk from 0.30 to 0.15 m" in weak
+    ending = {"asset.terminate_after_contacts_on": ["RL_foot"]}
+    assert "'RL_foot' touches the ground" in standing_note(make_task("a1_torque", 1, **ending))
     assert standing_note(make_task("a1_torque", 1, **{"control.stiffness": 0.0})) == "", "it is not held at all"
 
 
@@ -336,6 +367,16 @@ def test_training_says_that_the_robot_falls(tmp_path):
     words = ["--task=a1_torque", "--num_envs=2", "--max_iterations=1", "--device=cpu", "--set", "control.stiffness=3"]
     status, output, _ = run_here("train.py", *words, root=tmp_path)
     assert status == 0 and output.splitlines()[0].startswith("Note: the nominal pose does not stand under PD control")
+
+
+def test_another_robot_than_in_training(changed, tmp_path):
+    """A file with other axes or masses than that of the training is told; one in another order is the same robot."""
+    assert list(robot_notes(Path(changed(unitree_order, shuffle_motors)), A1)) == []
+    other = Path(changed(turn_left_hips, setting("worldbody/body/inertial", mass="5.713")))
+    axes, mass = robot_notes(other, A1)
+    assert "other axes than the robot of the training: FL_hip_joint, RL_hip_joint are seen and driven wrongly" in axes
+    assert mass == "asset.file has 13.453 kg, the robot of the training 12.453 kg"
+    assert "which is gone" in next(robot_notes(other, tmp_path / "gone.xml"))
 
 
 # --------------------------------------------------------------------------------------------------- symmetry
@@ -382,9 +423,10 @@ def test_unlike_sides_are_no_mirror_images(changed, make_task):
     assert "the axes of 'FR_hip_joint' and 'FL_hip_joint' are not mirror images" in error_of(lambda: task.mirror)
 
 
-def test_joints_without_range(changed, make_task):
+@pytest.mark.parametrize("engine", ENGINES)
+def test_joints_without_range(changed, make_task, engine):
     """They have no limits, neither for rewards nor for initial angles, instead of the range 0 to 0 of their fields."""
     free = joint("FL_hip_joint", limited="false")
-    task = make_task("a1_torque", 2, **{"asset.file": changed(free), "sim.engine": "mujoco_warp"})
+    task = make_task("a1_torque", 2, **{"asset.file": changed(free), "sim.engine": engine})
     assert task.dof_pos_limits[3].tolist() == [-np.inf, np.inf] and task.dof_pos_limits[0].isfinite().all()
     assert (task.dof_pos[:, 3] > 0.04).all() and task.rew_buf.isfinite().all()

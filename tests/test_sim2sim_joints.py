@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from settings import error_of
-from test_robot_files import EVEN_TRUNK, changed, joint, servo, setting, shuffle_motors, turn_left_hips
+from test_robot_files import EVEN_TRUNK, changed, joint, servo, setting, shuffle_motors, turn_left_hips, unitree_order
 
 for package in ("onnx", "onnxruntime", "jsonschema"):
     pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
@@ -39,10 +39,14 @@ def walk(robot, policy, steps=10):
 
 
 def test_mirrored_axes_are_turned_around(policy, changed):
-    """A file whose left hips turn the other way, as the authors' A1's do, walks as ours does, and a line says so."""
+    """A file whose left hips turn the other way, as the authors' A1's do, moves as ours does, and a line says so.
+
+    Its joints and motors are in Unitree's orders, of which nothing needs to be said.
+    """
     expected = walk(MujocoRobot(changed(EVEN_TRUNK), policy.description), policy)
     weak = [setting(f".//joint[@name='{leg}_hip_joint']", range="-0.7 0.8") for leg in ("FL", "RL")]
-    robot = MujocoRobot(changed(EVEN_TRUNK, turn_left_hips, shuffle_motors, *weak), policy.description)
+    changes = (EVEN_TRUNK, turn_left_hips, unitree_order, shuffle_motors, *weak)
+    robot = MujocoRobot(changed(*changes), policy.description)
     assert robot.notes == [
         "axes: those of the MJCF point the other way; angles and torques are negated (FL_hip_joint, RL_hip_joint)"
     ]

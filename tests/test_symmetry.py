@@ -10,9 +10,10 @@ from torch import nn
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.symmetry import counterparts, with_mirror_images
+from legged_torque.envs.base.symmetry import with_mirror_images
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.mirroring import counterparts
 
 TASKS = ["a1_position", "a1_torque", "a1_torque_curriculum", "a1_torque_multihead"]
 GROUPS = ("policy", "critic", "actions")

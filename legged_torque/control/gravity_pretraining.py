@@ -36,6 +36,7 @@ from legged_torque.utils.task_registry import task_registry
 from legged_torque.utils.threads import single_threaded
 
 STANDING_SECONDS = 5.0  # time after which the learned policy must stand
+HIGHEST_FORCE = 1.6  # of a contact of the controller, as share of the robot's weight; no less than its settings have
 
 
 @dataclass
@@ -163,7 +164,7 @@ def follow(
         upright = torch.ones_like(task.reset_buf)
         steps = []
         for _ in range(num_steps):
-            decided = controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0)
+            decided = controller(task.sim.qpos, task.sim.qvel, points_on_ground(task))
             observations = task.get_observations()["policy"]
             actions, residuals = actions_for(task, decided.total), residual_share(controller, decided)
             steps.append([observations, actions, decided.total.abs().mean(dim=1), residuals, upright])
@@ -262,15 +263,26 @@ def exchange(observations: Tensor, columns: list[int]) -> Tensor:
 
 
 def make_controller(task: LeggedRobot, settings: WholeBodySettings | None = None) -> WholeBodyController:
-    """Return the whole-body controller for the worlds of a task; without settings, with its own defaults."""
+    """Return the whole-body controller for the worlds of a task; without settings, with its own defaults.
+
+    Its height is the task's, and one contact may always carry the robot.
+    """
     dynamics = RobotDynamics(task.sim.mj_model, task.num_envs, task.device, task.foot_names)
-    settings = dataclasses.replace(settings or WholeBodySettings(), height=task.cfg.rewards.base_height_target)
+    settings, model = settings or WholeBodySettings(), task.sim.mj_model
+    weight = float(model.body_mass.sum()) * abs(float(model.opt.gravity[2]))
+    force, height = max(settings.highest_force, HIGHEST_FORCE * weight), task.cfg.rewards.base_height_target
+    settings = dataclasses.replace(settings, height=height, highest_force=force)
     return WholeBodyController(dynamics, task.default_dof_pos.tolist(), settings)
+
+
+def points_on_ground(task: LeggedRobot) -> Tensor:
+    """Return which geoms of the feet touch the ground, each a point of contact. Shape: (num_envs, k), bool."""
+    return task.contacts[:, task.feet_indices] > 0
 
 
 def act_by_controller(controller: WholeBodyController) -> Act:
     """Return the function that asks the controller for the torques of a task's state, and gives them."""
-    return lambda task: actions_for(task, controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0).total)
+    return lambda task: actions_for(task, controller(task.sim.qpos, task.sim.qvel, points_on_ground(task)).total)
 
 
 def act_by_policy(actor: MLPModel) -> Act:

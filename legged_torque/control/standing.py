@@ -82,7 +82,7 @@ def place_on_ground(
 def is_standing(task: LeggedRobot) -> Tensor:
     """Return which worlds stand at the last physics step: high, level, slow, only on feet. Shape: (num_envs,), bool."""
     upright = (task.base_height > LOWEST_HEIGHT) & (task.projected_gravity[:, 2] < HIGHEST_GRAVITY_Z)
-    only_feet = task.contacts.sum(dim=1) == task.feet_contact.sum(dim=1)
+    only_feet = task.contacts.sum(dim=1) == task.contacts[:, task.feet_indices].sum(dim=1)
     slow = torch.linalg.vector_norm(task.base_lin_vel, dim=1) < HIGHEST_SPEED
     return upright & only_feet & slow  # falls before are not known here, see measure_standing
 

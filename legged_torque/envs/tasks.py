@@ -148,10 +148,11 @@ def further_robots() -> Iterator[tuple[str, Any, Any]]:
     for module in pkgutil.iter_modules(robots.__path__):
         if module.name != "a1":
             parts = vars(importlib.import_module(f"{robots.__name__}.{module.name}"))
-            own = [part for part in parts.values() if getattr(part, "__module__", "") == parts["__name__"]]
-            settings = next(part for part in own if issubclass(part, LeggedRobotCfg))
-            training = next(part for part in own if issubclass(part, LeggedRobotCfgPPO))
-            yield module.name, settings, training
+            own = [c for c in parts.values() if isinstance(c, type) and c.__module__ == parts["__name__"]]
+            settings = [part for part in own if issubclass(part, LeggedRobotCfg)]
+            training = [part for part in own if issubclass(part, LeggedRobotCfgPPO)]
+            if settings and training:
+                yield module.name, settings[0], training[0]
 
 
 def on_ground(ground: type, task: type) -> Any:

@@ -76,8 +76,13 @@ def find_legs(source: Source, shapes: dict[int, list[Shape]]) -> list[Leg]:
         raise UserError(f"cannot import '{source.file}': it has no legs of two joints or more")
     if not (np.abs(data.xaxis[1:, 1]) > 0.7).any():
         raise UserError(f"cannot import '{source.file}': x must point forwards and y left, but no joint turns about y")
+    along_x, along_y, _ = np.abs(data.xaxis[1:]).sum(axis=0)
+    if along_x > along_y + TOLERANCE:
+        source.notes.append("more joints turn about x than about y: if it faces along y, turn the file, x is forwards")
     lows = [_lowest(data, chain[-1], shapes[chain[-1]]) for chain in chains]
     legs = [chain for chain, low in zip(chains, lows, strict=True) if low < 0.75 * min(lows)]
+    if not legs:
+        raise UserError(f"cannot import '{source.file}': no leg reaches below its trunk's origin; z must point upwards")
     names = _leg_names(source, legs, data)
     return [Leg(name, chain, _take_foot(source, shapes, chain, data)) for name, chain in zip(names, legs, strict=True)]
 
@@ -198,6 +203,6 @@ def mirrored_legs(source: Source, legs: list[Leg]) -> list[list[str]]:
 
 
 def world_shape(data: mujoco.MjData, body: int, shape: Shape) -> np.ndarray:
-    """Return the lowest point of a shape in the world frame [m]. Shape: (3,)."""
+    """Return where in the world frame a shape's center is, at the height of its lowest point [m]. Shape: (3,)."""
     ends = shape.ends() @ data.xmat[body].reshape(3, 3).T + data.xpos[body]
-    return ends[np.argmin(ends[:, 2])] - np.array([0, 0, shape.radius])
+    return np.append(ends.mean(axis=0)[:2], ends[:, 2].min() - shape.radius)

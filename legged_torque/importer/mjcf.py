@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import mujoco
-import numpy as np
 
 from legged_torque.importer.robot import FOOT, Robot
 from legged_torque.importer.shapes import Shape
@@ -59,7 +58,7 @@ def mjcf(robot: Robot) -> str:
     head = HEAD.format(
         title=robot.name,
         name=robot.name,
-        file=robot.source.file.name,
+        file=robot.source.file.name.replace("--", "- -"),
         notes=notes,
         center=_numbers([round(0.8 * height, 3)]),
         extent=_numbers([round(2.3 * height, 3)]),
@@ -106,9 +105,11 @@ def _joint(robot: Robot, model: mujoco.MjModel, body: int) -> str:
     joint = int(model.body_jntadr[body])
     place, dof = joint - 1, int(model.jnt_dofadr[joint])
     pos = f' pos="{_numbers(model.jnt_pos[joint])}"' if model.jnt_pos[joint].any() else ""
-    passive = (model.jnt_stiffness[joint], model.dof_damping[dof], model.dof_frictionloss[dof])
-    names = ("stiffness", "damping", "frictionloss")
-    extra = "".join(f' {name}="{_numbers([v])}"' for name, v in zip(names, passive, strict=True) if np.any(v))
+    others = {"stiffness": model.jnt_stiffness[joint], "damping": model.dof_damping[dof]}
+    others |= {"frictionloss": model.dof_frictionloss[dof], "ref": model.qpos0[model.jnt_qposadr[joint]]}
+    if model.jnt_stiffness[joint]:
+        others["springref"] = model.qpos_spring[model.jnt_qposadr[joint]]
+    extra = "".join(f' {name}="{_numbers([value])}"' for name, value in others.items() if value)
     return (
         f'<joint name="{robot.joints[place]}"{pos} axis="{_numbers(model.jnt_axis[joint])}" '
         f'range="{_numbers(robot.ranges[place])}" armature="{_numbers([robot.stance.armature[place]])}"{extra}/>'

@@ -8,13 +8,15 @@ import mujoco
 import numpy as np
 
 from legged_torque.importer.legs import Leg, world_shape, zero_pose
-from legged_torque.importer.source import Source
+from legged_torque.importer.source import GRAVITY, Source
 
 BANDWIDTH = 4.0  # [Hz] natural frequency of a joint under its gains, with the inertia of the leg below it
 DAMPING_RATIO = 0.5  # of the same
 SAG = 0.1  # [rad] by which a joint may give way under the robot's weight
 TIPPING = 2.0  # times the stiffness below which a robot with level trunk tips over its feet, shared by its legs
-CROUCH = {False: 0.75, True: 0.93}  # height of hips over feet in stance, of stretched legs'; with ankles and without
+BALANCING = 5  # times that both feet of a robot are moved below its center of mass
+MISSED = 0.02  # [m] by which a foot may miss its place
+CROUCH = {False: 0.75, True: 0.95}  # height of hips over feet in stance, of stretched legs'; without and with ankles
 BEND = {False: (0.8, -1.6), True: (-0.4, 0.8)}  # [rad] angles of thigh and knee about y to start from, likewise
 ARMATURE = 0.01 / 33.5  # [kg m^2 per N m] rotor's inertia per torque, that of the A1, where a file has none
 
@@ -37,19 +39,7 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
     ``ranges`` [rad] and ``torques`` [N m] are the joints' limits. Shapes: (joints, 2), (joints,).
     """
     model = source.model
-    if source.pose is not None:
-        angles = source.pose
-        source.notes.append("nominal pose: the keyframe of the file")
-    else:
-        angles = np.clip(np.zeros(len(source.joints)), ranges[:, 0], ranges[:, 1])
-        for leg in legs:
-            _bend(model, leg, angles, ranges)
-        share = CROUCH[legs[0].is_walking_on_soles]
-        source.notes.append(f"nominal pose: inverse kinematics, feet below hips at {share:.0%} of the stretched legs")
-    outside = [name for name, q, (low, high) in zip(source.joints, angles, ranges, strict=True) if not low <= q <= high]
-    if outside:
-        source.notes.append(f"the nominal pose was beyond the limits of {', '.join(outside)} and is moved inside")
-        angles = np.clip(angles, ranges[:, 0], ranges[:, 1])
+    angles = _nominal_pose(source, legs, ranges)
     data = zero_pose(model, angles)
     armature = model.dof_armature[6:].copy()
     bare = armature <= 0
@@ -63,7 +53,7 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
     inertia, holding = _inertias(model, data) + armature, _holding_torques(model, data, legs, lows)
     height = -float(np.mean([low[2] for low in lows]))
     stiffness = np.maximum((2 * np.pi * BANDWIDTH) ** 2 * inertia, np.abs(holding) / SAG)
-    weight = -float(model.opt.gravity[2] * model.body_mass.sum())
+    weight = GRAVITY * float(model.body_mass.sum())
     for leg in legs:
         joints = model.body_jntadr[leg.bodies] - 1
         stiffness[joints] = np.maximum(stiffness[joints], TIPPING * weight * height / len(legs))
@@ -71,17 +61,53 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
     return Stance(angles, height, armature, stiffness, damping, holding)
 
 
-def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarray) -> None:
-    """Bend a leg until its foot is below its hip; writes the angles of its joints."""
+def _nominal_pose(source: Source, legs: list[Leg], ranges: np.ndarray) -> np.ndarray:
+    """Return the angles [rad] of the file's keyframe, otherwise those that inverse kinematics finds. Adds notes."""
+    model = source.model
+    if source.pose is not None:
+        angles = source.pose
+        source.notes.append("nominal pose: the keyframe of the file")
+    else:
+        angles = np.clip(np.zeros(len(source.joints)), ranges[:, 0], ranges[:, 1])
+        ahead = 0.0
+        for _ in range(BALANCING if len(legs) == 2 else 1):
+            missed = {leg.name: _bend(model, leg, angles, ranges, ahead) for leg in legs}
+            data = zero_pose(model, angles)
+            feet = [world_shape(data, leg.bodies[-1], leg.foot)[0] for leg in legs]
+            ahead += float(data.subtree_com[1][0] - np.mean(feet))
+        share = CROUCH[legs[0].is_walking_on_soles]
+        source.notes.append(
+            f"nominal pose: inverse kinematics, feet below {'the center of mass' if len(legs) == 2 else 'hips'}, "
+            f"legs {share:.0%} stretched"
+        )
+        far = ", ".join(f"{name} by {miss:.2f} m" for name, miss in missed.items() if miss > MISSED)
+        if far:
+            source.notes.append(f"within the limits of joints, feet do not get there: {far}")
+    outside = [name for name, q, (low, high) in zip(source.joints, angles, ranges, strict=True) if not low <= q <= high]
+    if outside:
+        source.notes.append(f"the nominal pose was beyond the limits of {', '.join(outside)} and is moved inside")
+    low, high = np.ceil(1e3 * ranges[:, 0]) / 1e3, np.floor(1e3 * ranges[:, 1]) / 1e3
+    return np.clip(angles.round(3), low, high)  # as the settings have them, inside the limits
+
+
+def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarray, ahead: float) -> float:
+    """Bend a leg until its foot is below its hip, or ``ahead`` of that [m], and return by how much it missed [m].
+
+    Writes the angles of its joints.
+    """
     data = zero_pose(model)
     joints = np.array([model.body_jntadr[body] for body in leg.bodies])
     places = [*data.xanchor[joints], world_shape(data, leg.bodies[-1], leg.foot)]
     pitch = [i for i, joint in enumerate(joints) if abs(data.xaxis[joint][1]) > 0.7]
     if not pitch:
-        return
-    reach = sum(float(np.linalg.norm(b - a)) for a, b in zip(places[pitch[0] :], places[pitch[0] + 1 :], strict=False))
-    goal = places[pitch[0]] - np.array([0, 0, CROUCH[leg.is_walking_on_soles] * reach])
-    goal[1] = places[-1][1] if leg.is_walking_on_soles else goal[1]
+        return 0.0
+    links = np.diff([place[::2] for place in places[pitch[0] :]], axis=0)  # in the plane of x and z
+    lengths = CROUCH[leg.is_walking_on_soles] * np.linalg.norm(links, axis=1)
+    if leg.is_walking_on_soles:
+        lengths[-1] = abs(links[-1][1])  # feet stay flat
+    goal = places[pitch[0]] + np.array([ahead, 0, -lengths.sum()])
+    if leg.is_walking_on_soles or len(pitch) == len(joints):  # feet stay beside hips
+        goal[1] = places[-1][1]
     start, (low, high) = angles[joints - 1], ranges[joints - 1].T
     knee = joints[pitch[1]] if len(pitch) > 1 else None
     forwards = leg.is_walking_on_soles
@@ -106,8 +132,11 @@ def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarra
             )
             rows, error = np.vstack([rows, 0.3 * jacr[:, joints + 5]]), np.concatenate([error, 0.3 * lean])
         step = rows.T @ np.linalg.solve(rows @ rows.T + 1e-4 * np.eye(len(rows)), error)
-        q = np.clip(q + np.clip(step, -0.2, 0.2), low, high)
+        before, q = q, np.clip(q + step * 0.2 / max(0.2, np.abs(step).max()), low, high)
+        if np.abs(q - before).max() < 1e-5:
+            break
     angles[joints - 1] = q
+    return float(np.linalg.norm(goal - foot))
 
 
 def _inertias(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
@@ -124,7 +153,7 @@ def _holding_torques(model: mujoco.MjModel, data: mujoco.MjData, legs: list[Leg]
     mujoco.mj_comVel(model, data)
     mujoco.mj_rne(model, data, 0, data.qfrc_bias)
     torques = data.qfrc_bias.copy()
-    force = np.array([0, 0, -model.opt.gravity[2] * model.body_mass.sum() / len(legs)])
+    force = np.array([0, 0, GRAVITY * model.body_mass.sum() / len(legs)])
     for leg, low in zip(legs, lows, strict=True):
         jac = np.zeros((3, model.nv))
         mujoco.mj_jac(model, data, jac, None, low, leg.bodies[-1])

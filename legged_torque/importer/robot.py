@@ -8,16 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from legged_torque.envs.base.symmetry import counterparts
 from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names, mirrored_legs, world_shape, zero_pose
 from legged_torque.importer.pose import Stance, find_stance
 from legged_torque.importer.shapes import Shape
-from legged_torque.importer.source import Source, read_source
+from legged_torque.importer.source import GRAVITY, Source, read_source
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.mirroring import counterparts
 
 UNLIMITED = np.pi  # [rad] to both sides, of joints without a range
 IMPLAUSIBLE = 20.0  # times weight x height: torque limits beyond this are none
 SPEED = 20.0  # [rad/s] of joints without a speed limit
+FASTEST = 100.0  # [rad/s] speed limits from here on are none
 FOOT, TRUNK = "foot", "trunk"  # in the names of the geoms of feet and trunk
 
 
@@ -51,6 +52,11 @@ class Robot:
         return np.array([[table[kind] for kind in self.kinds] for table in tables])
 
     @property
+    def weight(self) -> float:
+        """Its weight [N]."""
+        return GRAVITY * float(self.source.model.body_mass.sum())
+
+    @property
     def notes(self) -> list[str]:
         """What was changed and why, a line each."""
         return self.source.notes
@@ -73,9 +79,9 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     mirrored = mirrored_legs(source, legs)
     if torque_limit is not None:
         source.notes.append(f"torque limits: {torque_limit:g} N m, as given")
-    speed = max(source.speed_limits, default=SPEED)
-    if not source.speed_limits:
-        source.notes.append(f"the file has no speed limits: {SPEED:g} rad/s assumed, asset.max_dof_vel")
+    speed = max((limit for limit in source.speed_limits if limit < FASTEST), default=SPEED)
+    if speed not in source.speed_limits:
+        source.notes.append(f"no speed limits that mean anything: {SPEED:g} rad/s assumed, asset.max_dof_vel")
     stance = find_stance(source, legs, ranges, torques)
     joints = joint_names(source, legs, mirrored)
     prefixes = [leg.name + "_" for leg in legs]
@@ -87,6 +93,7 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
             f"joint damping up to {damped.max():g} N m s/rad is kept; it often stands for a servo's and is too much "
             "for torque control: set it to 0 if it is not friction that you measured"
         )
+    source.notes.append("contacts and options are those of this library's robots: friction 1, condim 3, steps of 5 ms")
     _name_shapes(source, legs, shapes)
     return Robot(name, source, legs, shapes, joints, kinds, ranges, torques, speed, mirrored, symmetric, stance)
 
@@ -119,8 +126,8 @@ def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None
         return np.full(model.njnt - 1, given)
     data = zero_pose(model, source.pose)
     lowest = min(world_shape(data, body, shape)[2] for body, found in shapes.items() for shape in found)
-    enough = float(model.opt.gravity[2] * model.body_mass.sum() * lowest)
-    known = np.array([np.inf if limit is None else limit for limit in source.torque_limits])
+    enough = float(-GRAVITY * model.body_mass.sum() * lowest)
+    known = source.torque_limits
     odd = [name for name, limit in zip(source.joints, known, strict=True) if not 0 < limit < IMPLAUSIBLE * enough]
     if odd:
         source.notes.append(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.importer.pose import BANDWIDTH, DAMPING_RATIO, SAG
 from legged_torque.importer.robot import FOOT, TRUNK, Robot
+
+WEIGHT_TIMES_HEIGHT = 37.0  # [N m] of an A1 with its trunk at 0.303 m
 
 TEMPLATE = '''"""{title}: settings of ``{file}``, imported; each number is a proposal to look at."""
 
@@ -34,8 +37,11 @@ class {cls}Cfg(LeggedRobotCfg):
         damping = {damping}
         torque_scale = {torque_scale}
 
-{ranges}    class rewards:
+    class rewards:
         base_height_target = {height}
+
+        class scales:
+            torques = {torques:.2g}  # the A1's, as its squared torques are to this robot's: by weight times height
 
 
 class {cls}CfgPPO(LeggedRobotCfgPPO):
@@ -43,10 +49,6 @@ class {cls}CfgPPO(LeggedRobotCfgPPO):
 {symmetry}'''
 ENGINE = """    class sim:
         engine = "mujoco_warp"  # slower; the fused step cannot simulate this robot
-
-"""
-RANGES = """    class domain_rand:
-        foot_radius = [{low}, {high}]
 
 """
 SYMMETRY = """
@@ -67,8 +69,6 @@ def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
     ``path`` is that of its MJCF, as it is to be found; ``is_fused`` says whether the fused step can simulate it.
     """
     stance = robot.stance
-    feet = [leg.foot for leg in robot.legs]
-    radius = feet[0].size[0] if feet[0].kind == "sphere" else None
     kept = {shape.name for found in robot.shapes.values() for shape in found}
     return TEMPLATE.format(
         title=robot.name,
@@ -89,8 +89,8 @@ def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
         stiffness=_table(robot.by_kind(stance.stiffness)),
         damping=_table(robot.by_kind(stance.damping)),
         torque_scale=float(f"{0.12 * max(robot.torques):.2g}"),
-        ranges=RANGES.format(low=round(0.95 * radius, 4), high=round(1.05 * radius, 4)) if radius else "",
         height=round(stance.height, 3),
+        torques=LeggedRobotCfg.rewards.scales.torques * (WEIGHT_TIMES_HEIGHT / (robot.weight * stance.height)) ** 2,
         symmetry=SYMMETRY if robot.symmetric else "",
     )
 

@@ -10,11 +10,12 @@ import mujoco
 import numpy as np
 
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import kept_warnings
+from legged_torque.utils.mjcf import kept_warnings, motors_of, torque_range
 
 MESH_TYPES = (".stl", ".obj", ".msh")  # what MuJoCo reads
 VISUAL_GROUP = 3  # in which Menagerie keeps collision geoms, also those that one of its files switches off
 TINY = 1e-6  # [kg m^2], [kg] what counts as no inertia or mass of a fixed link; MuJoCo refuses less
+GRAVITY = 9.81  # [m/s^2], whatever the file has
 SITE = "link:"  # with which the names of sites begin that say where fixed links were
 
 
@@ -30,7 +31,7 @@ class Source:
     model: mujoco.MjModel
     sites: dict[int, list[tuple[str, np.ndarray]]]
     pose: np.ndarray | None  # angles [rad] of the file's keyframe, by joint but the free one
-    torque_limits: list[float | None]  # [N m] the tightest of the file, by joint
+    torque_limits: np.ndarray  # [N m] the tightest of the file, by joint; infinite without any
     speed_limits: list[float]  # [rad/s] those that an URDF has
     notes: list[str] = field(default_factory=list)  # what was changed and why, a line each
 
@@ -50,10 +51,12 @@ def read_source(file: Path) -> Source:
         raise UserError(f"cannot import '{file}': there is no such file")
     with kept_warnings():
         try:
+            root = ET.parse(file).getroot()
+            _refuse_macros(root, file)
             spec = mujoco.MjSpec.from_file(str(file))
-            notes = _prepare(spec, file)
+            notes = _prepare(spec, file, root.tag == "robot")
             model = _compile(spec, notes)
-        except (ValueError, mujoco.FatalError) as error:
+        except (ValueError, ET.ParseError, mujoco.FatalError) as error:
             raise UserError(f"cannot import '{file}': {' '.join(str(error).split())}") from None
     _check(model, file)
     sites: dict[int, list] = {}
@@ -62,20 +65,26 @@ def read_source(file: Path) -> Source:
         sites.setdefault(int(model.site_bodyid[site]), []).append((name, model.site_pos[site].copy()))
     pose = model.key_qpos[_home(model)][7:].copy() if model.nkey else None
     limits = _torque_limits(model, notes)
-    return Source(file, model, sites, pose, limits, _speed_limits(file), notes)
+    return Source(file, model, sites, pose, limits, _speed_limits(root), notes)
 
 
-def _prepare(spec: mujoco.MjSpec, file: Path) -> list[str]:
+def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
     """Make a file compile to one floating robot without anything else; return what was changed."""
-    notes = _find_meshes(spec, file)
+    notes = _find_meshes(spec, file, is_urdf)
+    in_pairs = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     for part in [*spec.sensors, *spec.lights, *spec.cameras, *spec.sites, *spec.excludes, *spec.pairs]:
         spec.delete(part)
+    switched_on = dict[str, None]()
     for geom in spec.geoms:
         geom.material = ""
-        if _is_urdf(file):
+        if is_urdf:
             geom.mass = 0.0  # links weigh what <inertial> says, those without it nothing
-        if geom.group == VISUAL_GROUP and not (geom.contype or geom.conaffinity):
+        if not (geom.contype or geom.conaffinity) and (geom.group == VISUAL_GROUP or geom.name in in_pairs):
             geom.conaffinity = 1
+            if geom.name not in in_pairs:
+                switched_on[geom.parent.name] = None
+    if switched_on:
+        notes.append(f"geoms of group {VISUAL_GROUP}, which the file switches off, collide: {', '.join(switched_on)}")
     for part in [*spec.materials, *spec.textures]:
         spec.delete(part)
     roots = [body for body in spec.worldbody.bodies if body.find_all("joint")]
@@ -86,12 +95,23 @@ def _prepare(spec: mujoco.MjSpec, file: Path) -> list[str]:
         notes.append(f"'{roots[0].name}' was fixed to the world; it floats now")
         for key in list(spec.keys):
             spec.delete(key)
+        _drop_footprint(roots[0], notes)
     for body in spec.bodies:
         if body.name and not body.joints and body.name != "world":
             body.add_site(name=SITE + body.name)
+    spec.option.gravity, spec.option.disableflags = [0.0, 0.0, -GRAVITY], 0
     spec.compiler.fusestatic = True
     spec.compiler.discardvisual = True
     return notes
+
+
+def _drop_footprint(root: mujoco.MjsBody, notes: list[str]) -> None:
+    """Put the trunk's origin where its first real link is, below a root of a URDF that is nothing but a frame."""
+    (link, *others) = root.bodies
+    is_frame = not (others or root.explicitinertial or list(root.geoms))
+    if is_frame and not link.joints:
+        link.pos, link.quat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
+        notes.append(f"'{root.name}' is no more than a frame: the trunk's origin is that of '{link.name}'")
 
 
 def _compile(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
@@ -115,7 +135,7 @@ def _compile(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
         return spec.compile()
 
 
-def _find_meshes(spec: mujoco.MjSpec, file: Path) -> list[str]:
+def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
     """Point meshes to their files; leave those out that are nowhere near or that MuJoCo cannot read, and say so."""
     missing = {}
     for mesh in list(spec.meshes):
@@ -132,7 +152,8 @@ def _find_meshes(spec: mujoco.MjSpec, file: Path) -> list[str]:
     for geom in list(spec.geoms):
         if geom.meshname in missing:
             collides = bool(geom.contype or geom.conaffinity)
-            if not _is_urdf(file) and not geom.parent.explicitinertial:
+            weighs = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+            if not is_urdf and (weighs or not geom.parent.explicitinertial):
                 raise UserError(
                     f"cannot import '{file}': the inertia of '{geom.parent.name}' follows from the mesh "
                     f"'{missing[geom.meshname].file}', which is missing or of a type other than {', '.join(MESH_TYPES)}"
@@ -187,41 +208,45 @@ def _home(model: mujoco.MjModel) -> int:
     return names.index("home") if "home" in names else 0
 
 
-def _torque_limits(model: mujoco.MjModel, notes: list[str]) -> list[float | None]:
-    """Return the tightest torque limit of each hinge: of forcerange, ctrlrange x gear, and the joint's own limit."""
-    limits: list[float | None] = [None] * (model.njnt - 1)
-
-    def tighten(joint: int, limit: float) -> None:
-        known = limits[joint - 1]
-        limits[joint - 1] = limit if known is None else min(known, limit)
-
-    servos = []
+def _torque_limits(model: mujoco.MjModel, notes: list[str]) -> np.ndarray:
+    """Return the tightest torque limit of each hinge [N m], the smaller of both directions. Adds notes."""
     for actuator in range(model.nu):
         if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
             raise UserError(f"the actuator '{model.actuator(actuator).name}' does not act on a joint")
-        joint, gear = int(model.actuator_trnid[actuator, 0]), abs(model.actuator_gear[actuator, 0])
-        gain = model.actuator_gainprm[actuator, 0]
-        is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
-        if not is_motor:
-            servos.append(model.joint(joint).name)
-        if model.actuator_forcelimited[actuator]:
-            tighten(joint, float(np.abs(model.actuator_forcerange[actuator]).min() * gear))
-        if is_motor and model.actuator_ctrllimited[actuator]:
-            tighten(joint, float(np.abs(model.actuator_ctrlrange[actuator]).min() * gear * gain))
+    is_servo = model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE
+    model.actuator_ctrllimited[is_servo] = False  # their controls are no torques
+    if is_servo.any():
+        notes.append(f"{is_servo.sum()} position or velocity servos became motors; their gains are left out")
+    if model.actuator_dyntype.any():
+        notes.append("the dynamics of actuators (filters, activations) are left out")
+    if model.body_gravcomp.any():
+        notes.append("the compensation of gravity is left out")
+    limits, bare, uneven = [], list[str](), list[str]()
     for joint in range(1, model.njnt):
+        motors = motors_of(model, joint)
+        ranges = [torque_range(model, motor) for motor in motors]
         if model.jnt_actfrclimited[joint]:
-            tighten(joint, float(np.abs(model.jnt_actfrcrange[joint]).min()))
-    if servos:
-        notes.append(f"{len(servos)} position or velocity servos became motors; their gains are left out")
-    return limits
+            ranges.append(tuple(model.jnt_actfrcrange[joint]))
+        down, up = (min([np.inf, *(sign * each[side] for each in ranges)]) for side, sign in ((0, -1), (1, 1)))
+        limits.append(min(down, up))
+        if model.nu and not motors:
+            bare.append(model.joint(joint).name)
+        if down != up:
+            uneven.append(model.joint(joint).name)
+    if bare:
+        notes.append(f"no actuator of the file drives {', '.join(bare)}: given motors, as every joint must have one")
+    if uneven:
+        notes.append(f"torque limits that differ by direction are the smaller of both: {', '.join(uneven)}")
+    return np.array(limits)
 
 
-def _is_urdf(file: Path) -> bool:
-    """Return whether a file describes its robot as URDF."""
-    return ET.parse(file).getroot().tag == "robot"
+def _refuse_macros(root: ET.Element, file: Path) -> None:
+    """Raise a UserError for a xacro, of which MuJoCo would read what is no macro and nothing else."""
+    if any("xacro" in part.tag for part in root.iter()):
+        raise UserError(f"cannot import '{file}': it is a xacro; make a URDF of it: xacro {file} > robot.urdf")
 
 
-def _speed_limits(file: Path) -> list[float]:
+def _speed_limits(root: ET.Element) -> list[float]:
     """Return the speed limits [rad/s] of an URDF's joints, which MuJoCo does not read; none of a MJCF."""
-    limits = ET.parse(file).getroot().findall("joint/limit")
-    return [float(limit.get("velocity", 0)) for limit in limits if float(limit.get("velocity", 0)) > 0]
+    limits = [float(limit.get("velocity", 0)) for limit in root.findall("joint/limit")]
+    return [limit for limit in limits if limit > 0]

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 
 from legged_torque.utils.errors import unknown_name
-from legged_torque.utils.mjcf import loading
 
 CONTACT_DATA = 4  # numbers per contact sensor: number of contacts, then the net force (x, y, z) in the world frame [N]
 
@@ -17,33 +14,29 @@ _DATASPEC = sum(1 << int(f) for f in (mujoco.mjtConDataField.mjCONDATA_FOUND, mu
 _REDUCE_NETFORCE = 3
 
 
-def read_spec(file: Path) -> mujoco.MjSpec:
-    """Read a MJCF file; a UserError if it is missing or cannot be read."""
-    with loading(file):
-        return mujoco.MjSpec.from_file(str(file))
-
-
 def collision_geoms(spec: mujoco.MjSpec, floor: str = FLOOR) -> list[str]:
     """Return the names of the geoms that can touch the ground, in the file's order."""
     geoms = [geom.name for geom in spec.geoms if geom.name and (geom.contype or geom.conaffinity)]
     return [name for name in geoms if name != floor]
 
 
-def indices_matching(names: list[str], parts: list[str]) -> list[int]:
-    """Return which names contain one of ``parts``; a UserError if a part matches no name."""
+def indices_matching(names: list[str], parts: list[str], kind: str = "collision geom") -> list[int]:
+    """Return which names contain one of ``parts``; a UserError if a part matches no name of this kind."""
     for part in parts:
         if not any(part in name for name in names):
-            raise unknown_name("collision geom (part of its name)", part, names)
+            raise unknown_name(f"{kind} (part of its name)", part, names)
     return [i for i, name in enumerate(names) if any(part in name for part in parts)]
 
 
 def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = FLOOR) -> mujoco.MjModel:
     """Compile the model to simulate: without what is only there to be seen, and with contact sensors.
 
+    Bodies without joints become part of what they are fixed to, unless something refers to them.
+
     The contacts of each of ``contact_geoms`` with the floor are sensed, by a sensor each, in this order. They are the
     only sensors of the model.
     """
-    spec.compiler.discardvisual = True
+    spec.compiler.discardvisual = spec.compiler.fusestatic = True
     for sensor in list(spec.sensors):
         spec.delete(sensor)
     for name in contact_geoms:
@@ -59,6 +52,14 @@ def build_model(spec: mujoco.MjSpec, contact_geoms: list[str], floor: str = FLOO
     return spec.compile()
 
 
+def use_known_options(model: mujoco.MjModel) -> None:
+    """Replace the options that MuJoCo Warp refuses although they change no motion: flags and the solver's method."""
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE | mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_FWDINV)
+    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
+        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON  # which finds the same minimum
+
+
 def max_contacts(model: mujoco.MjModel) -> int:
     """Return the most contacts that one world can have: one per sphere, two per capsule, eight per other geom.
 
@@ -72,6 +73,9 @@ def max_contacts(model: mujoco.MjModel) -> int:
     return sum(min(per_type.get(int(kind), 8) for kind in model.geom_type[pair]) for pair in pairs)
 
 
+_EQUALITY_ROWS = {int(mujoco.mjtEq.mjEQ_CONNECT): 3, int(mujoco.mjtEq.mjEQ_WELD): 6}  # others have one
+
+
 def max_constraints(model: mujoco.MjModel, contacts: int, any_friction: bool = False) -> int:
     """Return the most constraint rows that one world can have (pyramidal friction cones).
 
@@ -79,4 +83,8 @@ def max_constraints(model: mujoco.MjModel, contacts: int, any_friction: bool = F
     """
     rows_per_contact = 2 * (int(model.geom_condim.max()) - 1)
     friction = model.nv if any_friction else int((model.dof_frictionloss > 0).sum())
-    return contacts * rows_per_contact + friction + int(model.jnt_limited.sum())
+    friction += int((model.tendon_frictionloss > 0).sum())
+    equalities = sum(_EQUALITY_ROWS.get(int(kind), 1) for kind in model.eq_type)
+    return (
+        contacts * rows_per_contact + friction + int(model.jnt_limited.sum() + model.tendon_limited.sum()) + equalities
+    )

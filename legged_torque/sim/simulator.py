@@ -16,10 +16,10 @@ from legged_torque.sim import kernels
 from legged_torque.sim.fused.set_const import DerivedConstants
 from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.fused.tables import FUSED_FIELDS, unread_columns
-from legged_torque.sim.fused.tree import find_floor
+from legged_torque.sim.fused.tree import find_floor, read_tree
 from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.height_map import HeightMap
-from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts
+from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts, use_known_options
 from legged_torque.sim.per_world import check_fields, expand, owner
 from legged_torque.sim.robot_file import actuator_problems, refuse
 from legged_torque.sim.warp_step import WarpStep
@@ -81,6 +81,9 @@ class Simulator:
         if height_map is not None and engine != "fused":
             raise ValueError("only the fused engine takes a height map; the model of others has a hfield")
         refuse(list(actuator_problems(model)), f"sim.engine '{engine}' needs motors")
+        if engine == "fused":
+            read_tree(model)  # tells all reasons at once, before MuJoCo Warp tells its first one
+        use_known_options(model)
         self.mj_model, self.num_envs, self.device = model, num_envs, device
         prepare_device(device)
         self._wp_device = wp.get_device(device)
@@ -88,7 +91,10 @@ class Simulator:
         self.mj_model.opt.iterations = solver_iterations
         self.mj_model.opt.ls_iterations = ls_iterations
         with wp.ScopedDevice(self._wp_device):
-            self.model = mjw.put_model(model)
+            try:
+                self.model = mjw.put_model(model)
+            except NotImplementedError as error:
+                raise UserError(f"MuJoCo Warp cannot simulate this robot: {error}") from error
             self.model.opt.warn_overflow = 0  # it prints from inside kernels; check_buffers tells instead
             rows = max_constraints(model, contacts, any_friction="dof_frictionloss" in per_world)
             self.data = mjw.make_data(model, nworld=num_envs, nconmax=contacts, njmax=rows)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from legged_torque.utils.errors import UserError
+
 
 @dataclass(frozen=True)
 class Mirroring:
@@ -42,3 +44,18 @@ SCALAR = Mirroring.of_signs(1.0)  # a number that is the same in the mirror
 VECTOR = Mirroring.of_signs(1.0, -1.0, 1.0)  # a vector (x, y, z) in the trunk's frame: a velocity, a force, a place
 AXIAL_VECTOR = Mirroring.of_signs(-1.0, 1.0, -1.0)  # an axial vector there: an angular velocity, a moment
 PLANAR_VELOCITY = Mirroring.of_signs(1.0, -1.0, -1.0)  # v_x, v_y and yaw rate in the trunk's frame
+
+
+def counterparts(names: Sequence[str], mirrored_legs: Sequence[Sequence[str]]) -> tuple[int, ...]:
+    """Return where each part's counterpart on the other side is: that of FR_hip is FL_hip; a UserError without it."""
+    other_leg = {leg: other for pair in mirrored_legs for leg, other in (pair, reversed(pair))}
+    result = []
+    for name in names:
+        leg = next((leg for leg in other_leg if name.startswith(leg)), None)
+        if leg is None:
+            raise UserError(f"'{name}' has no counterpart: asset.mirrored_legs, {mirrored_legs}, lacks its leg")
+        other = other_leg[leg] + name.removeprefix(leg)
+        if other not in names:
+            raise UserError(f"'{name}' has no counterpart '{other}' on the other side")
+        result.append(list(names).index(other))
+    return tuple(result)

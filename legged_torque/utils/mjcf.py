@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Iterator
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import mujoco
@@ -42,6 +43,35 @@ def kept_warnings() -> Iterator[list[str]]:
         mujoco.set_mju_user_warning(before)
 
 
+def read_spec(file: Path, joints: Sequence[str] = ()) -> mujoco.MjSpec:
+    """Read a MJCF file, with its joints in the order of ``joints`` if moving whole limbs leads there; else as it is.
+
+    Keyframes are left out where limbs are moved, since they are in the file's order. A UserError if the file is missing
+    or cannot be read.
+    """
+    with loading(file):
+        spec = mujoco.MjSpec.from_file(str(file))
+        names = [joint.name for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
+        if names == list(joints) or sorted(names) != sorted(joints):
+            return spec
+        root = ElementTree.parse(file).getroot()
+        if root.find(".//include") is not None:
+            return spec
+        ranks = {name: rank for rank, name in enumerate(joints)}
+
+        def first_joint(part: ElementTree.Element) -> int:
+            below = part.iter("joint") if part.tag in ("body", "frame") else ()
+            return min((ranks.get(joint.get("name", ""), -1) for joint in below), default=-1)
+
+        for parent in root.findall("worldbody//*"):
+            parent[:] = sorted(parent, key=first_joint)
+        for keyframe in root.findall("keyframe"):
+            root.remove(keyframe)
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        spec.modelfiledir = str(Path(file).absolute().parent)
+        return spec
+
+
 def motors_of(model: mujoco.MjModel, joint: int) -> list[int]:
     """Return the actuators that act on a joint, found by their transmission."""
     on_joint = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
@@ -55,7 +85,7 @@ def why_no_motor(model: mujoco.MjModel, actuator: int) -> str:
     if model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED:
         return "has a gain that is not fixed"
     if model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_NONE:
-        return "is a servo, whose control is a target"
+        return "is a servo, whose control is a target: import_robot.py reads it as a motor"
     if model.actuator_dyntype[actuator] != mujoco.mjtDyn.mjDYN_NONE:
         return "has dynamics of its own"
     if not torque_per_control(model, actuator):
@@ -92,6 +122,25 @@ def joint_axes(model: mujoco.MjModel) -> np.ndarray:
     data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE] + 3] = 1.0
     mujoco.mj_kinematics(model, data)
     return data.xaxis.copy()
+
+
+def robot_notes(file: Path, trained: Path) -> Iterator[str]:
+    """Yield what of a robot in a MJCF is otherwise than of that with which a policy was trained: axes and mass."""
+    if not trained.is_file():
+        yield f"asset.file is not compared with that of the training, '{trained}', which is gone"
+        return
+    models = []
+    for each in (file, trained):
+        with loading(each):
+            models.append(read_spec(each).compile())
+    ours, theirs = ({m.joint(i).name: axis for i, axis in enumerate(joint_axes(m))} for m in models)
+    turned = [name for name, axis in theirs.items() if name in ours and axis @ ours[name] < 0.999]
+    if turned:
+        names = ", ".join(turned)
+        yield f"asset.file has other axes than the robot of the training: {names} are seen and driven wrongly"
+    masses = [float(model.body_mass.sum()) for model in models]
+    if abs(masses[0] - masses[1]) > 1e-3 * masses[1]:
+        yield f"asset.file has {masses[0]:.3f} kg, the robot of the training {masses[1]:.3f} kg"
 
 
 def joint_limits(model: mujoco.MjModel) -> np.ndarray:

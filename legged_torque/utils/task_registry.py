@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from legged_torque import resource_path
 from legged_torque.utils import distributed
 from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.devices import resolve_device
@@ -161,6 +162,11 @@ class TaskRegistry:
         if config["task"] != options.task:
             raise UserError(f"the run '{folder}' is of task '{config['task']}', not '{options.task}'")
         cfgs = self.get_cfgs(options.task, options, config)
+        robot, trained = cfgs[0].asset.file, config["env"]["asset"]["file"]
+        if robot != trained:
+            from legged_torque.utils.mjcf import robot_notes  # which imports mujoco
+
+            print_notes(robot_notes(resource_path(robot), resource_path(trained)))
         file = find_checkpoint(folder, options.checkpoint)
         newer_runs = not options.load_run and any(checkpoint_numbers(run) for run in root.glob("*") if run > folder)
         if newer_runs or (options.checkpoint is None and checkpoint_number(file) != checkpoint_numbers(folder)[-1]):

@@ -5,6 +5,7 @@ Needs neither torch nor Warp.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ import numpy as np
 from legged_torque.terrain.colors import NEUTRAL, color_of
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.layout import Layout
-from legged_torque.utils.mjcf import loading
+from legged_torque.utils.mjcf import loading, read_spec
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -113,9 +114,12 @@ def ground_of(task: LeggedRobot) -> Ground | None:
     return Ground(task.terrain.layout, task.terrain.map) if isinstance(task.terrain, RoughGround) else None
 
 
-def drawn_model(robot: Path, ground: Ground | None) -> mujoco.MjModel:
-    """Return the model of a robot's MJCF, visual geoms included, on its own plane or on rough ground, to draw it."""
-    spec = mujoco.MjSpec.from_file(str(robot))
+def drawn_model(robot: Path, ground: Ground | None, joints: Sequence[str] = ()) -> mujoco.MjModel:
+    """Return the model of a robot's MJCF, visual geoms included, on its own plane or on rough ground, to draw it.
+
+    ``joints`` are those of a task, in whose order its states are; without them, states are in that of the file.
+    """
+    spec = read_spec(robot, joints)
     if ground:
         ground.add_to(spec)
     with loading(robot):

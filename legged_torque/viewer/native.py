@@ -92,7 +92,7 @@ def watch(session: Session, robot: Path) -> None:
     import mujoco.viewer  # needs a screen
 
     ground = ground_of(session.task)
-    model = drawn_model(robot, ground)
+    model = drawn_model(robot, ground, session.task.dof_names)
     data = mujoco.MjData(model)
     keyboard = Keyboard(session)
     print(KEYS, flush=True)

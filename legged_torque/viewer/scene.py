@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import trimesh
@@ -30,10 +28,12 @@ class Scene:
     and zoom freely. Rough ground does not get between camera and robot.
     """
 
-    def __init__(self, server: viser.ViserServer, robot: Path, num_envs: int, ground: Ground | None = None) -> None:
-        """Build everything; ``robot`` is its MJCF, visual geoms included, ``ground`` None for a plane."""
+    def __init__(
+        self, server: viser.ViserServer, robot: mujoco.MjModel, num_envs: int, ground: Ground | None = None
+    ) -> None:
+        """Build everything; ``robot`` has visual geoms and the order of the states, ``ground`` is None for a plane."""
         self._server, self.ground = server, ground
-        self._model = mujoco.MjModel.from_xml_path(str(robot))
+        self._model = robot
         self._data = mujoco.MjData(self._model)
         self.is_following, self.shows_others = True, True  # the camera follows; the other worlds are drawn
         self.shows_scan = True  # where the height scan of the followed robot meets the ground

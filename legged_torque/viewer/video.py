@@ -86,7 +86,8 @@ class TaskRecorder(VideoRecorder):
     def __init__(self, task: LeggedRobot, num_worlds: int = 1) -> None:
         """Prepare to record the first worlds of a task; a single one is that with the fastest command at the start."""
         ground = ground_of(task)
-        super().__init__(drawn_model(resource_path(task.cfg.asset.file), ground), TRUNK, task.dt, ground)
+        model = drawn_model(resource_path(task.cfg.asset.file), ground, task.dof_names)
+        super().__init__(model, TRUNK, task.dt, ground)
         self._task = task
         self._worlds = list(range(num_worlds)) if num_worlds > 1 else []
 

@@ -14,7 +14,7 @@ import viser
 from legged_torque.utils.errors import UserError
 from legged_torque.viewer.access import Guard
 from legged_torque.viewer.controls import Controls
-from legged_torque.viewer.ground import Ground, ground_of
+from legged_torque.viewer.ground import Ground, drawn_model, ground_of
 from legged_torque.viewer.pacing import stopping_on_ctrl_c
 from legged_torque.viewer.plots import Plots
 from legged_torque.viewer.scene import Scene
@@ -43,7 +43,8 @@ class Page:
             self.server = PrivateServer(host, free_port(host, port), label=title, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 125, 246))
         self._ground = ground_of(session.task)
-        self._scene = Scene(self.server, robot, session.task.num_envs, self._ground)
+        model = drawn_model(robot, None, session.task.dof_names)
+        self._scene = Scene(self.server, model, session.task.num_envs, self._ground)
         self.controls = Controls(self.server, session, self._scene)
         self._plots = Plots(self.server, session)
         self.server.gui.main_panel.dock_right()

@@ -10,8 +10,8 @@ import numpy as np
 
 from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.envs.base.robot_checks import foot_notes, pose_problems
-from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching, read_spec
+from legged_torque.envs.base.robot_checks import engine_notes, floor_problems, foot_notes, pose_problems
+from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching
 from legged_torque.sim.robot_file import (
     model_problems,
     refuse,
@@ -20,7 +20,7 @@ from legged_torque.sim.robot_file import (
 )
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.errors import UserError, told_in, unknown_name
-from legged_torque.utils.mjcf import drawing_notes, joint_axes, loading
+from legged_torque.utils.mjcf import drawing_notes, joint_axes, loading, read_spec
 
 
 @dataclass
@@ -28,9 +28,9 @@ class Asset:
     """A robot's model and which of its parts mean what."""
 
     mj_model: mujoco.MjModel
-    dof_names: list[str]  # of the joints, in the order of the MJCF
+    dof_names: list[str]  # of the joints, in the order of the settings, whatever that of the MJCF
     geom_names: list[str]  # of the collision geoms; the lists below are places in this one
-    feet: list[int]  # in the order of ``foot_names``
+    feet: list[int]  # geoms of the feet, in the order of ``foot_names``
     penalized: list[int]  # geoms of the collision term
     terminating: list[int]  # geoms that end an episode
     notes: list[str]  # what a user should know of the robot, a line each
@@ -39,6 +39,12 @@ class Asset:
     def foot_names(self) -> list[str]:
         """Names of the geoms of the feet."""
         return [self.geom_names[place] for place in self.feet]
+
+    @property
+    def foot_of(self) -> list[int]:
+        """To which foot each geom of the feet belongs: those of one body are one foot."""
+        bodies = [int(self.mj_model.geom(name).bodyid[0]) for name in self.foot_names]
+        return [list(dict.fromkeys(bodies)).index(body) for body in bodies]
 
     def dof_axes(self) -> np.ndarray:
         """Return the axes of the joints in the trunk's frame, where all angles are 0. Shape: (num_dof, 3)."""
@@ -53,7 +59,7 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     or tasks cannot simulate the robot.
     """
     settings, file = cfg.asset, resource_path(cfg.asset.file)
-    spec = read_spec(file)
+    spec = read_spec(file, list(cfg.init_state.default_joint_angles))
     problems, notes, geoms = list(spec_problems(spec)), list(drawing_notes(spec)), collision_geoms(spec)
     chosen: list[list[int]] = []
     for parts in ([settings.foot_name], settings.penalize_contacts_on, settings.terminate_after_contacts_on):
@@ -67,13 +73,15 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     with told_in(problems):
         problems += model_problems(model)
         problems += pose_problems(nominal_pose(cfg.init_state.default_joint_angles, dof_names), model)
+    if not problems:
+        problems += floor_problems(model, [geoms[place] for place in chosen[0]])
     refuse(problems, f"'{settings.file}' cannot be simulated")
     if use_plain_motors(spec, model):
         with loading(file):
             model = spec.compile()
     model.opt.timestep = cfg.sim.dt
     feet, penalized, terminating = chosen
-    notes += foot_notes(model, [geoms[place] for place in feet])
+    notes += [*foot_notes(model, [geoms[place] for place in feet]), *engine_notes(model, cfg.sim.engine)]
     return Asset(model, dof_names, geoms, feet, penalized, terminating, notes)
 
 
@@ -100,7 +108,7 @@ def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence
 
 
 def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[float]:
-    """Return the angles [rad] of ``init_state.default_joint_angles``, in the order of the MJCF.
+    """Return the angles [rad] of ``init_state.default_joint_angles``, in the order of the model.
 
     A UserError if a joint is missing or unknown, or the order is another one.
     """
@@ -113,5 +121,7 @@ def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[flo
             raise UserError(f"{key} lacks the joint '{name}'")
     if list(angles) != list(dof_names):
         why = "in which policies see and drive them"
-        raise UserError(f"{key} must be in the order of the MJCF's joints, {why}: {', '.join(dof_names)}")
+        raise UserError(
+            f"the MJCF's joints cannot be put in the order of {key}, {why}, by moving limbs: {', '.join(dof_names)}"
+        )
     return list(angles.values())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import mujoco
 from torch import Tensor
 
 from legged_torque.sim.randomization import Parameter, Range
@@ -22,6 +23,7 @@ MODEL_FIELDS = (
 """Fields of the model of which each world has its own."""
 
 TRUNK = 1  # the trunk's body
+_ROUND = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)}  # types of feet that have a radius
 LEAST_MASS = 0.01  # [kg] of a trunk
 
 
@@ -65,14 +67,19 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
     trunk = offset(cfg, "trunk_mass_offset") | scale(cfg, "trunk_mass_scale")
     inertia_per_mass = list(model.body_inertia[TRUNK] / model.body_mass[TRUNK])
     joint_values = symmetry.joints and symmetry.joints.unsigned()
-    foot_vectors = symmetry.feet and symmetry.feet.of_vectors(VECTOR)
+    foot_vectors = symmetry.foot_geoms and symmetry.foot_geoms.of_vectors(VECTOR)
 
-    def of_joints(name: str, field: str, columns: Any) -> Parameter:
-        return of_model(task, name, field, columns, may_keep=True, mirror=joint_values, **absolute(cfg, name))
+    def of_joints(name: str, field: str, columns: Any, share: dict[str, Any]) -> Parameter:
+        drawn = absolute(cfg, name) or share
+        return of_model(task, name, field, columns, may_keep=True, mirror=joint_values, **drawn)
+
+    def added(name: str, unit: Tensor) -> dict[str, Any]:
+        return offset(cfg, f"{name}_share") | {"weight": unit.tolist()}
 
     trunk_com = offset(cfg, "trunk_com_offset") | {"shared": True, "listed_by_column": True, "mirror": VECTOR}
     foot_offset = offset(cfg, "foot_offset")
-    foot_radius = absolute(cfg, "foot_radius")
+    are_round = set(model.geom_type[feet]) <= _ROUND
+    foot_radius = absolute(cfg, "foot_radius") or (scale(cfg, "foot_radius_share") if are_round else {})
     inertia = {**trunk, "weight": inertia_per_mass, "shared": True, "same_draw_as": "trunk_mass"}
     return [
         of_model(task, "trunk_mass", "body_mass", [TRUNK], **trunk, **at_least(cfg, LEAST_MASS)),
@@ -80,10 +87,10 @@ def robot_parameters(task: LeggedRobot) -> list[Parameter]:
         of_model(task, "trunk_com", "body_ipos", entries(3, [TRUNK]), **trunk_com),
         of_model(task, "foot_radius", "geom_size", [3 * foot for foot in feet], shared=True, **foot_radius),
         of_model(task, "foot_offset", "geom_pos", entries(3, feet), mirror=foot_vectors, **foot_offset),
-        of_joints("dof_damping", "dof_damping", dofs),
-        of_joints("dof_armature", "dof_armature", dofs),
-        of_joints("dof_stiffness", "jnt_stiffness", joints),
-        of_joints("dof_frictionloss", "dof_frictionloss", dofs),
+        of_joints("dof_damping", "dof_damping", dofs, added("dof_damping", task.d_gains[0])),
+        of_joints("dof_armature", "dof_armature", dofs, scale(cfg, "dof_armature_share")),
+        of_joints("dof_stiffness", "jnt_stiffness", joints, added("dof_stiffness", task.p_gains[0])),
+        of_joints("dof_frictionloss", "dof_frictionloss", dofs, added("dof_frictionloss", task.torque_limits[1])),
     ]
 
 
@@ -172,8 +179,8 @@ def pair(limits: Sequence[float]) -> Range:
 
 
 def is_drawn(cfg: Any, name: str) -> bool:
-    """Return whether a parameter has a range and is not kept fixed."""
-    return getattr(cfg, name) is not None and name not in cfg.keep_fixed
+    """Return whether a parameter has a range and is not kept fixed, by this name or by that without ``_share``."""
+    return getattr(cfg, name) is not None and not {name, name.removesuffix("_share")} & set(cfg.keep_fixed)
 
 
 def offset(cfg: Any, name: str) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from legged_torque.sim.model import CONTACT_DATA, FLOOR
 from legged_torque.utils.errors import UserError
 
 STANDING_TIME = 3.0  # for which the nominal pose is held [s]
+LEAST_HEIGHT = 0.5  # of a standing robot's trunk, times that in the nominal pose
 MOST_TILT = 0.5  # of a standing robot's trunk [rad]
 _FAR = 10.0  # farther than any part is from the floor [m]
 
@@ -27,6 +28,7 @@ def standing_note(task: LeggedRobot) -> str:
     if not stiffness.any():
         return ""
     model, data = asset.mj_model, _placed(asset, pose)
+    height = float(data.qpos[2])
     for step in range(round(STANDING_TIME / model.opt.timestep)):
         if step % task.cfg.control.decimation == 0 or task.cfg.control.refresh_torques:
             wanted = stiffness * (pose - data.qpos[7:]) - damping * data.qvel[6:]
@@ -34,7 +36,7 @@ def standing_note(task: LeggedRobot) -> str:
         mujoco.mj_step(model, data)
         if any(warning.number for warning in data.warning):
             raise UserError(f"'{task.cfg.asset.file}' diverges under PD control: check masses, gains and sim.dt")
-        fate = _fall(asset, data)
+        fate = _fall(asset, data, height)
         if fate:
             after = f"after {(step + 1) * model.opt.timestep:.2f} s {fate}"
             return f"the nominal pose does not stand under PD control, {after}; see init_state, control.stiffness"
@@ -51,11 +53,16 @@ def _placed(asset: Asset, pose: np.ndarray) -> mujoco.MjData:
     return data
 
 
-def _fall(asset: Asset, data: mujoco.MjData) -> str:
-    """Return why a robot does not stand: a part that ends episodes touches the ground, or the trunk is tilted."""
+def _fall(asset: Asset, data: mujoco.MjData, height: float) -> str:
+    """Return why a robot does not stand: a part that ends episodes touches the ground, the trunk is tilted or has sunk.
+
+    ``height`` is that at which the trunk started [m].
+    """
     touching = data.sensordata.reshape(-1, CONTACT_DATA)[:, 0] > 0
     ending = [asset.geom_names[geom] for geom in asset.terminating if touching[geom]]
     if ending:
         return f"'{ending[0]}' touches the ground"
     tilt = np.arccos(np.clip(1.0 - 2.0 * (data.qpos[4] ** 2 + data.qpos[5] ** 2), -1.0, 1.0))
+    if data.qpos[2] < LEAST_HEIGHT * height:
+        return f"the trunk has sunk from {height:.2f} to {data.qpos[2]:.2f} m"
     return f"the trunk is tilted by {tilt:.2f} rad" if tilt > MOST_TILT else ""

@@ -28,6 +28,7 @@ from legged_torque.motors import make_motors
 from legged_torque.motors.action_delay import ActionDelay
 from legged_torque.motors.drive import Drive, in_kernel
 from legged_torque.sim.health import Health
+from legged_torque.sim.model import indices_matching
 from legged_torque.sim.randomization import Parameter, changes_legs
 from legged_torque.sim.simulator import Simulator
 from legged_torque.terrain import make_terrain
@@ -58,7 +59,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         actions: Last actions. Shape: (num_envs, num_actions).
         commands: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
         contacts: 1 for each collision geom that touches the ground, else 0. Shape: (num_envs, geoms).
-        feet_contact: The same for the feet. Shape: (num_envs, feet).
+        feet_contact: The same for the feet, of which each may have several geoms. Shape: (num_envs, feet).
         notes: What a user should know of this robot with these settings, a line each.
     """
 
@@ -182,7 +183,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.base_lin_vel.copy_(lin_vel)
         self.projected_gravity.copy_(gravity)
         self.contacts.copy_(self.sim.contact_found > 0)
-        self.feet_contact.copy_(self.contacts[:, self.feet_indices])
+        self.feet_contact.copy_(self.contacts[:, self.foot_geoms].amax(dim=2))
 
     def update_feet_air_time(self) -> None:
         """Count the time of each foot since it left the ground."""
@@ -260,9 +261,10 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.dof_names, self.foot_names = self.asset.dof_names, self.asset.foot_names
         self.num_dof = len(self.dof_names)
         axes = self.asset.dof_axes().tolist()
-        self.symmetry = RobotSymmetry(cfg.asset.mirrored_legs, self.dof_names, axes, self.foot_names)
-        if self.symmetry.joints and self.symmetry.feet:
-            problem = mirror_problem(model, self.symmetry.joints, self.symmetry.feet, self.foot_names)
+        foot_of = self.asset.foot_of
+        self.symmetry = RobotSymmetry(cfg.asset.mirrored_legs, self.dof_names, axes, self.foot_names, foot_of)
+        if self.symmetry.joints and self.symmetry.foot_geoms:
+            problem = mirror_problem(model, self.symmetry.joints, self.symmetry.foot_geoms, self.foot_names)
             self.symmetry.refuse(problem)
         self.motors = make_motors(cfg.motors.model, self.num_envs, self._tensor(model.actuator_forcerange.T))
         self.torque_limits, self.motor_strength = self.motors.limits, self.motors.strength
@@ -277,6 +279,9 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.feet_indices, self.penalized_contact_indices, self.termination_contact_indices = (
             torch.tensor(chosen, dtype=torch.long, device=self.device) for chosen in places
         )
+        geoms = [self.feet_indices[[own == foot for own in foot_of]] for foot in range(max(foot_of) + 1)]
+        longest = max(len(own) for own in geoms)  # shorter rows repeat their first geom
+        self.foot_geoms = torch.stack([torch.cat([own, own[:1].expand(longest - len(own))]) for own in geoms])
 
     def _init_buffers(self) -> None:
         """Allocate what the state, the controller and the episodes keep, and constants."""
@@ -285,7 +290,9 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.base_lin_vel, self.projected_gravity = zeros(n, 3), zeros(n, 3)
         self._gravity = self._tensor([0.0, 0.0, -1.0]).expand(n, 3)
         self.contacts = zeros(self.sim.contact_found.shape)
-        self.feet_contact, self.feet_air_time = zeros(n, len(self.feet_indices)), zeros(n, len(self.feet_indices))
+        self.feet_contact, self.feet_air_time = zeros(n, len(self.foot_geoms)), zeros(n, len(self.foot_geoms))
+        held = indices_matching(dof_names, self.cfg.rewards.held_joints, "joint in rewards.held_joints")
+        self.held_joints = self._tensor([float(joint in held) for joint in range(self.num_dof)])
         self.last_dof_vel, self.joint_offset = zeros(n, self.num_dof), zeros(n, self.num_dof)
         self.default_dof_pos = self._tensor(nominal_pose(self.cfg.init_state.default_joint_angles, dof_names))
         self.p_gains = zeros(n, 1) + self._tensor(by_joint("control.stiffness", control.stiffness, dof_names))
@@ -331,7 +338,9 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.events = RandomEvents(cfg, self.sim, self.command_generator, self.init_angles, initial_state(self), drawn)
         self.randomization = self.events.parameters
         self.parameter_mirrors = mirrors(drawn, self.randomization.sizes)
-        self.notes = [*self.asset.notes, *(range_notes(drawn) if cfg.domain_rand.randomize_parameters else ())]
+        self.notes = list(self.asset.notes)
+        if cfg.domain_rand.randomize_parameters:
+            self.notes += range_notes(drawn, self.torque_limits[1].cpu().numpy())
         if cfg.domain_rand.randomize_parameters and changes_legs(drawn):
             self.sim.vary_legs()
 

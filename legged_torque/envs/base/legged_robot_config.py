@@ -96,12 +96,13 @@ class LeggedRobotCfg(BaseConfig):
 
     class init_state:  # where episodes start, and the nominal pose
         pos: Place = [0.0, 0.0, 1.0]  # [m] of the trunk at a reset: high enough for stretched legs
-        default_joint_angles: dict[str, float] = {}  # [rad] q_nominal, by joint name, in the order of the MJCF
+        default_joint_angles: dict[str, float] = {}  # [rad] q_nominal, by joint name, in the order that policies see
 
     class domain_rand:
         """What is drawn at random: uniform ranges [lowest, highest]. See ``perturbations`` and ``parameter_ranges``.
 
-        Of a parameter without a range, every world has the robot's own value.
+        Of a parameter without a range, every world has the robot's own value. Ranges that end in ``_share`` are in
+        units of the robot itself, and count where the same range without that ending is None.
         """
 
         # initial state, at every reset
@@ -123,15 +124,20 @@ class LeggedRobotCfg(BaseConfig):
         keep_fixed: list[str] = []  # names of ranges below that are not drawn after all
         resampling_probability: Share = 0.002  # per control step and world
         trunk_mass_offset: Interval = [0.0, 0.0]  # [kg], then
-        trunk_mass_scale: PositiveInterval = [1.0, 1.0]  # times the mass; inertia in proportion
+        trunk_mass_scale: PositiveInterval = [0.8, 1.2]  # times the mass; inertia in proportion
         trunk_com_offset: Interval = [-0.003, 0.003]  # [m] the same on all three axes
         foot_radius: PositiveInterval | None = None  # [m]
+        foot_radius_share: PositiveInterval | None = [0.95, 1.05]  # times the robot's own, of round feet
         foot_offset: Interval = [-0.0025, 0.0025]  # [m] per foot and axis
         keep_probability: Share = 0.0  # of draws in which the joints keep their own values of the next four
         dof_damping: NotNegativeInterval | None = None  # [N m s/rad] per joint
+        dof_damping_share: NotNegativeInterval | None = [0.0, 0.4]  # of Kd, added to the robot's own
         dof_armature: NotNegativeInterval | None = None  # [kg m^2] per joint
+        dof_armature_share: NotNegativeInterval | None = [0.8, 2.0]  # times the robot's own
         dof_stiffness: NotNegativeInterval | None = None  # [N m/rad] per joint, of a spring towards angle 0
+        dof_stiffness_share: NotNegativeInterval | None = [0.0, 0.01]  # of Kp, added to the robot's own
         dof_frictionloss: NotNegativeInterval | None = None  # [N m] per joint
+        dof_frictionloss_share: NotNegativeInterval | None = [0.0, 0.012]  # of the torque limit, added likewise
         ground_friction: PositiveInterval = [0.8, 1.2]  # tangential; torsional and rolling in proportion
         contact_stiffness: PositiveInterval = [900.0, 1100.0]  # of MuJoCo's direct solref
         contact_damping: PositiveInterval = [72.0, 88.0]  # low where the stiffness is low
@@ -188,6 +194,7 @@ class LeggedRobotCfg(BaseConfig):
         soft_dof_pos_limit: Fraction = 0.9  # share of a joint's range, beyond which dof_pos_limits acts
         base_height_target: NotNegative = 0.0  # [m] of the trunk above the ground, in the nominal pose
         feet_air_time_target: NotNegative = 0.5  # [s] swings are rewarded for what they last beyond this
+        held_joints: list[str] = []  # parts of the names of joints that dof_deviation holds
 
         class scales:  # weights of Table III; each times the control step and its factor of ``curriculum``
             tracking_lin_vel: float = 1.0  # following commanded v_x and v_y
@@ -204,6 +211,9 @@ class LeggedRobotCfg(BaseConfig):
             feet_air_time: float = 0.1  # long swings
             symmetry: float = -0.5  # right and left foot of a pair both in the air
             stumble: float = 0.0  # feet pushed against walls
+            single_stance: float = 0.0  # swings of one foot of a pair while the other stands
+            dof_deviation: float = 0.0  # rewards.held_joints away from the nominal pose
+            alive: float = 0.0  # every step
 
         class curriculum:  # factors on the scales: linear from start to end between two total step counts (eq. 1)
             class tracking_lin_vel(LinearChange):
@@ -249,8 +259,14 @@ class LeggedRobotCfg(BaseConfig):
         factors = ("motor_strength", "stiffness_scale", "damping_scale")
         control = {name: [0.5, 1.5] for name in factors} | {f"{name}_per_joint": [0.95, 1.05] for name in factors}
         control |= {"joint_offset": [-0.05, 0.05], "trunk_com_offset": [-0.01, 0.01]}
+        shares = {
+            "dof_damping_share": [0.0, 4.0],
+            "dof_armature_share": [0.8, 5.0],
+            "dof_stiffness_share": [0.0, 0.025],
+        }
+        shares |= {"dof_frictionloss_share": [0.0, 0.03], "trunk_mass_scale": [0.6, 1.4]}
         errors = {"dof_vel": 1.5, "ang_vel": 0.2, "gravity": 0.1}
-        return {"domain_rand": {**ground, **control, "push_set_factor": 1.5}, "noise_scales": errors}
+        return {"domain_rand": {**ground, **control, **shares, "push_set_factor": 1.5}, "noise_scales": errors}
 
     def parameter_ranges(self) -> dict[str, dict]:
         """Return the named sets that ``--ranges`` chooses from: that of this class, and the hard one."""
@@ -275,7 +291,11 @@ class LeggedRobotCfg(BaseConfig):
     def of_older_runs() -> dict[str, dict]:
         """Return what runs were trained with whose ``config.yaml`` has no entry for these settings yet."""
         per_joint = ("motor_strength_per_joint", "stiffness_scale_per_joint", "damping_scale_per_joint")
-        return {"domain_rand": {**dict.fromkeys(per_joint), "push_set_factor": 1.0}}
+        shares = (
+            "foot_radius_share",
+            *(f"dof_{of}_share" for of in ("damping", "armature", "stiffness", "frictionloss")),
+        )
+        return {"domain_rand": {**dict.fromkeys((*per_joint, *shares)), "push_set_factor": 1.0}}
 
 
 class LeggedRobotCfgPPO(BaseConfig):

@@ -11,6 +11,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.symmetry import RobotSymmetry
 from legged_torque.sim.simulator import Simulator
 
+STANDING_COMMAND = 0.1  # norm of a command [m/s, rad/s] up to which robots may stand
 STUMBLING = 5.0
 """A foot stumbles if the force on it is this many times as large horizontally as vertically, as in legged_gym."""
 
@@ -33,6 +34,8 @@ class RewardTerms(ABC):
     base_ang_vel: Tensor
     projected_gravity: Tensor
     dof_pos: Tensor
+    default_dof_pos: Tensor
+    held_joints: Tensor
     dof_vel: Tensor
     last_dof_vel: Tensor
     dof_pos_limits: Tensor
@@ -108,6 +111,26 @@ class RewardTerms(ABC):
         in_air = 1.0 - self.feet_contact
         pairs = [in_air[:, right] * in_air[:, left] for right, left in self.symmetry.foot_pairs]
         return sum(pairs[1:], pairs[0])
+
+    def _reward_single_stance(self) -> Tensor:
+        """Share of feet_air_time_target for which a foot has swung while its counterpart stands; then 0.
+
+        Summed over pairs of feet, and only under a command to move. Who hops or stands on one leg gets nothing.
+        """
+        target = self.cfg.rewards.feet_air_time_target
+        swing = torch.where(self.feet_air_time < target, self.feet_air_time / target, 0.0)
+        swing = swing * (1.0 - self.feet_contact)
+        stance = self.feet_contact
+        pairs = [swing[:, r] * stance[:, left] + swing[:, left] * stance[:, r] for r, left in self.symmetry.foot_pairs]
+        return sum(pairs[1:], pairs[0]) * (self.commands.norm(dim=1) > STANDING_COMMAND)
+
+    def _reward_dof_deviation(self) -> Tensor:
+        """Sum of |q - q_nominal| over ``rewards.held_joints`` [rad]."""
+        return ((self.dof_pos - self.default_dof_pos) * self.held_joints).abs().sum(dim=1)
+
+    def _reward_alive(self) -> Tensor:
+        """1 at every step."""
+        return torch.ones_like(self.base_height)
 
     def _reward_stumble(self) -> Tensor:
         """1 if a foot is pushed against a wall: see :data:`STUMBLING`."""

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 import mujoco
 import numpy as np
 
+from legged_torque.sim.fused.tree import SLOWER, reasons_against
+from legged_torque.sim.model import FLOOR
 from legged_torque.sim.randomization import Parameter
 from legged_torque.utils.mirroring import Mirroring
 from legged_torque.utils.mjcf import joint_limits
@@ -24,13 +26,30 @@ def pose_problems(pose: Sequence[float], model: mujoco.MjModel) -> Iterator[str]
 
 
 def foot_notes(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
-    """Yield which legs have no foot, or several: a leg ends in a body without children."""
+    """Yield which legs have no foot, or a foot of other numbers of geoms: a leg ends in a body without children."""
     ends = set(range(2, model.nbody)) - set(model.body_parentid.tolist())
     bodies = [int(model.geom(name).bodyid[0]) for name in feet]
+    usual = min(bodies.count(body) for body in bodies)
     for body in sorted(ends.union(bodies)):
-        if bodies.count(body) != 1:
+        if bodies.count(body) != usual:
             has = f"the body '{model.body(body).name}' has {bodies.count(body)} feet"
             yield f"{has}; asset.foot_name chooses {', '.join(feet)}"
+
+
+def engine_notes(model: mujoco.MjModel, engine: str) -> Iterator[str]:
+    """Yield how much slower the engine is than the fused step, and why that does not simulate the robot."""
+    if engine == "mujoco_warp":
+        reasons = "; ".join(reasons_against(model))
+        why = f"which cannot simulate this robot: {reasons}" if reasons else "which can simulate this robot"
+        yield f"sim.engine 'mujoco_warp' steps worlds, {SLOWER} than 'fused', {why}"
+
+
+def floor_problems(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
+    """Yield which feet the ground lets through, whichever engine simulates them."""
+    kinds, floor = (model.geom_contype, model.geom_conaffinity), model.geom(FLOOR).id
+    through = [f for f in feet if not any(a[floor] & b[model.geom(f).id] for a, b in (kinds, kinds[::-1]))]
+    if through:
+        yield f"contype and conaffinity let {', '.join(through)} through the geom '{FLOOR}'"
 
 
 def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, foot_names: Sequence[str]) -> str:
@@ -52,16 +71,25 @@ def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, fo
     return ""
 
 
-def range_notes(drawn: Sequence[Parameter]) -> Iterator[str]:
-    """Yield which ranges leave out the robot's own value: they may be another robot's."""
-    for parameter in drawn:
-        if parameter.model_field is None or parameter.base is None:
-            continue
-        own = parameter.field[0, list(parameter.columns)].cpu().numpy()
-        weight = np.broadcast_to(parameter.weight, own.shape)
-        scaled = np.divide(own - parameter.base, weight, out=np.zeros_like(own), where=weight != 0.0)
-        low, high = parameter.offset
-        outside = scaled[(scaled < low - 1e-6 * abs(low)) | (scaled > high + 1e-6 * abs(high))]
-        if outside.size:
-            drawn_from = f"draws {low:g} to {high:g}, but the robot's own value is {outside[0]:g}"
-            yield f"domain_rand.{parameter.name} {drawn_from}: is it the range of another robot?"
+def range_notes(drawn: Sequence[Parameter], torques: np.ndarray) -> Iterator[str]:
+    """Yield which ranges may be another robot's.
+
+    They leave out the robot's own value, or change a mass by more than half, or draw dry friction of more than a tenth
+    of a joint's highest torque. Those are ``torques`` [N m]. Shape: (num_dof,).
+    """
+    for parameter in (each for each in drawn if each.model_field):
+        columns = list(parameter.columns)
+        own = parameter.field[0, columns].cpu().numpy()
+        weight, (low, high) = np.broadcast_to(parameter.weight, own.shape), parameter.offset
+        most = np.abs(weight) * max(-low, high)
+        told = ""
+        if parameter.model_field == "body_mass" and (most > 0.5 * own).any():
+            told = f"changes a mass of {own[0]:g} kg by {most[0]:g} kg"
+        elif parameter.model_field == "dof_frictionloss" and (most > 0.1 * torques[np.subtract(columns, 6)]).any():
+            told = f"draws up to {most.max():g} N m, but a motor has {torques.min():g} N m"
+        elif parameter.base is not None:
+            scaled = np.divide(own - parameter.base, weight, out=np.zeros_like(own), where=weight != 0.0)
+            outside = scaled[(scaled < low - 1e-6 * abs(low)) | (scaled > high + 1e-6 * abs(high))]
+            told = f"draws {low:g} to {high:g}, but the robot's own value is {outside[0]:g}" if outside.size else ""
+        if told:
+            yield f"domain_rand.{parameter.name} {told}: is it the range of another robot?"

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mirroring import AXIAL_VECTOR, Mirroring
+from legged_torque.utils.mirroring import AXIAL_VECTOR, Mirroring, counterparts
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -24,32 +24,44 @@ class RobotSymmetry:
     Attributes:
         joints: Mirroring of joint angles; their signs follow from the axes. None without symmetry.
         feet: Mirroring of one number per foot. None without symmetry.
+        foot_geoms: Mirroring of one number per geom of the feet. None without symmetry.
         foot_pairs: Places of the right and left foot of each pair of legs.
         problem: Why there is no symmetry, empty if there is one.
     """
 
     def __init__(
-        self, mirrored_legs: Sequence[Names], dof_names: Names, dof_axes: Sequence[Sequence[float]], foot_names: Names
+        self,
+        mirrored_legs: Sequence[Names],
+        dof_names: Names,
+        dof_axes: Sequence[Sequence[float]],
+        foot_names: Names,
+        foot_of: Sequence[int],
     ) -> None:
-        """Match names: those of the legs in ``asset.mirrored_legs``, and of joints and feet in their order.
+        """Match names: those of the legs in ``asset.mirrored_legs``, and of joints and geoms of feet in their order.
 
-        ``dof_axes`` are the joints' axes in the trunk's frame where all angles are 0. Shape: (num_dof, 3).
+        ``dof_axes`` are the joints' axes in the trunk's frame where all angles are 0, shape (num_dof, 3); ``foot_of``
+        says to which foot each of the geoms belongs.
         """
         self.joints: Mirroring | None = None
         self.feet: Mirroring | None = None
-        self.foot_pairs = [(_place(foot_names, right), _place(foot_names, left)) for right, left in mirrored_legs]
+        self.foot_geoms: Mirroring | None = None
+        geoms = [(_place(foot_names, right), _place(foot_names, left)) for right, left in mirrored_legs]
+        self.foot_pairs = [(foot_of[right], foot_of[left]) for right, left in geoms]
         self.problem = ""
         try:
             order = counterparts(dof_names, mirrored_legs)
             self.joints = Mirroring(order, _mirror_signs(dof_names, dof_axes, order))
-            self.feet = Mirroring(counterparts(foot_names, mirrored_legs), (1.0,) * len(foot_names))
+            geoms_order = counterparts(foot_names, mirrored_legs)
+            others = dict(zip(foot_of, (foot_of[place] for place in geoms_order), strict=True))
+            self.foot_geoms = Mirroring(geoms_order, (1.0,) * len(geoms_order))
+            self.feet = Mirroring(tuple(others.values()), (1.0,) * len(others))
         except UserError as error:
             self.refuse(str(error))
 
     def refuse(self, problem: str) -> None:
         """Have no symmetry, because of a problem; empty if there is none."""
         if problem:
-            self.joints, self.feet, self.problem = None, None, problem
+            self.joints, self.feet, self.foot_geoms, self.problem = None, None, None, problem
 
 
 def _mirror_signs(names: Names, axes: Sequence[Sequence[float]], order: Sequence[int]) -> tuple[float, ...]:
@@ -71,21 +83,6 @@ def _place(names: Names, leg: str) -> int:
         if name.startswith(leg):
             return place
     raise UserError(f"asset.mirrored_legs: no foot's name begins with '{leg}'; the feet are {', '.join(names)}")
-
-
-def counterparts(names: Names, mirrored_legs: Sequence[Names]) -> tuple[int, ...]:
-    """Return where each part's counterpart on the other side is: that of FR_hip is FL_hip; a UserError without it."""
-    other_leg = {leg: other for pair in mirrored_legs for leg, other in (pair, reversed(pair))}
-    result = []
-    for name in names:
-        leg = next((leg for leg in other_leg if name.startswith(leg)), None)
-        if leg is None:
-            raise UserError(f"'{name}' has no counterpart: asset.mirrored_legs, {mirrored_legs}, lacks its leg")
-        other = other_leg[leg] + name.removeprefix(leg)
-        if other not in names:
-            raise UserError(f"'{name}' has no counterpart '{other}' on the other side")
-        result.append(list(names).index(other))
-    return tuple(result)
 
 
 class Mirror:

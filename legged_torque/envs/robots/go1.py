@@ -31,14 +31,6 @@ class Go1Cfg(LeggedRobotCfg):
         action_scale = 0.25
         torque_scale = 4.0
 
-    class domain_rand:
-        trunk_mass_offset = [-1.0, 1.0]
-        foot_radius = [0.0219, 0.0241]
-        dof_damping = [0.0, 0.2]
-        dof_armature = [0.008, 0.02]
-        dof_stiffness = [0.0, 0.2]
-        dof_frictionloss = [0.0, 0.4]
-
     class rewards:
         base_height_target = 0.325
 

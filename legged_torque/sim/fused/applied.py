@@ -31,13 +31,14 @@ def apply_to_trunk(tables: Tables, worlds: Worlds, world: int, trunk: Trunk, pos
 
 @wp.func
 def apply_to_branch(
-    branch: AnyBranch, links: AnyLinks, tables: Tables, worlds: Worlds, world: int, b: int, poses: Poses
+    branch: AnyBranch, links: AnyLinks, tables: Tables, worlds: Worlds, world: int, b: int, joints: int, poses: Poses
 ):
     """Return a branch and its bodies with the forces on them."""
     for j in range(len(branch.acc)):
-        joint = tables.branch_joint[b, j]
-        branch.smooth.force[j] += worlds.qfrc_applied[world, dof(joint)]
-        force, torque = wrench_on(tables, worlds, world, joint + 1, poses[j + 1])
-        links.force = with_column(links.force, j, column(links.force, j) - force)
-        links.torque = with_column(links.torque, j, column(links.torque, j) - torque)
+        if j < joints:
+            joint = tables.branch_joint[b, j]
+            branch.smooth.force[j] += worlds.qfrc_applied[world, dof(joint)]
+            force, torque = wrench_on(tables, worlds, world, joint + 1, poses[j + 1])
+            links.force = with_column(links.force, j, column(links.force, j) - force)
+            links.torque = with_column(links.torque, j, column(links.torque, j) - torque)
     return branch, links

@@ -33,22 +33,39 @@ class Layout(NamedTuple):
     """What a kernel is made for: a robot's structure, and how its branches are spread over threads."""
 
     branches: int
-    depth: int  # joints per branch
+    depth: int  # most joints of a branch
     points: int  # most contacts of a branch with the floor
     lanes: int  # threads per world, a power of two; 1 on a CPU
     on_map: bool  # whether the ground is a height map, not a plane
+    alike: bool  # whether all branches have ``depth`` joints; else some have fewer
+    cylinders: bool  # whether any of its geoms is one
 
     @classmethod
     def of(cls, tree: Tree, on_gpu: bool, on_map: bool = False) -> "Layout":
         """Return a robot's layout: on a GPU a thread per branch, rounded up to a power of two, else one per world."""
         branches, depth = tree.joints.shape
         points = tree.most_points * (MAX_TOUCHES if on_map else 1)
-        return cls(branches, depth, points, 1 << (branches - 1).bit_length() if on_gpu else 1, on_map)
+        lanes = 1 << (branches - 1).bit_length() if on_gpu else 1
+        return cls(branches, depth, points, lanes, on_map, bool((tree.joints >= 0).all()), tree.has_cylinders)
 
     @property
     def per_lane(self) -> int:
         """Most branches of a thread."""
         return -(-self.branches // self.lanes)
+
+
+@functools.cache
+def joint_counter(layout: Layout) -> wp.Function:
+    """Return a function for the number of a branch's joints: a constant where all are alike, so that nothing masks."""
+    depth, alike = layout.depth, layout.alike
+
+    @wp.func
+    def num_joints(tables: Tables, b: int) -> int:
+        if wp.static(alike):
+            return wp.static(depth)
+        return tables.joint_count[b]
+
+    return num_joints
 
 
 @functools.cache
@@ -84,8 +101,8 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
 
     ``applied_forces`` says whether there are forces that a user applies, ``law`` what computes torques, if anything.
     """
-    branches, depth, points, lanes, on_map = layout
-    per_lane, place = layout.per_lane, places(layout)
+    branches, depth, points, lanes, on_map, _, cylinders = layout
+    per_lane, place, num_joints = layout.per_lane, places(layout), joint_counter(layout)
     find = find_map_contacts if on_map else find_contacts
     Branch, make_links = branch_types(depth).Branch, links_maker(depth)
     Kept = wp.array(dtype=Branch)
@@ -109,15 +126,19 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
     def make_branch(tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, contacts: AnyContacts) -> Branch:
         """Return a branch with its equations of motion, constraints and the accelerations to start from."""
         poses = wp.zeros(shape=wp.static(depth + 1), dtype=Pose)
-        branch, links = make_links(tables, worlds, world, b, trunk, poses)
+        joints = num_joints(tables, b)
+        branch, links = make_links(tables, worlds, world, b, joints, trunk, poses)
         if wp.static(applied_forces):
-            branch, links = apply_to_branch(branch, links, tables, worlds, world, b, poses)
-        branch = make_equations(branch, links, tables, world, b, trunk.rot)
-        branch.rows = make_joint_rows(branch.rows, tables, worlds, world, b)
+            branch, links = apply_to_branch(branch, links, tables, worlds, world, b, joints, poses)
+        branch = make_equations(branch, links, tables, world, b, joints, trunk.rot)
+        branch.rows = make_joint_rows(branch.rows, tables, worlds, world, b, joints)
         branch.first_contact = (world * wp.static(branches) + b) * wp.static(points)
-        branch.num_contacts = find(tables, world, b, trunk.pos, poses, contacts, branch.first_contact)
+        branch.num_contacts = find(
+            tables, world, b, trunk.pos, poses, contacts, branch.first_contact, wp.static(cylinders)
+        )
         for j in range(wp.static(depth)):
-            branch.acc[j] = worlds.qacc_warmstart[world, dof(tables.branch_joint[b, j])]
+            if j < joints:
+                branch.acc[j] = worlds.qacc_warmstart[world, dof(tables.branch_joint[b, j])]
         return branch
 
     @wp.func
@@ -172,7 +193,7 @@ def around_solver(layout: Layout, applied_forces: bool, law: wp.Function | None)
             b = lane + i * wp.static(lanes)
             branch = place.take(kept, world, i, branch)
             if place.has(lane, i):
-                integrate_branch(tables, worlds, world, b, branch, damped)
+                integrate_branch(tables, worlds, world, b, num_joints(tables, b), branch, damped)
                 if sense:
                     sense_branch(tables, worlds, world, b, branch, contacts)
 

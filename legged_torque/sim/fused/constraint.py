@@ -60,30 +60,31 @@ def row_force(mass: float, x: float) -> float:
 
 
 @wp.func
-def make_joint_rows(rows: AnyRows, tables: Tables, worlds: Worlds, world: int, b: int):
+def make_joint_rows(rows: AnyRows, tables: Tables, worlds: Worlds, world: int, b: int, joints: int):
     """Return the friction and limit rows of a branch, given ones that are all zero."""
     for j in range(len(rows.limit_mass)):
-        joint = tables.branch_joint[b, j]
-        vel = worlds.qvel[world, dof(joint)]
-        invweight = of_world(tables.dof_invweight0, world, dof(joint))
-        loss = of_world(tables.dof_frictionloss, world, dof(joint))
-        if loss > 0.0:
-            solref = of_world(tables.dof_solref, world, dof(joint))
-            solimp = of_world(tables.dof_solimp, world, dof(joint))
-            params = reference_dynamics(solref, solimp, 0.0, tables.timestep)
-            rows.friction_loss[j] = loss
-            rows.friction_mass[j] = constraint_mass(invweight, params[2])
-            rows.friction_reference[j] = -params[1] * vel
-        limits = of_world(tables.jnt_range, world, joint)
-        pos = worlds.qpos[world, qadr(joint)]
-        below, above = pos - limits[0], limits[1] - pos
-        dist = wp.min(below, above)
-        if dist < 0.0:
-            sign = wp.where(below < above, 1.0, -1.0)
-            solref = of_world(tables.jnt_solref, world, joint)
-            solimp = of_world(tables.jnt_solimp, world, joint)
-            params = reference_dynamics(solref, solimp, dist, tables.timestep)
-            rows.limit_sign[j] = sign
-            rows.limit_mass[j] = constraint_mass(invweight, params[2])
-            rows.limit_reference[j] = -params[0] * params[2] * dist - params[1] * sign * vel
+        if j < joints:
+            joint = tables.branch_joint[b, j]
+            vel = worlds.qvel[world, dof(joint)]
+            invweight = of_world(tables.dof_invweight0, world, dof(joint))
+            loss = of_world(tables.dof_frictionloss, world, dof(joint))
+            if loss > 0.0:
+                solref = of_world(tables.dof_solref, world, dof(joint))
+                solimp = of_world(tables.dof_solimp, world, dof(joint))
+                params = reference_dynamics(solref, solimp, 0.0, tables.timestep)
+                rows.friction_loss[j] = loss
+                rows.friction_mass[j] = constraint_mass(invweight, params[2])
+                rows.friction_reference[j] = -params[1] * vel
+            limits = of_world(tables.jnt_range, world, joint)
+            pos = worlds.qpos[world, qadr(joint)]
+            below, above = pos - limits[0], limits[1] - pos
+            dist = wp.min(below, above)
+            if dist < 0.0:
+                sign = wp.where(below < above, 1.0, -1.0)
+                solref = of_world(tables.jnt_solref, world, joint)
+                solimp = of_world(tables.jnt_solimp, world, joint)
+                params = reference_dynamics(solref, solimp, dist, tables.timestep)
+                rows.limit_sign[j] = sign
+                rows.limit_mass[j] = constraint_mass(invweight, params[2])
+                rows.limit_reference[j] = -params[0] * params[2] * dist - params[1] * sign * vel
     return rows

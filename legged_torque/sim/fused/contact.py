@@ -20,8 +20,11 @@ PARTING_ACCELERATION = wp.constant(40.0)
 changes how long the solver takes, no result."""
 INFINITY = wp.constant(1.0e30)
 CAPSULE = wp.constant(3)
+CYLINDER = wp.constant(5)
 BOX = wp.constant(6)
-"""MuJoCo's mjGEOM_CAPSULE and mjGEOM_BOX."""
+"""MuJoCo's mjGEOM_CAPSULE, mjGEOM_CYLINDER and mjGEOM_BOX."""
+UPRIGHT = wp.constant(1.0e-6)
+"""A cylinder whose axis leans less than this [rad] from the normal has no lowest direction across it."""
 MAX_CORNERS = wp.constant(4)
 """Most contacts of a box with a plane: MuJoCo takes the first four corners below its centre that touch."""
 
@@ -222,20 +225,42 @@ def make_contact(
 
 
 @wp.func
-def half_size(tables: Tables, world: int, geom: int) -> wp.vec3:
-    """Return the half sizes of a geom, in units of which its points stand."""
+def half_size(tables: Tables, world: int, geom: int, cylinders: bool) -> wp.vec3:
+    """Return the half sizes of a geom, in units of which its points stand; ``cylinders`` says if it may be one."""
     size = of_world(tables.geom_size, world, geom)
     half = size
     if tables.geom_type[geom] == CAPSULE:
         half = wp.vec3(0.0, 0.0, size[1])
+    if cylinders and tables.geom_type[geom] == CYLINDER:
+        half = wp.vec3(size[0], size[0], size[1])
     return half
 
 
 @wp.func
+def turn_cylinder(turn: wp.mat33, normal: wp.vec3) -> wp.mat33:
+    """Return a cylinder's orientation, turned about its axis so that its points are MuJoCo's.
+
+    The first axis becomes the one that leads down, against the normal, and the third one leads to the lower end.
+    """
+    axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
+    if wp.dot(axis, normal) > 0.0:
+        axis = -axis
+    down = axis * wp.dot(axis, normal) - normal
+    length = wp.length(down)
+    first = wp.vec3(turn[0, 0], turn[1, 0], turn[2, 0])
+    if length > UPRIGHT:
+        first = down / length
+    return wp.matrix_from_cols(first, wp.cross(axis, first), axis)
+
+
+@wp.func
 def find_contacts(
-    tables: Tables, world: int, b: int, origin: wp.vec3, poses: Poses, contacts: Contacts, first: int
+    tables: Tables, world: int, b: int, origin: wp.vec3, poses: Poses, contacts: Contacts, first: int, cylinders: bool
 ) -> int:
-    """Write the contacts of a branch with the floor from index ``first`` on and return how many there are."""
+    """Write the contacts of a branch with the floor from index ``first`` on and return how many there are.
+
+    ``cylinders`` says whether the robot has any: a constant, which keeps them out of kernels for others.
+    """
     normal = contacts.normal
     count = int(0)
     last_geom = int(-1)
@@ -245,13 +270,15 @@ def find_contacts(
     while point < tables.point_count[b]:
         geom = tables.point_geom[b, point]
         depth = tables.point_depth[b, point]
-        half = half_size(tables, world, geom)
+        half = half_size(tables, world, geom, cylinders)
         radius = tables.point_radius[b, point] * of_world(tables.geom_size, world, geom)[0]
         middle = poses[depth].pos + poses[depth].rot * of_world(tables.geom_pos, world, geom)
         if wp.dot(height + middle, normal) > wp.length(half) + radius:  # nothing of the geom reaches the floor
             point = tables.point_next[b, point]
             continue
         turn = poses[depth].rot * quat_to_matrix(of_world(tables.geom_quat, world, geom))
+        if cylinders and tables.geom_type[geom] == CYLINDER:
+            turn = turn_cylinder(turn, normal)
         arm = turn * wp.cw_mul(tables.point_offset[b, point], half)
         centre = middle + arm
         dist = wp.dot(height + centre, normal) - radius

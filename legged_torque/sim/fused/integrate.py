@@ -33,15 +33,18 @@ def integrate_trunk(timestep: float, worlds: Worlds, world: int, trunk: Trunk, a
 
 
 @wp.func
-def integrate_branch(tables: Tables, worlds: Worlds, world: int, b: int, branch: AnyBranch, damped: TrunkMotion):
+def integrate_branch(
+    tables: Tables, worlds: Worlds, world: int, b: int, joints: int, branch: AnyBranch, damped: TrunkMotion
+):
     """Write a branch's state after the step, given what implicit damping adds to the trunk's accelerations."""
     change = branch_step(branch, damped)
     for j in range(len(branch.acc)):
-        joint = tables.branch_joint[b, j]
-        vel = worlds.qvel[world, dof(joint)] + tables.timestep * (branch.acc[j] + change[j])
-        worlds.qacc_warmstart[world, dof(joint)] = branch.acc[j]
-        worlds.qvel[world, dof(joint)] = vel
-        worlds.qpos[world, qadr(joint)] = worlds.qpos[world, qadr(joint)] + tables.timestep * vel
+        if j < joints:
+            joint = tables.branch_joint[b, j]
+            vel = worlds.qvel[world, dof(joint)] + tables.timestep * (branch.acc[j] + change[j])
+            worlds.qacc_warmstart[world, dof(joint)] = branch.acc[j]
+            worlds.qvel[world, dof(joint)] = vel
+            worlds.qpos[world, qadr(joint)] = worlds.qpos[world, qadr(joint)] + tables.timestep * vel
 
 
 @wp.func

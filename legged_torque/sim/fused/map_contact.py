@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from legged_torque.sim.fused.contact import Contact, contact_normal, half_size, make_contact
+from legged_torque.sim.fused.contact import CYLINDER, Contact, contact_normal, half_size, make_contact
 from legged_torque.sim.fused.math import quat_to_matrix
 from legged_torque.sim.fused.smooth import Poses
 from legged_torque.sim.fused.surface import Surface, is_clear, make_surface, touch_map
@@ -72,26 +72,42 @@ class Point:
     half: wp.vec3  # see half_size
     centre: wp.vec3  # where the point is, as the middle
     radius: wp.float32  # how thick the geom is around it [m]
+    is_clear: wp.bool  # whether the whole geom is known to be above the ground
     is_near: wp.bool  # whether the ground may be so near
 
 
 @wp.func
-def see_geom(tables: Tables, world: int, b: int, index: int, poses: Poses) -> Point:
+def see_geom(
+    tables: Tables, world: int, b: int, index: int, origin: wp.vec3, poses: Poses, surface: Surface, cylinders: bool
+) -> Point:
     """Return a point of a branch with all that it shares with the others of its geom."""
     out = Point()
     out.geom = tables.point_geom[b, index]
     out.depth = tables.point_depth[b, index]
-    out.half = half_size(tables, world, out.geom)
+    out.half = half_size(tables, world, out.geom, cylinders)
     out.radius = tables.point_radius[b, index] * of_world(tables.geom_size, world, out.geom)[0]
     pose = poses[out.depth]
     out.middle = pose.pos + pose.rot * of_world(tables.geom_pos, world, out.geom)
     out.turn = pose.rot * quat_to_matrix(of_world(tables.geom_quat, world, out.geom))
+    half = wp.cw_mul(tables.point_offset[b, index], out.half)
+    if cylinders and tables.geom_type[out.geom] == CYLINDER:
+        half = out.half  # points around its ends are not corners of a box
+    middle = origin + out.middle
+    drop = wp.abs(out.turn[2, 0] * half[0]) + wp.abs(out.turn[2, 1] * half[1]) + wp.abs(out.turn[2, 2] * half[2])
+    out.is_clear = is_clear(surface, middle, middle[2] - drop - out.radius, wp.length(half) + out.radius)
     return out
 
 
 @wp.func
 def find_map_contacts(
-    tables: Tables, world: int, b: int, origin: wp.vec3, poses: Poses, contacts: MapContacts, first: int
+    tables: Tables,
+    world: int,
+    b: int,
+    origin: wp.vec3,
+    poses: Poses,
+    contacts: MapContacts,
+    first: int,
+    cylinders: bool,
 ) -> int:
     """Write the contacts of a branch with the height map from index ``first`` on and return how many there are.
 
@@ -108,12 +124,13 @@ def find_map_contacts(
         point.is_near = False
         while index < tables.point_count[b] and not point.is_near:
             if tables.point_geom[b, index] != point.geom:
-                point = see_geom(tables, world, b, index, poses)
-            if origin[2] + point.middle[2] > surface.top + wp.length(point.half) + point.radius:
-                index = tables.point_next[b, index]  # the geom is above all of the map
+                point = see_geom(tables, world, b, index, origin, poses, surface, cylinders)
+            if point.is_clear:
+                index = tables.point_next[b, index]
             else:
                 point.centre = point.middle + point.turn * wp.cw_mul(tables.point_offset[b, index], point.half)
-                point.is_near = not is_clear(surface, origin + point.centre, point.radius)
+                centre = origin + point.centre
+                point.is_near = not is_clear(surface, centre, centre[2] - point.radius, point.radius)
                 index += 1
         if point.is_near:
             touch = touch_map(surface, origin + point.centre, point.radius)

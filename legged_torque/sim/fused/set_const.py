@@ -7,7 +7,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from legged_torque.sim.fused.branches import Layout
+from legged_torque.sim.fused.branches import Layout, joint_counter
 from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, forward_solve
 from legged_torque.sim.fused.smooth import Pose, add_bodies, body_dynamics, links_maker, make_equations, make_trunk
 from legged_torque.sim.fused.solver import assemble_damping, eliminate
@@ -39,7 +39,7 @@ class DerivedConstants:
         for name in ("body_invweight0", "dof_invweight0"):
             expand(model, name, num_envs)
         self._layout = layout = Layout.of(tree, self._device.is_cuda, on_map=False)
-        self._measure, self._derive = make_measure(layout.depth), make_derive(layout)
+        self._measure, self._derive = make_measure(layout), make_derive(layout)
         self._dim = (num_envs, (layout.depth + 1) * KINDS * layout.lanes)
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, mj_model.qpos0[3:7])
@@ -140,16 +140,18 @@ def write_weight(
 
 
 @wp.func
-def branch_at_rest(branch: AnyBranch, tables: Tables, world: int, b: int):
+def branch_at_rest(branch: AnyBranch, tables: Tables, world: int, b: int, joints: int):
     """Return a branch, given its inertia matrix without armatures, with the matrix with them factorized."""
     for j in range(len(branch.acc)):
-        branch.smooth.mass[j, j] += of_world(tables.dof_armature, world, dof(tables.branch_joint[b, j]))
+        if j < joints:
+            branch.smooth.mass[j, j] += of_world(tables.dof_armature, world, dof(tables.branch_joint[b, j]))
     return assemble_damping(branch, 0.0)
 
 
 @functools.cache
-def make_measure(depth: int) -> wp.Kernel:
-    """Return the kernel that measures branches of ``depth`` joints."""
+def make_measure(layout: Layout) -> wp.Kernel:
+    """Return the kernel that measures branches."""
+    depth, num_joints = layout.depth, joint_counter(layout)
     Smooth, make_links = branch_types(depth).Smooth, links_maker(depth)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -174,13 +176,15 @@ def make_measure(depth: int) -> wp.Kernel:
         worlds.qvel = rest
         poses = wp.zeros(shape=wp.static(depth + 1), dtype=Pose)
         trunk = make_trunk(tables, worlds, world)
-        branch, links = make_links(tables, worlds, world, b, trunk, poses)
-        branch = make_equations(branch, links, tables, world, b, trunk.rot)
+        joints = num_joints(tables, b)
+        branch, links = make_links(tables, worlds, world, b, joints, trunk, poses)
+        branch = make_equations(branch, links, tables, world, b, joints, trunk.rot)
         for j in range(wp.static(depth)):
-            joint = tables.branch_joint[b, j]
-            branch.smooth.mass[j, j] -= of_world(tables.dof_armature, world, dof(joint))
-            ipos = of_world(tables.body_ipos, world, joint + 1)
-            coms[world, b, j] = poses[j + 1].pos + poses[j + 1].rot * ipos
+            if j < joints:
+                joint = tables.branch_joint[b, j]
+                branch.smooth.mass[j, j] -= of_world(tables.dof_armature, world, dof(joint))
+                ipos = of_world(tables.body_ipos, world, joint + 1)
+                coms[world, b, j] = poses[j + 1].pos + poses[j + 1].rot * ipos
         measured[world, b] = branch.smooth
 
     return measure_branches
@@ -197,8 +201,8 @@ def make_derive(layout: Layout) -> wp.Kernel:
     threads per body of a branch and kind of weight, which all factorize its equations and then take their own rows.
     All of them run the same loop, which is short, since code that runs once must first be fetched.
     """
-    branches, depth, _, lanes, _ = layout
-    per_lane, (Branch, _, Smooth) = layout.per_lane, branch_types(depth)
+    branches, depth, _, lanes, _, alike, _ = layout
+    per_lane, num_joints, (Branch, _, Smooth) = layout.per_lane, joint_counter(layout), branch_types(depth)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def derive_constants(
@@ -233,7 +237,7 @@ def make_derive(layout: Layout) -> wp.Kernel:
             b = lane + i * wp.static(lanes)
             if b < wp.static(branches):
                 branch.smooth = measured[row(world, measured.shape[0]), b]
-                branch = branch_at_rest(branch, tables, world, b)
+                branch = branch_at_rest(branch, tables, world, b, num_joints(tables, b))
                 system = eliminate(branch, system, TrunkSystem())
                 total = add_bodies(total, branch.smooth.total)
         whole = whole_inertia(trunk, total, wp.static(lanes))
@@ -241,15 +245,17 @@ def make_derive(layout: Layout) -> wp.Kernel:
         for i in range(wp.static(per_lane)):
             b = lane + i * wp.static(lanes)
             if b < wp.static(branches):
+                joints = num_joints(tables, b)
                 if wp.static(per_lane > 1):  # a CPU's thread has several branches, of which it kept the last one
                     branch.smooth = measured[row(world, measured.shape[0]), b]
-                    branch = branch_at_rest(branch, tables, world, b)
-                body = int(1)
-                com = rot * of_world(tables.body_ipos, world, 1)
-                if body_depth > 0:
-                    body = tables.branch_joint[b, body_depth - 1] + 1
-                    com = coms[row(world, coms.shape[0]), b, body_depth - 1]
-                weight = inverse_weight(branch, trunk_factor, rot, com, body_depth, kind, rows)
-                write_weight(weight, kind, world, body, body_invweight0, dof_invweight0)
+                    branch = branch_at_rest(branch, tables, world, b, joints)
+                if wp.static(alike) or body_depth <= joints:
+                    body = int(1)
+                    com = rot * of_world(tables.body_ipos, world, 1)
+                    if body_depth > 0:
+                        body = tables.branch_joint[b, body_depth - 1] + 1
+                        com = coms[row(world, coms.shape[0]), b, body_depth - 1]
+                    weight = inverse_weight(branch, trunk_factor, rot, com, body_depth, kind, rows)
+                    write_weight(weight, kind, world, body, body_invweight0, dof_invweight0)
 
     return derive_constants

@@ -128,8 +128,8 @@ def links_maker(n: int) -> wp.Function:
     Branch, Links, _ = branch_types(n)
 
     @wp.func
-    def make_links(tables: Tables, worlds: Worlds, world: int, b: int, trunk: Trunk, poses: Poses):
-        """Return a branch with its joints, and its bodies; fill their poses."""
+    def make_links(tables: Tables, worlds: Worlds, world: int, b: int, joints: int, trunk: Trunk, poses: Poses):
+        """Return a branch with its joints, and its bodies; fill their poses. Places of no joint stay zero."""
         branch = Branch()
         links = Links()
         pose = trunk_pose(trunk)
@@ -139,40 +139,44 @@ def links_maker(n: int) -> wp.Function:
         lin_acc = trunk_acc(tables, world, trunk)
         poses[0] = pose
         for j in range(wp.static(n)):
-            joint = tables.branch_joint[b, j]
-            angle = worlds.qpos[world, qadr(joint)]
-            vel = worlds.qvel[world, dof(joint)]
-            pos, quat, anchor, axis = turn_hinge(tables, world, joint, angle, pos, quat)
-            lever = wp.cross(anchor, axis)
-            ang_acc += wp.cross(ang, axis) * vel
-            lin_acc += (wp.cross(ang, lever) + wp.cross(lin, axis)) * vel
-            ang += axis * vel
-            lin += lever * vel
-            pose.pos = pos
-            pose.rot = quat_to_matrix(quat)
-            pose.ang_vel = ang
-            pose.lin_vel = lin
-            poses[j + 1] = pose
-            body = body_dynamics(tables, world, joint + 1, pose, ang_acc, lin_acc)
-            links.mass[j] = body.mass
-            links.moment = with_column(links.moment, j, body.moment)
-            links.inertia_diagonal = with_column(links.inertia_diagonal, j, wp.get_diag(body.inertia))
-            rest = wp.vec3(body.inertia[0, 1], body.inertia[0, 2], body.inertia[1, 2])
-            links.inertia_rest = with_column(links.inertia_rest, j, rest)
-            links.force = with_column(links.force, j, body.force)
-            links.torque = with_column(links.torque, j, body.torque)
-            branch.smooth.axis = with_column(branch.smooth.axis, j, axis)
-            branch.smooth.lever = with_column(branch.smooth.lever, j, lever)
-            branch.smooth.force[j] = joint_force(tables, world, b, j, angle, vel, worlds.ctrl)
-            branch.smooth.damping[j] = of_world(tables.dof_damping, world, dof(joint))
+            if j < joints:
+                joint = tables.branch_joint[b, j]
+                angle = worlds.qpos[world, qadr(joint)]
+                vel = worlds.qvel[world, dof(joint)]
+                pos, quat, anchor, axis = turn_hinge(tables, world, joint, angle, pos, quat)
+                lever = wp.cross(anchor, axis)
+                ang_acc += wp.cross(ang, axis) * vel
+                lin_acc += (wp.cross(ang, lever) + wp.cross(lin, axis)) * vel
+                ang += axis * vel
+                lin += lever * vel
+                pose.pos = pos
+                pose.rot = quat_to_matrix(quat)
+                pose.ang_vel = ang
+                pose.lin_vel = lin
+                poses[j + 1] = pose
+                body = body_dynamics(tables, world, joint + 1, pose, ang_acc, lin_acc)
+                links.mass[j] = body.mass
+                links.moment = with_column(links.moment, j, body.moment)
+                links.inertia_diagonal = with_column(links.inertia_diagonal, j, wp.get_diag(body.inertia))
+                rest = wp.vec3(body.inertia[0, 1], body.inertia[0, 2], body.inertia[1, 2])
+                links.inertia_rest = with_column(links.inertia_rest, j, rest)
+                links.force = with_column(links.force, j, body.force)
+                links.torque = with_column(links.torque, j, body.torque)
+                branch.smooth.axis = with_column(branch.smooth.axis, j, axis)
+                branch.smooth.lever = with_column(branch.smooth.lever, j, lever)
+                branch.smooth.force[j] = joint_force(tables, world, b, j, angle, vel, worlds.ctrl)
+                branch.smooth.damping[j] = of_world(tables.dof_damping, world, dof(joint))
         return branch, links
 
     return make_links
 
 
 @wp.func
-def make_equations(branch: AnyBranch, links: AnyLinks, tables: Tables, world: int, b: int, rot: wp.mat33):
-    """Return a branch with its equations of motion, added up from its last body to its first."""
+def make_equations(branch: AnyBranch, links: AnyLinks, tables: Tables, world: int, b: int, joints: int, rot: wp.mat33):
+    """Return a branch with its equations of motion, added up from its last body to its first.
+
+    Places of no joint get an equation of their own, whose solution is zero.
+    """
     smooth = branch.smooth
     total = Body()
     for reverse in range(len(branch.acc)):
@@ -193,7 +197,10 @@ def make_equations(branch: AnyBranch, links: AnyLinks, tables: Tables, world: in
                 smooth.mass[j, i] = coupling
         smooth.mass_lin = with_column(smooth.mass_lin, j, force)
         smooth.mass_ang = with_column(smooth.mass_ang, j, wp.transpose(rot) * torque)
-        smooth.mass[j, j] += of_world(tables.dof_armature, world, dof(tables.branch_joint[b, j]))
+        if j < joints:
+            smooth.mass[j, j] += of_world(tables.dof_armature, world, dof(tables.branch_joint[b, j]))
+        else:
+            smooth.mass[j, j] = 1.0
     smooth.total = total
     branch.smooth = smooth
     return branch

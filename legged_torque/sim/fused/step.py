@@ -55,7 +55,7 @@ class FusedStep:
         of ``data`` act with ``applied_forces``. The ground is the model's plane, or a height map, of which that plane
         says how it feels. A UserError if the robot has something that this step does not simulate.
         """
-        tree = read_tree(mj_model)
+        tree = read_tree(mj_model, on_map=height_map is not None)
         self._device = data.qpos.device
         if height_map is not None:
             check_map(mj_model)

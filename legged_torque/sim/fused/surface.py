@@ -5,10 +5,14 @@ import math
 import numpy as np
 import warp as wp
 
+from legged_torque.sim.fused.math import inverse_sqrt
 from legged_torque.sim.height_map import HeightMap
 
-USUAL_RADIUS = 0.05
-"""Spheres up to this size [m] that are high enough above the ground are known to be so from one number."""
+NEAR, FAR = 0.05, 0.2
+"""Spheres up to the first size, and geoms up to the second [m], that are high enough above the ground are known to be
+so from one number."""
+BLOCK = wp.constant(2)
+"""Cells along a side of what shares such a number for geoms."""
 MAX_REACH = wp.constant(0.2)
 """How far around the centre of a sphere that is below the surface the way out is looked for [m]."""
 ALIKE = wp.constant(0.999)
@@ -17,36 +21,50 @@ ON_EDGE = wp.constant(1.0e-5)
 """A point this share of a triangle's height outside of it is still inside, so that rounding leaves no gaps."""
 MIN_DISTANCE = wp.constant(1.0e-6)
 """A direction over a shorter way [m] is lost in float32."""
+FAR_AWAY = wp.constant(1.0e10)
+"""Squared distance of what has not been found [m^2]."""
 
 
 @wp.struct
 class Surface:
     """Heights on a square grid, continued at the borders with the heights there."""
 
-    heights: wp.array2d(dtype=wp.float32)  # in the world [m]. Shape: (rows, cols); rows along x, columns along y
+    heights: wp.array(dtype=wp.float32)  # in the world [m], row by row; rows along x, columns along y
+    shape: wp.vec2i  # rows and columns
     scale: wp.float32  # side of a cell [m]
+    density: wp.float32  # cells per metre
     corner: wp.vec2  # x and y of the first height [m]
-    top: wp.float32  # the greatest height [m]
     ceiling: wp.array2d(dtype=wp.float32)  # the greatest height near each cell [m]. Shape: (rows - 1, cols - 1)
     near: wp.float32  # how far around a cell that is [m]
+    far_ceiling: wp.array2d(dtype=wp.float32)  # the greatest height in a wider neighbourhood of each block of cells [m]
+    far: wp.float32  # how far around a block that is [m]
 
 
 def make_surface(height_map: HeightMap) -> Surface:
     """Return a height map on the current device."""
     heights, scale = np.asarray(height_map.heights, np.float32), height_map.horizontal_scale
-    cells = math.ceil(USUAL_RADIUS / scale)
-    ceiling = np.pad(heights, cells, "edge")
-    for _ in range(2):  # along one axis after the other: a cell's greatest height of so many cells on either side
-        ends = range(len(ceiling) - 2 * cells - 1, len(ceiling) + 1)
-        ceiling = np.maximum.reduce([ceiling[first:end] for first, end in enumerate(ends)]).T
+    near, far = math.ceil(NEAR / scale), math.ceil(FAR / scale)
     surface = Surface()
-    surface.heights = wp.array(heights, dtype=wp.float32)
+    surface.heights = wp.array(heights.flatten(), dtype=wp.float32)
+    surface.shape = wp.vec2i(*heights.shape)
     surface.scale = scale
+    surface.density = 1.0 / scale
     surface.corner = wp.vec2(*height_map.corner)
-    surface.top = float(heights.max())
-    surface.ceiling = wp.array(ceiling, dtype=wp.float32)
-    surface.near = cells * scale
+    surface.ceiling = wp.array(_greatest(heights, 1, near), dtype=wp.float32)
+    surface.near = near * scale
+    surface.far_ceiling = wp.array(_greatest(heights, BLOCK, far), dtype=wp.float32)
+    surface.far = far * scale
     return surface
+
+
+def _greatest(heights: np.ndarray, side: int, around: int) -> np.ndarray:
+    """Return the greatest height in each square of so many cells a side, and in so many cells around it."""
+    for _ in range(2):  # along one axis after the other
+        squares = -(-(len(heights) - 1) // side)
+        padded = np.pad(heights, ((around, around + side), (0, 0)), "edge")
+        ends = range(side + 2 * around + 1)
+        heights = np.maximum.reduce([padded[i : i + squares * side : side] for i in ends]).T
+    return heights
 
 
 @wp.struct
@@ -60,198 +78,272 @@ class Touch:
 
 
 @wp.struct
-class Triangle:
-    """A triangle as seen from the centre of a sphere."""
+class Patch:
+    """Nine samples of a map, the corners of four cells, as seen from the centre of a sphere."""
 
-    nearest: wp.vec3  # the point of its plane that is nearest to the centre; once known, that of the triangle
-    is_face: wp.bool  # whether that is inside of it, not on its edges or at a vertex
-    normal: wp.vec3  # upwards
-    dist: wp.float32  # of the centre above its plane [m]
+    x: wp.float32  # of the first row
+    y: wp.vec3  # of the three columns
+    z: wp.float32  # of the centre, in the world
+    first: wp.vec3  # heights of the rows, in the world
+    second: wp.vec3
+    third: wp.vec3
 
 
 @wp.struct
-class Cell:
-    """The corners of a cell as seen from the centre of a sphere."""
+class Face:
+    """A triangle as seen from the centre of a sphere."""
 
-    low: wp.vec3
-    next_row: wp.vec3
-    next_col: wp.vec3
-    high: wp.vec3
+    falls: wp.vec2  # how much it falls along x and y, per metre
+    upright: wp.float32  # its upward unit normal is this times (falls, 1)
+    dist: wp.float32  # of the centre above its plane [m]
+    is_inside: wp.bool  # whether the point of its plane that is nearest to the centre is inside of it
+
+
+@wp.struct
+class Nearest:
+    """What is nearest to the centre of a sphere, as far as the surface has been looked at."""
+
+    face: Face  # of the triangles, where it is inside of one
+    face_sq: wp.float32  # its squared distance
+    edge: wp.vec3  # of the edges, the point from the centre
+    edge_sq: wp.float32  # its squared distance
+    above: wp.float32  # how far the centre is above the surface, vertically [m]
+    num_faces: wp.int32  # how many triangles the sphere touches inside of them
+
+
+@wp.func
+def place_on_map(surface: Surface, centre: wp.vec3, radius: float) -> wp.vec3:
+    """Return the centre of a sphere from the map's corner, in x and y.
+
+    Outside of the map all is flat outwards: a place further out is like one near the border.
+    """
+    place = centre
+    margin = wp.max(radius, MAX_REACH) + 2.0 * surface.scale
+    for k in range(2):
+        end = float(surface.shape[k] - 1) * surface.scale
+        place[k] = wp.clamp(centre[k] - surface.corner[k], -margin, end + margin)
+    return place
+
+
+@wp.func
+def see_row(surface: Surface, i: int, j: int) -> wp.vec3:
+    """Return the heights of three samples from (i, j) on."""
+    first = wp.clamp(i, 0, surface.shape[0] - 1) * surface.shape[1]
+    out = wp.vec3()
+    for b in range(3):
+        out[b] = surface.heights[first + wp.clamp(j + b, 0, surface.shape[1] - 1)]
+    return out
+
+
+@wp.func
+def see_patch(surface: Surface, place: wp.vec3, i: int, j: int) -> Patch:
+    """Return the four cells between samples (i, j) and (i + 2, j + 2) as seen from a place on the map."""
+    patch = Patch()
+    patch.x = float(i) * surface.scale - place[0]
+    patch.z = place[2]
+    y = float(j) * surface.scale - place[1]
+    patch.y = wp.vec3(y, y + surface.scale, y + 2.0 * surface.scale)
+    patch.first = see_row(surface, i, j)
+    patch.second = see_row(surface, i + 1, j)
+    patch.third = see_row(surface, i + 2, j)
+    return patch
+
+
+@wp.func
+def next_row(patch: Patch, scale: float) -> Patch:
+    """Return a patch whose first row is another one's second."""
+    patch.x += scale
+    patch.first = patch.second
+    patch.second = patch.third
+    return patch
+
+
+@wp.func
+def see_face(surface: Surface, patch: Patch, b: int, half: int) -> Face:
+    """Return one of the two triangles of a cell of a patch's first two rows.
+
+    The diagonal runs from a cell's corner (0, 0) to (1, 1); the half 0 has the corner (1, 0).
+    """
+    falls = wp.vec2(patch.first[b] - patch.second[b], patch.second[b] - patch.second[b + 1])
+    if half == 1:
+        falls = wp.vec2(patch.first[b + 1] - patch.second[b + 1], patch.first[b] - patch.first[b + 1])
+    face = Face()
+    face.falls = surface.density * falls
+    face.upright = inverse_sqrt(1.0 + wp.length_sq(face.falls))
+    above = patch.z - patch.first[b] - (face.falls[0] * patch.x + face.falls[1] * patch.y[b])
+    face.dist = above * face.upright
+    sideways = -(face.dist * face.upright) * face.falls
+    u, v = sideways[0] - patch.x, sideways[1] - patch.y[b]
+    long, short = wp.where(half == 0, u, v), wp.where(half == 0, v, u)
+    face.is_inside = wp.min(surface.scale - long, wp.min(long - short, short)) >= -ON_EDGE * surface.scale
+    return face
+
+
+@wp.func
+def normal_of(face: Face) -> wp.vec3:
+    """Return a triangle's upward unit normal."""
+    return face.upright * wp.vec3(face.falls[0], face.falls[1], 1.0)
+
+
+@wp.func
+def look_at_face(face: Face, radius: float, best: Nearest) -> Nearest:
+    """Return what is nearest when a triangle is known, without its edges."""
+    away_sq = wp.where(face.is_inside, face.dist * face.dist, FAR_AWAY)
+    if away_sq < best.face_sq:
+        best.face_sq = away_sq
+        best.face = face
+    best.num_faces += wp.where(wp.where(face.is_inside, face.dist, FAR_AWAY) < radius, 1, 0)
+    return best
+
+
+@wp.func
+def look_at_edge(start: wp.vec3, edge: wp.vec3, best: Nearest) -> Nearest:
+    """Return what is nearest when an edge between two samples is known."""
+    point = start + wp.clamp(-wp.dot(start, edge) / wp.length_sq(edge), 0.0, 1.0) * edge
+    away_sq = wp.length_sq(point)
+    if away_sq < best.edge_sq:
+        best.edge_sq = away_sq
+        best.edge = point
+    return best
+
+
+@wp.func
+def look_at_row(surface: Surface, patch: Patch, radius: float, best: Nearest) -> Nearest:
+    """Return what is nearest when the two cells of a patch's first two rows are known.
+
+    Of each cell three edges: the other two are its neighbours'.
+    """
+    for b in range(2):
+        for half in range(2):
+            best = look_at_face(see_face(surface, patch, b, half), radius, best)
+        start, z = wp.vec3(patch.x, patch.y[b], patch.first[b] - patch.z), patch.first[b]
+        best = look_at_edge(start, wp.vec3(surface.scale, 0.0, patch.second[b] - z), best)
+        best = look_at_edge(start, wp.vec3(0.0, surface.scale, patch.first[b + 1] - z), best)
+        best = look_at_edge(start, wp.vec3(surface.scale, surface.scale, patch.second[b + 1] - z), best)
+    return best
+
+
+@wp.func
+def height_above(surface: Surface, patch: Patch) -> float:
+    """Return how far the centre of a sphere is above the surface, vertically, if it is over the patch [m]."""
+    if patch.x + surface.scale <= 0.0:
+        patch = next_row(patch, surface.scale)
+    is_second = patch.y[1] <= 0.0
+    low = wp.where(is_second, patch.first[1], patch.first[0])
+    along_x = wp.where(is_second, patch.second[1], patch.second[0])
+    along_y = wp.where(is_second, patch.first[2], patch.first[1])
+    high = wp.where(is_second, patch.second[2], patch.second[1])
+    x, y = -surface.density * patch.x, -surface.density * wp.where(is_second, patch.y[1], patch.y[0])
+    third = wp.where(x >= y, along_x, along_y)
+    return patch.z - low - (wp.max(x, y) * (third - low) + wp.min(x, y) * (high - third))
+
+
+@wp.func
+def distance_sq_to_patch(patch: Patch, scale: float) -> float:
+    """Return the squared distance from the centre to a patch, filled up to its highest sample."""
+    top = wp.max(wp.max(wp.max(patch.first), wp.max(patch.second)), wp.max(patch.third))
+    x, y = wp.max(patch.x, -patch.x - 2.0 * scale), wp.max(patch.y[0], -patch.y[2])
+    return wp.length_sq(wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(patch.z - top, 0.0)))
 
 
 @wp.struct
 class Window:
-    """The cells of a map that a sphere may touch; their places are relative to its centre."""
+    """The patches of a map that a sphere may touch, by their first samples."""
 
     first: wp.vec2i
     last: wp.vec2i
-    start: wp.vec3  # from the centre to the place of height (0, 0), at z = 0
 
 
 @wp.func
-def half_of_cell(x: float, y: float) -> int:
-    """Return in which of a cell's two triangles a place in it is; the diagonal runs from corner (0, 0) to (1, 1)."""
-    return wp.where(x >= y, 0, 1)
-
-
-@wp.func
-def see_cell(surface: Surface, i: int, j: int, window: Window) -> Cell:
-    """Return a cell as seen from the centre of the window's sphere."""
-    rows, cols = surface.heights.shape[0], surface.heights.shape[1]
-    row, next_row = wp.clamp(i, 0, rows - 1), wp.clamp(i + 1, 0, rows - 1)
-    col, next_col = wp.clamp(j, 0, cols - 1), wp.clamp(j + 1, 0, cols - 1)
-    x, y = surface.scale * float(i - window.first[0]), surface.scale * float(j - window.first[1])
-    next_x, next_y = surface.scale * float(i + 1 - window.first[0]), surface.scale * float(j + 1 - window.first[1])
-    cell = Cell()
-    cell.low = window.start + wp.vec3(x, y, surface.heights[row, col])
-    cell.next_row = window.start + wp.vec3(next_x, y, surface.heights[next_row, col])
-    cell.next_col = window.start + wp.vec3(x, next_y, surface.heights[row, next_col])
-    cell.high = window.start + wp.vec3(next_x, next_y, surface.heights[next_row, next_col])
-    return cell
-
-
-@wp.func
-def see_triangle(cell: Cell, half: int) -> Triangle:
-    """Return one of the two triangles of a cell; where it is nearest, if not with its face, is not known yet."""
-    b, c = wp.where(half == 0, cell.next_row, cell.high), wp.where(half == 0, cell.high, cell.next_col)
-    a = cell.low
-    out = Triangle()
-    area = wp.cross(b - a, c - a)
-    out.normal = wp.normalize(area)
-    out.dist = -wp.dot(out.normal, a)
-    out.nearest = -out.dist * out.normal
-    ab, bc, ca = wp.dot(area, wp.cross(a, b)), wp.dot(area, wp.cross(b, c)), wp.dot(area, wp.cross(c, a))
-    out.is_face = wp.min(ab, wp.min(bc, ca)) >= -ON_EDGE * wp.dot(area, area)
-    return out
-
-
-@wp.func
-def nearest_on_edge(a: wp.vec3, b: wp.vec3) -> wp.vec3:
-    """Return the point between ``a`` and ``b`` that is nearest to the origin."""
-    edge = b - a
-    return a + wp.clamp(-wp.dot(a, edge) / wp.dot(edge, edge), 0.0, 1.0) * edge
-
-
-@wp.func
-def nearest_on_edges(cell: Cell, half: int) -> wp.vec3:
-    """Return the point of a triangle's edges that is nearest to the centre."""
-    b, c = wp.where(half == 0, cell.next_row, cell.high), wp.where(half == 0, cell.high, cell.next_col)
-    nearest = nearest_on_edge(cell.low, b)
-    other = nearest_on_edge(b, c)
-    if wp.length_sq(other) < wp.length_sq(nearest):
-        nearest = other
-    other = nearest_on_edge(c, cell.low)
-    if wp.length_sq(other) < wp.length_sq(nearest):
-        nearest = other
-    return nearest
-
-
-@wp.func
-def make_window(surface: Surface, centre: wp.vec3, reach: float) -> Window:
-    """Return the cells within a distance along x and y of a point.
-
-    Outside of the map all is flat outwards: a place further out is like one near the border.
-    """
+def make_window(surface: Surface, place: wp.vec3, reach: float) -> Window:
+    """Return the patches within a distance along x and y of a place on the map: one up to half a cell."""
+    cells = reach * surface.density
     window = Window()
-    margin = reach + 2.0 * surface.scale
     for k in range(2):
-        place = wp.clamp(
-            centre[k] - surface.corner[k], -margin, float(surface.heights.shape[k] - 1) * surface.scale + margin
-        )
-        window.first[k] = int(wp.floor((place - reach) / surface.scale))
-        window.last[k] = int(wp.floor((place + reach) / surface.scale))
-        window.start[k] = float(window.first[k]) * surface.scale - place
-    window.start[2] = -centre[2]
+        at = place[k] * surface.density
+        window.first[k] = int(wp.floor(at - wp.max(cells, 0.5)))
+        window.last[k] = wp.where(cells > 0.5, int(wp.floor(at + cells)), window.first[k])
     return window
 
 
 @wp.func
-def triangle_under(surface: Surface, centre: wp.vec3) -> Triangle:
-    """Return the triangle that is vertically under, or above, a point."""
-    window = make_window(surface, centre, 0.0)
-    half = half_of_cell(-window.start[0], -window.start[1])
-    cell = see_cell(surface, window.first[0], window.first[1], window)
-    out = see_triangle(cell, half)
-    if not out.is_face:
-        out.nearest = nearest_on_edges(cell, half)
-    return out
+def find_nearest(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
+    """Return what is nearest to the centre of a sphere.
 
-
-@wp.func
-def distance_sq_to_cell(cell: Cell) -> float:
-    """Return the squared distance from the centre to a cell, filled up to its highest corner."""
-    top = wp.max(wp.max(cell.low[2], cell.next_row[2]), wp.max(cell.next_col[2], cell.high[2]))
-    x, y = wp.max(cell.low[0], -cell.high[0]), wp.max(cell.low[1], -cell.high[1])
-    away = wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(-top, 0.0))
-    return wp.length_sq(away)
-
-
-@wp.func
-def farthest_along(cell: Cell, point: wp.vec3, direction: wp.vec3) -> float:
-    """Return how far a cell is in front of a point at most, times the length of the direction."""
-    first = wp.max(wp.dot(cell.low, direction), wp.dot(cell.next_row, direction))
-    second = wp.max(wp.dot(cell.next_col, direction), wp.dot(cell.high, direction))
-    return wp.max(first, second) - wp.dot(point, direction)
-
-
-@wp.func
-def is_clear(surface: Surface, centre: wp.vec3, radius: float) -> bool:
-    """Return whether a sphere is above all that is near, which is all that most spheres need to know."""
-    i = int(wp.clamp((centre[0] - surface.corner[0]) / surface.scale, 0.0, float(surface.ceiling.shape[0] - 1)))
-    j = int(wp.clamp((centre[1] - surface.corner[1]) / surface.scale, 0.0, float(surface.ceiling.shape[1] - 1)))
-    return radius <= surface.near and centre[2] - radius > surface.ceiling[i, j]
-
-
-@wp.func
-def nearest_triangle(surface: Surface, window: Window, reach: float, under: Triangle) -> Triangle:
-    """Return which triangle is nearest to the centre of the window's sphere; among equals, one with its face.
-
-    The one under the centre is where the search starts; others count within ``reach``.
+    The way out of the ground is as long as the centre is below it, vertically, or shorter.
     """
-    best = under
-    best_sq = wp.length_sq(best.nearest)
-    for i in range(window.first[0], window.last[0] + 1):
-        for j in range(window.first[1], window.last[1] + 1):
-            cell = see_cell(surface, i, j, window)
-            is_near = distance_sq_to_cell(cell) < (1.0 + ON_EDGE) * wp.min(best_sq, reach * reach)
-            if best.is_face and farthest_along(cell, best.nearest, -best.nearest) <= ON_EDGE * best_sq:
-                is_near = False  # all of it is behind that face
-            if is_near:
-                for half in range(2):
-                    other = see_triangle(cell, half)
-                    weight = float(1.0)
-                    if other.is_face != best.is_face:
-                        weight = wp.where(other.is_face, 1.0 - ON_EDGE, 1.0 + ON_EDGE)
-                    if weight * other.dist * other.dist < best_sq:  # its plane is near enough
-                        if not other.is_face:
-                            other.nearest = nearest_on_edges(cell, half)
-                        other_sq = wp.length_sq(other.nearest)
-                        if weight * other_sq < best_sq:
-                            best = other
-                            best_sq = other_sq
+    best = Nearest()
+    best.face_sq = FAR_AWAY
+    best.edge_sq = FAR_AWAY
+    window = make_window(surface, place, 0.0)
+    i, j = window.first[0], window.first[1]
+    is_first = bool(True)
+    while i <= window.last[0]:
+        patch = see_patch(surface, place, i, j)
+        reach = float(0.0)
+        if is_first:
+            best.above = height_above(surface, patch)
+            reach = wp.max(radius, wp.min(-best.above, MAX_REACH))
+        most_sq = wp.max(radius * radius, wp.min(best.face_sq, best.edge_sq))
+        rows = wp.where(distance_sq_to_patch(patch, surface.scale) <= (1.0 + ON_EDGE) * most_sq, 2, 0)
+        while rows > 0:  # not unrolled: a thread waits for instructions longer than it works on them
+            best = look_at_row(surface, patch, radius, best)
+            patch = next_row(patch, surface.scale)
+            rows -= 1
+        is_first = False
+        j += 2
+        if j > window.last[1]:
+            j = window.first[1]
+            i += 2
+        if reach > 0.5 * surface.scale:  # one patch is not enough
+            window = make_window(surface, place, reach)
+            i = window.first[0]
+            j = window.first[1]
     return best
 
 
 @wp.func
-def second_face(surface: Surface, window: Window, radius: float, point: wp.vec3, normal: wp.vec3) -> Triangle:
+def second_face(surface: Surface, place: wp.vec3, radius: float, point: wp.vec3, normal: wp.vec3) -> Face:
     """Return the deepest other face that a sphere touches at a concave edge, given where it touches the surface.
 
     Both points are in front of the other's face. One at the distance of the radius if there is none.
     """
-    best = Triangle()
+    best = Face()
     best.dist = radius
-    for i in range(window.first[0], window.last[0] + 1):
-        for j in range(window.first[1], window.last[1] + 1):
-            cell = see_cell(surface, i, j, window)
-            is_near = distance_sq_to_cell(cell) < radius * radius
-            if is_near and farthest_along(cell, point, normal) > 10.0 * MIN_DISTANCE:
-                for half in range(2):
-                    other = see_triangle(cell, half)
-                    if other.is_face and other.dist < best.dist and wp.dot(normal, other.normal) < ALIKE:
-                        way = other.nearest - point
-                        if wp.min(wp.dot(way, normal), -wp.dot(way, other.normal)) > 10.0 * MIN_DISTANCE:
+    window = make_window(surface, place, radius)
+    for i in range(window.first[0], window.last[0] + 1, 2):
+        for j in range(window.first[1], window.last[1] + 1, 2):
+            patch = see_patch(surface, place, i, j)
+            rows = int(2)
+            while rows > 0:
+                for b in range(2):
+                    for half in range(2):
+                        other = see_face(surface, patch, b, half)
+                        other_normal = normal_of(other)
+                        way = -other.dist * other_normal - point
+                        is_concave = wp.min(wp.dot(way, normal), -wp.dot(way, other_normal)) > 10.0 * MIN_DISTANCE
+                        is_new = is_concave and wp.dot(normal, other_normal) < ALIKE
+                        if is_new and other.is_inside and other.dist < best.dist:
                             best = other
+                patch = next_row(patch, surface.scale)
+                rows -= 1
     return best
+
+
+@wp.func
+def is_clear(surface: Surface, centre: wp.vec3, lowest: float, radius: float) -> bool:
+    """Return whether what is within a radius along x and y of a point is above all that is near.
+
+    ``lowest`` is the height of its lowest point. That is all that most points and geoms need to know.
+    """
+    i = int(wp.clamp((centre[0] - surface.corner[0]) * surface.density, 0.0, float(surface.ceiling.shape[0] - 1)))
+    j = int(wp.clamp((centre[1] - surface.corner[1]) * surface.density, 0.0, float(surface.ceiling.shape[1] - 1)))
+    out = bool(False)
+    if radius <= surface.near:
+        out = lowest > surface.ceiling[i, j]
+    elif radius <= surface.far:
+        out = lowest > surface.far_ceiling[i // BLOCK, j // BLOCK]
+    return out
 
 
 @wp.func
@@ -262,23 +354,24 @@ def touch_map(surface: Surface, centre: wp.vec3, radius: float) -> Touch:
     triangles of one plane are never felt. Of a sphere whose centre is below the surface it is the shortest way out.
     """
     out = Touch()
-    under = triangle_under(surface, centre)
-    above = under.dist / under.normal[2]
-    reach = wp.max(radius, wp.min(-above, MAX_REACH))
-    window = make_window(surface, centre, reach)
-    nearest = nearest_triangle(surface, window, reach, under)
-    away = wp.length(nearest.nearest)
-    out.first = nearest.normal
-    out.dist[0] = nearest.dist - radius
-    if not nearest.is_face and away > MIN_DISTANCE:
-        side = wp.where(above < 0.0, 1.0, -1.0)
-        out.first = side * nearest.nearest / away
+    place = place_on_map(surface, centre, radius)
+    nearest = find_nearest(surface, place, radius)
+    away = wp.sqrt(nearest.edge_sq)
+    is_face = wp.sqrt(nearest.face_sq) < away + MIN_DISTANCE  # of equals the face: it has the better normal
+    out.first = normal_of(nearest.face)
+    out.dist[0] = nearest.face.dist - radius
+    point = -nearest.face.dist * out.first
+    if not is_face:
+        point = nearest.edge
+        side = wp.where(nearest.above < 0.0, 1.0, -1.0)
+        out.first = wp.where(away > MIN_DISTANCE, side / away * point, wp.vec3(0.0, 0.0, 1.0))
         out.dist[0] = -side * away - radius
     if out.dist[0] < 0.0:
         out.count = 1
-        other = second_face(surface, window, radius, nearest.nearest, out.first)
-        if other.dist < radius:
-            out.count = 2
-            out.second = other.normal
-            out.dist[1] = other.dist - radius
+        if nearest.num_faces > wp.where(is_face, 1, 0):
+            other = second_face(surface, place, radius, point, out.first)
+            if other.dist < radius:
+                out.count = 2
+                out.second = normal_of(other)
+                out.dist[1] = other.dist - radius
     return out

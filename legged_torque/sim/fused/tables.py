@@ -10,6 +10,8 @@ import warp as wp
 from legged_torque.sim.fused.tree import Tree, find_floor
 from legged_torque.sim.fused.types import vec5
 
+UNLIMITED = 1e10
+"""Of a range that does not limit: MuJoCo's mjMAXVAL, beyond which it takes a state as diverged."""
 MIN_TOLERANCE = 1e-9
 """Of ``opt.tolerance``: float32 resolves no smaller decrease of the cost."""
 
@@ -73,6 +75,7 @@ class Tables:
     impratio: wp.float32
     cost_scale: wp.float32  # from the cost to MuJoCo's units for its decrease
     tolerance: wp.float32  # the solver stops when a step promises less decrease, in these units
+    joint_count: wp.array(dtype=wp.int32)  # (branch)
 
 
 FUSED_FIELDS = [
@@ -124,8 +127,23 @@ def qadr(joint: int) -> int:
     return joint + 6
 
 
+_RANGES = {
+    "jnt_range": "jnt_limited",
+    "actuator_ctrlrange": "actuator_ctrllimited",
+    "actuator_forcerange": "actuator_forcelimited",
+}
+"""Fields that are ranges, and those that say which of them limit."""
+
+
 def make_tables(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Tables:
-    """Return a robot's tables on the current device; parameters stay those of MuJoCo Warp's model, not copies."""
+    """Return a robot's tables on the current device; parameters stay those of MuJoCo Warp's model, not copies.
+
+    There, ranges that do not limit become so wide that they do not.
+    """
+    for name, limited in _RANGES.items():
+        ranges = getattr(warp_model, name).numpy()
+        ranges[:, getattr(model, limited) == 0] = -UNLIMITED, UNLIMITED
+        getattr(warp_model, name).assign(ranges)
     tables = Tables()
     for name in Tables.vars:
         if hasattr(warp_model, name):
@@ -140,6 +158,7 @@ def make_tables(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Tab
     sensors[model.sensor_refid] = model.sensor_adr
     tables.geom_sensor = wp.array(sensors, dtype=wp.int32)
     actuator_of = {int(model.actuator_trnid[i, 0]): i for i in range(model.nu)}
+    tables.joint_count = wp.array((tree.joints >= 0).sum(axis=1), dtype=wp.int32)
     tables.branch_joint = wp.array(tree.joints, dtype=wp.int32)
     tables.branch_actuator = wp.array(np.vectorize(lambda j: actuator_of.get(j, -1))(tree.joints), dtype=wp.int32)
     padded = [points + [(0, 0, (0.0, 0.0, 0.0), 0.0)] * (tree.most_points - len(points)) for points in tree.points]

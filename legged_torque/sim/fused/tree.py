@@ -1,7 +1,9 @@
 """The structure of a robot, if it is one that the fused step can simulate."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,29 +13,40 @@ from legged_torque.utils.mjcf import why_no_motor
 
 MAX_BRANCHES = 16  # threads of a world must fit into half a warp
 _CAPSULE_ENDS = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
+_LOWEST_ON_CIRCLES = [(1.0, 0.0, 1.0), (1.0, 0.0, -1.0), (-0.5, 0.75**0.5, 1.0), (-0.5, -(0.75**0.5), 1.0)]
+_AROUND_CIRCLES = [
+    (math.cos(angle), math.sin(angle), z) for z in (-1.0, 1.0) for angle in (math.pi / 4 * i for i in range(8))
+]
 _BOX_CORNERS = [(float(x), float(y), float(z)) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]
 _GEOM_POINTS = {
     mujoco.mjtGeom.mjGEOM_SPHERE: ([(0.0, 0.0, 0.0)], 1.0),
     mujoco.mjtGeom.mjGEOM_CAPSULE: (_CAPSULE_ENDS, 1.0),
+    mujoco.mjtGeom.mjGEOM_CYLINDER: (_LOWEST_ON_CIRCLES, 0.0),
     mujoco.mjtGeom.mjGEOM_BOX: (_BOX_CORNERS, 0.0),
 }
-"""Where a geom can touch the ground: points in units of its half sizes, and how many radii it is thick around them."""
+"""Where a geom can touch the ground: points in units of its half sizes, and how many radii it is thick around them.
 
+Those of a cylinder stand in axes that are turned about its own, see :func:`~.contact.turn_cylinder`: the lowest points
+of both end circles, and two more of the lower circle, which make a triangle. On a height map such points could turn
+into walls: there it has points all around its end circles that turn with it.
+"""
 
+SLOWER = "about 30 times slower"  # on an H200, see docs/performance.md
 FLOORS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 """What robots stand on; the fused step knows planes only, its height maps are none of the model's geoms."""
 
 
 @dataclass
 class Tree:
-    """A robot's structure: a floating trunk and branches of hinge joints, each with ``depth`` joints.
+    """A robot's structure: a floating trunk and branches of hinge joints.
 
     ``points`` are, per branch, those that can touch the floor: geom, depth of its body (0 is the trunk), position in
     half sizes of the geom, radius in first sizes of the geom.
     """
 
-    joints: np.ndarray  # joint of each place. Shape: (branches, depth)
+    joints: np.ndarray  # joint of each place, -1 behind the end of a branch. Shape: (branches, most joints of one)
     points: list[list[tuple[int, int, tuple[float, float, float], float]]]
+    has_cylinders: bool  # whether any of these geoms is one
 
     @property
     def most_points(self) -> int:
@@ -41,36 +54,42 @@ class Tree:
         return max(1, *(len(points) for points in self.points))
 
 
-def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:1]) -> Tree:
-    """Return the structure of a robot on a floor of one of some types.
+def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:1], on_map: bool = False) -> Tree:
+    """Return the structure of a robot on a floor of one of some types, which may stand for a height map.
 
     A UserError, which tells all of it, if it has something that the fused step does not simulate.
     """
-    reasons = [*_of_bodies(model), *_of_contacts(model, floors), *_of_motors(model), *_of_options(model)]
+    _refuse(reasons_against(model, floors))
     chains = _chains(model)
-    lengths = {len(chain) for chain in chains}
-    for body in (chain[-1] for chain in chains):
-        if body in model.body_parentid:
-            reasons.append(f"body '{model.body(body).name}' branches")
-    if len(lengths) != 1:
-        reasons.append("its legs have unlike numbers of joints")
-    if len(chains) > MAX_BRANCHES:
-        reasons.append(f"it has more than {MAX_BRANCHES} legs")
-    _refuse(reasons)
     points: list[list] = [[] for _ in chains]
     depths = {body: (i, j + 1) for i, chain in enumerate(chains) for j, body in enumerate(chain)}
     trunk_geoms = 0
-    for geom in range(model.ngeom):
-        if model.geom_bodyid[geom] == 0 or not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
-            continue
+    geoms = np.flatnonzero(_touching(model, find_floor(model)))
+    for geom in geoms:
         if model.geom_bodyid[geom] == 1:  # spread over the branches
             branch, depth = trunk_geoms % len(chains), 0
             trunk_geoms += 1
         else:
             branch, depth = depths[model.geom_bodyid[geom]]
         offsets, radius = _GEOM_POINTS[mujoco.mjtGeom(model.geom_type[geom])]
-        points[branch] += [(geom, depth, offset, radius) for offset in offsets]
-    return Tree(np.array([[model.body_jntadr[body] for body in chain] for chain in chains]), points)
+        if on_map and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            offsets = _AROUND_CIRCLES
+        points[branch] += [(int(geom), depth, offset, radius) for offset in offsets]
+    joints = np.full((len(chains), max(map(len, chains))), -1)
+    for i, chain in enumerate(chains):
+        joints[i, : len(chain)] = model.body_jntadr[chain]
+    return Tree(joints, points, mujoco.mjtGeom.mjGEOM_CYLINDER in model.geom_type[geoms])
+
+
+def reasons_against(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS) -> list[str]:
+    """Return why the fused step cannot simulate a robot on a floor of one of some types, nothing if it can."""
+    reasons = [*_of_bodies(model), *_of_contacts(model, floors), *_of_motors(model), *_of_options(model)]
+    chains = _chains(model)
+    ends = [chain[-1] for chain in chains]
+    reasons += [f"body '{model.body(body).name}' branches" for body in ends if body in model.body_parentid]
+    if not 0 < len(chains) <= MAX_BRANCHES:
+        reasons.append(f"it has {len(chains)} legs, not 1 to {MAX_BRANCHES}")
+    return reasons
 
 
 def find_floor(model: mujoco.MjModel) -> int:
@@ -89,8 +108,14 @@ def check_map(model: mujoco.MjModel) -> None:
 def _refuse(reasons: list[str]) -> None:
     """Raise a UserError with all reasons not to simulate a robot, if there are any."""
     if reasons:
-        advice = "use sim.engine = 'mujoco_warp', without randomize_parameters"
+        advice = f"use sim.engine = 'mujoco_warp', {SLOWER}, without randomize_parameters"
         raise UserError(f"sim.engine 'fused' cannot simulate this robot: {'; '.join(reasons)}; {advice}")
+
+
+def _of(part: Any, chosen: np.ndarray) -> str:
+    """Return the names of chosen parts of a model, of many the first three, given how to get one by its number."""
+    names = [f"'{part(i).name}'" for i in np.flatnonzero(chosen)]
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _broken(rules: dict[str, bool]) -> list[str]:
@@ -108,17 +133,35 @@ def _chains(model: mujoco.MjModel) -> list[list[int]]:
     return chains
 
 
+_HARMLESS_DISABLED = ("midphase", "nativeccd", "multiccd", "island", "autoreset", "warmstart", "equality")
+_HARMLESS_ENABLED = ("energy", "fwdinv", "invdiscrete", "multiccd")
+"""Flags that change no motion of a robot without equalities and convex collisions; a minimum has no warm start."""
+_INTEGRATORS = (mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtIntegrator.mjINT_EULER)
+"""Those are the same where all that depends on velocities is linear damping of joints."""
+
+
+def _names(flags: Any, values: int, harmless: Sequence[str]) -> list[str]:
+    """Return the names of some of MuJoCo's flags, as a MJCF has them, but for harmless ones."""
+    found = [name[7:].lower() for name, flag in flags.__members__.items() if name[6] == "_" and int(flag) & values]
+    return [name for name in found if name not in harmless]
+
+
 def _of_options(model: mujoco.MjModel) -> list[str]:
     """Return which options and other parts of the model the fused step does not simulate."""
     option = model.opt
-    enabled = option.enableflags & ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)  # which changes no motion
-    flags = option.disableflags or enabled or option.noslip_iterations or option.disableactuator
+    disabled = _names(mujoco.mjtDisableBit, option.disableflags, _HARMLESS_DISABLED)
+    if option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+        disabled = [flag for flag in disabled if flag != "eulerdamp"]
+    enabled = _names(mujoco.mjtEnableBit, option.enableflags, _HARMLESS_ENABLED)
     others = model.eq_active0.any() or model.ntendon or model.npair or model.nmocap
     return _broken(
         {
             "the friction cone must be pyramidal": option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL,
-            "the integrator must be implicitfast": option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-            "it sets flags in its options": not flags,
+            "the integrator must be implicitfast or Euler": option.integrator in _INTEGRATORS,
+            f"it disables {', '.join(disabled)}": not disabled,
+            f"it enables {', '.join(enabled)}": not enabled,
+            "it disables groups of actuators": not option.disableactuator,
+            "it has noslip iterations": not option.noslip_iterations,
             "it moves through a fluid": not (option.density or option.viscosity),
             "equalities, tendons, pairs or mocap": not others,
             "some contacts are excluded": not (_excluded(model) == 0).any(),
@@ -130,17 +173,17 @@ def _of_bodies(model: mujoco.MjModel) -> list[str]:
     """Return what the fused step does not simulate of bodies and joints."""
     hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
     is_free = model.njnt > 0 and model.jnt_type[0] == free and model.jnt_bodyid[0] == 1
-    hinges = (model.body_jntnum[1:] == 1).all() and (model.jnt_type[1:] == hinge).all()
+    has_hinge = (model.body_jntnum == 1) & (np.append(model.jnt_type, -1)[model.body_jntadr] == hinge)
+    odd = ~has_hinge & (np.arange(model.nbody) > 1)
     root = [model.dof_damping[:6], model.dof_armature[:6], model.dof_frictionloss[:6], model.jnt_stiffness[:1]]
     passive = is_free and any(values.any() for values in root)
     nonlinear = _any_of(model, "jnt_stiffnesspoly", "jnt_springyield", "dof_dampingpoly")
     return _broken(
         {
             "its trunk is not free": is_free,
-            "each body but the trunk must have one hinge joint (fixed bodies: compiler fusestatic)": bool(hinges),
+            f"each body but the trunk must have one hinge joint, unlike {_of(model.body, odd)}": not odd.any(),
             "something beside the trunk hangs on the world": not (model.body_parentid[2:] == 0).any(),
             "bodies are compensated for gravity": not model.body_gravcomp.any(),
-            "each joint needs a range": bool(model.jnt_limited[1:].all()),
             "joint limits have margins": not model.jnt_margin.any(),
             "joints limit the forces of their actuators": not model.jnt_actfrclimited.any(),
             "the trunk's free joint has passive forces or armature": not passive,
@@ -155,23 +198,42 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
     floor = np.flatnonzero(np.isin(model.geom_type, floors) & collides)
     robot = collides & (model.geom_bodyid > 0)
     types, affinities, bodies = model.geom_contype[robot], model.geom_conaffinity[robot], model.geom_bodyid[robot]
-    kinds = {mujoco.mjtGeom(kind) for kind in model.geom_type[robot]}
     apart = _may_collide(model)[np.ix_(bodies, bodies)]
-    on_floor = [(types & model.geom_conaffinity[one]) | (affinities & model.geom_contype[one]) for one in floor]
-    solrefs = np.concatenate([model.geom_solref[collides], model.jnt_solref, model.dof_solref])
+    alone = len(floor) == 1 and (collides & ~robot).sum() == 1
+    touching = _touching(model, floor[0]) if alone else robot
+    on_floor = np.append(np.flatnonzero(touching), floor)
+    odd = touching & ~np.isin(model.geom_type, list(_GEOM_POINTS))
+    condims = _condims(model, floor[0])[touching] if alone else np.zeros(0)
+    solrefs = np.concatenate([model.geom_solref[on_floor], model.jnt_solref, model.dof_solref])
     mixed = ~((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1))
     return _broken(
         {
-            "it needs one plane and no other obstacle": len(floor) == 1 and (collides & ~robot).sum() == 1,
-            "only spheres, capsules and boxes may collide": kinds <= set(_GEOM_POINTS),
+            "it needs one plane and no other obstacle": alone,
+            f"only spheres, capsules, cylinders and boxes may collide, unlike {_of(model.geom, odd)}": not odd.any(),
             "parts of the robot collide with each other": not (types[:, None] & affinities)[apart].any(),
-            "the floor lets some of its geoms through": all((touch != 0).all() for touch in on_floor),
-            "condim must be 3": bool((model.geom_condim[collides] == 3).all()),
-            "geoms have margins or gaps": not (model.geom_margin[collides].any() or model.geom_gap[collides].any()),
+            "condim of contacts with the floor must be 3": bool((condims == 3).all()),
+            "geoms have margins or gaps": not (model.geom_margin[on_floor].any() or model.geom_gap[on_floor].any()),
             "surfaces move or stick": not _any_of(model, "geom_surfacevel", "geom_adhesion"),
             "a solref mixes its two formats": not mixed.any(),
         }
     )
+
+
+def _touching(model: mujoco.MjModel, floor: int) -> np.ndarray:
+    """Return which geoms of the robot can touch the floor. Shape: (ngeom,), bool."""
+    by_type, by_affinity = (
+        model.geom_contype & model.geom_conaffinity[floor],
+        model.geom_conaffinity & model.geom_contype[floor],
+    )
+    return ((by_type | by_affinity) != 0) & (model.geom_bodyid > 0)
+
+
+def _condims(model: mujoco.MjModel, floor: int) -> np.ndarray:
+    """Return the dimension of each geom's contacts with the floor: that of higher priority, else the higher one."""
+    priority, condim = model.geom_priority, model.geom_condim
+    equal = np.maximum(condim, condim[floor])
+    higher = np.where(priority > priority[floor], condim, condim[floor])
+    return np.where(priority == priority[floor], equal, higher)
 
 
 def _excluded(model: mujoco.MjModel) -> np.ndarray:
@@ -196,7 +258,6 @@ def _of_motors(model: mujoco.MjModel) -> list[str]:
         {
             "actuators must be motors": plain and bool((model.actuator_gainprm[:, 0] == 1).all()),
             "each motor needs a hinge of its own": len(set(joints)) == len(joints) and 0 not in joints,
-            "motors need ranges": bool(model.actuator_forcelimited.all() and model.actuator_ctrllimited.all()),
         }
     )
 

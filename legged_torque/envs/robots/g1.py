@@ -1,0 +1,70 @@
+"""The Unitree G1 with 12 joints in its legs: figures of Unitree's MJCF, the same for all approaches."""
+
+from __future__ import annotations
+
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+
+_LEG = {"hip_pitch": -0.1, "hip_roll": 0.0, "hip_yaw": 0.0, "knee": 0.3, "ankle_pitch": -0.2, "ankle_roll": 0.0}
+
+
+class G1Cfg(LeggedRobotCfg):
+    """Settings of the G1; alone, of position control on a plane: task ``g1_position``."""
+
+    class asset:
+        file = "resources/robots/g1/g1.xml"
+        foot_name = "foot"
+        penalize_contacts_on = ["shin", "thigh", "hand", "pelvis", "torso", "head"]
+        terminate_after_contacts_on = ["shin", "thigh", "hand", "pelvis", "torso", "head"]
+        mirrored_legs = [["right", "left"]]
+        max_dof_vel = 20.0
+
+    class init_state:
+        pos = [0.0, 0.0, 0.82]
+        default_joint_angles = {f"{leg}_{joint}_joint": _LEG[joint] for leg in ("left", "right") for joint in _LEG}
+
+    class control:
+        stiffness = {"hip": 100.0, "knee": 150.0, "ankle": 40.0}
+        damping = {"hip": 2.0, "knee": 4.0, "ankle": 2.0}
+        action_scale = 0.25
+        torque_scale = 10.0
+
+    class domain_rand:
+        init_roll = [-0.1, 0.1]
+        init_pitch = [-0.1, 0.1]
+        trunk_mass_offset = [-2.0, 2.0]
+        dof_damping = [0.0, 0.4]
+        dof_armature = [0.008, 0.02]
+        dof_stiffness = [0.0, 0.4]
+        dof_frictionloss = [0.0, 0.8]
+
+    class commands:
+        class ranges:
+            lin_vel_x = [-0.6, 1.0]
+            lin_vel_y = [-0.4, 0.4]
+
+    class rewards:
+        base_height_target = 0.785
+        feet_air_time_target = 0.4
+        held_joints = ["hip_roll", "hip_yaw"]
+
+        class scales:
+            ang_vel_xy = -0.05
+            orientation = -2.0
+            dof_pos_limits = -5.0
+            dof_acc = -1e-7
+            torques = -1e-5
+            action_rate = -0.01
+            collision = 0.0
+            base_height = -10.0
+            feet_air_time = 0.0
+            single_stance = 1.0
+            dof_deviation = -0.2
+            alive = 0.2
+
+
+class G1CfgPPO(LeggedRobotCfgPPO):
+    """Training of a G1, which is the same left and right."""
+
+    class algorithm:
+        class symmetry_cfg:
+            use_data_augmentation = True
