@@ -1,6 +1,9 @@
-"""Run an exported policy in plain MuJoCo: ``python scripts/sim2sim.py logs/<experiment>/<run>/exported_<n>``.
+"""Run an exported policy in plain MuJoCo, without torch and Warp.
 
-Needs neither torch nor Warp.
+Examples:
+    python scripts/sim2sim.py logs/a1_torque_multihead/RUN/exported_1119
+    python scripts/sim2sim.py exported --command 0.5 0 0 --video walk.mp4
+    python scripts/sim2sim.py exported --viewer --robots 1
 """
 
 from __future__ import annotations

@@ -1,7 +1,14 @@
-"""Train a policy: ``python scripts/train.py --task=a1_torque_multihead``.
+"""Train a policy.
 
 On several GPUs of a machine: ``torchrun --standalone --nproc_per_node=2 scripts/train.py --task=a1_torque_multihead``;
 on several machines: docs/howto/cluster.md.
+
+Examples:
+    python scripts/train.py --task=a1_torque_multihead                # the default training: 110 million steps
+    python scripts/train.py --task=a1_torque --max_iterations 20      # a short one
+    python scripts/train.py --task=a1_position --perturbation low --set rewards.scales.torques=-1e-4
+    python scripts/train.py --task=a1_torque --resume                 # go on with the last run
+    python scripts/train.py --task=my_task --task_file my_task.py     # a task of your own
 """
 
 from __future__ import annotations
@@ -17,8 +24,9 @@ from typing import TYPE_CHECKING, Any
 
 from legged_torque.envs import task_registry
 from legged_torque.utils import distributed
-from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of
-from legged_torque.utils.cli import check_output, importing, run_script
+from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of, task_file_words
+from legged_torque.utils.busy_cores import BusyCores
+from legged_torque.utils.cli import check_output, importing, run_script, script_command
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
@@ -37,10 +45,11 @@ def main() -> None:
     add_train_args(parser)
     parser.add_argument("--list", action="store_true", help="print all tasks and exit")
     args = parser.parse_args()
+    cores = BusyCores()
+    options = options_of(args)
     if args.list:
         print("\n".join(task_registry.names()))
         return
-    options = options_of(args)
     if options.resume:
         if options.preset:
             raise UserError("--preset cannot be given with --resume, which keeps the settings of the run")
@@ -53,6 +62,8 @@ def main() -> None:
         env_cfg, train_cfg = run.env_cfg, run.train_cfg
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
         options.max_iterations = options.max_iterations or run.config.get("max_iterations")
+        if distributed.rank() == 0:
+            print(f"Resuming from {run.checkpoint}, after {run.iterations} iterations.")
     elif options.load_run or options.checkpoint is not None:
         raise UserError("--load_run and --checkpoint need --resume")
     else:
@@ -65,11 +76,13 @@ def main() -> None:
         from legged_torque.utils.progress import CompileProgress
     set_seed(train_cfg.seed)
     with CompileProgress():
-        train(options, env_cfg, train_cfg)
+        train(options, env_cfg, train_cfg, cores)
 
 
-def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
+def train(options: Options, env_cfg: Any, train_cfg: Any, cores: BusyCores) -> None:
     """Build the task and train it, from a pre-trained policy if the task has one."""
+    import torch
+
     from legged_torque.envs.base.held_pose import standing_note
     from legged_torque.envs.base.legged_robot import LeggedRobot
     from legged_torque.learning.pretrained import find_pretrained, pretrained_file, start_from
@@ -93,6 +106,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
     if remaining < 1:
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
     if is_first:
+        print_notes(filter(None, [cores.note(torch.get_num_threads()) if env.device == "cpu" else None]))
         announce(runner, options, env_cfg, train_cfg, total)
     try:
         runner.learn(remaining, init_at_random_ep_len=True)
@@ -102,7 +116,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
     if is_first:
         print(f"The run is in {runner.log_dir}")
         for what, script in {"See it walk": "play", "Measure it": "evaluate", "Take it elsewhere": "export"}.items():
-            print(f"{what}: python scripts/{script}.py {run_words(options.task, runner.log_dir)}")
+            print(f"{what}: {script_command(script)} {run_words(options, runner.log_dir)}")
     runner.close()
     if runner.stopped_by:
         sys.exit(128 + runner.stopped_by)  # as shells tell it: 130 after Ctrl-C
@@ -117,12 +131,12 @@ def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: 
     place = device_name(device) if num_processes == 1 else f"{num_processes} x {device_name(device)}"
     print(f"Training {options.task} on {place}: {num_processes * runner.env.num_envs} worlds, {total} iterations.")
     print(f"Curves: tensorboard --logdir {runner.log_dir}")
-    print(f"See it learn: python scripts/play.py {run_words(options.task, runner.log_dir)} --viewer web", flush=True)
+    print(f"See it learn: {script_command('play')} {run_words(options, runner.log_dir)} --viewer web", flush=True)
 
 
-def run_words(task: str, run_dir: str) -> str:
+def run_words(options: Options, run_dir: str) -> str:
     """Return the options with which other scripts find a run."""
-    return f"--task={task} --load_run={run_dir}"
+    return " ".join([*task_file_words(options.task_file), f"--task={options.task}", f"--load_run={run_dir}"])
 
 
 if __name__ == "__main__":

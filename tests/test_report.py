@@ -384,7 +384,7 @@ def test_without_the_extra(folder, tmp_path, monkeypatch, capsys, package):
     """One line says what a report needs, and neither report nor tables are written."""
     monkeypatch.setitem(sys.modules, package, None)
     assert run_script(folder, "--out", tmp_path / "out") == 2
-    assert capsys.readouterr().err.endswith(" need the extra: pip install -e .[plots]\n")
+    assert capsys.readouterr().err.endswith(" need the extra: pip install 'legged_torque[plots]'\n")
     assert not list((tmp_path / "out").glob("*.[mc]*"))
 
 

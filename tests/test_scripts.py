@@ -326,8 +326,9 @@ def test_resume_in_a_folder_by_its_path(root, tmp_path):
     """``--load_run`` takes a path, ``--checkpoint`` an earlier checkpoint, and other options still change settings."""
     (run,) = (root / "logs" / "a1_position").glob("*_good")
     words = [f"--load_run={run}", "--checkpoint=1", "--resume", "--max_iterations=2", "--logger=none", "--seed=9"]
-    status, _, error = run_here("train.py", "--task=a1_position", "--device=cpu", *words, root=tmp_path)
+    status, output, error = run_here("train.py", "--task=a1_position", "--device=cpu", *words, root=tmp_path)
     assert (status, error) == (0, "")
+    assert f"Resuming from {run / 'model_1.pt'}, after 1 iterations.\n" in output
     (new,) = (tmp_path / "logs" / "a1_position").iterdir()
     files = {path.name for path in new.iterdir() if path.is_file()}
     assert files == {"config.yaml", "model_1.pt", "model_2.pt", "worlds_2.pt"}

@@ -127,5 +127,5 @@ def test_recorded_worlds(make_task, monkeypatch):
 def test_missing_extra(monkeypatch, tmp_path):
     """Without an encoder the extra is named."""
     monkeypatch.setitem(sys.modules, "imageio", None)
-    with pytest.raises(video.UserError, match=r"videos need the extra: pip install -e \.\[video\]"):
+    with pytest.raises(video.UserError, match=r"videos need the extra: pip install 'legged_torque\[video\]'"):
         write_video(tmp_path / "out.mp4", None, 1, [[moment()]], 0.02)

@@ -481,5 +481,5 @@ def test_missing_extra(monkeypatch):
         monkeypatch.delitem(sys.modules, f"legged_torque.viewer.{name}", raising=False)
     play = runpy.run_path(str(SCRIPTS_DIR / "play.py"))
     args = argparse.Namespace(viewer="web", task="a1_torque", host="127.0.0.1", port=8080)
-    with pytest.raises(UserError, match=r"pip install -e \.\[viewer\]"):
+    with pytest.raises(UserError, match=r"pip install 'legged_torque\[viewer\]'"):
         play["import_viewer"](args)

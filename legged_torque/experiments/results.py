@@ -201,7 +201,7 @@ def welch(first: list[float], second: list[float]) -> float | None:
     try:
         from scipy.stats import ttest_ind_from_stats
     except ImportError:
-        raise UserError("reports need the extra: pip install -e .[plots]") from None
+        raise UserError("reports need the extra: pip install 'legged_torque[plots]'") from None
     if min(len(first), len(second)) < 2 or stdev(first) == stdev(second) == 0.0:
         return None
     one, other = ((fmean(values), stdev(values), len(values)) for values in (first, second))

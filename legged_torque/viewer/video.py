@@ -130,7 +130,7 @@ def write_video(
         import imageio_ffmpeg  # noqa: F401
         import PIL  # noqa: F401
     except ImportError:
-        raise UserError("videos need the extra: pip install -e .[video]") from None
+        raise UserError("videos need the extra: pip install 'legged_torque[video]'") from None
     side = math.isqrt(len(steps[0]))
     width, height = SIZE if side == 1 else (length // side // 2 * 2 for length in GRID_SIZE)  # mp4 wants even numbers
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
