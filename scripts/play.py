@@ -73,6 +73,7 @@ def main() -> None:
     else:
         watch = import_viewer(args)  # whatever is missing is reported before anything slow is done
         session = Session(task_registry.get_task_class(args.task), run, resolve_device(args.device))
+        session.follow_newest(args.checkpoint is None)
         watch(session, resource_path(run.env_cfg.asset.file))
 
 

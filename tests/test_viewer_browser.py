@@ -24,8 +24,9 @@ from legged_torque.terrain.selection import select_tiles
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import LoadedRun
+from legged_torque.viewer.ports import free_port
 from legged_torque.viewer.session import Session
-from legged_torque.viewer.web import Page, free_port, watch
+from legged_torque.viewer.web import Page, watch
 
 TIMEOUT = 120.0
 """Seconds that the page may take for something: a software renderer draws about a frame a second."""

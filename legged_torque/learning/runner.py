@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self.logger.device = "cpu"  # where numbers are averaged that are on the host anyway
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         self.log_dir = log_dir
+        self.on_checkpoint: Callable[[Path], None] | None = None  # called with each checkpoint of a training
         self.stopped_by = 0  # number of the signal that has ended the last training; 0: none
         self._seconds_before = 0.0  # training time before this process
         self._saved_iteration = -1  # that of the last checkpoint
@@ -93,6 +95,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             self.alg.broadcast_parameters()
         with told_by_name(Path(self.log_dir or "")):
             self.logger.init_logging_writer()
+        self._save_checkpoint()  # so that the run can be watched from its first second
         start_it = self.current_learning_iteration
         total_it = start_it + num_learning_iterations
         guard = TrainingGuard(self.env, self.alg)
@@ -301,6 +304,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             self._saved_iteration = self.current_learning_iteration
             if digest:
                 remove_other_worlds(file)
+            if self.on_checkpoint:
+                self.on_checkpoint(file)
         warning = self.env.sim.check_buffers()
         if warning:
             print(f"Warning: {warning}.")

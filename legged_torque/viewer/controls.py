@@ -51,7 +51,7 @@ class Controls:
         """Build the panel."""
         self._gui, self._session, self._scene = server.gui, session, scene
         self._ground = scene.ground
-        self._loaded: tuple[int, str, int] | None = None
+        self._loaded: tuple[int, str, int, bool] | None = None
         self._weights: dict[str, viser.GuiInputHandle[float]] = {}
         self.status = self._gui.add_html("")
         self._add_command()
@@ -114,7 +114,8 @@ class Controls:
         with gui.add_folder("Run"):
             names = tuple(map(str, state.checkpoints)) or (str(state.checkpoint),)
             self.checkpoints = gui.add_dropdown("checkpoint", names, initial_value=str(state.checkpoint))
-            newest = gui.add_checkbox("follow training", False, hint="load each new checkpoint as soon as it is saved")
+            hint = "load each new checkpoint as soon as it is saved"
+            self.newest = newest = gui.add_checkbox("follow training", False, hint=hint)
             hint = "random parameters, pushes and noise; rebuilds the worlds"
             self.perturbation = gui.add_dropdown("perturbation", tuple(session.perturbations()), hint=hint)
 
@@ -179,11 +180,12 @@ class Controls:
         names = tuple(map(str, sorted({*state.checkpoints, state.checkpoint})))
         if names != tuple(self.checkpoints.options):
             self.checkpoints.options = names
-        loaded = (state.checkpoint, state.perturbation, state.message_number)
+        loaded = (state.checkpoint, state.perturbation, state.message_number, state.follows_newest)
         if loaded != self._loaded:  # otherwise a choice that is not carried out yet would jump back
             self._loaded = loaded
             set_value(self.checkpoints, str(state.checkpoint))
             set_value(self.perturbation, state.perturbation)
+            set_value(self.newest, state.follows_newest)
         tile = [] if state.reading is None else state.reading.tile.astype(int).tolist()
         if tile != self._tile:  # as above
             self._tile = tile

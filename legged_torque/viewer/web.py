@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import errno
 import html
-import socket
 import threading
 import time
 from pathlib import Path
 
 import viser
 
-from legged_torque.utils.errors import UserError
 from legged_torque.viewer.access import Guard
 from legged_torque.viewer.controls import Controls
 from legged_torque.viewer.ground import Ground, ground_of
 from legged_torque.viewer.pacing import stopping_on_ctrl_c
 from legged_torque.viewer.plots import Plots
+from legged_torque.viewer.ports import free_port
 from legged_torque.viewer.scene import Scene
 from legged_torque.viewer.session import Session
 from legged_torque.viewer.state import SessionState
@@ -86,21 +84,6 @@ class Page:
             for client in self.server.get_clients().values():
                 client.add_notification("That did not work", state.message, color="red", auto_close_seconds=10)
         self._message_shown = state.message_number
-
-
-def free_port(host: str, port: int) -> int:
-    """Return the first free port from a port on, or raise a UserError: at a wrong address viser would wait forever."""
-    for candidate in range(port, min(port + 100, 65536)):
-        try:
-            (family, _, _, _, address), *_ = socket.getaddrinfo(host, candidate, type=socket.SOCK_STREAM)
-            with socket.socket(family, socket.SOCK_STREAM) as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind(address)
-            return candidate
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise UserError(f"cannot serve at {host}:{candidate}: {error.strerror or error}") from None
-    raise UserError(f"no port from {port} on is free")
 
 
 def status_html(state: SessionState, ground: Ground | None = None) -> str:
