@@ -104,6 +104,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, beside: Beside) -> Non
         announce(runner, options, env_cfg, train_cfg, total, beside.page)
         runner.on_checkpoint = functools.partial(beside.show, options.task)
     try:
+        runner.save_checkpoint()  # so that the run can be watched from its first second
         runner.learn(remaining, init_at_random_ep_len=True)
     except TrainingError:
         runner.close()

@@ -95,7 +95,6 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             self.alg.broadcast_parameters()
         with told_by_name(Path(self.log_dir or "")):
             self.logger.init_logging_writer()
-        self._save_checkpoint()  # so that the run can be watched from its first second
         start_it = self.current_learning_iteration
         total_it = start_it + num_learning_iterations
         guard = TrainingGuard(self.env, self.alg)
@@ -120,8 +119,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
                 if guard.problem:
                     break
                 if self.current_learning_iteration % self.cfg["save_interval"] == 0:
-                    self._save_checkpoint()
-            self._save_checkpoint()  # writes the last log too
+                    self.save_checkpoint()
+            self.save_checkpoint()  # writes the last log too
         self.stopped_by = stop.number
         self.logger.stop_logging_writer()
         if self._nobody_reads:
@@ -294,7 +293,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             self._log_is_broken, self.logger.writer = True, NoLogWriter("")
             self.logger.ep_extras.clear()
 
-    def _save_checkpoint(self) -> None:
+    def save_checkpoint(self) -> None:
         """Save into the run's folder with all that was logged, and warn if the simulator had too little room."""
         self._write_log()
         if self.log_dir is not None and self._saved_iteration != self.current_learning_iteration:

@@ -12,12 +12,14 @@ import viser
 from legged_torque.viewer.access import Guard
 from legged_torque.viewer.controls import Controls
 from legged_torque.viewer.ground import Ground, ground_of
+from legged_torque.viewer.layers import commanded_pose
 from legged_torque.viewer.pacing import stopping_on_ctrl_c
-from legged_torque.viewer.plots import Plots
+from legged_torque.viewer.plots import WIDTH, Plots
 from legged_torque.viewer.ports import free_port
 from legged_torque.viewer.scene import Scene
 from legged_torque.viewer.session import Session
 from legged_torque.viewer.state import SessionState
+from legged_torque.viewer.steering import Steering
 
 FRAME_INTERVAL = 1.0 / 30.0  # seconds between drawings of the robots
 PLOT_INTERVAL = 0.2  # seconds between drawings of the plots and the status
@@ -37,14 +39,17 @@ class Page:
     def __init__(self, session: Session, robot: Path, title: str, host: str, port: int) -> None:
         """Serve the page at a port or the next free one; ``robot`` is its MJCF, visual geoms included."""
         self._session, self.guard = session, Guard(host)
-        with self.guard.at_the_door():
+        self._steering = Steering()
+        with self.guard.at_the_door(self._steering.around):
             self.server = PrivateServer(host, free_port(host, port), label=title, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 125, 246))
         self._ground = ground_of(session.task)
-        self._scene = Scene(self.server, robot, session.task.num_envs, self._ground)
+        geoms = session.task.asset.geom_names
+        self._scene = Scene(self.server, robot, session.task.num_envs, geoms, self._ground)
         self.controls = Controls(self.server, session, self._scene)
         self._plots = Plots(self.server, session)
         self.server.gui.main_panel.dock_right()
+        self.server.gui.main_panel.set_width(WIDTH)
         self._message_shown = 0
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
@@ -67,9 +72,12 @@ class Page:
         """Draw until closed; plots and status less often than the robots."""
         next_plots = 0.0
         while not self._closed.wait(FRAME_INTERVAL):
-            state = self._session.state
+            state, shares = self._session.state, self._steering.take()
+            if shares:
+                self.controls.steer(shares)
             if state.reading is not None:
-                self._scene.update(state.reading, state.world)
+                past = list(self._session.history) or [state.reading]
+                self._scene.update(state.reading, state.world, commanded_pose(past, self._session.task.dt))
             if time.perf_counter() >= next_plots:
                 next_plots = time.perf_counter() + PLOT_INTERVAL
                 with self.server.atomic():
