@@ -109,20 +109,22 @@ def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
         from legged_torque.viewer.web import watch
     except ImportError as error:
         raise UserError(f"--viewer web needs the extra: pip install -e .[viewer] ({error})") from None
-    return functools.partial(watch, title=args.task, host=args.host, port=args.port)
+    return functools.partial(watch, title=args.task, host=args.host, port=args.port, no_renderer=NO_RENDERER)
 
 
 def roll_out(args: argparse.Namespace, env: LeggedRobot, runner: OnPolicyRunner, checkpoint: Path) -> None:
     """Roll out mean actions, print the metrics, save a video."""
     from legged_torque.envs.base.metrics import measure
-    from legged_torque.viewer.video import TaskRecorder
+    from legged_torque.viewer.video import TaskRecorder, show_in_tensorboard
 
     recorder = TaskRecorder(env, args.grid)
     metrics = measure(env, runner.get_inference_policy(env.device), args.steps, lambda commands: recorder.add_step())
     print(f"{checkpoint}, after {int(runner.logger.tot_timesteps):,} steps of training:")
     for name, value in metrics.means().items():
         print(f"  {name:<18} {value:8.4f} {UNITS[name]}")
-    recorder.save(args.video or checkpoint.parent / "videos" / f"{checkpoint.stem}.mp4", NO_RENDERER)
+    in_run = checkpoint.parent / "videos" / f"{checkpoint.stem}.mp4"
+    if recorder.save(args.video or in_run, NO_RENDERER) and not args.video:
+        show_in_tensorboard(in_run, runner.current_learning_iteration)
 
 
 if __name__ == "__main__":

@@ -133,6 +133,7 @@ class Scene:
         scene.configure_environment_map("studio", environment_intensity=0.5)
         camera = self._server.initial_camera
         camera.position, camera.look_at, camera.fov = (1.2, -1.2, 0.62), (0.0, 0.0, 0.24), 0.75
+        self._server.on_client_connect(look_from_a_phone)
 
     def _add_plane(self) -> viser.GridHandle:
         """Add a plane, and return it."""
@@ -156,6 +157,14 @@ class Scene:
             "/scan", np.zeros((1, 3)), SCAN_COLOR, point_size=0.009, point_shape="circle", precision="float32"
         )
         return scene.add_glb("/ground", ground_glb(ground), cast_shadow=False, receive_shadow=True)
+
+
+def look_from_a_phone(client: viser.ClientHandle) -> None:
+    """Let a browser that is higher than wide see the robot above the sheet with the controls."""
+    if client.camera.aspect < 1.0:
+        with client.atomic():
+            client.camera.position = (1.85, -1.85, 1.0)  # this moves what it looks at, too
+            client.camera.look_at = (0.0, 0.0, -0.4)
 
 
 def places(num_envs: int) -> np.ndarray:

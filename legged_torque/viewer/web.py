@@ -16,6 +16,7 @@ from legged_torque.viewer.layers import commanded_pose
 from legged_torque.viewer.pacing import stopping_on_ctrl_c
 from legged_torque.viewer.plots import WIDTH, Plots
 from legged_torque.viewer.ports import free_port
+from legged_torque.viewer.recording import Recording
 from legged_torque.viewer.scene import Scene
 from legged_torque.viewer.session import Session
 from legged_torque.viewer.state import SessionState
@@ -36,8 +37,19 @@ class PrivateServer(viser.ViserServer):
 class Page:
     """Draws a session in a thread of its own, which never touches the task's tensors."""
 
-    def __init__(self, session: Session, robot: Path, title: str, host: str, port: int) -> None:
-        """Serve the page at a port or the next free one; ``robot`` is its MJCF, visual geoms included."""
+    def __init__(
+        self, session: Session, robot: Path, title: str, host: str, port: int, no_renderer: str | None = None
+    ) -> None:
+        """Serve the page at a port or the next free one.
+
+        Args:
+            session: What is shown.
+            robot: Its MJCF, visual geoms included.
+            title: Of the page.
+            host: Address that is served at.
+            port: The first one to try.
+            no_renderer: Why no videos can be drawn here; None if they can.
+        """
         self._session, self.guard = session, Guard(host)
         self._steering = Steering()
         with self.guard.at_the_door(self._steering.around):
@@ -48,6 +60,7 @@ class Page:
         self._scene = Scene(self.server, robot, session.task.num_envs, geoms, self._ground)
         self.controls = Controls(self.server, session, self._scene)
         self._plots = Plots(self.server, session)
+        self._recording = Recording(self.server, session.task, no_renderer)
         self.server.gui.main_panel.dock_right()
         self.server.gui.main_panel.set_width(WIDTH)
         self._message_shown = 0
@@ -77,6 +90,7 @@ class Page:
                 self.controls.steer(shares)
             if state.reading is not None:
                 past = list(self._session.history) or [state.reading]
+                self._recording.update(past)
                 self._scene.update(state.reading, state.world, commanded_pose(past, self._session.task.dt))
             if time.perf_counter() >= next_plots:
                 next_plots = time.perf_counter() + PLOT_INTERVAL
@@ -107,9 +121,9 @@ def status_html(state: SessionState, ground: Ground | None = None) -> str:
     return f'<div style="font-size:13px;line-height:1.5;padding:4px 12px">{"<br>".join(lines)}</div>'
 
 
-def watch(session: Session, robot: Path, title: str, host: str, port: int) -> None:
+def watch(session: Session, robot: Path, title: str, host: str, port: int, no_renderer: str | None = None) -> None:
     """Serve a :class:`Page` and step until Ctrl-C."""
-    page = Page(session, robot, title, host, port)
+    page = Page(session, robot, title, host, port, no_renderer)
     if page.server.get_port() != port:
         print(f"Port {port} is taken.")
     if page.guard.token:
