@@ -86,7 +86,7 @@ def killed(device_check, tmp_path_factory):
         process = subprocess.Popen(
             command, stdout=output, stderr=subprocess.STDOUT, env=environment, start_new_session=True
         )
-    wait_for(lambda: list(out.glob("*/*/model_*.pt")))
+    wait_for(lambda: list(out.glob("*/*/model_2.pt")))
     os.killpg(process.pid, signal.SIGKILL)  # the training is asked to stop by the system
     process.wait()
     cell = out / "a1_torque_multihead-low-s1"

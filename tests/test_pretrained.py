@@ -72,7 +72,7 @@ def test_a_policy_is_found_or_made(made, trained):
 def test_making_leaves_the_training_as_it_is(trained):
     """Random numbers of a training are the same whether it had to make its policy or found one."""
     _, (_, found), (_, made_here) = trained
-    infos = [torch.load(files[0], weights_only=True)["infos"] for files in (found, made_here)]
+    infos = [torch.load(files[1], weights_only=True)["infos"] for files in (found, made_here)]
     assert torch.equal(*(info["random_states"][0]["cpu"] for info in infos))
     assert [info["total_timesteps"] for info in infos] == [16 * 8] * 2
 
@@ -82,14 +82,14 @@ def test_first_iterations_train_the_critic_alone(made, trained):
     network = read_pretrained(made[1])["actor_state_dict"]
     network.pop(STD)
     _, (_, found), (_, made_here) = trained
-    assert len(found) == len(made_here) == 2
+    assert len(found) == len(made_here) == 3  # the first is that of the start
     for actor, log_std in load(found):
         assert same(actor, network)
         torch.testing.assert_close(log_std, torch.full((12,), -0.6931472))  # of 0.5
-    (first, log_std), (second, later_log_std) = load(made_here)
+    (first, log_std), (second, later_log_std) = load(made_here[1:])
     assert same(first, network) and not same(second, network)
     assert (log_std == 0.0).all() and (later_log_std != 0.0).all()
-    critics = [torch.load(file, weights_only=True)["critic_state_dict"] for file in found]
+    critics = [torch.load(file, weights_only=True)["critic_state_dict"] for file in found[1:]]
     assert all(not torch.equal(value, critics[1][name]) for name, value in critics[0].items())
 
 
@@ -101,9 +101,9 @@ def test_a_resumed_training_has_its_policy(trained, tmp_path):
     assert (status, error) == (0, "") and "pre-trained" not in output
     assert not (tmp_path / "logs" / "pretrained").exists()
     files = sorted(tmp_path.glob(f"logs/{TASK}/*/model_*.pt"))
-    assert [file.name for file in files] == ["model_3.pt", "model_4.pt"]
-    (before, _), (third, _), (fourth, _) = load([found[1], *files])
-    assert same(before, third) and not same(third, fourth)
+    assert [file.name for file in files] == ["model_2.pt", "model_3.pt", "model_4.pt"]
+    (before, _), (start, _), (third, _), (fourth, _) = load([found[2], *files])
+    assert same(before, start) and same(before, third) and not same(third, fourth)
 
 
 def test_what_does_not_fit_is_refused(made):
