@@ -23,7 +23,9 @@ from legged_torque.utils.cli import Parser, check_at_least, check_output, finite
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
-from legged_torque.utils.task_registry import set_seed
+from legged_torque.utils.options import Options
+from legged_torque.utils.runs import load_config
+from legged_torque.utils.task_registry import LoadedRun, set_seed
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -48,6 +50,8 @@ def main() -> None:
         window; default: %(default)s"""
     parser.add_argument("--viewer", choices=NUM_ENVS, default="none", help=hint)
     hint = "address of the page; default: %(default)s, this machine alone; others need the printed token"
+    hint = "folder of a run whose policy walks beside the followed robot, under the same command (--viewer web)"
+    parser.add_argument("--compare", metavar="RUN", help=hint)
     parser.add_argument("--host", default="127.0.0.1", help=hint)
     parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
     args = parser.parse_args()
@@ -67,6 +71,7 @@ def main() -> None:
     run.env_cfg.terrain.curriculum = False  # robots stay on their tiles
     if kinds:
         select_tiles(run.env_cfg.terrain, kinds, levels, 1)
+    compared = load_compared(args, run) if args.compare else None
     set_seed(args.seed)
     if args.viewer == "none":
         roll_out(args, *task_registry.make_loaded(run, options), run.checkpoint)
@@ -74,7 +79,27 @@ def main() -> None:
         watch = import_viewer(args)  # whatever is missing is reported before anything slow is done
         session = Session(task_registry.get_task_class(args.task), run, resolve_device(args.device))
         session.follow_newest(args.checkpoint is None)
+        if compared:
+            session.companion = Session(
+                task_registry.get_task_class(compared.config["task"]), compared, resolve_device(args.device)
+            )
         watch(session, resource_path(run.env_cfg.asset.file))
+
+
+def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
+    """Return the run of ``--compare``; a UserError if its robot cannot walk beside that of another run."""
+    if args.viewer != "web":
+        raise UserError("--compare needs --viewer web")
+    task = load_config(Path(args.compare))["task"]
+    options = Options(task, args.device, num_envs=1, load_run=args.compare, perturbation=args.perturbation)
+    compared = task_registry.load_run(options)
+    if compared.env_cfg.asset.file != run.env_cfg.asset.file:
+        raise UserError(
+            f"--compare needs runs of one robot, not {run.env_cfg.asset.file} and {compared.env_cfg.asset.file}"
+        )
+    if {run.env_cfg.terrain.mesh_type, compared.env_cfg.terrain.mesh_type} != {"plane"}:
+        raise UserError("--compare needs level ground; see --set terrain.mesh_type=plane")
+    return compared
 
 
 def choose_worlds(args: argparse.Namespace) -> None:

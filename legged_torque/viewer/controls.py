@@ -131,6 +131,11 @@ class Controls:
             self.checkpoints = gui.add_dropdown("checkpoint", names, initial_value=str(state.checkpoint))
             hint = "load each new checkpoint as soon as it is saved"
             self.newest = newest = gui.add_checkbox("follow training", False, hint=hint)
+            companion = session.companion
+            if companion:
+                others = tuple(map(str, companion.state.checkpoints))
+                other = gui.add_dropdown("beside", others, initial_value=str(companion.state.checkpoint))
+                on_user_change(other, lambda: companion.load_checkpoint(int(other.value)))
             hint = "random parameters, pushes and noise; rebuilds the worlds"
             self.perturbation = gui.add_dropdown("perturbation", tuple(session.perturbations()), hint=hint)
 

@@ -11,6 +11,7 @@ import viser
 from viser import transforms
 
 from legged_torque.utils.mjcf import DRAWN_GROUPS
+from legged_torque.viewer.lane import heading_of
 from legged_torque.viewer.meshes import geom_mesh
 from legged_torque.viewer.reading import Reading
 
@@ -93,8 +94,7 @@ def commanded_pose(past: Sequence[Reading], dt: float) -> np.ndarray:
     now = past[-1]
     steps = min(GHOST_STEPS, len(past) - 1, int(now.age[0]))
     pose, begin = now.qpos[now.world].copy(), past[-1 - steps].qpos[now.world]
-    w, x, y, z = begin[3:7]
-    heading, place = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)), begin[:2].astype(float)
+    heading, place = heading_of(begin), begin[:2].astype(float)
     for reading in past[len(past) - steps :]:
         v_x, v_y, rate = reading.commands[now.world]
         cos, sin = np.cos(heading + 0.5 * rate * dt), np.sin(heading + 0.5 * rate * dt)

@@ -13,6 +13,7 @@ from legged_torque.viewer.session import HISTORY_STEPS, Session
 from legged_torque.viewer.state import SessionState
 
 COMMAND, ACTUAL, APPLIED = "#1faa55", "#2f7df6", "#343a40"
+BESIDE = "#f08c00"
 PARTS = ("#f08c00", "#2f7df6", "#ae3ec9", "#1faa55")  # colors of the parts of torques
 VELOCITIES = ("v_x, forward [m/s]", "v_y, to the left [m/s]", "yaw rate, to the left [rad/s]")
 STRIDE = 2  # plots show every second control step
@@ -37,7 +38,7 @@ class Plots:
         self._parts = [(name, PARTS[i % len(PARTS)]) for i, name in enumerate(parts)]
         panel = gui.add_panel()
         with panel.add_tab("Walking", viser.Icon.ACTIVITY):
-            legend = [("commanded", COMMAND), ("actual", ACTUAL)]
+            legend = [("commanded", COMMAND), ("actual", ACTUAL)] + [("beside", BESIDE)] * bool(session.companion)
             gui.add_html(legend_html(legend))
             self._velocities = [add_plot(gui, title, legend, (-1.6, 1.6)) for title in VELOCITIES]
             self._gait, self._bars = gui.add_html(""), gui.add_html("")
@@ -84,8 +85,9 @@ class Plots:
             return
         time = np.array([reading.time - now for reading in past], np.float32)
         velocities = np.array([(one.commands[one.world], one.velocities[one.world]) for one in past])
+        beside = [self._velocities_beside(past)] if self._session.companion else []
         for i, plot in enumerate(self._velocities):
-            plot.data = (time, *velocities[:, :, i].T)
+            plot.data = (time, *velocities[:, :, i].T, *(values[:, i] for values in beside))
         self._gait.content = gait_html(self._feet, feet, GAIT_SECONDS)
         torques = np.array([[*reading.torque_parts, reading.torques] for reading in past])
         for plot, joint in zip(self._torques, self._chosen, strict=False):
@@ -98,6 +100,12 @@ class Plots:
         rewards = np.array([reading.rewards for reading in past])
         chosen = self._term.value
         self._term_plot.data = (time, rewards.sum(axis=1) if chosen == SUM else rewards[:, self._terms.index(chosen)])
+
+    def _velocities_beside(self, past: Sequence[Reading]) -> np.ndarray:
+        """Return the velocities of the companion's robot at the times of some steps; NaN where it has none."""
+        assert self._session.companion
+        known = {round(reading.time, 4): reading.velocities[0] for reading in list(self._session.companion.history)}
+        return np.array([known.get(round(reading.time, 4), np.full(3, np.nan)) for reading in past])
 
     def _torque_bars(self, reading: Reading, mixing: dict[str, float]) -> str:
         """Return all torques of this moment as bars, in parts if the task mixes action terms."""

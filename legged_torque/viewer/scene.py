@@ -11,6 +11,7 @@ import viser
 from viser import transforms
 
 from legged_torque.viewer.ground import Ground, Smooth
+from legged_torque.viewer.lane import Lane
 from legged_torque.viewer.layers import Layers
 from legged_torque.viewer.meshes import body_glb, ground_glb
 from legged_torque.viewer.reading import Reading
@@ -68,16 +69,35 @@ class Scene:
         nowhere = np.zeros((1, 2, 3))
         self._arrows = [server.scene.add_arrows(name, nowhere, color, **sizes) for name, color in colors.items()]
         self.layers = Layers(server, self._model, geoms)
+        self._lane = Lane()
+        self._labels: list[viser.LabelHandle] = []
+        self._seen: set[int] = set()  # browsers that have taken the page's camera
 
-    def update(self, reading: Reading, world: int, ghost: np.ndarray) -> None:
-        """Draw a state, and all that is shown of a world to follow; ``ghost`` is a row of positions like its own."""
-        positions, quats = self._poses(np.vstack([reading.qpos, ghost]), [*range(len(reading.qpos)), world])
-        shown = slice(-1) if self.shows_others else slice(world, world + 1)
+    def name_robots(self, first: str, second: str) -> None:
+        """Write names above the followed robot and the one beside it."""
+        self._labels = [self._server.scene.add_label(f"/name/{i}", name) for i, name in enumerate((first, second))]
+
+    def update(self, reading: Reading, world: int, ghost: np.ndarray, beside: np.ndarray | None = None) -> None:
+        """Draw a state, and all that is shown of a world to follow.
+
+        Args:
+            reading: The state.
+            world: The followed one.
+            ghost: Positions of its ghost, like a row of the reading's.
+            beside: Likewise of the robot beside it, in a simulation of its own; None if there is none.
+        """
+        num_envs, lane = len(reading.qpos), []
+        if beside is not None:
+            lane = [self._lane.place(reading.qpos[world], beside)]
+        rows = np.vstack([reading.qpos, *lane, ghost])
+        positions, quats = self._poses(rows, [*range(num_envs)] + [world] * (len(lane) + 1))
+        shown = [*(range(num_envs) if self.shows_others else [world]), *range(num_envs, num_envs + len(lane))]
         if self.is_following:
             self._offset[:2] = -positions[world, 1, :2]
             if self.ground:
                 self._offset[2] = -self._height.follow(float(self.ground.height(positions[world, 1])))
                 self._lift_cameras()
+        self._frame_phones()
         positions += self._offset
         is_current = world == reading.world
         trunk, rotation = positions[world, 1], transforms.SO3(quats[world, 1]).as_matrix()
@@ -90,6 +110,8 @@ class Scene:
                 self._scan.visible = self.shows_scan and is_current
                 self._scan.points = (reading.scan + self._offset + [0.0, 0.0, 0.01]).astype(np.float32)
             self.layers.update(reading, positions[[world, -1]], quats[[world, -1]], is_current)
+            for label, robot in zip(self._labels, (world, num_envs), strict=False):
+                label.position = positions[robot, 1] + [0.0, 0.0, 0.35]
             velocities = (reading.commands[world], reading.velocities[world])
             for handle, vector, height in zip(self._arrows, velocities, (0.22, 0.17), strict=True):
                 start = trunk + np.array([0.0, 0.0, height])
@@ -110,6 +132,18 @@ class Scene:
             positions[i] = self._data.xpos + self._places[world]
             quats[i] = self._data.xquat
         return positions, quats
+
+    def _frame_phones(self) -> None:
+        """Let new browsers that are higher than wide see the robot above the sheet with the controls."""
+        for number, client in self._server.get_clients().items():
+            camera = client.camera
+            if number in self._seen or not np.any(camera.look_at):
+                continue
+            self._seen.add(number)
+            if camera.aspect < 1.0:
+                with client.atomic():
+                    camera.position = (1.85, -1.85, 1.0)  # this moves what it looks at, too
+                    camera.look_at = (0.0, 0.0, -0.4)
 
     def _lift_cameras(self) -> None:
         """Let the cameras of all browsers look over the ground between them and what they look at."""
@@ -133,7 +167,6 @@ class Scene:
         scene.configure_environment_map("studio", environment_intensity=0.5)
         camera = self._server.initial_camera
         camera.position, camera.look_at, camera.fov = (1.2, -1.2, 0.62), (0.0, 0.0, 0.24), 0.75
-        self._server.on_client_connect(look_from_a_phone)
 
     def _add_plane(self) -> viser.GridHandle:
         """Add a plane, and return it."""
@@ -157,14 +190,6 @@ class Scene:
             "/scan", np.zeros((1, 3)), SCAN_COLOR, point_size=0.009, point_shape="circle", precision="float32"
         )
         return scene.add_glb("/ground", ground_glb(ground), cast_shadow=False, receive_shadow=True)
-
-
-def look_from_a_phone(client: viser.ClientHandle) -> None:
-    """Let a browser that is higher than wide see the robot above the sheet with the controls."""
-    if client.camera.aspect < 1.0:
-        with client.atomic():
-            client.camera.position = (1.85, -1.85, 1.0)  # this moves what it looks at, too
-            client.camera.look_at = (0.0, 0.0, -0.4)
 
 
 def places(num_envs: int) -> np.ndarray:

@@ -173,7 +173,7 @@ def show_in_tensorboard(video: Path, iterations: int) -> None:
     reader: Any = imageio.get_reader(video)
     with reader:
         duration = 2000.0 / reader.get_meta_data()["fps"]  # of every second frame [ms]
-        frames = [Image.fromarray(frame[::2, ::2]) for frame in list(reader)[::2]]
+        frames = [Image.fromarray(frame[::2, ::2]) for number, frame in enumerate(reader) if number % 2 == 0]
     gif = io.BytesIO()
     frames[0].save(gif, "GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
     size = {"width": frames[0].width, "height": frames[0].height, "colorspace": 3}

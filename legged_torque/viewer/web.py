@@ -5,8 +5,10 @@ from __future__ import annotations
 import html
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import viser
 
 from legged_torque.viewer.access import Guard
@@ -58,6 +60,8 @@ class Page:
         self._ground = ground_of(session.task)
         geoms = session.task.asset.geom_names
         self._scene = Scene(self.server, robot, session.task.num_envs, geoms, self._ground)
+        if session.companion:
+            self._scene.name_robots(session.name, session.companion.name)
         self.controls = Controls(self.server, session, self._scene)
         self._plots = Plots(self.server, session)
         self._recording = Recording(self.server, session.task, no_renderer)
@@ -91,14 +95,23 @@ class Page:
             if state.reading is not None:
                 past = list(self._session.history) or [state.reading]
                 self._recording.update(past)
-                self._scene.update(state.reading, state.world, commanded_pose(past, self._session.task.dt))
+                ghost = commanded_pose(past, self._session.task.dt)
+                self._scene.update(state.reading, state.world, ghost, self._beside())
             if time.perf_counter() >= next_plots:
                 next_plots = time.perf_counter() + PLOT_INTERVAL
                 with self.server.atomic():
                     self._plots.update(state)
-                    self.controls.status.content = status_html(state, self._ground)
+                    companion = self._session.companion
+                    beside = [(companion.name, companion.state)] if companion else []
+                    self.controls.status.content = status_html(state, self._ground, beside)
                     self.controls.update(state)
                     self._notify(state)
+
+    def _beside(self) -> np.ndarray | None:
+        """Return the positions of the companion's robot, as a row of ``sim.qpos``; None without one."""
+        companion = self._session.companion
+        reading = companion.state.reading if companion else None
+        return reading.qpos[0] if reading else None
 
     def _notify(self, state: SessionState) -> None:
         """Show an error as a notification on the page."""
@@ -108,13 +121,22 @@ class Page:
         self._message_shown = state.message_number
 
 
-def status_html(state: SessionState, ground: Ground | None = None) -> str:
-    """Return the status line by line: checkpoint, time, tile of the followed robot on rough ground, last message."""
+def status_html(
+    state: SessionState, ground: Ground | None = None, beside: Sequence[tuple[str, SessionState]] = ()
+) -> str:
+    """Return the status line by line: checkpoint, time, tile of the followed robot on rough ground, last message.
+
+    ``beside`` are names and states of companions, with a line each.
+    """
     running = "paused" if state.is_paused else f"{state.real_time:.2f} x real time"
     color = "#e03131" if state.is_error else "inherit"
     lines = [
         f"<b>model_{state.checkpoint}</b>, after {state.trained_steps / 1e6:,.1f} million steps",
         f"{state.time:.1f} s simulated, {running}, {state.falls} falls",
+        *(
+            f"beside: <b>{html.escape(name)}</b>, model_{other.checkpoint}, {other.falls} falls"
+            for name, other in beside
+        ),
         *([ground.tile_text(*state.reading.tile.astype(int))] if ground and state.reading else []),
         f'<span style="color:{color}">{html.escape(state.message) or "&nbsp;"}</span>',
     ]
