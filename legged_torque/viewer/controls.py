@@ -44,7 +44,7 @@ def connect(
     on_user_change(automatic, toggle)
 
 
-KEYS = "Keys, while held: W S or arrows v_x, A D v_y, left right arrows yaw; or a gamepad's sticks"
+KEYS = "or hold W A S D, arrows, or a gamepad's sticks"
 
 
 class Controls:
