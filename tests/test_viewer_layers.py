@@ -65,7 +65,7 @@ def test_lane():
 
 
 def test_gait():
-    """Dark from the step where a foot lands to the one where it lifts off, at the end of the row; shares of the time."""
+    """Dark from the step where a foot lands to the one where it lifts off, now at the right; shares of the time."""
     from legged_torque.viewer.bars import gait_html
 
     contacts = np.zeros((100, 2))
