@@ -15,6 +15,7 @@ if not (CHROMIUM and DRIVER):
     pytest.skip("Chromium or its driver is not installed", allow_module_level=True)
 
 from PIL import Image
+from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
@@ -84,7 +85,8 @@ def session(make_task, tmp_path, request):
 @pytest.fixture
 def page(session):
     """The session's page."""
-    page = Page(session, resource_path(session.task.cfg.asset.file), "a1_torque_multihead", "127.0.0.1", 8480)
+    robot = resource_path(session.task.cfg.asset.file)
+    page = Page(session, robot, "a1_torque_multihead", "127.0.0.1", 8480, "no renderer in tests")
     yield page
     page.close()
 
@@ -119,7 +121,19 @@ def test_page(session, page, browser, tmp_path):
     wait_for(robot_is_drawn)
     print(f"the page: {tmp_path / 'page.png'}")
     text = browser.find_element(By.TAG_NAME, "body").text
-    for words in ("model_0", "Command", "x [m/s]", "yaw [rad/s]", "Mixing weights", "v_x, forward [m/s]", "FR thigh"):
+    for words in (
+        "Feet on the ground",
+        "FR",
+        "ghost",
+        "collision geoms",
+        "model_0",
+        "Command",
+        "x [m/s]",
+        "yaw [rad/s]",
+        "Mixing weights",
+        "v_x, forward [m/s]",
+        "FR thigh",
+    ):
         assert words in text
 
     def told_to_go():
@@ -130,7 +144,7 @@ def test_page(session, page, browser, tmp_path):
         field.send_keys(Keys.CONTROL + "a")
         field.send_keys("0.8", Keys.TAB)
         time.sleep(0.5)
-        return session.state.command == (0.8, 0.0, 0.0)
+        return session.state.command and session.state.command[0] == 0.8  # the others stay as they were drawn
 
     wait_for(told_to_go)
     wait_for(lambda: abs(session.state.reading.velocities[:, 0] - 0.8).max() < 0.1)
@@ -143,6 +157,23 @@ def test_page(session, page, browser, tmp_path):
 
     wait_for(stopped)
     wait_for(lambda: abs(session.state.reading.velocities[:, 0]).max() < 0.1)
+    hold = ActionChains(browser)
+    hold.key_down("w").key_down(Keys.ARROW_LEFT).perform()
+    wait_for(lambda: session.state.command == (1.0, 0.0, 1.0))
+    place = browser.find_element(By.XPATH, "//label[contains(., 'x [m/s]')]/following::input[not(@type='hidden')][1]")
+    wait_for(lambda: place.get_attribute("value") == "1")
+    hold.key_up("w").key_up(Keys.ARROW_LEFT).perform()
+    wait_for(lambda: session.state.command == (0.0, 0.0, 0.0))
+    for name in ("ghost", "collision geoms"):
+        box = f"//label[normalize-space()='{name}']/following::input[1]"
+        browser.execute_script("arguments[0].click()", browser.find_element(By.XPATH, box))
+    handles = [page._scene.layers._ghost._handles, page._scene.layers._collision._handles]
+    wait_for(lambda: all(handles) and all(handle.visible for bodies in handles for handle in bodies.values()))
+    for label in ("Record", "Stop and download"):
+        button = browser.find_element(By.XPATH, f"//button[contains(., '{label}')]")
+        browser.execute_script("arguments[0].click()", button)
+        wait_for(lambda label=label: page._recording._button.label != label)
+    wait_for(lambda: "no renderer in tests" in browser.find_element(By.TAG_NAME, "body").text)
     complaints = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
     assert not complaints
 

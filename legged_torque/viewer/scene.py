@@ -17,6 +17,7 @@ from legged_torque.viewer.meshes import body_glb, ground_glb
 from legged_torque.viewer.reading import Reading
 
 COMMAND_COLOR, VELOCITY_COLOR, SCAN_COLOR = (10, 150, 50), (20, 90, 230), (214, 51, 108)
+PHONE = 0.6  # width by height of a view below which it is that of a phone
 SPACING = 2.0  # distance between neighbouring worlds [m]
 LIFTING = 0.2  # share of the way to where it sees the robot by which a camera moves up in a frame
 ARROW_LENGTH = 0.5  # length of the arrow of a velocity of 1 m/s [m]
@@ -134,13 +135,13 @@ class Scene:
         return positions, quats
 
     def _frame_phones(self) -> None:
-        """Let new browsers that are higher than wide see the robot above the sheet with the controls."""
+        """Let new browsers on phones see the robot above the sheet with the controls."""
         for number, client in self._server.get_clients().items():
             camera = client.camera
             if number in self._seen or not np.any(camera.look_at):
                 continue
             self._seen.add(number)
-            if camera.aspect < 1.0:
+            if camera.aspect < PHONE:
                 with client.atomic():
                     camera.position = (1.85, -1.85, 1.0)  # this moves what it looks at, too
                     camera.look_at = (0.0, 0.0, -0.4)
