@@ -62,6 +62,8 @@ class Beside:
         if self._page:
             end(self._page)
         if self._video and is_waiting:
+            if self._video.poll() is None:
+                print(f"Waiting for the video of {self._video_log.stem}.", flush=True)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._video.wait(LAST_VIDEO_TIMEOUT)
             self._check_video()
