@@ -110,7 +110,7 @@ def choose_worlds(args: argparse.Namespace) -> None:
     if not 1 <= args.grid <= MAX_GRID or math.isqrt(args.grid) ** 2 != args.grid:
         raise UserError(f"--grid must be 1, 4, 9, 16 or {MAX_GRID}, not {args.grid}")
     if args.num_envs is None:
-        args.num_envs = max(NUM_ENVS[args.viewer], args.grid)
+        args.num_envs = 1 if args.compare else max(NUM_ENVS[args.viewer], args.grid)
     elif 1 <= args.num_envs < args.grid:
         raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
 

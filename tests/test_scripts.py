@@ -210,6 +210,8 @@ def test_mistakes_when_training(root, words, message):
         ("play.py", "--steps=0", "--steps must be at least 1, not 0"),
         ("play.py", "--terrain=stairs", "unknown kind of terrain 'stairs'; did you mean 'stairs_up'?"),
         ("play.py", "--level=0.5", "--level needs --terrain: the kinds of rough ground"),
+        ("play.py", "--compare=logs", "--compare needs --viewer web"),
+        ("play.py", "--compare=logs --viewer=web", "the run 'logs' has no config.yaml"),
         ("play.py", "--grid=5", "--grid must be 1, 4, 9, 16 or 25, not 5"),
         ("play.py", "--grid=0", "--grid must be 1, 4, 9, 16 or 25, not 0"),
         ("play.py", "--grid=36", "--grid must be 1, 4, 9, 16 or 25, not 36"),
