@@ -31,7 +31,9 @@ from legged_torque.utils.cli import Parser, add_command_arg, check_at_least, che
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
-from legged_torque.utils.task_registry import experiment_dir, set_seed
+from legged_torque.utils.options import Options
+from legged_torque.utils.runs import load_config
+from legged_torque.utils.task_registry import LoadedRun, experiment_dir, set_seed
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -54,25 +56,23 @@ def main() -> None:
         run = task_registry.load_run(options) if args.agent == "policy" else None
         env_cfg, train_cfg = (run.env_cfg, run.train_cfg) if run else task_registry.get_cfgs(args.task, options)
         from legged_torque.envs.base.commands import fix_command
-        from legged_torque.viewer.session import Session
     env_cfg.terrain.curriculum = False  # robots stay on their tiles
     if kinds:
         select_tiles(env_cfg.terrain, kinds, levels, 1)
     set_seed(args.seed)
     if run and args.viewer != "none":
-        watch = import_viewer(args)  # whatever is missing is reported before anything slow is done
-        session = Session(task_registry.get_task_class(args.task), run, resolve_device(args.device))
-        if args.command:
-            session.set_command(tuple(args.command))
-        watch(session, resource_path(env_cfg.asset.file))
+        show(args, run)
         return
     if args.command:
         fix_command(env_cfg, args.command)
     if run:
+        from legged_torque.viewer.video import show_in_tensorboard
+
         env, runner = task_registry.make_loaded(run, options)
         title = f"{run.checkpoint}, after {int(runner.logger.tot_timesteps):,} steps of training"
         video = run.checkpoint.parent / "videos" / f"{run.checkpoint.stem}.mp4"
-        roll_out(args, env, runner.get_inference_policy(env.device), title, video)
+        if roll_out(args, env, runner.get_inference_policy(env.device), title, video):
+            show_in_tensorboard(video, run.iterations)
     else:
         env, _ = task_registry.make_env(args.task, options, env_cfg)
         video = experiment_dir(train_cfg, options.log_root) / "videos" / f"{args.agent}.mp4"
@@ -96,6 +96,8 @@ def parse_args() -> argparse.Namespace:
     hint = """none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's
         window; default: %(default)s"""
     parser.add_argument("--viewer", choices=NUM_ENVS, default="none", help=hint)
+    hint = "folder of a run whose policy walks beside the followed robot, under the same command (--viewer web)"
+    parser.add_argument("--compare", metavar="RUN", help=hint)
     hint = "address of the page; default: %(default)s, this machine alone; others need the printed token"
     parser.add_argument("--host", default="127.0.0.1", help=hint)
     parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
@@ -112,6 +114,35 @@ def parse_args() -> argparse.Namespace:
     return args
 
 
+def show(args: argparse.Namespace, run: LoadedRun) -> None:
+    """Show a policy live, and one that it is compared with."""
+    compared = load_compared(args, run) if args.compare else None
+    watch, device = import_viewer(args), resolve_device(args.device)  # what is missing is told before anything slow
+    with importing():
+        from legged_torque.viewer.session import Session
+    session = Session(task_registry.get_task_class(args.task), run, device)
+    session.follow_newest(args.checkpoint is None)
+    if compared:
+        session.companion = Session(task_registry.get_task_class(compared.config["task"]), compared, device)
+    if args.command:
+        session.set_command(tuple(args.command))
+    watch(session, resource_path(run.env_cfg.asset.file))
+
+
+def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
+    """Return the run of ``--compare``; a UserError if its robot cannot walk beside that of another run."""
+    task = load_config(Path(args.compare))["task"]
+    options = Options(task, args.device, num_envs=1, load_run=args.compare, perturbation=args.perturbation)
+    compared = task_registry.load_run(options)
+    if compared.env_cfg.asset.file != run.env_cfg.asset.file:
+        raise UserError(
+            f"--compare needs runs of one robot, not {run.env_cfg.asset.file} and {compared.env_cfg.asset.file}"
+        )
+    if {run.env_cfg.terrain.mesh_type, compared.env_cfg.terrain.mesh_type} != {"plane"}:
+        raise UserError("--compare needs level ground; see --set terrain.mesh_type=plane")
+    return compared
+
+
 def choose_worlds(args: argparse.Namespace) -> None:
     """Choose how many worlds there are and how many of them are drawn; a UserError if that many cannot be."""
     if args.grid is not None and args.viewer != "none":
@@ -120,7 +151,7 @@ def choose_worlds(args: argparse.Namespace) -> None:
     if not 1 <= args.grid <= MAX_GRID or math.isqrt(args.grid) ** 2 != args.grid:
         raise UserError(f"--grid must be 1, 4, 9, 16 or {MAX_GRID}, not {args.grid}")
     if args.num_envs is None:
-        args.num_envs = max(NUM_ENVS[args.viewer], args.grid)
+        args.num_envs = 1 if args.compare else max(NUM_ENVS[args.viewer], args.grid)
     elif 1 <= args.num_envs < args.grid:
         raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
 
@@ -131,6 +162,8 @@ def check_agent(args: argparse.Namespace) -> None:
         raise UserError(f"--agent {args.agent} has no run: --load_run, --checkpoint and --viewer are for the policy's")
     if args.headless and args.viewer == "native":
         raise UserError("--headless opens no window, but --viewer native is one; --viewer web is a page")
+    if args.compare and args.viewer != "web":
+        raise UserError("--compare needs --viewer web")
     if args.no_video and (args.video or args.grid > 1 or args.viewer != "none"):
         raise UserError("--no_video prints metrics alone: leave out --video, --grid and --viewer")
 
@@ -162,13 +195,13 @@ def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
         from legged_torque.viewer.web import watch
     except ImportError as error:
         raise UserError(f"--viewer web needs the extra: pip install 'legged_torque[viewer]' ({error})") from None
-    return functools.partial(watch, title=args.task, host=args.host, port=args.port)
+    return functools.partial(watch, title=args.task, host=args.host, port=args.port, no_renderer=NO_RENDERER)
 
 
 def roll_out(
     args: argparse.Namespace, env: LeggedRobot, policy: Callable[[TensorDict], Tensor], title: str, video: Path
-) -> None:
-    """Roll actions out, print the metrics, save a video, by default to the file ``video``."""
+) -> bool:
+    """Roll actions out, print the metrics, save a video, by default to the file ``video``; return if that is there."""
     from legged_torque.envs.base.metrics import measure
     from legged_torque.viewer.video import TaskRecorder
 
@@ -177,8 +210,7 @@ def roll_out(
     print(f"{title}:")
     for name, value in metrics.means().items():
         print(f"  {name:<18} {value:8.4f} {UNITS[name]}")
-    if recorder:
-        recorder.save(args.video or video, NO_RENDERER)
+    return recorder is not None and recorder.save(args.video or video, NO_RENDERER) and not args.video
 
 
 if __name__ == "__main__":

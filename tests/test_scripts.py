@@ -20,7 +20,7 @@ import yaml
 from settings import COMBINATIONS, OTHER_ROBOTS, ROUGH, TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from legged_torque.utils.runs import checkpoint_number, find_checkpoint
+from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--set=runner.num_steps_per_env=4", "--max_iterations=2"]
@@ -210,6 +210,8 @@ def test_mistakes_when_training(root, words, message):
         ("play.py", "--steps=0", "--steps must be at least 1, not 0"),
         ("play.py", "--terrain=stairs", "unknown kind of terrain 'stairs'; did you mean 'stairs_up'?"),
         ("play.py", "--level=0.5", "--level needs --terrain: the kinds of rough ground"),
+        ("play.py", "--compare=logs", "--compare needs --viewer web"),
+        ("play.py", "--compare=logs --viewer=web", "the run 'logs' has no config.yaml"),
         ("play.py", "--grid=5", "--grid must be 1, 4, 9, 16 or 25, not 5"),
         ("play.py", "--grid=0", "--grid must be 1, 4, 9, 16 or 25, not 0"),
         ("play.py", "--grid=36", "--grid must be 1, 4, 9, 16 or 25, not 36"),
@@ -304,7 +306,7 @@ def test_run_folder(root):
     (run,) = (root / "logs" / "a1_position").glob("*_good")
     assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_good", run.name)
     assert {path.name.split(".tfevents")[0] for path in run.iterdir() if path.is_file()} == {
-        "model_0.pt",
+        "model_0.pt",  # so that the training can be watched at once
         "model_1.pt",
         "model_2.pt",
         "worlds_2.pt",
@@ -408,8 +410,9 @@ def test_train_stop_resume_play(tmp_path):
     status, output, error = finish(process)
     assert status == 130 and "Traceback" not in error and "Stopping" in output + error
     (first,) = logs.iterdir()
-    checkpoint = find_checkpoint(first, None)
-    count = checkpoint_number(checkpoint)
+    beginning, count = checkpoint_numbers(first)
+    assert beginning == 0
+    checkpoint = checkpoint_file(first, count)
     state = torch.load(checkpoint, weights_only=True)
     assert 2 <= count == state["iter"] and state["infos"]["total_timesteps"] == count * 8
     events = EventAccumulator(str(first)).Reload()
@@ -454,6 +457,6 @@ def test_resume_keeps_the_number_of_iterations(root, tmp_path):
     status, _, error = run_here("train.py", *words, root=tmp_path)
     assert (status, error) == (0, "")
     (new,) = (tmp_path / "logs" / "a1_position").iterdir()
-    assert {path.name for path in new.glob("model_*")} == {"model_1.pt", "model_2.pt"}
+    assert checkpoint_numbers(new) == [1, 2]
     config = yaml.safe_load((new / "config.yaml").read_text())
     assert (config["max_iterations"], config["preset"]) == (2, "parallel")

@@ -7,6 +7,7 @@ import io
 import re
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -74,6 +75,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self.logger.device = "cpu"  # where numbers are averaged that are on the host anyway
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         self.log_dir = log_dir
+        self.on_checkpoint: Callable[[Path], None] | None = None  # called with each checkpoint of a training
         self.stopped_by = 0  # number of the signal that has ended the last training; 0: none
         self._seconds_before = 0.0  # training time before this process
         self._saved_iteration = -1  # that of the last checkpoint
@@ -108,7 +110,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         total_it = start_it + num_learning_iterations
         guard = TrainingGuard(self.env, self.alg)
         warmup = self.cfg["pretraining"]["critic_warmup_iterations"]
-        self._save_checkpoint()  # so that there is something to see at once
+        self.save_checkpoint()  # so that there is something to see at once
         self._display = self._new_display(total_it)
         with self._display, StopRequest(self._display.tell) as stop:
             for _ in range(num_learning_iterations):
@@ -130,8 +132,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
                 if guard.problem:
                     break
                 if self.current_learning_iteration % self.cfg["save_interval"] == 0:
-                    self._save_checkpoint()
-            self._save_checkpoint()  # writes the last log too
+                    self.save_checkpoint()
+            self.save_checkpoint()  # writes the last log too
         self.stopped_by = stop.number
         self.logger.stop_logging_writer()
         if self._nobody_reads:
@@ -326,7 +328,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         except BrokenPipeError as error:  # | head: as good as Ctrl-C
             self._nobody_reads = error
 
-    def _save_checkpoint(self) -> None:
+    def save_checkpoint(self) -> None:
         """Save into the run's folder with all that was logged, and warn if the simulator had too little room."""
         self._write_log()
         if self.log_dir is not None and self._saved_iteration != self.current_learning_iteration:
@@ -336,6 +338,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             self._saved_iteration = self.current_learning_iteration
             if digest:
                 remove_other_worlds(file)
+            if self.on_checkpoint:
+                self.on_checkpoint(file)
         warning = self.env.sim.check_buffers()
         if warning:
             warn(warning)
