@@ -9,6 +9,7 @@ import torch
 from test_terrain import make_ground, rays
 
 from legged_torque.terrain.colors import NEUTRAL, color_of
+from legged_torque.viewer.framing import size_of
 from legged_torque.viewer.ground import CLEARANCE, Ground, drawn_model, patches
 from legged_torque.viewer.video import DISTANCE, Camera
 
@@ -90,15 +91,28 @@ def test_camera(terrain, ground, azimuth):
         middle = terrain.layout.origins(terrain.map.heights)[row, col]
         position = middle + 1.7 * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         position[2] = ground.height(position) + 0.3
-        camera = Camera(ground).look_at(position)
+        camera = Camera(ground, 1.0).look_at(position)
         lookat, (azimuth_of, elevation) = np.array(camera.lookat), np.radians([camera.azimuth, camera.elevation])
         ahead = np.array([np.cos(azimuth_of), np.sin(azimuth_of), np.tan(elevation)]) * np.cos(elevation)
         ways = lookat - np.linspace(0.3, 1.0, 50)[:, None] * camera.distance * ahead
         assert lookat[2] == pytest.approx(ground.height(position) + 0.25, abs=1e-5)
         assert (ways[:, 2] > ground.height(ways)).all() and ways[-1, 2] > ground.height(ways[-1]) + 0.9 * CLEARANCE
-    plane = Camera(None).look_at(np.array([1.0, 2.0, 0.5]))
+    plane = Camera(None, 1.0).look_at(np.array([1.0, 2.0, 0.5]))
     assert (plane.distance, plane.azimuth, plane.elevation) == pytest.approx((DISTANCE, 130.0, -18.0))
     np.testing.assert_allclose(plane.lookat, [1.0, 2.0, 0.25])
+
+
+@pytest.mark.parametrize(("robot", "top", "size"), [("a1", 0.4, 1.0), ("go2", 0.45, None), ("g1", 1.32, None)])
+def test_camera_sees_robots_of_every_size(robot, top, size):
+    """Feet and head of a robot that is so tall [m] are in the picture, and fill a fifth of its height or more."""
+    model = drawn_model(XML.parents[1] / robot / f"{robot}.xml", None)
+    camera = Camera(None, size or size_of(model)).look_at(np.zeros(3))
+    assert size is None or size_of(model) == size  # pictures of the A1 are as they always were
+    elevation = np.radians(camera.elevation)
+    away, up = -camera.distance * np.cos(elevation), camera.lookat[2] - camera.distance * np.sin(elevation)
+    feet, head = (np.arctan2(z - up, -away) - elevation for z in (0.0, top))
+    half = 0.5 * np.radians(model.vis.global_.fovy)
+    assert -0.9 * half < feet < 0.0 < head < 0.9 * half and head - feet > 0.4 * half
 
 
 def test_camera_follows_smoothly():
@@ -118,7 +132,7 @@ def test_camera_follows_smoothly():
             return np.full(points.shape[:-1], levels[self.frame])
 
     steps = Steps()
-    camera, seen = Camera(steps), []
+    camera, seen = Camera(steps, 1.0), []
     for steps.frame in range(len(levels)):
         seen.append(camera.look_at(np.zeros(3)).lookat[2] - 0.25)
     assert seen[0] == 0.0 < seen[1] < seen[2] < 0.1 and seen[3] == pytest.approx(2.0)

@@ -18,6 +18,7 @@ import mujoco
 
 from legged_torque.deploy.simulation import Simulation
 from legged_torque.utils.errors import UserError
+from legged_torque.viewer.framing import size_of
 from legged_torque.viewer.ground import Ground, drawn_model, ground_of
 from legged_torque.viewer.pacing import Pacer, stopping_on_ctrl_c
 from legged_torque.viewer.state import SessionState
@@ -103,7 +104,7 @@ def watch(session: Session, robot: Path) -> None:
     with window:
         window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         window.cam.trackbodyid = 1
-        window.cam.distance, window.cam.azimuth, window.cam.elevation = 1.8, 130.0, -18.0
+        window.cam.distance, window.cam.azimuth, window.cam.elevation = 1.8 * size_of(model), 130.0, -18.0
         stepping = threading.Thread(target=session.run, name="session")  # drawing must not hold up the steps
         stepping.start()
         with stopping_on_ctrl_c(session.stop):

@@ -9,6 +9,7 @@ import numpy as np
 import viser
 from viser import transforms
 
+from legged_torque.viewer.framing import size_of
 from legged_torque.viewer.ground import Ground, Smooth
 from legged_torque.viewer.lane import Lane
 from legged_torque.viewer.layers import Layers
@@ -50,6 +51,7 @@ class Scene:
         self._server, self.ground = server, ground
         self._model = robot
         self._data = mujoco.MjData(self._model)
+        self._size = size_of(robot)
         self.is_following, self.shows_others = True, True  # the camera follows; the other worlds are drawn
         self.shows_scan = True  # where the height scan of the followed robot meets the ground
         self._scan: viser.PointCloudHandle | None = None
@@ -111,10 +113,10 @@ class Scene:
                 self._scan.points = (reading.scan + self._offset + [0.0, 0.0, 0.01]).astype(np.float32)
             self.layers.update(reading, positions[[world, -1]], quats[[world, -1]], is_current)
             for label, robot in zip(self._labels, (world, num_envs), strict=False):
-                label.position = positions[robot, 1] + [0.0, 0.0, 0.35]
+                label.position = positions[robot, 1] + [0.0, 0.0, 0.35 * self._size]
             velocities = (reading.commands[world], reading.velocities[world])
             for handle, vector, height in zip(self._arrows, velocities, (0.22, 0.17), strict=True):
-                start = trunk + np.array([0.0, 0.0, height])
+                start = trunk + np.array([0.0, 0.0, height * self._size])
                 end = start + ARROW_LENGTH * rotation @ [vector[0], vector[1], 0.0]
                 handle.points = np.stack([start, end])[None].astype(np.float32)
                 handle.visible = bool(np.hypot(vector[0], vector[1]) > 0.05)
@@ -142,8 +144,8 @@ class Scene:
             self._seen.add(number)
             if camera.aspect < PHONE:
                 with client.atomic():
-                    camera.position = (1.85, -1.85, 1.0)  # this moves what it looks at, too
-                    camera.look_at = (0.0, 0.0, -0.4)
+                    camera.position = self._size * np.array([1.85, -1.85, 1.0])  # this moves what it looks at, too
+                    camera.look_at = (0.0, 0.0, -0.4 * self._size)
 
     def _lift_cameras(self) -> None:
         """Let the cameras of all browsers look over the ground between them and what they look at."""
@@ -166,7 +168,8 @@ class Scene:
         scene.configure_default_lights(True, cast_shadow=True)
         scene.configure_environment_map("studio", environment_intensity=0.5)
         camera = self._server.initial_camera
-        camera.position, camera.look_at, camera.fov = (1.2, -1.2, 0.62), (0.0, 0.0, 0.24), 0.75
+        camera.position, camera.fov = self._size * np.array([1.2, -1.2, 0.62]), 0.75
+        camera.look_at = (0.0, 0.0, 0.24 * self._size)
 
     def _add_plane(self) -> viser.GridHandle:
         """Add a plane, and return it."""

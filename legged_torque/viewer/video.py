@@ -22,6 +22,7 @@ from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_whole
 from legged_torque.utils.rendering import INSTALL_HINT
+from legged_torque.viewer.framing import size_of
 from legged_torque.viewer.ground import Ground, Smooth, drawn_model, ground_of
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ SIZE = (960, 540)  # width and height of a video of one robot [pixels]
 GRID_SIZE = (1280, 720)  # about the width and height of a video of several robots [pixels]
 COMMAND_COLOR = (0.1, 0.8, 0.2, 0.9)
 VELOCITY_COLOR = (0.1, 0.4, 1.0, 0.9)
-DISTANCE = 1.6  # of the camera from the robot on level ground [m]
+DISTANCE, TARGET = 1.6, 0.25  # of the camera from what it looks at on level ground, which is so high [m]; of an A1
 TRUNK = 1  # the trunk's body in the MJCF of a task
 _TEXT_COLORS = {"plain": (255, 255, 255), "command": (110, 240, 130), "velocity": (130, 190, 255)}
 _BOX_COLOR = (20, 24, 30, 190)
@@ -148,7 +149,8 @@ def write_video(
         renderer = mujoco.Renderer(model, height, width)
     except Exception as error:  # whatever the graphics driver raises
         raise UserError(f"the renderer does not start: {error} ({INSTALL_HINT})") from None
-    cameras = [Camera(ground) for _ in steps[0]]
+    size = size_of(model)
+    cameras = [Camera(ground, size) for _ in steps[0]]
     with tempfile.TemporaryDirectory() as folder:
         part = Path(folder) / file.name
         writer = imageio.get_writer(part, fps=round(0.5 / control_step), macro_block_size=1)
@@ -157,7 +159,7 @@ def write_video(
             for number, moments in shown:
                 tiles = []
                 for moment, camera in zip(moments, cameras, strict=True):
-                    image = _draw(renderer, data, trunk, moment, camera)
+                    image = _draw(renderer, data, trunk, moment, camera, size)
                     rows = _table(number * control_step, moment) if side == 1 else _line(moment)
                     tiles.append(add_overlay(image, rows))
                 rows_of_tiles = [np.hstack(tiles[i : i + side]) for i in range(0, len(tiles), side)]
@@ -190,16 +192,17 @@ def show_in_tensorboard(video: Path, iterations: int) -> None:
 class Camera:
     """Looks at a robot from a fixed direction, from above the ground."""
 
-    def __init__(self, ground: Ground | None) -> None:
-        """Prepare for a video; None is a plane."""
-        self._ground, self._target, self._height = ground, Smooth(), Smooth()
+    def __init__(self, ground: Ground | None, size: float) -> None:
+        """Prepare for a video of a robot of a :func:`size_of`; None is a plane."""
+        self._ground, self._size, self._target, self._height = ground, size, Smooth(), Smooth()
 
     def look_at(self, position: np.ndarray) -> mujoco.MjvCamera:
         """Return the camera of a frame, by the position of the robot's trunk [m]."""
         camera, elevation = mujoco.MjvCamera(), np.radians(18.0)
-        camera.lookat[:] = (position[0], position[1], 0.25)
+        camera.lookat[:] = (position[0], position[1], self._size * TARGET)
         camera.azimuth = 130.0
-        ahead, height = DISTANCE * np.cos(elevation), DISTANCE * np.sin(elevation)
+        distance = self._size * DISTANCE
+        ahead, height = distance * np.cos(elevation), distance * np.sin(elevation)
         if self._ground:
             camera.lookat[2] += self._target.follow(float(self._ground.height(position)))
             azimuth = np.radians(camera.azimuth)
@@ -210,14 +213,16 @@ class Camera:
         return camera
 
 
-def _draw(renderer: mujoco.Renderer, data: mujoco.MjData, trunk: int, moment: Moment, camera: Camera) -> np.ndarray:
-    """Return the image of a robot and the arrows of its velocities. Shape: (height, width, 3)."""
+def _draw(
+    renderer: mujoco.Renderer, data: mujoco.MjData, trunk: int, moment: Moment, camera: Camera, size: float
+) -> np.ndarray:
+    """Return the image of a robot of a :func:`size_of` and the arrows of its velocities. Shape: (height, width, 3)."""
     data.qpos[:] = moment.qpos
     mujoco.mj_forward(renderer.model, data)
     position, rotation = data.xpos[trunk], data.xmat[trunk].reshape(3, 3)
     renderer.update_scene(data, camera.look_at(position))
     for vector, color, height in ((moment.command, COMMAND_COLOR, 0.24), (moment.velocity, VELOCITY_COLOR, 0.2)):
-        start = position + np.array([0.0, 0.0, height])
+        start = position + np.array([0.0, 0.0, size * height])
         _add_arrow(renderer.scene, start, rotation @ [vector[0], vector[1], 0.0], color)
     return renderer.render()
 
