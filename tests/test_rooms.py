@@ -34,10 +34,10 @@ def test_gains_by_joint():
 
 
 def test_order_of_the_pose():
-    """The nominal pose is written in the order of the file, which is that of all vectors of joints."""
+    """A pose's order is that of all vectors of joints; one that the file's limbs cannot be put in is refused."""
     assert nominal_pose({"a": 1.0, "b": 2.0}, ["a", "b"]) == [1.0, 2.0]
     told = error_of(nominal_pose, {"b": 2.0, "a": 1.0}, ["a", "b"])
-    assert "must be in the order of the MJCF's joints" in told and told.endswith(": a, b")
+    assert "cannot be put in the order of init_state.default_joint_angles" in told and told.endswith(": a, b")
 
 
 def test_robot_without_mirrored_legs(make_task):

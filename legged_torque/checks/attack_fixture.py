@@ -44,6 +44,7 @@ WORDS = {
     "learning_curve.py": (*_LOADED, "--steps=2"),
     "physics_accuracy.py": (*_LOADED, "--steps=1"),
     "export.py": _LOADED,
+    "import_robot.py": (ROBOT, "--name=robot", "--out=out"),
     "sim2sim.py": ("exported", "--steps=2", "--robots=1"),
     "experiment.py": (PLAN, "--device=cpu", "--dry-run"),
     "report.py": (RESULTS, "--out=out"),

@@ -54,7 +54,7 @@ def find_shapes(source: Source) -> dict[int, list[Shape]]:
                 replaced[key] = replaced.get(key, 0) + 1
     if replaced:
         changes = ", ".join(f"{count} x {key}" for key, count in sorted(replaced.items()))
-        source.notes.append(f"the fused step knows spheres, capsules and boxes; fitted: {changes}")
+        source.notes.append(f"spheres, capsules and boxes in the place of other geoms: {changes}")
     bare = [body for body, found in shapes.items() if not found]
     for body in bare:
         shapes[body] = [fit_inertia(model, body)]

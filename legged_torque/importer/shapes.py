@@ -1,4 +1,4 @@
-"""Plain geoms in place of any others: the fused step knows spheres, capsules and boxes."""
+"""Plain geoms in place of any others: spheres, capsules and boxes, which are cheap and right on any ground."""
 
 from __future__ import annotations
 

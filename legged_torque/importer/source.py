@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -49,7 +50,8 @@ def read_source(file: Path) -> Source:
     """Read a MJCF or URDF; a UserError says why it cannot become a robot of this library."""
     if not file.is_file():
         raise UserError(f"cannot import '{file}': there is no such file")
-    with kept_warnings():
+    with kept_warnings(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what matters is told when the result is loaded
         try:
             root = ET.parse(file).getroot()
             _refuse_macros(root, file)

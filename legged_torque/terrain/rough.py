@@ -15,8 +15,9 @@ from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.errors import UserError
 
-COPIES, BYTES = 3, 4
-"""Of a map on the device: for rewards and scans, for contacts, and what is greatest near each cell; in float32."""
+COPIES, BYTES = 3.25, 4
+"""Of a map on the device: for rewards and scans, for contacts, and what is greatest near each cell, and near each block
+of four; in float32."""
 
 
 class RoughGround(Terrain):
@@ -81,7 +82,7 @@ class RoughGround(Terrain):
         down = ~up & (distance < 0.5 * episode_length_s * commands[:, :2].norm(dim=1))
         levels = (self.levels + up.long() - down.long()).clamp(min=0)
         num_rows = self.layout.num_rows
-        levels = torch.where(levels < num_rows, levels, torch.randint_like(levels, num_rows))
+        levels = torch.where(levels < num_rows, levels, torch.randint_like(self.levels, num_rows))
         self.levels.copy_(torch.where(mask, levels, self.levels))
 
     def curriculum_values(self) -> dict[str, Tensor]:

@@ -18,11 +18,16 @@ def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
 
 def quat_rotate_yaw(quat: Tensor, vec: Tensor) -> Tensor:
     """Turn vectors (..., 3) about the world's z axis as far as unit quaternions (..., 4) do; axes are broadcast."""
+    x, y = rotate_yaw(quat, vec[..., 0], vec[..., 1])
+    return torch.stack(torch.broadcast_tensors(x, y, vec[..., 2]), dim=-1)
+
+
+def rotate_yaw(quat: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Do the same with x and y that are not in one tensor (...,)."""
     w, z = quat[..., 0], quat[..., 3]
     norm = (w.square() + z.square()).clamp(min=1e-12)  # 0 upside down, where there is no heading
     cos, sin = (w.square() - z.square()) / norm, 2.0 * w * z / norm
-    x, y, height = vec.unbind(dim=-1)
-    return torch.stack(torch.broadcast_tensors(cos * x - sin * y, sin * x + cos * y, height), dim=-1)
+    return cos * x - sin * y, sin * x + cos * y
 
 
 def yaw(quat: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from legged_torque.utils.math import quat_rotate_yaw
+from legged_torque.utils.math import quat_rotate_yaw, rotate_yaw
 from legged_torque.utils.mirroring import Mirroring
 
 if TYPE_CHECKING:
@@ -42,7 +42,12 @@ class HeightScan:
 
     def __call__(self) -> Tensor:
         """Return the scan of this moment [m]. Shape: (num_envs, points)."""
-        return (self._task.terrain.height_above(self.points()) - OFFSET).clamp(-CLIP, CLIP)
+        task = self._task
+        assert task.terrain.map is not None  # only rough ground is scanned
+        base_x, base_y, base_z = task.base_pos.unsqueeze(2).unbind(dim=1)
+        x, y = rotate_yaw(task.base_quat.unsqueeze(1), self.offsets[:, 0], self.offsets[:, 1])
+        height = task.terrain.map.height_at(base_x + x, base_y + y)  # points() would write them: 9 MB of 4096 worlds
+        return (base_z - height - OFFSET).clamp(-CLIP, CLIP)
 
 
 class LateScan:

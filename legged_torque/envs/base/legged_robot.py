@@ -84,7 +84,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.observations = Observations(self.observation_terms(), *seen, self.num_envs)
         self.obs_buf = self.observations.buffers
         self.health = Health(watched(self), self.sim.diverged)
-        self._parts = (self._judge, self._add_up, self._finish_step)
+        self._parts = (self._judge, self._add_up, self._end_episodes, self._finish_step)
         self.reset()
 
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
@@ -145,10 +145,11 @@ class LeggedRobot(RewardTerms, BaseTask):
 
     def post_physics_step(self) -> None:
         """Do what follows the physics: termination, rewards, resets, commands, observations."""
-        judge, add_up, finish_step = self._parts
+        judge, add_up, end_episodes, finish_step = self._parts
         judge()
         self.health.check()
         add_up()
+        end_episodes()
         self._reset_worlds()
         finish_step()
 
@@ -162,7 +163,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.health.begin()
 
     def _add_up(self) -> None:
-        """End broken worlds without a reward, now that they are known, add to sums and set levels; torch only."""
+        """End broken worlds without a reward, now that they are known, and add to sums; torch only."""
         diverged = self.sim.diverged
         self.health.end()
         self.num_diverged.add_(diverged.sum())
@@ -173,7 +174,13 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.episode_return.add_(self.rew_buf)
         self.log.add_step(self)
         self.update_feet_air_time()
-        ended = self.reset_buf & ~diverged  # where broken worlds have got to says nothing
+
+    def _end_episodes(self) -> None:
+        """Set levels; torch only.
+
+        This is a part by itself: with the sum over worlds of :meth:`_add_up`, it would run on one processor of a GPU.
+        """
+        ended = self.reset_buf & ~self.sim.diverged  # where broken worlds have got to says nothing
         self.terrain.end_episodes(ended, self.base_pos, self.commands, self.cfg.env.episode_length_s)
 
     def _update_state(self) -> None:
