@@ -76,10 +76,11 @@ def best_row(cells: Cells, metric: Metric, column: str) -> list[str]:
     return [*row, f"`{task}`", ours, f"{sign} {share:+.1%}"]
 
 
-def number_text(summary: Summary, digits: int) -> str:
-    """Return mean, standard error and number of seeds, with so many decimals."""
+def number_text(summary: Summary, digits: int, planned: int = 0) -> str:
+    """Return mean and standard error with so many decimals, and the number of seeds if it is not the planned one."""
     error = "" if summary.standard_error is None else f" ± {summary.standard_error:.{digits}f}"
-    return f"{summary.mean:.{digits}f}{error} ({len(summary.values)})"
+    count = "" if len(summary.values) == planned else f" ({len(summary.values)})"
+    return f"{summary.mean:.{digits}f}{error}{count}"
 
 
 def marked(text: str, is_significant: bool, *summaries: Summary) -> str:
