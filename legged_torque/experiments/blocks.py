@@ -28,7 +28,7 @@ body { background: var(--back); color: var(--text); font: 16px/1.5 system-ui, sa
 nav { display: flex; flex-wrap: wrap; gap: .3rem 1.2rem; } p, ul { max-width: 60rem; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .85rem; margin: .6rem 0; }
-th, td { border: 1px solid var(--line); padding: .25rem .5rem; text-align: left; white-space: nowrap; }
+th, td { border: 1px solid var(--line); padding: .25rem .35rem; text-align: left; white-space: nowrap; }
 th { background: var(--soft); }
 tr:not(.more):has(+ .more) td { border-top: 2px solid var(--text); }
 tr:has(+ .more) td:first-child { border-bottom: none; } .more td:first-child { border-top: none; }

@@ -24,7 +24,7 @@ CURVES = {
     "Tracking": ("Figure 3", CurveFigure("track_percentage")),
     "Tracking over seconds": ("Figure 3 over seconds", CurveFigure("track_percentage", over="seconds")),
     "Height": ("Figure 5a", CurveFigure("height")),
-    "Critic": ("Figure 5b", CurveFigure("critic_gradient_norm", scale="log", window=0.05)),
+    "Critic": ("Figure 5b", CurveFigure("critic_gradient_norm", scale="log", window=0.03)),
 }
 """Title in the report on an experiment of your own, that in one like the paper's, and what it shows."""
 BARS: dict[str, tuple[str, ...]] = {

@@ -86,6 +86,7 @@ def draw_curves(experiment: Experiment, what: CurveFigure, title: str) -> Figure
     figure, axes = load_pyplot().subplots(1, len(panels), **grid)
     end = max(curve.places[-1] for curves in panels.values() for seeds in curves.values() for curve in seeds)
     for axis, (environment, curves) in zip(axes[0], panels.items(), strict=True):
+        axis.set_yscale(what.scale)  # before lines are drawn, whose means depend on it
         notes = []
         for task, seeds in curves.items():
             shown = [curve.smoothed(what.window * end) for curve in seeds] if what.window else seeds
@@ -95,7 +96,8 @@ def draw_curves(experiment: Experiment, what: CurveFigure, title: str) -> Figure
             note = progress_note(seeds, experiment.num_expected(task, environment), AXES[what.over][2])
             notes += [f"{name_of(task)}{note}"] if note else []
         axis.axvline(end * (1.0 + STRIP / 2), color="#999999", linewidth=0.8)
-        axis.set(xlim=(0, end * (1.0 + STRIP * (len(plan.tasks) + 0.7))), yscale=what.scale)
+        axis.set_xticks([tick for tick in axis.get_xticks() if 0 <= tick <= end])
+        axis.set_xlim(0, end * (1.0 + STRIP * (len(plan.tasks) + 0.7)))
         axis.set_xlabel("\n".join([AXES[what.over][1], *notes]))
         axis.set_title(ENVIRONMENTS.get(environment, environment))
         axis.grid(alpha=0.3)
@@ -127,7 +129,9 @@ def caption(panels: dict[str, dict[str, list[Curve]]], what: CurveFigure) -> str
     """Return what the lines, bands and marks of a figure mean."""
     seeds = [curve for curves in panels.values() for some in curves.values() for curve in some]
     smooth = f" of running medians over {what.window:.0%} of the training" if what.window else ""
-    text = f"mean over seeds{smooth}, band: one standard error to each side"
+    text = (
+        f"{'geometric ' if what.scale == 'log' else ''}mean over seeds{smooth}, band: one standard error to each side"
+    )
     text += f"; points at the right: single seeds, mean of their last {LAST_SHARE:.0%}"
     return text if all(curve.is_finished for curve in seeds) else f"{text}; cross: a training that is not finished"
 
@@ -151,16 +155,22 @@ def progress_note(seeds: list[Curve], num_expected: int, unit: str) -> str:
 
 
 def draw_curve(axis: Axes, seeds: list[Curve], label: str, styles: Style) -> None:
-    """Draw the mean over the seeds with its standard error, and a cross where an unfinished training ends."""
+    """Draw the mean over the seeds with its standard error, and a cross where an unfinished training ends.
+
+    On a logarithmic axis it is the geometric mean.
+    """
     color, line, _ = styles
+    is_log = axis.get_yscale() == "log"
+    on_axis = np.exp if is_log else np.asarray
     places = np.unique(np.concatenate([curve.places for curve in seeds]))
     values = np.array([np.interp(places, curve.places, curve.values, left=np.nan, right=np.nan) for curve in seeds])
+    values = np.log(np.where(values > 0.0, values, np.nan)) if is_log else values
     count = np.isfinite(values).sum(axis=0)
     mean = np.nansum(values, axis=0) / count
-    axis.plot(places, mean, color=color, linestyle=line, linewidth=1.6, label=label)
+    axis.plot(places, on_axis(mean), color=color, linestyle=line, linewidth=1.6, label=label)
     if len(seeds) > 1:
         error = np.sqrt(np.nansum((values - mean) ** 2, axis=0) / np.maximum(count - 1, 1) / count)
         error[count < 2] = np.nan
-        axis.fill_between(places, mean - error, mean + error, color=color, alpha=0.2, linewidth=0)
+        axis.fill_between(places, on_axis(mean - error), on_axis(mean + error), color=color, alpha=0.2, linewidth=0)
     ends = np.array([curve.places[-1] for curve in seeds if not curve.is_finished])
-    axis.plot(ends, np.interp(ends, places, mean), "x", color=color, markersize=7, markeredgewidth=1.8)
+    axis.plot(ends, on_axis(np.interp(ends, places, mean)), "x", color=color, markersize=7, markeredgewidth=1.8)

@@ -50,6 +50,11 @@ def name_of(task: str) -> str:
     return MODELS.get(task, task)
 
 
+def method(task: str) -> str:
+    """Return how a report calls a task."""
+    return MODELS.get(task, f"`{task}`")
+
+
 def seeds_text(count: int) -> str:
     """Return a number of seeds in words."""
     return f"{count} seed{'' if count == 1 else 's'}"

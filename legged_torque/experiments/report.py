@@ -13,7 +13,7 @@ from legged_torque.experiments.against_paper import MEANINGS, best_torque, count
 from legged_torque.experiments.blocks import VIDEO_TYPES, Block, Bullets, Code, Grid, Heading, Paragraph, Picture
 from legged_torque.experiments.curves import MILLION
 from legged_torque.experiments.figures import file_name, planned_figures, rough_figures
-from legged_torque.experiments.figures_style import name_of, seeds_text
+from legged_torque.experiments.figures_style import method, name_of, seeds_text
 from legged_torque.experiments.grounds import MEASURES, kinds_of, over_levels
 from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE, Matrix
 from legged_torque.experiments.paper_values import PAPER_METRICS
@@ -117,12 +117,13 @@ def table_one(experiment: Experiment, table: Table, from_step: float) -> list[Bl
     texts = (
         count(table),
         f"Mean ± standard error over {seeds_text(len(experiment.plan.seeds))} (how many, if not all), "
-        f"{experiment.ranges()} ranges, and by how much it is better than the paper's. {what_counts(from_step)} `doubled` is "
-        "trained in `high_frequency` and evaluated in `doubled` as well while it trains, or else has the number of the last checkpoint. The "
+        f"{experiment.ranges()} ranges. {what_counts(from_step)} `doubled` is trained in `high_frequency` and "
+        "evaluated in `doubled` as well while it trains, or else has the number of the last checkpoint. The "
         "paper's numbers are means of four seeds and of all evaluations after step 90 million; it prints no errors, "
         "and no numbers of default torque control.",
         "**Bold**: significantly better than every other task of the column (see Differences). †: seeds are missing or "
         "trainings are not finished, so the number will change. With one seed, the standard error counts as 0.",
+        methods_text(experiment),
     )
     legend = Grid(["sign", "meaning"], list(MEANINGS.items()))
     columns = [name for name in table if is_of_paper(name)]
@@ -137,8 +138,14 @@ def own_table(experiment: Experiment, table: Table, from_step: float) -> list[Bl
         "of the column. †: seeds are missing or trainings are not finished."
     )
     grid = metric_table(experiment, table, [name for name in table if is_of_paper(name)])
-    beside = "The paper's numbers are means of four seeds after step 90 million, and percentages: by how much better."
-    return [Paragraph(f"{text} {beside}" if "paper" in grid.header else text), grid]
+    beside = " The paper's numbers, beside ours, are means of four seeds after step 90 million."
+    return [Paragraph(text + (beside if "paper" in grid.header else "")), Paragraph(methods_text(experiment)), grid]
+
+
+def methods_text(experiment: Experiment) -> str:
+    """Return which task each method is."""
+    named = [task for task in experiment.plan.tasks if name_of(task) != task]
+    return f"Methods: {', '.join(f'{name_of(task)} is `{task}`' for task in named)}." if named else ""
 
 
 def what_counts(from_step: float) -> str:
@@ -171,7 +178,7 @@ def rough_blocks(experiment: Experiment, figures: list[str], out: Path) -> list[
             rows = []
             for task, some in seeds.items():
                 means = [[over_levels(each, measure, kind) for each in some] for kind in [*kinds, None]]
-                rows.append([name_of(task), *(mean_text(part, digits, plan) for part in means)])
+                rows.append([method(task), *(mean_text(part, digits, plan) for part in means)])
             blocks += [Paragraph(f"{meaning}:"), Grid(["task", *kinds, "all"], rows)]
     return blocks
 
@@ -204,7 +211,7 @@ def differences(table: Table) -> list[Block]:
         tasks = [task for task in cells if cells[task]]
         families = {"All pairs": list(combinations(tasks, 2))}
         for baseline in (task for task in BASELINES if task in tasks):
-            families[f"Against `{baseline}`"] = [(task, baseline) for task in tasks if task != baseline]
+            families[f"Against {method(baseline)}"] = [(task, baseline) for task in tasks if task != baseline]
         for title, pairs in families.items():
             if all(p is None for metric in PAPER_METRICS for p in compare(cells, metric.name, pairs)):
                 blocks.append(Paragraph(f"{title}: no test is possible; it takes at least two seeds of two tasks."))
@@ -215,7 +222,7 @@ def differences(table: Table) -> list[Block]:
 
 def difference_table(cells: Cells, pairs: list[tuple[str, str]]) -> Grid:
     """Return the differences of pairs of tasks in all metrics, with their p values."""
-    rows = [[f"`{first}` - `{second}`"] for first, second in pairs]
+    rows = [[f"{method(first)} − {method(second)}"] for first, second in pairs]
     for metric in PAPER_METRICS:
         p_values = compare(cells, metric.name, pairs)
         for row, (first, second), p in zip(rows, pairs, p_values, strict=True):
@@ -275,7 +282,8 @@ def run_blocks(experiment: Experiment) -> list[Block]:
     """Return what the trainings without a plan are, and what counts as one of them."""
     text = (
         "There is no `experiment.yaml`, so these are the trainings that the folder holds. Runs of the same "
-        "task, `--run_name`, random events and seed are one training that was resumed; of two that both begin at 0, the later counts."
+        "task, `--run_name`, random events and seed are one training that was resumed; of two that both begin at 0, "
+        "the later counts."
     )
     steps = [f"{run.steps / MILLION:.4g} of {run.total_steps / MILLION:.4g}" for run in experiment.runs]
     rows = [

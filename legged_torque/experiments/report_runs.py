@@ -8,7 +8,7 @@ from typing import Any
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.experiments.matrix import Cell, Matrix
+from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix
 from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import Options
@@ -41,7 +41,7 @@ def find_trainings(folder: Path, notes: list[str]) -> Trainings:
             continue
         found.setdefault(key, []).append(run)
     if not found:
-        raise UserError(f"there is neither an experiment.yaml nor a run with its {CONFIG_FILE} in '{folder}'")
+        raise UserError(f"there is neither a file '{folder / SETTINGS_FILE}' nor a run with its {CONFIG_FILE}")
     return {Cell(runs[-1], *key, tuple(dict.fromkeys([key[1], *also[key]]))): runs for key, runs in found.items()}
 
 

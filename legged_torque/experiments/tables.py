@@ -6,7 +6,7 @@ from itertools import combinations
 
 from legged_torque.experiments.against_paper import judge, marked, number_text
 from legged_torque.experiments.blocks import Grid
-from legged_torque.experiments.figures_style import name_of
+from legged_torque.experiments.figures_style import method
 from legged_torque.experiments.paper_values import PAPER_METRICS, PAPER_TASKS, paper_value
 from legged_torque.experiments.results import Cells, Experiment, Table, compare
 from legged_torque.utils.metrics import Metric
@@ -36,21 +36,13 @@ def metric_table(experiment: Experiment, table: Table, columns: list[str]) -> Gr
     return Grid(header, rows)
 
 
-def method(task: str) -> str:
-    """Return the paper's name of a task and its own, or only that."""
-    return f"`{task}`" if name_of(task) == task else f"{name_of(task)} (`{task}`)"
-
-
 def number(cells: Cells, task: str, metric: Metric, paper: float | None, planned: int) -> str:
-    """Return an entry: sign, mean, standard error, seeds if not all, and by how much it is better than the paper's."""
+    """Return an entry: sign against the paper's value, mean, standard error, and number of seeds if not all."""
     summary = cells[task].get(metric.name)
     if summary is None:
         return "–"
     text = marked(number_text(summary, metric.digits, planned), is_best(cells, task, metric), summary)
-    if paper is None:
-        return text
-    verdict = judge(metric, summary, paper)
-    return f"{verdict.sign} {text}, {verdict.share:+.1%}"
+    return text if paper is None else f"{judge(metric, summary, paper).sign} {text}"
 
 
 def is_best(cells: Cells, task: str, metric: Metric) -> bool:
