@@ -84,9 +84,9 @@ def test_page_of_own_runs(logs, monkeypatch, capsys):
     page = Page((logs / "report" / "report.html").read_text())
     assert page.tables[0][0] == ["metric", "method", "low", "own"]
     assert page.tables[0][1:4] == [
-        ["Track % [share]", "mine", "–", "0.5500 ± 0.0500"],
-        ["", "mine wide", "0.7000", "–"],
-        ["", "other", "–", "0.4000"],
+        ["Track % [share]", "mine", "–", "0.5500 ± 0.0500 (2)"],
+        ["", "mine wide", "0.7000 (1)", "–"],
+        ["", "other", "–", "0.4000 (1)"],
     ]
     assert "default ranges" in text and "Table I" not in text and "no training has begun" not in text
     assert "| `mine wide` | low | 1 | 2026-01-04_00-00-00_wide | 110 of 110 |" in text

@@ -105,10 +105,16 @@ def draw_curves(experiment: Experiment, what: CurveFigure, title: str) -> Figure
         axes[0, 0].set_ylim(0, None)
     axes[0, 0].set_ylabel(METRICS_BY_NAME[what.metric].label)
     lines = {line.get_label(): line for axis in axes[0] for line in axis.lines if line.get_label()[0] != "_"}
-    columns = min(len(lines), 2 + 2 * len(panels))
+    columns = legend_columns(list(lines), width)
     figure.legend(lines.values(), lines, loc="outside lower center", ncols=columns, handlelength=3.5, frameon=False)
     figure.suptitle(textwrap.fill(f"{title}: {caption(panels, what)}", int(12 * width)), fontsize=11)
     return figure
+
+
+def legend_columns(labels: list[str], width: float) -> int:
+    """Return into how many columns a legend fits below a figure of this width [inch]."""
+    widths = [0.8 + 0.08 * len(label) for label in labels]  # of line, gaps and letters
+    return len(labels) if sum(widths) <= width else max(1, int(width / max(widths)))
 
 
 def curves_of(experiment: Experiment, what: CurveFigure) -> dict[str, dict[str, list[Curve]]]:
@@ -132,6 +138,7 @@ def caption(panels: dict[str, dict[str, list[Curve]]], what: CurveFigure) -> str
     text = (
         f"{'geometric ' if what.scale == 'log' else ''}mean over seeds{smooth}, band: one standard error to each side"
     )
+    text += "; finished seeds keep their last value" if what.over == "seconds" else ""
     text += f"; points at the right: single seeds, mean of their last {LAST_SHARE:.0%}"
     return text if all(curve.is_finished for curve in seeds) else f"{text}; cross: a training that is not finished"
 
@@ -157,13 +164,15 @@ def progress_note(seeds: list[Curve], num_expected: int, unit: str) -> str:
 def draw_curve(axis: Axes, seeds: list[Curve], label: str, styles: Style) -> None:
     """Draw the mean over the seeds with its standard error, and a cross where an unfinished training ends.
 
-    On a logarithmic axis it is the geometric mean.
+    A finished training keeps its last value while others go on. On a logarithmic axis it is the geometric mean.
     """
     color, line, _ = styles
     is_log = axis.get_yscale() == "log"
     on_axis = np.exp if is_log else np.asarray
     places = np.unique(np.concatenate([curve.places for curve in seeds]))
-    values = np.array([np.interp(places, curve.places, curve.values, left=np.nan, right=np.nan) for curve in seeds])
+    ends = [curve.values[-1] if curve.is_finished else np.nan for curve in seeds]
+    parts = zip(seeds, ends, strict=True)
+    values = np.array([np.interp(places, each.places, each.values, left=np.nan, right=end) for each, end in parts])
     values = np.log(np.where(values > 0.0, values, np.nan)) if is_log else values
     count = np.isfinite(values).sum(axis=0)
     mean = np.nansum(values, axis=0) / count
@@ -172,5 +181,5 @@ def draw_curve(axis: Axes, seeds: list[Curve], label: str, styles: Style) -> Non
         error = np.sqrt(np.nansum((values - mean) ** 2, axis=0) / np.maximum(count - 1, 1) / count)
         error[count < 2] = np.nan
         axis.fill_between(places, on_axis(mean - error), on_axis(mean + error), color=color, alpha=0.2, linewidth=0)
-    ends = np.array([curve.places[-1] for curve in seeds if not curve.is_finished])
-    axis.plot(ends, on_axis(np.interp(ends, places, mean)), "x", color=color, markersize=7, markeredgewidth=1.8)
+    crosses = np.array([curve.places[-1] for curve in seeds if not curve.is_finished])
+    axis.plot(crosses, on_axis(np.interp(crosses, places, mean)), "x", color=color, markersize=7, markeredgewidth=1.8)

@@ -124,6 +124,11 @@ def table_one(experiment: Experiment, table: Table, from_step: float) -> list[Bl
         "**Bold**: significantly better than every other task of the column (see Differences). †: seeds are missing or "
         "trainings are not finished, so the number will change. With one seed, the standard error counts as 0.",
         methods_text(experiment),
+        *(
+            ["With other ranges than `default`, it is not the paper's task."]
+            if experiment.ranges() != "default"
+            else []
+        ),
     )
     legend = Grid(["sign", "meaning"], list(MEANINGS.items()))
     columns = [name for name in table if is_of_paper(name)]
@@ -132,10 +137,11 @@ def table_one(experiment: Experiment, table: Table, from_step: float) -> list[Bl
 
 def own_table(experiment: Experiment, table: Table, from_step: float) -> list[Block]:
     """Return the metrics of an experiment of the user's own."""
+    planned = f"{seeds_text(len(experiment.plan.seeds))} (how many, if not all)"
+    seeds = planned if experiment.is_planned else "seeds (how many)"
     text = (
-        f"Mean ± standard error over {seeds_text(len(experiment.plan.seeds))} (how many, if not all), "
-        f"{experiment.ranges()} ranges. {what_counts(from_step)} **Bold**: significantly better than every other task "
-        "of the column. †: seeds are missing or trainings are not finished."
+        f"Mean ± standard error over {seeds}, {experiment.ranges()} ranges. {what_counts(from_step)} **Bold**: "
+        "significantly better than every other task of the column. †: seeds are missing or trainings are not finished."
     )
     grid = metric_table(experiment, table, [name for name in table if is_of_paper(name)])
     beside = " The paper's numbers, beside ours, are means of four seeds after step 90 million."

@@ -22,13 +22,13 @@ def metric_table(experiment: Experiment, table: Table, columns: list[str]) -> Gr
     tasks = sorted(table[columns[0]], key=lambda task: [*PAPER_TASKS, *experiment.plan.tasks].index(task))
     has_paper = {c: any(paper_value(task, c, PAPER_METRICS[0].name) for task in tasks) for c in columns}
     header = ["metric", "method", *(name for c in columns for name in ([c, "paper"] if has_paper[c] else [c]))]
+    planned = len(experiment.plan.seeds) if experiment.is_planned else 0  # 0: every entry tells its number of seeds
     rows = []
     for metric in PAPER_METRICS:
         for place, task in enumerate(tasks):
             row = [metric.label if place == 0 else "", method(task)]
             for column in columns:
                 paper = paper_value(task, column, metric.name)
-                planned = experiment.num_expected(task, experiment.columns()[column][0])
                 row.append(number(table[column], task, metric, paper, planned))
                 if has_paper[column]:
                     row.append("–" if paper is None else f"{paper:.{metric.digits}f}")
