@@ -27,7 +27,7 @@ body { background: var(--back); color: var(--text); font: 16px/1.5 system-ui, sa
   margin: 0 auto; padding: 0 1rem 3rem; }
 nav { display: flex; flex-wrap: wrap; gap: .3rem 1.2rem; } p, ul { max-width: 60rem; }
 .wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .85rem; margin: .6rem 0; }
+table { border-collapse: collapse; font-size: .83rem; margin: .6rem 0; }
 th, td { border: 1px solid var(--line); padding: .25rem .35rem; text-align: left; white-space: nowrap; }
 th { background: var(--soft); }
 tr:not(.more):has(+ .more) td { border-top: 2px solid var(--text); }

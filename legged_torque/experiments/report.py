@@ -199,7 +199,9 @@ def other_table(experiment: Experiment, table: Table) -> list[Block]:
     """Return the metrics in environments other than those of training, which the paper does not have."""
     columns = [name for name in table if not is_of_paper(name)]
     text = "Trained -> evaluated, over seeds and evaluations as above. The paper has no such numbers."
-    return [Paragraph(text), metric_table(experiment, table, columns)] if columns else [Paragraph("None were planned.")]
+    if not columns:
+        return [Paragraph("None were planned.")] if experiment.is_planned else []
+    return [Paragraph(text), metric_table(experiment, table, columns)]
 
 
 def differences(table: Table) -> list[Block]:

@@ -36,13 +36,13 @@ def find_trainings(folder: Path, notes: list[str]) -> Trainings:
             task = " ".join(filter(None, [str(config["task"]), str(train["runner"].get("run_name") or "")]))
             key = (task, environment_of(config), int(train["seed"]))
             also[key] = tuple(map(str, train.get("evaluation", {}).get("also") or ()))
-        except (UserError, LookupError, TypeError, ValueError, AttributeError) as error:
+        except (UserError, LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
             notes.append(f"the run '{run.relative_to(folder)}' cannot be read: {error}")
             continue
         found.setdefault(key, []).append(run)
     if not found:
         raise UserError(f"there is neither a file '{folder / SETTINGS_FILE}' nor a run with its {CONFIG_FILE}")
-    return {Cell(runs[-1], *key, tuple(dict.fromkeys([key[1], *also[key]]))): runs for key, runs in found.items()}
+    return {Cell(found[key][-1], *key, tuple(dict.fromkeys([key[1], *also[key]]))): found[key] for key in sorted(found)}
 
 
 def plan_of(trainings: Trainings) -> Matrix:
@@ -51,7 +51,7 @@ def plan_of(trainings: Trainings) -> Matrix:
     for cell in trainings:
         names = environments.setdefault(cell.environment, [])
         names += [name for name in cell.evaluated_in if name not in names]
-    tasks = list(dict.fromkeys(sorted(cell.task for cell in trainings)))
+    tasks = list(dict.fromkeys(cell.task for cell in trainings))
     return Matrix(tasks, environments, sorted({cell.seed for cell in trainings}))
 
 
