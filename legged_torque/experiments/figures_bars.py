@@ -41,14 +41,14 @@ def draw_bars(experiment: Experiment, table: Table, names: Sequence[str], title:
 
 def draw_panel(axis: Axes, experiment: Experiment, table: Table, column: str, metric: Metric) -> None:
     """Draw a metric in a column of Table I. Bars far beyond the others are cut off, so that the others stay legible."""
-    heights, papers, notes, tasks = [], [], [], experiment.plan.tasks
+    heights, papers, notes, tasks = [], [], [], experiment.plan.tasks  # heights: of the highest seeds
     for place, task in enumerate(tasks):
         summary, paper = table[column][task].get(metric.name), paper_value(task, column, metric.name)
         if summary is None:
             heights.append(0.0)
             notes.append("no\ndata")
         else:
-            heights.append(summary.mean)
+            heights.append(max(summary.values))
             planned = experiment.num_expected(task, experiment.columns()[column][0])
             notes.append("" if summary.is_final else f"{len(summary.values)} of\n{planned} *")
             draw_bar(axis, summary, metric.digits, style(tasks, task), place)

@@ -96,8 +96,8 @@ def draw_curves(experiment: Experiment, what: CurveFigure, title: str) -> Figure
             note = progress_note(seeds, experiment.num_expected(task, environment), AXES[what.over][2])
             notes += [f"{name_of(task)}{note}"] if note else []
         axis.axvline(end * (1.0 + STRIP / 2), color="#999999", linewidth=0.8)
-        axis.set_xticks([tick for tick in axis.get_xticks() if 0 <= tick <= end])
         axis.set_xlim(0, end * (1.0 + STRIP * (len(plan.tasks) + 0.7)))
+        axis.set_xticks([tick for tick in axis.get_xticks() if 0 <= tick <= end])
         axis.set_xlabel("\n".join([AXES[what.over][1], *notes]))
         axis.set_title(ENVIRONMENTS.get(environment, environment))
         axis.grid(alpha=0.3)
