@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from legged_torque.experiments import figures, figures_curves
+from legged_torque.experiments import figures, figures_curves, figures_style
 from legged_torque.experiments.curves import CURVE_METRICS, read_rows
 from legged_torque.experiments.matrix import Cell, Matrix
 from legged_torque.experiments.paper_values import ENVIRONMENTS, PAPER_METRICS, TABLE_I, paper_value
@@ -85,6 +85,12 @@ def folder(tmp_path):
         write_result(cell, "doubled", tracking - 0.3)
     write_part(folder / "a1_torque-low-s1" / "2026-01-01_00-00-00", [line(i, i / 100) for i in range(10, 60, 10)])
     return folder
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    """Figures of few pixels, which are drawn fast."""
+    monkeypatch.setitem(figures_style.SETTINGS, "savefig.dpi", 20)
 
 
 def run_script(*words):
