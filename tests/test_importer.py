@@ -287,6 +287,14 @@ TRAPS = {
     ),
     "pose at a limit": (urdf().replace('"-2.6" upper="-0.5"', '"-2.6" upper="-1.50049"'), "contacts and options"),
     "no speed limits": (urdf().replace('velocity="15"', 'velocity="1000"'), "no speed limits that mean anything: 20"),
+    "joint without name": (
+        as_mjcf("").replace(MOTOR, "").replace('<joint name="FL_calf"', "<joint"),
+        "the joint of 'FL_calf' had no name: 'FL_calf_joint'",
+    ),
+    "geoms of one name": (
+        as_mjcf("").replace(BALL, BALL * 2).replace('body name="FL_thigh"', 'body name="FL_calf_2"'),
+        "contacts and options",
+    ),
     "two dashes": (urdf().replace("LF_KFE", "LF--KFE"), "contacts and options"),
 }
 
@@ -332,6 +340,7 @@ def test_feet_below_hips(written):
         ),
         ("<mujoco><worldbody/></mujoco>", "0 bodies with joints"),
         ("<mujoco", "unclosed token"),
+        (urdf().replace('velocity="15"', 'velocity="fast"'), "could not convert string to float: 'fast'"),
     ],
 )
 def test_refusals(tmp_path, text, reason):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 
 import numpy as np
@@ -138,8 +139,11 @@ def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None
 
 
 def _name_shapes(source: Source, legs: list[Leg], shapes: dict[int, list[Shape]]) -> None:
-    """Name all shapes after their bodies: trunk, <leg>_<kind>, <leg>_foot; feet join the shapes of their bodies."""
-    model = source.model
+    """Name all shapes after their bodies: trunk, <leg>_<kind>, <leg>_foot; feet join the shapes of their bodies.
+
+    Those that would get a name that another one has are numbered on.
+    """
+    model, taken = source.model, {f"{leg.name}_{FOOT}" for leg in legs}
     owner = {body: leg for leg in legs for body in leg.bodies}
     for body, found in shapes.items():
         name = TRUNK if body == 1 else model.body(body).name or f"body{body}"
@@ -147,8 +151,9 @@ def _name_shapes(source: Source, legs: list[Leg], shapes: dict[int, list[Shape]]
             leg = owner[body]
             kind = name.removeprefix(leg.name).strip("_").replace(FOOT, "sole") or f"link{leg.bodies.index(body) + 1}"
             name = f"{leg.name}_{kind}"
-        for number, shape in enumerate(found, 1):
-            shape.name = name if number == 1 else f"{name}_{number}"
+        for shape in found:
+            shape.name = next(n for n in chain([name], (f"{name}_{i}" for i in count(2))) if n not in taken)
+            taken.add(shape.name)
     for leg in legs:
         leg.foot.name = f"{leg.name}_{FOOT}"
         shapes[leg.bodies[-1]].append(leg.foot)

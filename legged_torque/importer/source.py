@@ -58,6 +58,7 @@ def read_source(file: Path) -> Source:
             spec = mujoco.MjSpec.from_file(str(file))
             notes = _prepare(spec, file, root.tag == "robot")
             model = _compile(spec, notes)
+            speed_limits = _speed_limits(root)
         except (ValueError, ET.ParseError, mujoco.FatalError) as error:
             raise UserError(f"cannot import '{file}': {' '.join(str(error).split())}") from None
     _check(model, file)
@@ -67,7 +68,7 @@ def read_source(file: Path) -> Source:
         sites.setdefault(int(model.site_bodyid[site]), []).append((name, model.site_pos[site].copy()))
     pose = model.key_qpos[_home(model)][7:].copy() if model.nkey else None
     limits = _torque_limits(model, notes)
-    return Source(file, model, sites, pose, limits, _speed_limits(root), notes)
+    return Source(file, model, sites, pose, limits, speed_limits, notes)
 
 
 def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
@@ -101,6 +102,10 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
     for body in spec.bodies:
         if body.name and not body.joints and body.name != "world":
             body.add_site(name=SITE + body.name)
+    unnamed = [joint for joint in spec.joints if not joint.name and joint.type != mujoco.mjtJoint.mjJNT_FREE]
+    for number, joint in enumerate(unnamed, 1):
+        joint.name = f"{joint.parent.name or number}_joint"
+        notes.append(f"the joint of '{joint.parent.name}' had no name: '{joint.name}'")
     spec.option.gravity, spec.option.disableflags = [0.0, 0.0, -GRAVITY], 0
     spec.compiler.fusestatic = True
     spec.compiler.discardvisual = True
