@@ -50,6 +50,7 @@ setup(
         "wandb": ["wandb"],
         "ray": ["ray>=2.52,<3"],
         "export": EXPORT,
+        "docs": ["zensical>=0.0.67,<0.1"],  # the site of mkdocs.yml
         "test": TEST,
         "dev": ["ruff>=0.17,<0.18", "mypy>=2.4,<2.5", "pre-commit>=4.2,<5", "types-PyYAML"],
     },
