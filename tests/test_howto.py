@@ -222,8 +222,6 @@ def test_commands(page, tmp_path):
             calls = script_calls(block)
             lines = block.replace("\\\n", " ").strip().splitlines()
             assert len(calls) == len(lines), f"{page}:{line}"
-                f"{page}:{line}"
-            )
             for script, words in calls:
                 status, output, error = run_here(script, *words, *TINY[script], root=tmp_path)
                 assert (status, error) == (0, "") and output, [script, *words]
