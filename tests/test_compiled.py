@@ -65,10 +65,10 @@ def results(task, num=5):
 
 @pytest.mark.parametrize(("name", "more"), [("a1_torque_multihead", {}), ("a1_torque_curriculum", HISTORY)])
 def test_a_compiled_step_is_the_same(make_task, graphs, name, more):
-    """Three graphs do all of it, to the bit, also in worlds that end and beside one that diverges."""
+    """Four graphs do all of it, to the bit, also in worlds that end and beside one that diverges."""
     expected = results(make_task(name, 5, **SETTINGS, **more))
     found = results(compile_parts(make_task(name, 5, **SETTINGS, **more)))
-    assert len(graphs) == 3
+    assert len(graphs) == 4
     assert expected[2][-4][1] and expected[2][-4][2] and not expected[2][-4][0]
     for values, others in zip(found, expected, strict=True):
         assert all(torch.equal(*pair) for pair in zip(values, others, strict=True))
@@ -85,7 +85,7 @@ def test_compiled_once(make_task, graphs):
         task.step(actions)
     task.reset()
     task.step(actions)
-    assert len(graphs) == 3 and not task.rew_buf.is_inference() and not TORCH_COMPILES.is_set()
+    assert len(graphs) == 4 and not task.rew_buf.is_inference() and not TORCH_COMPILES.is_set()
 
 
 class RoughRobot(TorqueRobot):
@@ -121,7 +121,7 @@ def test_what_cannot_be_compiled_runs_as_it_is(graphs, capsys):
     capsys.readouterr()
     found = results(compile_parts(make_rough()))
     output, error = capsys.readouterr()
-    assert output == "rough\n" * 5 and len(graphs) == 2
+    assert output == "rough\n" * 5 and len(graphs) == 3
     assert error.count("\n") == 1 and "_judge runs uncompiled" in error and "_reward_rough" in error
     for values, others in zip(found, expected, strict=True):
         assert all(torch.equal(*pair) for pair in zip(values, others, strict=True))

@@ -13,7 +13,7 @@ import pytest
 CHROMIUM, DRIVER = (shutil.which("chromium") or shutil.which("google-chrome")), shutil.which("chromedriver")
 PARTS = {"viser": importlib.util.find_spec("viser"), "selenium": importlib.util.find_spec("selenium")}
 MISSING = [name for name, part in {**PARTS, "chromium": CHROMIUM, "chromedriver": DRIVER}.items() if not part]
-if MISSING and os.environ.get("NEEDS_BROWSER"):  # .ci/run sets it
+if MISSING and os.environ.get("NEEDS_BROWSER"):  # where the page must be tested
     pytest.fail(f"not installed: {', '.join(MISSING)}")
 if MISSING:
     pytest.skip(f"not installed: {', '.join(MISSING)}", allow_module_level=True)
