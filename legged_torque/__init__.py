@@ -5,16 +5,18 @@ from pathlib import Path
 __version__ = "0.1.0"
 
 
-def _find_dir(name: str) -> Path:
-    """Return a folder that a wheel holds inside the package and a checkout beside it."""
+def _find_dir(name: str, installed_name: str = "") -> Path:
+    """Return a folder that a wheel holds inside the package, maybe by another name, and a checkout beside it."""
     package = Path(__file__).resolve().parent
-    installed = package / name
+    installed = package / (installed_name or name)
     return installed if installed.is_dir() else package.parent / name
 
 
 RESOURCES_DIR = _find_dir("resources")  # folder of the robot models
 
 SCRIPTS_DIR = _find_dir("scripts")  # folder of the scripts
+
+EXPERIMENTS_DIR = _find_dir("experiments", "descriptions")  # folder of the descriptions of experiments
 
 
 def resource_path(file: str | Path) -> Path:
@@ -26,3 +28,13 @@ def resource_path(file: str | Path) -> Path:
     """
     path = Path(file)
     return RESOURCES_DIR.parent / path if path.parts[:1] == ("resources",) else path
+
+
+def experiment_path(file: str | Path) -> Path:
+    """Return where the description of an experiment is: ``experiments/<name>`` comes with the package.
+
+    Args:
+        file: A path. One below ``experiments/`` means :data:`EXPERIMENTS_DIR`, unless the current directory has it.
+    """
+    path = Path(file)
+    return EXPERIMENTS_DIR / path.name if path.parts[:1] == ("experiments",) and not path.exists() else path

@@ -21,7 +21,7 @@ from legged_torque import SCRIPTS_DIR
 from legged_torque.checks.baseline import Baseline
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.args import Parser, add_settings_args, options_of
+from legged_torque.utils.args import Parser, add_settings_args, options_of, task_file_words
 from legged_torque.utils.cli import check_at_least, check_output, importing, run_script, write_json
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError, is_out_of_memory
@@ -174,7 +174,7 @@ def training_command(args: argparse.Namespace, num_envs: int) -> list[str]:
     """Return the command that trains with the same options."""
     given = {name: getattr(args, name) for name in ("task", "seed", "perturbation", "ranges", "device", "preset")}
     words = [f"--{name}={value}" for name, value in given.items() if value is not None]
-    words += [f"--num_envs={num_envs}", *(f"--set={change}" for change in args.set)]
+    words += [*task_file_words(args.task_file), f"--num_envs={num_envs}", *(f"--set={change}" for change in args.set)]
     return [sys.executable, str(SCRIPTS_DIR / "train.py"), *words]
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.args import Parser, add_build_args, options_of
+from legged_torque.utils.args import Parser, add_build_args, options_of, task_file_words
 from legged_torque.utils.cli import check_at_least, importing, run_script
 from legged_torque.utils.errors import UserError
 
@@ -85,7 +85,8 @@ def train_words(args: argparse.Namespace) -> list[str]:
     words = [f"--{name}={getattr(args, name)}" for name in names if getattr(args, name) is not None]
     changes = ["evaluation.interval=1", f"evaluation.also=[{args.perturbation}]", "evaluation.also_from=1"]
     changes += [f"runner.save_interval={SAVE_INTERVAL}", *args.set]
-    return [*words, "--logger=none", *(f"--set={change}" for change in changes)]
+    words += [*task_file_words(args.task_file), "--logger=none"]
+    return [*words, *(f"--set={change}" for change in changes)]
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ without_renderer()  # before anything imports mujoco
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import importing, run_script
+from legged_torque.utils.cli import importing, run_script, script_command
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import set_seed
 
@@ -35,7 +35,7 @@ def main() -> None:
         from legged_torque.utils.progress import CompileProgress
     file = pretrained_file(options.task, train_cfg, options.log_root)
     if not file.exists():
-        raise UserError(f"there is no pre-trained policy '{file}'; run scripts/pretrain_gravity.py first")
+        raise UserError(f"there is no pre-trained policy '{file}'; make it first: {script_command('pretrain_gravity')}")
     check_spaces(file, env_cfg, train_cfg)
 
     print(f"{'':12} {'frequency':>9} {'after':>6} {'standing':>9} {'mean torque':>12}")

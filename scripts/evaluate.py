@@ -1,6 +1,12 @@
-"""Measure a checkpoint: ``python scripts/evaluate.py --task=a1_position --perturbation=high``.
+"""Measure a checkpoint.
 
 With ``--terrain`` and ``--level``, robots try to cross tiles of rough ground, once in each world: see docs/terrain.md.
+
+Examples:
+    python scripts/evaluate.py --task=a1_position                       # as in training
+    python scripts/evaluate.py --task=a1_position --perturbation=high   # in another environment
+    python scripts/evaluate.py --task=a1_position --command 0.5 0 0.2   # with one command
+    python scripts/evaluate.py --task=a1_position --terrain all --level 0.5
 """
 
 from __future__ import annotations
@@ -60,14 +66,14 @@ def main() -> None:
         run = task_registry.load_run(options)
         import torch
 
-        from legged_torque.envs.base.metrics import COMMANDS
+        from legged_torque.envs.base.commands import fix_command
         from legged_torque.learning.evaluator import evaluation_cfg
     if grounds:
         env_cfg = grounds.cfg(run.env_cfg, run.env_cfg.env.num_envs)
     else:
         env_cfg = evaluation_cfg(run.env_cfg, run.env_cfg.env.num_envs)
-        for name, value in zip(COMMANDS, args.command or (), strict=False):
-            setattr(env_cfg.commands.ranges, name, [value, value])
+        if args.command:
+            fix_command(env_cfg, args.command)
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options, env_cfg)
     torch.manual_seed(args.seed)  # building and loading have drawn numbers too

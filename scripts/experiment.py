@@ -1,6 +1,11 @@
-"""Train and evaluate tasks x environments x seeds: ``python scripts/experiment.py experiments/low.yaml``.
+"""Train and evaluate tasks x environments x seeds.
 
 Finished cells are skipped and interrupted ones resumed: to continue an experiment, repeat the command.
+
+Examples:
+    python scripts/experiment.py experiments/paper.yaml --dry-run     # list pending jobs
+    python scripts/experiment.py experiments/paper.yaml               # run them on all GPUs
+    python scripts/experiment.py my.yaml --device cpu --jobs 2 --out results
 """
 
 from legged_torque.utils.interrupt import end_on_interrupt
@@ -14,12 +19,13 @@ import contextlib
 import sys
 from pathlib import Path
 
+from legged_torque import experiment_path
 from legged_torque.experiments.job import CPU_JOBS, GPU_JOBS, MPS_JOBS, Launcher
 from legged_torque.experiments.local_launcher import LocalLauncher
 from legged_torque.experiments.matrix import SETTINGS_FILE, cell_state, check_same, read_matrix
 from legged_torque.experiments.mps import multi_process_service
 from legged_torque.experiments.run import ExperimentRun, claim_folder
-from legged_torque.utils.args import Parser
+from legged_torque.utils.args import Parser, add_options
 from legged_torque.utils.cli import check_output, importing, run_script
 from legged_torque.utils.errors import UserError, unknown_name
 
@@ -41,9 +47,10 @@ def main() -> None:
     parser.add_argument("--launcher", default="local", help=help_text)
     parser.add_argument("--address", help="of the Ray cluster; default: auto, the one that this machine belongs to")
     parser.add_argument("--dry-run", action="store_true", help="only list what is left to do")
+    add_options(parser, "task_file")
     args = parser.parse_args()
     with importing():
-        matrix = read_matrix(args.file)
+        matrix = read_matrix(experiment_path(args.file), args.task_file)
     out = (args.out or Path("logs", "experiments", args.file.stem)).resolve()
     check_output(out / SETTINGS_FILE)
     launcher = make_launcher(args)
@@ -53,7 +60,7 @@ def main() -> None:
             print(f"{cell.name}: {cell_state(cell)}")
         return
     with multi_process_service() if args.mps else contextlib.nullcontext():
-        claim_folder(matrix, args.file, out)
+        claim_folder(matrix, experiment_path(args.file), out)
         status = ExperimentRun(matrix, out, launcher).run()
     sys.exit(status)
 
@@ -63,6 +70,8 @@ def make_launcher(args: argparse.Namespace) -> Launcher:
     if args.launcher == "ray":
         if args.mps:
             raise UserError("--mps is for this machine; on a cluster, start the service on each node")
+        if args.task_file:
+            raise UserError("--task_file is for this machine; on a cluster, install the tasks: docs/howto/own_tasks.md")
         with importing():
             from legged_torque.experiments.ray_launcher import RayLauncher
         return RayLauncher(args.address or "auto", args.device, args.jobs)

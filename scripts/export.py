@@ -1,4 +1,9 @@
-"""Export a checkpoint for a robot: ``python scripts/export.py --task=a1_torque_multihead``."""
+"""Export a checkpoint for a robot.
+
+Examples:
+    python scripts/export.py --task=a1_torque_multihead                     # the last run's last checkpoint
+    python scripts/export.py --task=a1_torque_multihead --load_run=RUN --checkpoint=500 --out=exported
+"""
 
 from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer

@@ -1,4 +1,12 @@
-"""Watch a trained policy walk: ``python scripts/play.py --task=a1_torque_multihead``, live with ``--viewer web``."""
+"""Watch a policy walk.
+
+Examples:
+    python scripts/play.py --task=a1_torque_multihead                       # print metrics, save a video
+    python scripts/play.py --task=a1_torque_multihead --viewer web          # a page to watch and steer
+    python scripts/play.py --task=a1_torque_multihead --command 0.5 0 0.2   # a fixed command
+    python scripts/play.py --task=a1_torque_multihead --no_video            # metrics alone
+    python scripts/play.py --task=a1_torque --agent random                  # a task without a policy
+"""
 
 from __future__ import annotations
 
@@ -19,34 +27,77 @@ from legged_torque import resource_path
 from legged_torque.envs import task_registry
 from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
 from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, check_at_least, check_output, finite, importing, run_script
+from legged_torque.utils.cli import Parser, add_command_arg, check_at_least, check_output, finite, importing, run_script
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
-from legged_torque.utils.task_registry import set_seed
+from legged_torque.utils.options import Options
+from legged_torque.utils.runs import load_config
+from legged_torque.utils.task_registry import LoadedRun, experiment_dir, set_seed
 
 if TYPE_CHECKING:
+    from tensordict import TensorDict
+    from torch import Tensor
+
     from legged_torque.envs.base.legged_robot import LeggedRobot
-    from legged_torque.learning.runner import OnPolicyRunner
     from legged_torque.viewer.session import Session
 
+AGENTS = ("zero", "random")  # what acts without a policy
 NUM_ENVS = {"none": 16, "web": 4, "native": 1}  # default number of worlds, by viewer
 MAX_GRID = 25  # maximum number of tiles; more would be unreadable
 
 
 def main() -> None:
-    """Load a run; roll it out or show it live."""
+    """Roll a policy out or show it live; without a policy, roll out zero or random actions."""
+    args = parse_args()
+    kinds, levels = named_kinds(args.terrain), rising_levels(args.level)
+    options = options_of(args)
+    with importing():
+        run = task_registry.load_run(options) if args.agent == "policy" else None
+        env_cfg, train_cfg = (run.env_cfg, run.train_cfg) if run else task_registry.get_cfgs(args.task, options)
+        from legged_torque.envs.base.commands import fix_command
+    env_cfg.terrain.curriculum = False  # robots stay on their tiles
+    if kinds:
+        select_tiles(env_cfg.terrain, kinds, levels, 1)
+    set_seed(args.seed)
+    if run and args.viewer != "none":
+        show(args, run)
+        return
+    if args.command:
+        fix_command(env_cfg, args.command)
+    if run:
+        from legged_torque.viewer.video import show_in_tensorboard
+
+        env, runner = task_registry.make_loaded(run, options)
+        title = f"{run.checkpoint}, after {int(runner.logger.tot_timesteps):,} steps of training"
+        video = run.checkpoint.parent / "videos" / f"{run.checkpoint.stem}.mp4"
+        if roll_out(args, env, runner.get_inference_policy(env.device), title, video):
+            show_in_tensorboard(video, run.iterations)
+    else:
+        env, _ = task_registry.make_env(args.task, options, env_cfg)
+        video = experiment_dir(train_cfg, options.log_root) / "videos" / f"{args.agent}.mp4"
+        roll_out(args, env, agent(args.agent, env), f"{args.agent} actions", video)
+
+
+def parse_args() -> argparse.Namespace:
+    """Return the command line; a UserError if it makes no sense."""
     parser = Parser(__doc__)
     add_task_args(parser)
     parser.set_defaults(seed=1)
     hint = "control steps, 50 of them a second; default: %(default)s"
     parser.add_argument("--steps", type=int, default=500, help=hint)
-    parser.add_argument("--video", type=Path, help="mp4 to write; default: in the run's folder")
-    parser.add_argument("--grid", type=int, help="number of robots in the video: 1, 4, 9, 16 or 25; default: 1")
+    hint = "who acts: the run's policy, or zero or random actions (from -1 to 1) without a run; default: %(default)s"
+    parser.add_argument("--agent", choices=("policy", *AGENTS), default="policy", help=hint)
+    add_command_arg(parser)
     add_terrain_args(parser)
+    parser.add_argument("--video", type=Path, help="mp4 to write; default: in the run's folder")
+    parser.add_argument("--no_video", action="store_true", help="print metrics alone")
+    parser.add_argument("--grid", type=int, help="number of robots in the video: 1, 4, 9, 16 or 25; default: 1")
     hint = """none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's
         window; default: %(default)s"""
     parser.add_argument("--viewer", choices=NUM_ENVS, default="none", help=hint)
+    hint = "folder of a run whose policy walks beside the followed robot, under the same command (--viewer web)"
+    parser.add_argument("--compare", metavar="RUN", help=hint)
     hint = "address of the page; default: %(default)s, this machine alone; others need the printed token"
     parser.add_argument("--host", default="127.0.0.1", help=hint)
     parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
@@ -55,25 +106,41 @@ def main() -> None:
     if not 1 <= args.port <= 65535:
         raise UserError(f"--port must be from 1 to 65535, not {args.port}")
     choose_worlds(args)
-    kinds, levels = named_kinds(args.terrain), rising_levels(args.level)
-    if levels and not kinds:
+    check_agent(args)
+    if args.level and not args.terrain:
         raise UserError("--level needs --terrain: the kinds of rough ground")
     if args.video:
         check_output(args.video)
-    options = options_of(args)
+    return args
+
+
+def show(args: argparse.Namespace, run: LoadedRun) -> None:
+    """Show a policy live, and one that it is compared with."""
+    compared = load_compared(args, run) if args.compare else None
+    watch, device = import_viewer(args), resolve_device(args.device)  # what is missing is told before anything slow
     with importing():
-        run = task_registry.load_run(options)
         from legged_torque.viewer.session import Session
-    run.env_cfg.terrain.curriculum = False  # robots stay on their tiles
-    if kinds:
-        select_tiles(run.env_cfg.terrain, kinds, levels, 1)
-    set_seed(args.seed)
-    if args.viewer == "none":
-        roll_out(args, *task_registry.make_loaded(run, options), run.checkpoint)
-    else:
-        watch = import_viewer(args)  # whatever is missing is reported before anything slow is done
-        session = Session(task_registry.get_task_class(args.task), run, resolve_device(args.device))
-        watch(session, resource_path(run.env_cfg.asset.file))
+    session = Session(task_registry.get_task_class(args.task), run, device)
+    session.follow_newest(args.checkpoint is None)
+    if compared:
+        session.companion = Session(task_registry.get_task_class(compared.config["task"]), compared, device)
+    if args.command:
+        session.set_command(tuple(args.command))
+    watch(session, resource_path(run.env_cfg.asset.file))
+
+
+def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
+    """Return the run of ``--compare``; a UserError if its robot cannot walk beside that of another run."""
+    task = load_config(Path(args.compare))["task"]
+    options = Options(task, args.device, num_envs=1, load_run=args.compare, perturbation=args.perturbation)
+    compared = task_registry.load_run(options)
+    if compared.env_cfg.asset.file != run.env_cfg.asset.file:
+        raise UserError(
+            f"--compare needs runs of one robot, not {run.env_cfg.asset.file} and {compared.env_cfg.asset.file}"
+        )
+    if {run.env_cfg.terrain.mesh_type, compared.env_cfg.terrain.mesh_type} != {"plane"}:
+        raise UserError("--compare needs level ground; see --set terrain.mesh_type=plane")
+    return compared
 
 
 def choose_worlds(args: argparse.Namespace) -> None:
@@ -84,9 +151,29 @@ def choose_worlds(args: argparse.Namespace) -> None:
     if not 1 <= args.grid <= MAX_GRID or math.isqrt(args.grid) ** 2 != args.grid:
         raise UserError(f"--grid must be 1, 4, 9, 16 or {MAX_GRID}, not {args.grid}")
     if args.num_envs is None:
-        args.num_envs = max(NUM_ENVS[args.viewer], args.grid)
+        args.num_envs = 1 if args.compare else max(NUM_ENVS[args.viewer], args.grid)
     elif 1 <= args.num_envs < args.grid:
         raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
+
+
+def check_agent(args: argparse.Namespace) -> None:
+    """Raise a UserError if what is asked for does not go with who acts or what is shown."""
+    if args.agent != "policy" and (args.load_run or args.checkpoint is not None or args.viewer != "none"):
+        raise UserError(f"--agent {args.agent} has no run: --load_run, --checkpoint and --viewer are for the policy's")
+    if args.headless and args.viewer == "native":
+        raise UserError("--headless opens no window, but --viewer native is one; --viewer web is a page")
+    if args.compare and args.viewer != "web":
+        raise UserError("--compare needs --viewer web")
+    if args.no_video and (args.video or args.grid > 1 or args.viewer != "none"):
+        raise UserError("--no_video prints metrics alone: leave out --video, --grid and --viewer")
+
+
+def agent(name: str, env: LeggedRobot) -> Callable[[TensorDict], Tensor]:
+    """Return what acts without a policy: zero actions, or random ones, drawn uniformly from -1 to 1."""
+    import torch
+
+    actions = torch.zeros(env.num_envs, env.num_actions, device=env.device)
+    return lambda obs: actions.uniform_(-1.0, 1.0) if name == "random" else actions
 
 
 def add_terrain_args(parser: Parser) -> None:
@@ -107,21 +194,23 @@ def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
     try:
         from legged_torque.viewer.web import watch
     except ImportError as error:
-        raise UserError(f"--viewer web needs the extra: pip install -e .[viewer] ({error})") from None
-    return functools.partial(watch, title=args.task, host=args.host, port=args.port)
+        raise UserError(f"--viewer web needs the extra: pip install 'legged_torque[viewer]' ({error})") from None
+    return functools.partial(watch, title=args.task, host=args.host, port=args.port, no_renderer=NO_RENDERER)
 
 
-def roll_out(args: argparse.Namespace, env: LeggedRobot, runner: OnPolicyRunner, checkpoint: Path) -> None:
-    """Roll out mean actions, print the metrics, save a video."""
+def roll_out(
+    args: argparse.Namespace, env: LeggedRobot, policy: Callable[[TensorDict], Tensor], title: str, video: Path
+) -> bool:
+    """Roll actions out, print the metrics, save a video, by default to the file ``video``; return if that is there."""
     from legged_torque.envs.base.metrics import measure
     from legged_torque.viewer.video import TaskRecorder
 
-    recorder = TaskRecorder(env, args.grid)
-    metrics = measure(env, runner.get_inference_policy(env.device), args.steps, lambda commands: recorder.add_step())
-    print(f"{checkpoint}, after {int(runner.logger.tot_timesteps):,} steps of training:")
+    recorder = None if args.no_video else TaskRecorder(env, args.grid)
+    metrics = measure(env, policy, args.steps, lambda commands: recorder.add_step() if recorder else None)
+    print(f"{title}:")
     for name, value in metrics.means().items():
         print(f"  {name:<18} {value:8.4f} {UNITS[name]}")
-    recorder.save(args.video or checkpoint.parent / "videos" / f"{checkpoint.stem}.mp4", NO_RENDERER)
+    return recorder is not None and recorder.save(args.video or video, NO_RENDERER) and not args.video
 
 
 if __name__ == "__main__":

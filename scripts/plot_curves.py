@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from legged_torque.experiments.curves import read_curves
-from legged_torque.experiments.figures import draw_single_curves
+from legged_torque.experiments.figures_curves import draw_single_curves
 from legged_torque.utils.args import Parser
 from legged_torque.utils.cli import check_output, run_script
 from legged_torque.utils.plotting import save_figure

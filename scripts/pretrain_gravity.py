@@ -12,8 +12,8 @@ end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
 from legged_torque.envs import task_registry
-from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import check_output, importing, run_script, write_json
+from legged_torque.utils.args import Parser, add_build_args, options_of, task_file_words
+from legged_torque.utils.cli import check_output, importing, run_script, script_command, write_json
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.paths import without_machine
 
@@ -45,7 +45,8 @@ def main() -> None:
     if args.json:
         write_json(args.json, without_machine(report))
     print(f"The policy is in {file}")
-    print(f"Train from it: python scripts/train.py --task={args.task}")
+    words = [script_command("train"), *task_file_words(args.task_file), f"--task={args.task}"]
+    print(f"Train from it: {' '.join(words)}")
 
 
 if __name__ == "__main__":

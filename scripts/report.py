@@ -1,4 +1,7 @@
-"""Report on an experiment: ``python scripts/report.py logs/experiments/paper --out my_report``."""
+"""Report on an experiment or on runs: ``python scripts/report.py logs/experiments/low``.
+
+Takes the folder of an experiment, a folder with runs of train.py (logs/a1_torque, or all of logs), or a single run.
+"""
 
 from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import without_renderer
@@ -19,8 +22,9 @@ from legged_torque.utils.cli import check_at_least, check_output, run_script
 def main() -> None:
     """Read the results, draw figures, write tables and the report: as Markdown, and as one page for a browser."""
     parser = Parser(__doc__)
-    parser.add_argument("experiment", type=Path, help="folder of results that experiment.py has made")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the report, its tables and figures")
+    parser.add_argument("experiment", type=Path, help="folder of experiment.py's results, or with runs of train.py")
+    help_text = "folder for the report, its tables and figures; default: report, in the folder of the results"
+    parser.add_argument("--out", type=Path, help=help_text)
     help_text = (
         "step from which evaluations count; default: the last 18%% of a training: from 90 of 110 million, as in Table I"
     )
@@ -30,20 +34,21 @@ def main() -> None:
     args = parser.parse_args()
     if args.from_step is not None:
         check_at_least(args, 0, "from_step")
-    file, page = args.out / "report.md", args.out / "report.html"
+    out = args.out or args.experiment / "report"
+    file, page = out / "report.md", out / "report.html"
     check_output(file)
     check_output(page)
     experiment = read_experiment(args.experiment)
     videos = find_videos(args.videos, experiment.plan.tasks) if args.videos else {}
     from_step = experiment.last_part() if args.from_step is None else args.from_step
     table = summarize(experiment, from_step)
-    args.out.mkdir(parents=True, exist_ok=True)
-    figures = draw_all(experiment, table, args.out)
-    blocks = report(experiment, table, from_step, figures, args.out, videos)
+    out.mkdir(parents=True, exist_ok=True)
+    figures = draw_all(experiment, table, out)
+    blocks = report(experiment, table, from_step, figures, out, videos)
     title = f"Results of {experiment.folder.resolve().name}"
     file.write_text(to_markdown(title, blocks), encoding="utf-8")
     page.write_text(to_html(title, blocks), encoding="utf-8")
-    write_tables(experiment, table, args.out)
+    write_tables(experiment, table, out)
     missing = len(missing_lines(experiment, from_step))
     print(f"{file}, {page.name}, {len(figures)} figures; missing or not finished: {missing} lines")
 

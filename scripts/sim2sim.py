@@ -1,6 +1,9 @@
-"""Run an exported policy in plain MuJoCo: ``python scripts/sim2sim.py logs/<experiment>/<run>/exported_<n>``.
+"""Run an exported policy in plain MuJoCo, without torch and Warp.
 
-Needs neither torch nor Warp.
+Examples:
+    python scripts/sim2sim.py logs/a1_torque_multihead/RUN/exported_1119
+    python scripts/sim2sim.py exported --command 0.5 0 0 --video walk.mp4
+    python scripts/sim2sim.py exported --viewer --robots 1
 """
 
 from __future__ import annotations
@@ -86,6 +89,7 @@ def main() -> None:
         from legged_torque.deploy.robot import MujocoRobot
         from legged_torque.deploy.simulation import Events, Simulation
         from legged_torque.envs import LeggedRobotCfg
+        from legged_torque.utils.display import Counter
         from legged_torque.utils.metrics import UNITS, estimates, ratios
         from legged_torque.viewer.native import simulation_window
         from legged_torque.viewer.video import SimulationRecorder
@@ -103,9 +107,11 @@ def main() -> None:
         print(f"{policy.description['task']}, {training['checkpoint']} of {training['run']}, in MuJoCo with '{xml}':")
         for note in robot.notes:
             print(f"  note: {note}")
-        for number in range(args.robots):
-            record = recorder.add_step if recorder and number == 0 else lambda: None
-            sums.append(simulation.run(args.steps, [args.seed, number], lambda record=record: (record(), show())))
+        with Counter("simulating, step", args.robots * args.steps) as counter:
+            for number in range(args.robots):
+                record = recorder.add_step if recorder and number == 0 else lambda: None
+                after = (record, show, counter.add)
+                sums.append(simulation.run(args.steps, [args.seed, number], lambda after=after: [do() for do in after]))
     control_step = 1.0 / policy.description["timing"]["control_frequency"]
     metrics = estimates(ratios(np.array(sums).T, robot.weight, control_step))
     print(f"  {args.robots} robots x {args.steps} steps of {control_step:g} s")

@@ -1,7 +1,14 @@
-"""Train a policy: ``python scripts/train.py --task=a1_torque_multihead``.
+"""Train a policy.
 
 On several GPUs of a machine: ``torchrun --standalone --nproc_per_node=2 scripts/train.py --task=a1_torque_multihead``;
 on several machines: docs/howto/cluster.md.
+
+Examples:
+    python scripts/train.py --task=a1_torque_multihead                # the default training: 110 million steps
+    python scripts/train.py --task=a1_torque --max_iterations 20      # a short one
+    python scripts/train.py --task=a1_position --perturbation low --set rewards.scales.torques=-1e-4
+    python scripts/train.py --task=a1_torque --resume                 # go on with the last run
+    python scripts/train.py --task=my_task --task_file my_task.py     # a task of your own
 """
 
 from __future__ import annotations
@@ -12,19 +19,22 @@ from legged_torque.utils.rendering import without_renderer
 end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
+import functools
 import sys
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.envs import task_registry
 from legged_torque.utils import distributed
-from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of
-from legged_torque.utils.cli import check_output, importing, run_script
+from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of, task_file_words
+from legged_torque.utils.busy_cores import BusyCores
+from legged_torque.utils.cli import check_at_least, check_output, importing, run_script, script_command
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.options import DEFAULT_PRESET, Options
 from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, package_versions
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
+from legged_torque.viewer.beside import Beside
 
 if TYPE_CHECKING:
     from legged_torque.learning.runner import OnPolicyRunner
@@ -36,11 +46,17 @@ def main() -> None:
     add_task_args(parser)
     add_train_args(parser)
     parser.add_argument("--list", action="store_true", help="print all tasks and exit")
+    hint = "web: a page beside the training, on which its newest policy walks; default: %(default)s"
+    parser.add_argument("--viewer", choices=("none", "web"), default="none", help=hint)
+    hint = "iterations from one short video of the policy to the next, made beside the training; default: no videos"
+    parser.add_argument("--video_interval", type=int, default=0, metavar="N", help=hint)
     args = parser.parse_args()
+    check_at_least(args, 0, "video_interval")
+    cores = BusyCores()
+    options = options_of(args)
     if args.list:
         print("\n".join(task_registry.names()))
         return
-    options = options_of(args)
     if options.resume:
         if options.preset:
             raise UserError("--preset cannot be given with --resume, which keeps the settings of the run")
@@ -53,6 +69,8 @@ def main() -> None:
         env_cfg, train_cfg = run.env_cfg, run.train_cfg
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
         options.max_iterations = options.max_iterations or run.config.get("max_iterations")
+        if distributed.rank() == 0:
+            print(f"Resuming from {run.checkpoint}, after {run.iterations} iterations.")
     elif options.load_run or options.checkpoint is not None:
         raise UserError("--load_run and --checkpoint need --resume")
     else:
@@ -63,13 +81,17 @@ def main() -> None:
         check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)
     with importing():
         from legged_torque.utils.progress import CompileProgress
+    is_first = distributed.rank() == 0
+    beside = Beside(is_first and args.viewer == "web", args.video_interval if is_first else 0)
     set_seed(train_cfg.seed)
     with CompileProgress():
-        train(options, env_cfg, train_cfg)
+        train(options, env_cfg, train_cfg, cores, beside)
 
 
-def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
+def train(options: Options, env_cfg: Any, train_cfg: Any, cores: BusyCores, beside: Beside) -> None:
     """Build the task and train it, from a pre-trained policy if the task has one."""
+    import torch
+
     from legged_torque.envs.base.held_pose import standing_note
     from legged_torque.envs.base.legged_robot import LeggedRobot
     from legged_torque.learning.pretrained import find_pretrained, pretrained_file, start_from
@@ -85,6 +107,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
     runner, _ = task_registry.make_alg_runner(env, options.task, options, train_cfg)
     if starts_pretrained:
         start_from(runner, pretrained)  # the other processes get the networks of the first one
+    runner.verbose = options.verbose
     total = options.max_iterations or num_iterations(env, train_cfg)
     settings = {"env": to_dict(env_cfg), "train": to_dict(train_cfg), "version": package_versions()}
     distributed.check_same(flat({**settings, "task": options.task, "max_iterations": total}))
@@ -92,22 +115,26 @@ def train(options: Options, env_cfg: Any, train_cfg: Any) -> None:
     if remaining < 1:
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
     if is_first:
-        announce(runner, options, env_cfg, train_cfg, total)
+        print_notes(filter(None, [cores.note(torch.get_num_threads()) if env.device == "cpu" else None]))
+        announce(runner, options, env_cfg, train_cfg, total, beside.page)
+        runner.on_checkpoint = functools.partial(beside.show, task_words(options))
     try:
         runner.learn(remaining, init_at_random_ep_len=True)
     except TrainingError:
         runner.close()
         raise
+    finally:
+        beside.close(is_waiting=sys.exc_info()[0] is None and not runner.stopped_by)
     if is_first:
         print(f"The run is in {runner.log_dir}")
         for what, script in {"See it walk": "play", "Measure it": "evaluate", "Take it elsewhere": "export"}.items():
-            print(f"{what}: python scripts/{script}.py {run_words(options.task, runner.log_dir)}")
+            print(f"{what}: {script_command(script)} {run_words(options, runner.log_dir)}")
     runner.close()
     if runner.stopped_by:
         sys.exit(128 + runner.stopped_by)  # as shells tell it: 130 after Ctrl-C
 
 
-def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: Any, total: int) -> None:
+def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: Any, total: int, page: str) -> None:
     """Create the run's folder with its settings, and print where it is and how to watch it."""
     device, num_processes = runner.env.device, distributed.world_size()
     settings = {"task": options.task, "preset": options.preset or DEFAULT_PRESET, "device": device}
@@ -116,12 +143,18 @@ def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: 
     place = device_name(device) if num_processes == 1 else f"{num_processes} x {device_name(device)}"
     print(f"Training {options.task} on {place}: {num_processes * runner.env.num_envs} worlds, {total} iterations.")
     print(f"Curves: tensorboard --logdir {runner.log_dir}")
-    print(f"See it learn: python scripts/play.py {run_words(options.task, runner.log_dir)} --viewer web", flush=True)
+    how = page or f"{script_command('play')} {run_words(options, runner.log_dir)} --viewer web"
+    print(f"See it learn: {how}", flush=True)
 
 
-def run_words(task: str, run_dir: str) -> str:
+def task_words(options: Options) -> list[str]:
+    """Return the options with which other scripts find a task."""
+    return [*task_file_words(options.task_file), f"--task={options.task}"]
+
+
+def run_words(options: Options, run_dir: str) -> str:
     """Return the options with which other scripts find a run."""
-    return f"--task={task} --load_run={run_dir}"
+    return " ".join([*task_words(options), f"--load_run={run_dir}"])
 
 
 if __name__ == "__main__":

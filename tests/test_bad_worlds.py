@@ -254,7 +254,7 @@ def test_training_with_a_bad_world(make_runner, tmp_path, capsys):
     runner, task = make_runner(tmp_path)
     task.reward_divisor[2] = 0.0
     runner.learn(PATIENCE + 1)
-    lines = [line for line in capsys.readouterr().out.splitlines() if "not finite;" in line]
+    lines = [line for line in capsys.readouterr().err.splitlines() if "not finite;" in line]
     assert lines == ["Warning: reward term 'ratio' was not finite; resets of worlds for it: 4."]
     for tensor in runner.alg.actor.parameters():
         assert torch.isfinite(tensor).all()
@@ -330,9 +330,11 @@ def test_stops_late_if_some_updates_are_made(make_runner, tmp_path):
 
 
 def test_exit_status(make_dividing, tmp_path):
-    """The script ends with one line and status 1, which is not that of a user's mistake, and leaves a checkpoint."""
+    """The script ends with the reason and status 1, which is not that of a user's mistake, and leaves a checkpoint."""
     words = ["--task=a1_BrokenRobot", "--device=cpu", "--num_envs=2", "--set=algorithm.num_mini_batches=2"]
     status, output, error = run_here("train.py", *words, "--set=runner.num_steps_per_env=4", root=tmp_path)
     assert status == 1 and "The run is in" not in output
-    assert re.fullmatch(r"error: training cannot learn: .*100%; not finite, .*: reward term 'ratio' 8\n", error)
-    assert [file.name for file in tmp_path.glob("logs/*/*/model_*.pt")] == [f"model_{PATIENCE}.pt"]
+    warning, line = error.splitlines()
+    assert warning == "Warning: reward term 'ratio' was not finite; resets of worlds for it: 8."
+    assert re.fullmatch(r"error: training cannot learn: .*100%; not finite, .*: reward term 'ratio' 8", line)
+    assert {file.name for file in tmp_path.glob("logs/*/*/model_*.pt")} == {"model_0.pt", f"model_{PATIENCE}.pt"}

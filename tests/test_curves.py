@@ -69,7 +69,7 @@ def test_plot_curves(files, tmp_path):
     result = run_here("plot_curves.py", *map(str, files), f"--out={picture}", root=tmp_path)
     assert result == (0, "", "")
     text = picture.read_text()
-    assert text.count("<!-- a1_torque, seed 3 -->") == 2 and "<!-- a1_torque, high, seed 3 -->" in text
+    assert text.count("<!-- Default torque, seed 3 -->") == 2 and "<!-- Default torque, high, seed 3 -->" in text
     assert "<!-- Cost of transport -->" in text
     result = run_here("plot_curves.py", str(tmp_path / "none.json"), f"--out={picture}", root=tmp_path)
     assert_told_in_one_line(result, "cannot read")

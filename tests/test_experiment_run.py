@@ -21,6 +21,7 @@ from legged_torque.experiments.job import GPU_JOBS
 from legged_torque.experiments.local_launcher import LocalLauncher, find_workers
 from legged_torque.experiments.matrix import read_matrix
 from legged_torque.experiments.run import ExperimentRun, time_left
+from legged_torque.utils import display
 
 STAND_IN_TRAIN = """
 import os, signal, sys, time, zipfile
@@ -45,8 +46,8 @@ if behaviour.startswith("killed") and not (behaviour.endswith("once") and done):
     zipfile.ZipFile(run / "model_2.pt", "w").close()
     os.kill(os.getpid(), signal.SIGKILL)
 while done < 4 and not stopped and not (behaviour == "early" and done == 2):
-    print(f"Learning iteration {done}/4", flush=True)
     done += 1
+    print(f"iteration {done} of 4, 0:00:01, 0:00:02 left; tracking 0.5{done}0 (best 0.600), 0.0 falls/min", flush=True)
     while behaviour == "slow" and done == 3 and not stopped:
         time.sleep(0.02)
 zipfile.ZipFile(run / f"model_{done}.pt", "w").close()
@@ -107,7 +108,7 @@ def test_order_and_commands(stage, tmp_path):
     result = json.loads((out / "a1_torque-low-s3" / "result_high.json").read_text())
     assert (result["perturbation"], result["num_envs"], result["steps"]) == ("high", "256", "2000")
     assert output.count("training on cpu took") == 8 and output.count("evaluation in") == 12
-    assert "8 of 8 cells done, " in output and "time left unknown yet" in output and " left\n" in output
+    assert "8 of 8 cells done, " in output and "time left unknown" in output and " left\n" in output
 
 
 def test_a_damaged_checkpoint_does_not_block_its_cell(stage, tmp_path):
@@ -181,7 +182,7 @@ def test_stop(stage, tmp_path, number):
 
     def stop():
         """Send the signal when the training is under way."""
-        wait_for(lambda: any("iteration 2/4" in log.read_text() for log in out.glob("*/train.log")))
+        wait_for(lambda: any("iteration 3 of 4" in log.read_text() for log in out.glob("*/train.log")))
         os.kill(os.getpid(), number)
 
     thread = threading.Thread(target=stop)
@@ -341,26 +342,29 @@ def test_results_of_another_training_are_not_kept(stage, tmp_path):
     assert json.loads((out / "a1_torque-low-s1" / "result_low.json").read_text())["perturbation"] == "low"
 
 
-def test_live_line(stage, tmp_path):
-    """In a terminal a line is rewritten that says which cell is trained and how far it is."""
+def test_panel(stage, tmp_path):
+    """On a terminal a panel says how far the cell is that is trained, how well it tracks, and what is done."""
     (stage / "behaviour").write_text("slow")
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     stream = io.StringIO()
     stream.isatty = lambda: True
     run = ExperimentRun(read_matrix(file), out, LocalLauncher("cpu", 1))
-    run._shown = -experiment_run.SHOW_EVERY
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(stream):
-        patch.setattr(experiment_run, "SHOW_EVERY", 0.05)
-        patch.setenv("COLUMNS", "120")
+        patch.setattr(display, "REDRAW_EVERY", 0.05)
+        patch.setenv("TERM", "xterm")
+        patch.setenv("COLUMNS", "100")
         thread = threading.Thread(target=run.run)
         thread.start()
         wait_for(lambda: "75%" in stream.getvalue())
         (stage / "behaviour").write_text("")
         os.kill(int((out / "a1_position-low-s1" / "lock").read_text()), signal.SIGTERM)
         thread.join()
-    live = next(line for line in stream.getvalue().split("\r") if "75%" in line)
-    assert live.startswith("0 of 2 cells done, ") and live.strip().endswith(" | a1_position-low-s1 75%")
-    assert len(live) == 119
+    lines = re.sub(r"\033\[[\d;?]*[A-Za-z]", "", stream.getvalue()).splitlines()
+    (head, row) = next((lines[i - 2], line) for i, line in enumerate(lines) if "75%" in line)
+    assert re.fullmatch(r"│ 0 of 2 cells done [╸━]+ +37% 0:00:\d\d, time left unknown │", head)
+    assert re.fullmatch(r"│ a1_position-low-s1 +cpu +training 75% +0.530 +0:00:02 +│", row)
+    assert {len(line) for line in lines if line.startswith("│")} == {98}
+    assert any(re.match(r"\d{4}-.*  a1_position-low-s1: training has ended after 3 of 4", line) for line in lines)
 
 
 def test_workers(monkeypatch):

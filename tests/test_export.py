@@ -353,7 +353,7 @@ def test_missing_extras(make_task, exported, tmp_path, monkeypatch, package):
     """A package that is not installed is told with the extra's name, by the export and by what it has written."""
     task = make_task("a1_torque", num_envs=3)
     monkeypatch.setitem(sys.modules, package, None)
-    told = f"{package} is not installed; exported policies need the extra: pip install -e .[export]"
+    told = f"{package} is not installed; exported policies need the extra: pip install 'legged_torque[export]'"
     assert error_of(export_policy, task, None, tmp_path / "out", "a1_torque", TRAINING) == told
     assert not list(tmp_path.iterdir())
     if package != "onnx":

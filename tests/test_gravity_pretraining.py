@@ -141,7 +141,7 @@ def test_report(made):
         "Round 1 of 2: following 20 configurations.",
         "Round 2 of 2: following 21 configurations.",
         f"Kept {kept} of 246 pairs; dropped: ",
-        f"Epoch 3 of 3: root mean square error training {training[5]:.2f} N m, held out ",
+        f"Learned in 3 epochs: root mean square error training {training[5]:.2f} N m, held out ",
         f"Standing after 5 s: the controller {report['standing']['controller']:.1%} and the policy ",
         f"The policy is in {file.relative_to(root)}",
     ):

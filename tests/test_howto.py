@@ -2,18 +2,37 @@
 
 import re
 import runpy
+import shlex
+import sys
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+from test_scripts import run_here
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.curriculum import LinearCurriculum
+from legged_torque.utils.cli import Parser
 from legged_torque.utils.options import Options
 
 ROOT = Path(__file__).resolve().parents[1]
+GENERATED = ("docs/reference/", "docs/results/")
+FILES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").rglob("*.md"))
+PAGES = [name for name in (str(file.relative_to(ROOT)) for file in FILES) if not name.startswith(GENERATED)]
+RUN_PYTHON = {"README.md", "docs/terrain.md"} | {page for page in PAGES if page.startswith("docs/howto/")}
+"""Pages whose Python is run: that of docs/terrain.md in tests/test_terrain.py, all else here."""
+TINY = {
+    "train.py": [
+        "--device=cpu",
+        "--num_envs=2",
+        "--max_iterations=2",
+        "--set=runner.num_steps_per_env=4",
+        "--set=evaluation.interval=0",
+    ]
+}
+"""What makes the commands of a page short."""
 
 
 def blocks(page, language):
@@ -170,3 +189,64 @@ def test_robot(run_page):
     np.testing.assert_allclose(task.base_pos[0].numpy(), data.qpos[:3], atol=2e-3)
     assert 0.2 < data.qpos[2] < 0.3
     train(make("minidog_torque"), "minidog_torque")
+
+
+def fences(page):
+    """Each Bash and Python block of a page: line, whether it is marked as not run, language, text."""
+    text = (ROOT / page).read_text("utf-8")
+    pattern = r"^(<!-- not run: \S[^\n]* -->\n)?```(bash|python)\n(.*?)^```"
+    found = re.finditer(pattern, text, flags=re.MULTILINE | re.DOTALL)
+    return [(text.count("\n", 0, match.start(2)) + 1, bool(match[1]), match[2], match[3]) for match in found]
+
+
+def script_calls(block):
+    """(script, words) of each call of a script in a Bash block, also behind ``&&`` and ``torchrun``."""
+    lines = re.split(r"\n|&&", block.replace("\\\n", " "))
+    words = [shlex.split(line, comments=True) for line in lines if "$(" not in line]
+    places = [(line, place) for line in words for place, word in enumerate(line) if re.match(r"scripts/\w+\.py$", word)]
+    return [(line[place].removeprefix("scripts/"), line[place + 1 :]) for line, place in places]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_python_is_run_or_marked(page):
+    """Python that no test runs says so in the line above, ``<!-- not run: why -->``, and no other does."""
+    for line, is_marked, language, _ in fences(page):
+        assert language == "bash" or is_marked != (page in RUN_PYTHON), f"{page}:{line}"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands(page, tmp_path):
+    """Bash that is not marked is run, in its order and with few worlds and steps, so it calls nothing but scripts."""
+    for line, is_marked, language, block in fences(page):
+        if language == "bash" and not is_marked:
+            calls = script_calls(block)
+            lines = block.replace("\\\n", " ").strip().splitlines()
+            assert len(calls) == len(lines), f"{page}:{line}"
+            for script, words in calls:
+                status, output, error = run_here(script, *words, *TINY[script], root=tmp_path)
+                assert (status, error) == (0, "") and output, [script, *words]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_options_of_commands(page, monkeypatch, tmp_path):
+    """Each script that a page calls, marked or not, has these options, tasks and settings; here it ends once parsed."""
+    parse = Parser.parse_args
+
+    def parse_only(parser, *words):
+        args = parse(parser, *words)
+        if getattr(args, "set", None) is not None and args.task in task_registry.names():
+            task_registry.get_cfgs(args.task, Options(set=args.set, perturbation=args.perturbation))
+        parsed.append(args)
+        raise SystemExit(0)
+
+    parsed = []
+    monkeypatch.setattr(Parser, "parse_args", parse_only)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    calls = [call for _, _, language, block in fences(page) if language == "bash" for call in script_calls(block)]
+    for script, words in calls:
+        monkeypatch.setattr(sys, "argv", [script, *words])
+        with pytest.raises(SystemExit) as stop:
+            runpy.run_path(str(ROOT / "scripts" / script), run_name="__main__")
+        assert stop.value.code == 0, [script, *words]
+    assert len(parsed) == len(calls)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCES = ("CHANGELOG.md", "LICENSE", "MANIFEST.in", "README.md", "setup.py")
+SOURCES = ("CHANGELOG.md", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml", "setup.py")
 FOLDERS = ("experiments", "legged_torque", "resources", "scripts", "tests")
 SMALL = ["--num_envs=2", "--set=runner.num_steps_per_env=4", "--max_iterations=1", "--logger=none"]
 EXPERIMENT = """
@@ -77,9 +77,22 @@ def files(folder):
 def test_contents(installed):
     """The package holds its own files, the robots and the scripts, each once."""
     expected = files(ROOT / "legged_torque")
-    expected |= {f"{folder}/{name}" for folder in ("resources", "scripts") for name in files(ROOT / folder)}
+    folders = {"resources": "resources", "scripts": "scripts", "experiments": "descriptions"}
+    expected |= {f"{inside}/{name}" for folder, inside in folders.items() for name in files(ROOT / folder)}
     assert files(installed / "legged_torque") == expected
     assert {path.name for path in installed.iterdir() if path.suffix != ".dist-info"} == {"legged_torque"}
+
+
+def test_command_and_experiments(installed, tmp_path):
+    """The console command is there, and finds the experiments that come with the package."""
+    (points,) = installed.glob("*.dist-info/entry_points.txt")
+    assert "legged-torque = legged_torque.utils.command:main" in points.read_text()
+    code = "import legged_torque as l; print(*map(l.experiment_path, ('experiments/smoke.yaml', 'mine.yaml')))"
+    environment = os.environ | {"PYTHONPATH": str(installed)}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    smoke, mine = done.stdout.split()
+    assert Path(smoke).read_text() == (ROOT / "experiments" / "smoke.yaml").read_text()
+    assert smoke.startswith(str(installed)) and mine == "mine.yaml"
 
 
 def test_scripts_from_another_directory(installed, tmp_path):

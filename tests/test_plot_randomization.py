@@ -51,7 +51,7 @@ def test_without_matplotlib(tmp_path, monkeypatch):
     """The extra that is missing is named."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     result, _ = plot(tmp_path)
-    assert_told_in_one_line(result, "pip install -e .[plots]")
+    assert_told_in_one_line(result, "pip install 'legged_torque[plots]'")
 
 
 def test_unknown_format(tmp_path):

@@ -9,7 +9,7 @@ from test_ppo import make_ppo, record_rollout, shift_policy, state_of
 from test_scripts import assert_told_in_one_line, contents, run_here
 
 from legged_torque.control import gravity_pretraining
-from legged_torque.learning.pretrained import check_spaces, read_pretrained
+from legged_torque.learning.pretrained import check_making, check_spaces, read_pretrained
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def trained(made):
             status, output, error = run_here("train.py", *words, *more, f"--run_name={name}", root=root)
             assert (status, error) == (0, ""), output + error
             assert contents(file.parent) == before
-            runs.append((output, sorted(root.glob(f"logs/{TASK}/*_{name}/model_*.pt"))))
+            runs.append((output, sorted(root.glob(f"logs/{TASK}/*_{name}/model_[1-9].pt"))))
     return other, *runs
 
 
@@ -101,8 +101,8 @@ def test_a_resumed_training_has_its_policy(trained, tmp_path):
     assert (status, error) == (0, "") and "pre-trained" not in output
     assert not (tmp_path / "logs" / "pretrained").exists()
     files = sorted(tmp_path.glob(f"logs/{TASK}/*/model_*.pt"))
-    assert [file.name for file in files] == ["model_3.pt", "model_4.pt"]
-    (before, _), (third, _), (fourth, _) = load([found[1], *files])
+    assert [file.name for file in files] == ["model_2.pt", "model_3.pt", "model_4.pt"]
+    (before, _), (third, _), (fourth, _) = load([found[1], *files[1:]])
     assert same(before, third) and not same(third, fourth)
 
 
@@ -123,6 +123,21 @@ def test_what_does_not_fit_is_refused(made):
         assert f"'{file.relative_to(root)}'" in result[2]
     assert contents(root) == before
     check_spaces(file, *get_cfgs(task="a1_torque"))  # another task with the same spaces may use it
+
+
+def test_one_made_with_other_settings_is_refused(made):
+    """The settings of its making are compared, but not those of a training that starts from it."""
+    root, file, _, _ = made
+    same = words_of(**FEW, num_configurations=CONFIGURATIONS, num_steps=STEPS)
+    words, before = [*SMALL, f"--task={TASK}", "--max_iterations=1"], contents(root)
+    result = run_here("train.py", *words, *same, "--set=pretraining.max_residual=2.5", root=root)
+    assert_told_in_one_line(result, "was made with pretraining.max_residual 3.0, here it is 2.5: remove the file")
+    assert "or take it as it is with --set pretraining.max_residual=3.0" in result[2] and contents(root) == before
+    result = run_here("train.py", *words, root=root)
+    assert_told_in_one_line(result, f"was made with pretraining.num_configurations {CONFIGURATIONS}, here it is 20000")
+    assert contents(root) == before
+    _, train_cfg = get_cfgs(*same, *words_of(critic_warmup_iterations=3, file="x.pt"), task=TASK)
+    check_making(file, train_cfg)
 
 
 @pytest.mark.parametrize("content", ["text", "half", "other", "missing"])

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from legged_torque.experiments import figures
+from legged_torque.experiments import figures, figures_curves, figures_style
 from legged_torque.experiments.curves import CURVE_METRICS, read_rows
 from legged_torque.experiments.matrix import Cell, Matrix
 from legged_torque.experiments.paper_values import ENVIRONMENTS, PAPER_METRICS, TABLE_I, paper_value
@@ -85,6 +85,12 @@ def folder(tmp_path):
         write_result(cell, "doubled", tracking - 0.3)
     write_part(folder / "a1_torque-low-s1" / "2026-01-01_00-00-00", [line(i, i / 100) for i in range(10, 60, 10)])
     return folder
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    """Figures of few pixels, which are drawn fast."""
+    monkeypatch.setitem(figures_style.SETTINGS, "savefig.dpi", 20)
 
 
 def run_script(*words):
@@ -318,10 +324,11 @@ def test_what_is_missing(report):
 def test_text(report):
     """Numbers stand beside the paper's, marked where they are not final, and the test and the commands are named."""
     text, _, _ = report
-    low, often = "≈ 0.7500 ± 0.0500 (2), -1.9% | 0.7642", "✗ 0.5500 ± 0.0500 (2), -23.2% | 0.7163"
-    assert f"| Track % [share] | `a1_position` (PD) | {low} | {often} |" in text
-    assert "| Track % [share] | `a1_torque` (Default torque) | 0.5000 (1) † | – | – | – |" in text
-    assert "| `a1_position` (PD) | 0.6500 ± 0.0500 (2) |" in text.partition("## In other environments")[2]
+    low, often = "≈ 0.7500 ± 0.0500 | 0.7642", "✗ 0.5500 ± 0.0500 | 0.7163"
+    assert f"| Track % [share] | PD | {low} | {often} |" in text
+    assert "|  | Default torque | 0.5000 (1) † | – | – | – |" in text  # after those of the paper
+    assert "| Track % [share] | PD | 0.6500 ± 0.0500 |" in text.partition("## In other environments")[2]
+    assert "over 2 seeds (how many, if not all)" in text and "PD is `a1_position`" in text
     assert "Welch's t-test" in text and "Holm's correction" in text
     assert "All pairs: no test is possible; it takes at least two seeds of two tasks." in text
     assert "NVIDIA H200" in text and "python 3.11.0, torch 2.11.0" in text
@@ -339,11 +346,11 @@ def test_significant_differences(tmp_path, monkeypatch):
     assert run_script(tmp_path / "e", "--out", tmp_path / "out") == 0
     text = (tmp_path / "out" / "report.md").read_text()
     assert "Nothing: all trainings and evaluations are complete." in text
-    assert "| `a1_position` (PD) | ✗ **0.7020 ± 0.0006 (3)**, -8.1% | 0.7642 |" in text
-    assert "| Track xy [m²/s²] | `a1_torque` (Default torque) | **5.0200 ± 0.0058 (3)** | – |" in text
+    assert "| PD | ✗ **0.7020 ± 0.0006** | 0.7642 |" in text
+    assert "|  | Default torque | **5.0200 ± 0.0058** | – |" in text  # its error is the smallest
     p = holm([welch([0.701, 0.702, 0.703], [0.501, 0.502, 0.503]), 0.0, 0.0])[0]
-    assert p < 0.05 and "| `a1_position` - `a1_torque` | **+0.2000, p = " in text
-    assert "Against `a1_position`:" in text and "| `a1_multihead` - `a1_position` | **-0.1000, p = " in text
+    assert p < 0.05 and "| PD − Default torque | **+0.2000, p = " in text
+    assert "Against PD:" in text and "| Multi-head − PD | **-0.1000, p = " in text
 
 
 def test_figures(folder, tmp_path):
@@ -363,20 +370,26 @@ def test_figures(folder, tmp_path):
 
 
 def test_labels_of_curves(folder):
-    """A panel per environment, in which an unfinished task says how far it is; a task without data is not drawn."""
+    """A panel per environment, below which an unfinished task says how far it is; what has no data is not drawn."""
     pytest.importorskip("matplotlib", reason="figures need matplotlib: pip install -e .[plots]")
-    figure = figures.draw_curves(read_experiment(folder), "Figure 3")
-    labels = [[text.get_text() for text in axis.get_legend().get_texts()] for axis in figure.axes]
-    assert labels == [["PD", "Default torque (1 of 2 seeds, up to 50e6 steps)"], ["PD"]]
+    figure = figures_curves.draw_curves(read_experiment(folder), figures.CURVES["Tracking"][1], "Figure 3")
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["PD", "Default torque"]
+    notes = [axis.get_xlabel().partition("\n")[2] for axis in figure.axes]
+    assert notes == ["Default torque (1 of 2 seeds, up to 50e6 steps)", ""]
+    points = [line.get_ydata().tolist() for line in figure.axes[0].lines if line.get_marker() == "o"]
+    assert pytest.approx(points[0]) == [0.725, 0.825]  # of each seed, those at 100 and 110 million
 
 
 def test_notes_of_curves():
     """Labels tell seeds that are missing and how far unfinished ones are."""
-    curve = lambda end, finished: figures.Curve([0.0, end], [0.0, 1.0], finished)  # noqa: E731
-    assert figures.progress_note([curve(110, True)] * 4, 4, " s") == ""
-    assert figures.progress_note([curve(110, True)] * 2, 4, " s") == " (2 of 4 seeds)"
-    assert figures.progress_note([curve(60, False)] * 2, 4, "e6 steps") == " (2 of 4 seeds, up to 60e6 steps)"
-    assert figures.progress_note([curve(110, True), curve(57, False)], 2, " s") == " (2 of 2 seeds, up to 57–110 s)"
+    note = figures_curves.progress_note
+    curve = lambda end, finished: figures_curves.Curve([0.0, end], [0.0, 1.0], finished)  # noqa: E731
+    assert note([curve(110, True)] * 4, 4, " s") == ""
+    assert note([curve(110, True)] * 2, 4, " s") == " (2 of 4 seeds)"
+    assert note([curve(60, False)] * 2, 4, "e6 steps") == " (2 of 4 seeds, up to 60e6 steps)"
+    assert (
+        figures_curves.progress_note([curve(110, True), curve(57, False)], 2, " s") == " (2 of 2 seeds, up to 57–110 s)"
+    )
 
 
 @pytest.mark.parametrize("package", ["matplotlib", "scipy.stats"])
@@ -384,7 +397,7 @@ def test_without_the_extra(folder, tmp_path, monkeypatch, capsys, package):
     """One line says what a report needs, and neither report nor tables are written."""
     monkeypatch.setitem(sys.modules, package, None)
     assert run_script(folder, "--out", tmp_path / "out") == 2
-    assert capsys.readouterr().err.endswith(" need the extra: pip install -e .[plots]\n")
+    assert capsys.readouterr().err.endswith(" need the extra: pip install 'legged_torque[plots]'\n")
     assert not list((tmp_path / "out").glob("*.[mc]*"))
 
 

@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 import pytest
 from test_report import HEADER, SETTINGS, line, run_script, write_experiment, write_part
 
-from legged_torque.experiments import figures
+from legged_torque.experiments import figures, figures_curves, figures_style
 from legged_torque.experiments.against_paper import best_torque, count, judge
 from legged_torque.experiments.blocks import Code, Grid, Paragraph
 from legged_torque.experiments.paper_values import ENVIRONMENTS, PAPER_METRICS, PAPER_TASKS, paper_column
@@ -82,7 +82,7 @@ def test_best_torque_methods(papers_table):
     assert rows["Track % [share]", "low"] == expected
     assert rows["Track xy [m²/s²]", "low"][1:] == ["`a1_new`", "0.0310 (1) †", "≈ +1.9%"]
     force = rows["Collision forces [N]", "low"]
-    assert force[0] == "135.1 (PD)" and force[1] == "`a1_torque_curriculum`" and force[3] == "✗ -0.7%"  # 136.0
+    assert force[0] == "135.1 (PD)" and force[1] == "Torque curriculum" and force[3] == "✗ -0.7%"  # 136.0
     assert rows["Track % [share]", "high"][1:] == ["no data", "", ""]
     assert text.text.startswith("**In 1 of 15 rows the best torque method is better than the paper's best by 5%")
 
@@ -183,8 +183,9 @@ def test_tables_are_the_same_in_both(written):
     text, _, page = written
     assert page.tables == markdown_tables(text) and len(page.tables) > 5
     assert re.findall(r"^## (.*)", text, re.M)[:2] == ["Table I", "Best torque method against the paper's best"]
-    first = next(row for row in page.tables[1] if row[1] == "a1_position (PD)")
-    assert first[2:] == ["✗ 0.7100 ± 0.0029 (3), -0.9%", "0.7163", "✗ 0.6200 ± 0.0058 (3), -8.4%", "0.6765"]
+    assert page.tables[1][0] == ["metric", "method", "high_frequency", "paper", "doubled", "paper"]
+    assert page.tables[1][1][:2] == ["Track % [share]", "PD"] and page.tables[1][2][:2] == ["", "a1_new"]
+    assert page.tables[1][1][2:] == ["✗ 0.7100 ± 0.0029", "0.7163", "✗ 0.6200 ± 0.0058", "0.6765"]
     assert {"better", "within", "worse", None} == set(page.kinds)
 
 
@@ -228,11 +229,13 @@ def test_curves_over_seconds(folder):
     """They end at the time of the last evaluation, those over steps at its steps; new tasks differ in their styles."""
     pytest.importorskip("matplotlib", reason="figures need matplotlib: pip install -e .[plots]")
     experiment = read_experiment(folder)
-    for title, end in {"Figure 3": 110.0, "Figure 3 over seconds": 110.5}.items():
-        (axis,) = figures.draw_curves(experiment, title).axes
-        assert [max(each.get_xdata()) for each in axis.lines if len(each.get_xdata())] == [end, end]
-    tasks = [f"new_{number}" for number in range(6)]
-    assert len({figures.style(tasks, task) for task in tasks} | set(figures.STYLES.values())) == 12
+    for title, end in {"Tracking": 110.0, "Tracking over seconds": 110.5}.items():
+        (axis,) = figures_curves.draw_curves(experiment, figures.CURVES[title][1], title).axes
+        lines = [each for each in axis.lines if each.get_label()[0] != "_"]
+        assert [max(each.get_xdata()) for each in lines] == [end, end]
+    tasks = ["a1_position", *(f"new_{number}" for number in range(6))]
+    assert len({figures_style.style(tasks, task) for task in tasks}) == 7
+    assert figures_style.style(tasks, "a1_position") == figures_style.STYLES["a1_position"]
 
 
 @pytest.mark.parametrize("name", ["nowhere", "empty", "paper"])

@@ -20,6 +20,8 @@ import yaml
 from settings import COMBINATIONS, OTHER_ROBOTS, ROUGH, TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers
+
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--set=runner.num_steps_per_env=4", "--max_iterations=2"]
 
@@ -90,7 +92,7 @@ def root(tmp_path_factory):
     checkpoint = (run / "model_2.pt").read_bytes()
     for name, content in {"text": b"this is no checkpoint\n", "half": checkpoint[: len(checkpoint) // 2]}.items():
         copy = shutil.copytree(run, root / "logs" / f"{name}_checkpoint" / run.name)
-        for number in (1, 2):
+        for number in (0, 1, 2):
             (copy / f"model_{number}.pt").write_bytes(content)
     return root
 
@@ -124,7 +126,7 @@ MISTAKES = [
     ("--num_envs=few", "argument --num_envs: invalid int value: 'few'"),
     ("--max_iterations=0", "--max_iterations must be at least 1, not 0"),
     ("--resume --load_run=2026", "unknown run '2026'"),
-    ("--resume --checkpoint=7", "unknown checkpoint '7'; allowed: 1, 2"),
+    ("--resume --checkpoint=7", "unknown checkpoint '7'; allowed: 0, 1, 2"),
     ("--resume --checkpoint=last", "argument --checkpoint: invalid int value: 'last'"),
     ("--resume --experiment_name=nothing", "there is no run with a checkpoint in"),
     ("--resume", "the run has 2 iterations already; raise --max_iterations"),
@@ -196,7 +198,7 @@ def test_mistakes_when_training(root, words, message):
     [
         ("play.py", "--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
         ("play.py", "--load_run=2026", "unknown run '2026'"),
-        ("play.py", "--checkpoint=7", "unknown checkpoint '7'; allowed: 1, 2"),
+        ("play.py", "--checkpoint=7", "unknown checkpoint '7'; allowed: 0, 1, 2"),
         ("play.py", "--experiment_name=not_yaml", "config.yaml' is not valid YAML"),
         ("play.py", "--experiment_name=text_checkpoint", "model_2.pt' is not a readable checkpoint"),
         (
@@ -208,6 +210,8 @@ def test_mistakes_when_training(root, words, message):
         ("play.py", "--steps=0", "--steps must be at least 1, not 0"),
         ("play.py", "--terrain=stairs", "unknown kind of terrain 'stairs'; did you mean 'stairs_up'?"),
         ("play.py", "--level=0.5", "--level needs --terrain: the kinds of rough ground"),
+        ("play.py", "--compare=logs", "--compare needs --viewer web"),
+        ("play.py", "--compare=logs --viewer=web", "the run 'logs' has no config.yaml"),
         ("play.py", "--grid=5", "--grid must be 1, 4, 9, 16 or 25, not 5"),
         ("play.py", "--grid=0", "--grid must be 1, 4, 9, 16 or 25, not 0"),
         ("play.py", "--grid=36", "--grid must be 1, 4, 9, 16 or 25, not 36"),
@@ -302,6 +306,7 @@ def test_run_folder(root):
     (run,) = (root / "logs" / "a1_position").glob("*_good")
     assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_good", run.name)
     assert {path.name.split(".tfevents")[0] for path in run.iterdir() if path.is_file()} == {
+        "model_0.pt",  # so that the training can be watched at once
         "model_1.pt",
         "model_2.pt",
         "worlds_2.pt",
@@ -323,10 +328,12 @@ def test_resume_in_a_folder_by_its_path(root, tmp_path):
     """``--load_run`` takes a path, ``--checkpoint`` an earlier checkpoint, and other options still change settings."""
     (run,) = (root / "logs" / "a1_position").glob("*_good")
     words = [f"--load_run={run}", "--checkpoint=1", "--resume", "--max_iterations=2", "--logger=none", "--seed=9"]
-    status, _, error = run_here("train.py", "--task=a1_position", "--device=cpu", *words, root=tmp_path)
+    status, output, error = run_here("train.py", "--task=a1_position", "--device=cpu", *words, root=tmp_path)
     assert (status, error) == (0, "")
+    assert f"Resuming from {run / 'model_1.pt'}, after 1 iterations.\n" in output
     (new,) = (tmp_path / "logs" / "a1_position").iterdir()
-    assert {path.name for path in new.iterdir() if path.is_file()} == {"config.yaml", "model_2.pt", "worlds_2.pt"}
+    files = {path.name for path in new.iterdir() if path.is_file()}
+    assert files == {"config.yaml", "model_1.pt", "model_2.pt", "worlds_2.pt"}
     state = torch.load(new / "model_2.pt", weights_only=True)
     assert (state["iter"], state["infos"]["total_timesteps"]) == (2, 2 * 2 * 4)
     train = yaml.safe_load((new / "config.yaml").read_text())["train"]
@@ -338,9 +345,9 @@ def test_learning_curve(root, tmp_path):
     file = tmp_path / "new" / "curve.json"
     words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--steps=3", f"--json={file}"]
     status, output, error = run_here("learning_curve.py", *words, root=root)
-    assert (status, error) == (0, "") and len(output.splitlines()) == 2
+    assert (status, error) == (0, "") and len(output.splitlines()) == 3
     curve = json.loads(file.read_text())
-    assert [point["steps"] for point in curve["points"]] == [8, 16]
+    assert [point["steps"] for point in curve["points"]] == [0, 8, 16]
     assert all(math.isfinite(value) for point in curve["points"] for value in point.values())
 
 
@@ -397,21 +404,25 @@ def test_train_stop_resume_play(tmp_path):
     changes = [f"--set={key}={value}" for key, value in settings.items()]
     process = start("train.py", *task, *changes, "--num_envs=2", "--max_iterations=100000", root=tmp_path)
     for line in process.stdout:
-        if "Learning iteration 1/" in line:
+        if "iteration 1 of" in line:
             break
     process.send_signal(signal.SIGINT)
     status, output, error = finish(process)
     assert status == 130 and "Traceback" not in error and "Stopping" in output + error
     (first,) = logs.iterdir()
-    (checkpoint,) = first.glob("model_*.pt")
-    count = int(checkpoint.stem.removeprefix("model_"))
+    beginning, count = checkpoint_numbers(first)
+    assert beginning == 0
+    checkpoint = checkpoint_file(first, count)
     state = torch.load(checkpoint, weights_only=True)
     assert 2 <= count == state["iter"] and state["infos"]["total_timesteps"] == count * 8
     events = EventAccumulator(str(first)).Reload()
     assert [event.step for event in events.Scalars("Loss/value")] == list(range(count))
 
-    status, output, error = run_here("train.py", *task, "--resume", f"--max_iterations={count + 2}", root=tmp_path)
+    status, output, error = run_here(
+        "train.py", *task, "--resume", "--verbose", f"--max_iterations={count + 2}", root=tmp_path
+    )
     assert (status, error) == (0, "")
+    assert "\033" not in output and " of " not in output.partition("worlds, ")[2]
     (second,) = set(logs.iterdir()) - {first}
     state = torch.load(second / f"model_{count + 2}.pt", weights_only=True)
     assert state["iter"] == count + 2 and state["infos"]["total_timesteps"] == (count + 2) * 8
@@ -446,6 +457,6 @@ def test_resume_keeps_the_number_of_iterations(root, tmp_path):
     status, _, error = run_here("train.py", *words, root=tmp_path)
     assert (status, error) == (0, "")
     (new,) = (tmp_path / "logs" / "a1_position").iterdir()
-    assert [path.name for path in new.glob("model_*")] == ["model_2.pt"]
+    assert checkpoint_numbers(new) == [1, 2]
     config = yaml.safe_load((new / "config.yaml").read_text())
     assert (config["max_iterations"], config["preset"]) == (2, "parallel")

@@ -60,7 +60,7 @@ def test_standing_of_a_missing_policy(tmp_path):
     """It is told in one line where the policy should be; nothing is made."""
     result = run_here("check_standing.py", *SMALL, root=tmp_path)
     assert_told_in_one_line(
-        result, f"no pre-trained policy 'logs/pretrained/{TASK}.pt'; run scripts/pretrain_gravity.py"
+        result, f"no pre-trained policy 'logs/pretrained/{TASK}.pt'; make it first: python scripts/pretrain_gravity.py"
     )
     assert result[1] == "" and not list(tmp_path.iterdir())
 
@@ -128,7 +128,7 @@ def test_without_matplotlib(made, tmp_path, monkeypatch):
     """The extra that is missing is named."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     result, picture = plot(made[2], tmp_path)
-    assert_told_in_one_line(result, "pip install -e .[plots]")
+    assert_told_in_one_line(result, "pip install 'legged_torque[plots]'")
     assert not picture.exists()
 
 

@@ -1,5 +1,6 @@
 """Videos: size and number of frames, the numbers in the corner, which worlds are drawn."""
 
+import io
 import os
 import subprocess
 import sys
@@ -9,6 +10,9 @@ import numpy as np
 import pytest
 
 pytest.importorskip("PIL", reason="Pillow is not installed: pip install -e .[video]")
+
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.viewer import video
 from legged_torque.viewer.video import Moment, TaskRecorder, add_overlay, write_video
@@ -127,5 +131,23 @@ def test_recorded_worlds(make_task, monkeypatch):
 def test_missing_extra(monkeypatch, tmp_path):
     """Without an encoder the extra is named."""
     monkeypatch.setitem(sys.modules, "imageio", None)
-    with pytest.raises(video.UserError, match=r"videos need the extra: pip install -e \.\[video\]"):
+    with pytest.raises(video.UserError, match=r"videos need the extra: pip install 'legged_torque\[video\]'"):
         write_video(tmp_path / "out.mp4", None, 1, [[moment()]], 0.02)
+
+
+def test_videos_in_tensorboard(tmp_path):
+    """Every second frame at half the size, as moving pictures by the number of iterations."""
+    imageio = pytest.importorskip("imageio", reason="the extra 'video' is not installed")
+    pytest.importorskip("imageio_ffmpeg", reason="the extra 'video' is not installed")
+    file = tmp_path / "model_7.mp4"
+    with imageio.get_writer(file, fps=25, macro_block_size=1) as writer:
+        for number in range(6):
+            writer.append_data(np.full((64, 96, 3), 40 * number, np.uint8))
+    for iterations in (7, 9):
+        video.show_in_tensorboard(file, iterations)
+    events = EventAccumulator(str(tmp_path)).Reload().Images("video")
+    assert [(event.step, event.width, event.height) for event in events][-1] == (9, 48, 32)
+    picture = Image.open(io.BytesIO(events[-1].encoded_image_string))
+    assert (picture.format, picture.n_frames, picture.info["duration"]) == ("GIF", 3, 80)
+    picture.seek(2)
+    assert np.asarray(picture.convert("RGB")).mean() == pytest.approx(160.0, abs=4.0)

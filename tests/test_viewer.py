@@ -242,6 +242,33 @@ def test_mixing(make_session):
     assert session.task.mixing[0] > trained[0] and not session.state.is_mixing_set  # checkpoint 1 is an earlier one
 
 
+def test_companion(make_session, runs, tmp_path):
+    """Another policy walks with the first one: step by step, under its command, pushed and reset with it."""
+    session, _, _ = make_session("a1_torque", **{"commands.resampling_probability": 0.5})
+    env_cfg, train_cfg = task_registry.get_cfgs("a1_position")
+    env_cfg.env.num_envs = 1
+    run = LoadedRun(runs["a1_position"], {}, env_cfg, train_cfg, checkpoint_file(runs["a1_position"], 1))
+    other = session.companion = Session(task_registry.get_task_class("a1_position"), run, "cpu")
+    for count in range(1, 7):
+        session.tick()
+        np.testing.assert_array_equal(other.state.reading.commands[0], session.state.reading.commands[0])
+        assert other.state.time == session.state.time and int(other.task.episode_length_buf[0]) == count
+    session.set_paused(True)
+    ticks(session, 2)
+    assert other.state.time == session.state.time
+    before = other.task.sim.qvel[0, :2].clone()
+    session.set_paused(False)
+    session.push(0.0, 5.0)
+    session.tick()
+    assert (other.task.sim.qvel[0, :2] - before).norm() > 3.0
+    session.reset()
+    session.tick()
+    assert int(other.task.episode_length_buf[0]) == 1
+    other.load_checkpoint(2)
+    session.tick()
+    assert other.state.checkpoint == 2 and session.state.checkpoint == 2
+
+
 def test_no_mixing(make_session):
     """Other tasks have no weights."""
     session, _, _ = make_session("a1_torque")
@@ -481,5 +508,5 @@ def test_missing_extra(monkeypatch):
         monkeypatch.delitem(sys.modules, f"legged_torque.viewer.{name}", raising=False)
     play = runpy.run_path(str(SCRIPTS_DIR / "play.py"))
     args = argparse.Namespace(viewer="web", task="a1_torque", host="127.0.0.1", port=8080)
-    with pytest.raises(UserError, match=r"pip install -e \.\[viewer\]"):
+    with pytest.raises(UserError, match=r"pip install 'legged_torque\[viewer\]'"):
         play["import_viewer"](args)

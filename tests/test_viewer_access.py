@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gzip
 import http.client
 import socket
 import threading
@@ -16,6 +17,7 @@ from websockets.http11 import Response
 from websockets.sync.client import connect
 
 from legged_torque.viewer.access import Guard, is_local
+from legged_torque.viewer.steering import Steering
 
 
 def page(connection, request):
@@ -24,8 +26,17 @@ def page(connection, request):
     return None if is_connection else Response(200, "OK", Headers({"Content-Length": "5"}), b"hello")
 
 
+def html_page(connection, request):
+    """Answer as viser does with its page, zipped for browsers that can unzip it."""
+    body = b"<html><head><title>robots</title></head></html>"
+    is_zipped = "gzip" in request.headers.get("Accept-Encoding", "")
+    body = gzip.compress(body) if is_zipped else body
+    encoding = "gzip" if is_zipped else "identity"
+    return Response(200, "OK", Headers({"Content-Length": str(len(body)), "Content-Encoding": encoding}), body)
+
+
 @contextlib.contextmanager
-def serving(guard):
+def serving(guard, page=page, **door):
     """A server on this machine that asks a guard; gives its port."""
     loop, ready, ports = asyncio.new_event_loop(), threading.Event(), []
 
@@ -36,7 +47,7 @@ def serving(guard):
             with contextlib.suppress(asyncio.CancelledError):
                 await asyncio.Event().wait()
 
-    with guard.at_the_door():
+    with guard.at_the_door(**door):
         thread = threading.Thread(target=lambda: loop.run_until_complete(task), daemon=True)
         task = loop.create_task(run())
         thread.start()
@@ -114,3 +125,49 @@ def test_addresses_that_only_this_machine_reaches(host, expected):
     """All others need a token."""
     assert is_local(host) is expected
     assert bool(Guard(host).token) is not expected
+
+
+def answer(port, path, **headers):
+    """Ask for a path; return status and body."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", path, headers=headers)
+    response = connection.getresponse()
+    body = response.read()
+    connection.close()
+    return response.status, body
+
+
+def test_script_of_the_page():
+    """It stands in the head of the page, zipped or not, and nowhere else."""
+    with serving(Guard("127.0.0.1"), html_page, change=Steering().around) as port:
+        plain = answer(port, "/")[1]
+        assert plain.startswith(b"<html><head><script>") and plain.endswith(
+            b"</script><title>robots</title></head></html>"
+        )
+        assert gzip.decompress(answer(port, "/?token=1", **{"Accept-Encoding": "gzip"})[1]) == plain
+        assert b"<script>" not in answer(port, "/assets/other.html")[1]
+
+
+@pytest.mark.parametrize(
+    ("query", "headers", "status", "wish"),
+    [
+        ("shares=0.50,-1.00,0.00", {"X-Steer": "1"}, 204, (0.5, -1.0, 0.0)),
+        ("shares=0.5,0,0", {}, 403, None),  # what a page of another site can send
+        ("shares=0.5,0,0", {"X-Steer": "1", "Origin": "http://evil.example"}, 403, None),
+        *((f"shares={text}", {"X-Steer": "1"}, 400, None) for text in ("nan,0,0", "1.01,0,0", "1,0", "a,b,c", "")),
+        ("", {"X-Steer": "1"}, 400, None),
+    ],
+)
+def test_wishes(query, headers, status, wish):
+    """Three shares from the page itself are taken, once; everything else is refused."""
+    steering = Steering()
+    with serving(Guard("127.0.0.1"), change=steering.around) as port:
+        assert answer(port, f"/steer?{query}", **headers)[0] == status
+    assert steering.take() == wish and steering.take() is None
+
+
+def test_steering_needs_the_token():
+    """As everything else does, for other machines."""
+    guard, steering = Guard("0.0.0.0"), Steering()
+    with serving(guard, change=steering.around) as port:
+        assert answer(port, "/steer?shares=1,0,0", **{"X-Steer": "1"})[0] == 403 and steering.take() is None

@@ -186,7 +186,8 @@ def option_cases(parsers: Mapping[str, Parser]) -> Iterator[Case]:
 def bad_words(action: argparse.Action) -> Iterator[tuple[str, bool]]:
     """Yield texts for an option, and whether it is wrong to accept each."""
     if action.type is int:
-        yield from ((text, True) for text in ("", "x", "1.5", "nan", "-1", "1e3", "9" * 30))
+        yield from ((text, True) for text in ("", "x", "1.5", "nan", "1e3", "9" * 30))
+        yield "-1", action.dest != "checkpoint"
         yield "0", False
         if action.dest == "num_envs":
             yield "3000000000", True

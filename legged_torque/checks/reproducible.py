@@ -119,7 +119,7 @@ class Training:
         many = ["-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={self._processes}"]
         command = [sys.executable, *(many if self._processes > 1 else []), str(SCRIPTS_DIR / "train.py"), *self._words]
         command += [f"--log_root={self.folder}", f"--experiment_name={self._experiment.name}"]
-        command += [f"--max_iterations={iterations}", *(["--resume"] if self._has_checkpoint() else [])]
+        command += [f"--max_iterations={iterations}", "--verbose", *(["--resume"] if self._has_checkpoint() else [])]
         return subprocess.Popen(
             command,
             text=True,

@@ -30,6 +30,7 @@ from legged_torque.control.whole_body import WholeBodyController, WholeBodySetti
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
+from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.random_state import own_random_numbers, seeded_state
 from legged_torque.utils.task_registry import task_registry
@@ -159,19 +160,22 @@ def follow(
 ) -> Followed:
     """Follow random configurations for some control steps; ``act`` moves them if given, otherwise the controller."""
     parts: list[list[Tensor]] = []
-    for start in range(0, num_configurations, task.num_envs):
-        place_on_ground(task, controller.dynamics)
-        upright = torch.ones_like(task.reset_buf)
-        steps = []
-        for _ in range(num_steps):
-            decided = controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0)
-            observations = task.get_observations()["policy"]
-            actions, residuals = actions_for(task, decided.total), residual_share(controller, decided)
-            steps.append([observations, actions, decided.total.abs().mean(dim=1), residuals, upright])
-            task.step(act(task) if act else actions)  # they hold for a control step
-            upright = upright & ~task.reset_buf
-        count = min(task.num_envs, num_configurations - start)
-        parts.append([torch.stack(numbers)[:, :count] for numbers in zip(*steps, strict=True)])
+    starts = range(0, num_configurations, task.num_envs)
+    with Counter("following, step", len(starts) * num_steps) as counter:
+        for start in starts:
+            place_on_ground(task, controller.dynamics)
+            upright = torch.ones_like(task.reset_buf)
+            steps = []
+            for _ in range(num_steps):
+                decided = controller(task.sim.qpos, task.sim.qvel, task.feet_contact > 0)
+                observations = task.get_observations()["policy"]
+                actions, residuals = actions_for(task, decided.total), residual_share(controller, decided)
+                steps.append([observations, actions, decided.total.abs().mean(dim=1), residuals, upright])
+                task.step(act(task) if act else actions)  # they hold for a control step
+                upright = upright & ~task.reset_buf
+                counter.add()
+            count = min(task.num_envs, num_configurations - start)
+            parts.append([torch.stack(numbers)[:, :count] for numbers in zip(*steps, strict=True)])
     return Followed(*(torch.cat(numbers, dim=1) for numbers in zip(*parts, strict=True)))
 
 
@@ -221,22 +225,24 @@ def supervise(task: LeggedRobot, actor: MLPModel, collection: Collection, settin
     optimizer = torch.optim.Adam(actor.parameters(), lr=settings.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.num_epochs * num_batches)
     errors: dict[str, list[float]] = {"training": [], "held_out": []}
-    for epoch in range(settings.num_epochs):
-        losses = []
-        for pairs in collection.training.shuffled().split(settings.batch_size):
-            wrong = imitation_errors(task, actor, pairs)
-            optimizer.zero_grad()
-            wrong.square().mean().backward()
-            optimizer.step()
-            schedule.step()
-            losses.append(of_torques(task, wrong.detach()))
-        with torch.no_grad():
-            batches = collection.held_out.split(settings.batch_size)
-            held_out = [of_torques(task, imitation_errors(task, actor, pairs)) for pairs in batches]
-        for name, values in (("training", losses), ("held_out", held_out)):
-            errors[name].append(task.cfg.control.torque_scale * float(torch.stack(values).mean().sqrt()))
-        now = ", ".join(f"{name.replace('_', ' ')} {values[-1]:.2f} N m" for name, values in errors.items())
-        print(f"Epoch {epoch + 1} of {settings.num_epochs}: root mean square error {now}.", flush=True)
+    with Counter("learning, epoch", settings.num_epochs) as counter:
+        for _ in range(settings.num_epochs):
+            losses = []
+            for pairs in collection.training.shuffled().split(settings.batch_size):
+                wrong = imitation_errors(task, actor, pairs)
+                optimizer.zero_grad()
+                wrong.square().mean().backward()
+                optimizer.step()
+                schedule.step()
+                losses.append(of_torques(task, wrong.detach()))
+            with torch.no_grad():
+                batches = collection.held_out.split(settings.batch_size)
+                held_out = [of_torques(task, imitation_errors(task, actor, pairs)) for pairs in batches]
+            for name, values in (("training", losses), ("held_out", held_out)):
+                errors[name].append(task.cfg.control.torque_scale * float(torch.stack(values).mean().sqrt()))
+            now = ", ".join(f"{name.replace('_', ' ')} {values[-1]:.2f} N m" for name, values in errors.items())
+            counter.add(f"root mean square error {now}")
+    print(f"Learned in {settings.num_epochs} epochs: root mean square error {now}.", flush=True)
     return errors
 
 

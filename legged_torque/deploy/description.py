@@ -208,4 +208,6 @@ def _numbers(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
 
 def missing_extra(package: str) -> UserError:
     """Return the error for a package that is not installed."""
-    return UserError(f"{package} is not installed; exported policies need the extra: pip install -e .[export]")
+    return UserError(
+        f"{package} is not installed; exported policies need the extra: pip install 'legged_torque[export]'"
+    )

@@ -6,6 +6,7 @@ import itertools
 from dataclasses import dataclass
 
 from legged_torque.experiments.blocks import BETTER, WITHIN, WORSE, Block, Grid, Paragraph
+from legged_torque.experiments.figures_style import method
 from legged_torque.experiments.paper_values import ENVIRONMENTS, MODELS, PAPER_METRICS, paper_column
 from legged_torque.experiments.results import Cells, Summary, Table
 from legged_torque.utils.metrics import Metric
@@ -52,8 +53,8 @@ def best_torque(table: Table) -> list[Block]:
     reached = sum(row[-1].startswith(BETTER) for row in rows)
     texts = (
         f"**In {reached} of {len(rows)} rows the best torque method is better than the paper's best by {TARGET:.0%} or",
-        f"more** ({BETTER}; {WITHIN}: better by less, {WORSE}: not better). Torque methods are all tasks but",
-        f"{', '.join(f'`{task}`' for task in POSITION_TASKS)}; the best has the best mean. Positive percentages",
+        f"more** ({BETTER}; {WITHIN}: better by less, {WORSE}: not better). Torque methods are all but",
+        f"{', '.join(map(method, POSITION_TASKS))}; the best has the best mean. Positive percentages",
         "are better, whichever direction that is.",
     )
     header = ["metric", "environment", "paper's best", "our best torque method", "ours", "better by"]
@@ -73,13 +74,14 @@ def best_row(cells: Cells, metric: Metric, column: str) -> list[str]:
     share = judge(metric, found[task], papers[model]).share
     sign = BETTER if share >= TARGET else WITHIN if share > 0.0 else WORSE
     ours = marked(number_text(found[task], metric.digits), False, found[task])
-    return [*row, f"`{task}`", ours, f"{sign} {share:+.1%}"]
+    return [*row, method(task), ours, f"{sign} {share:+.1%}"]
 
 
-def number_text(summary: Summary, digits: int) -> str:
-    """Return mean, standard error and number of seeds, with so many decimals."""
+def number_text(summary: Summary, digits: int, planned: int = 0) -> str:
+    """Return mean and standard error with so many decimals, and the number of seeds if it is not the planned one."""
     error = "" if summary.standard_error is None else f" ± {summary.standard_error:.{digits}f}"
-    return f"{summary.mean:.{digits}f}{error} ({len(summary.values)})"
+    count = "" if len(summary.values) == planned else f" ({len(summary.values)})"
+    return f"{summary.mean:.{digits}f}{error}{count}"
 
 
 def marked(text: str, is_significant: bool, *summaries: Summary) -> str:

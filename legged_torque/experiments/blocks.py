@@ -27,9 +27,11 @@ body { background: var(--back); color: var(--text); font: 16px/1.5 system-ui, sa
   margin: 0 auto; padding: 0 1rem 3rem; }
 nav { display: flex; flex-wrap: wrap; gap: .3rem 1.2rem; } p, ul { max-width: 60rem; }
 .wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .85rem; margin: .6rem 0; }
-th, td { border: 1px solid var(--line); padding: .25rem .5rem; text-align: left; white-space: nowrap; }
+table { border-collapse: collapse; font-size: .83rem; margin: .6rem 0; }
+th, td { border: 1px solid var(--line); padding: .25rem .35rem; text-align: left; white-space: nowrap; }
 th { background: var(--soft); }
+tr:not(.more):has(+ .more) td { border-top: 2px solid var(--text); }
+tr:has(+ .more) td:first-child { border-bottom: none; } .more td:first-child { border-top: none; }
 .better { background: var(--better); } .within { background: var(--within); } .worse { background: var(--worse); }
 pre { background: var(--soft); padding: .7rem; overflow-x: auto; font-size: .85rem; }
 figure { margin: 1.2rem 0; } img, video { max-width: 100%; height: auto; background: #fff; }
@@ -95,7 +97,10 @@ class Bullets:
 
 @dataclass
 class Grid:
-    """A table; a cell that begins with one of the signs of this module has its colour."""
+    """A table; a cell that begins with one of the signs of this module has its colour.
+
+    A row whose first cell is empty belongs to the group of the row above.
+    """
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -109,8 +114,8 @@ class Grid:
     def html(self) -> str:
         """Return the table, which can be scrolled sideways."""
         head = "".join(f"<th>{inline(cell)}</th>" for cell in self.header)
-        rows = ("".join(self._cell(cell) for cell in row) for row in self.rows)
-        body = "".join(f"<tr>{row}</tr>\n" for row in rows)
+        rows = ((' class="more"' if row[0] == "" else "", "".join(map(self._cell, row))) for row in self.rows)
+        body = "".join(f"<tr{kind}>{cells}</tr>\n" for kind, cells in rows)
         return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>\n{body}</tbody></table></div>'
 
     def _cell(self, text: str) -> str:

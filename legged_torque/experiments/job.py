@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import re
 import shlex
 import time
 from dataclasses import dataclass
@@ -13,8 +12,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
+from legged_torque.experiments.experiment_display import Row
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, cell_state, command_of, is_json, step_words
 from legged_torque.experiments.times import read_times, write_times
+from legged_torque.learning.training_display import WHAT, read_tracking
+from legged_torque.utils.display import read_progress
 from legged_torque.utils.errors import UserError
 
 CPU_JOBS, GPU_JOBS, MPS_JOBS = 1, 2, 4
@@ -24,7 +26,7 @@ LOST = 256
 """Exit status of a step whose machine is gone: no process ends with it."""
 _KEEP_EVERY = 20.0  # seconds between writes of the device time
 _TAIL = 65536  # bytes that are read from the end of a log
-_ITERATION = re.compile(r"Learning iteration (\d+)/(\d+)")
+_LAST_LINES = 4096  # characters at the end of a log in which its progress is looked for
 
 
 class Process(Protocol):
@@ -131,10 +133,18 @@ class Job:
         """Return the fraction of the training's iterations that is done; 1 for an evaluation."""
         if self.state.step == "evaluate":
             return 1.0
-        found = _ITERATION.findall(self.output())
-        if found:
-            return (int(found[-1][0]) + 1) / max(int(found[-1][1]), 1)
+        found = read_progress(self.output()[-_LAST_LINES:])
+        if found and found[0] == WHAT:
+            return found[1] / max(found[2], 1)
         return self.state.iterations / (self.state.total or 1)
+
+    def row(self, device: str) -> Row:
+        """Return what is shown of the step, which runs on a device."""
+        text = self.output()[-_LAST_LINES:]
+        what, done, total, left = read_progress(text) or ("", 0, 1, "")
+        doing = self._step_name if what in ("", WHAT) or self.state.step == "evaluate" else what.partition(",")[0]
+        share = f" {done / max(total, 1):.0%}" if what else ""
+        return Row(self.cell.name, device or "waiting", f"{doing}{share}", read_tracking(text), left)
 
     def step_text(self) -> str:
         """Describe the step."""
@@ -166,10 +176,6 @@ class Job:
             return f"{self.step_text()} has left no readable '{self.cell.part_file(name)}'"
         self.cell.part_file(name).replace(self.cell.result_file(name))
         return ""
-
-    def __str__(self) -> str:
-        """Describe the step in a few words, with its progress."""
-        return f"{self.cell.name} {'evaluation' if self.state.step == 'evaluate' else f'{self.fraction():.0%}'}"
 
 
 def try_lock(file: Path) -> BinaryIO | None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 import sys
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
+from legged_torque.utils.args import task_file_words
 from legged_torque.utils.config import convert, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
@@ -97,6 +99,7 @@ class Matrix:
     train: dict[str, Any] = field(default_factory=dict)  # changed settings, by dotted path
     evaluation: dict[str, int] = field(default_factory=dict)  # as EVALUATION
     grounds: dict[str, Any] = field(default_factory=dict)  # as GROUNDS; empty: none
+    task_files: tuple[str, ...] = ()  # what --task_file of the command line gives; no description can
 
     def cells(self, out: Path) -> list[Cell]:
         """Return all cells in a folder, seed by seed, so that tasks can be compared before all seeds are done."""
@@ -143,11 +146,15 @@ class CellState:
         return f"{training}evaluate in {', '.join(self.missing)}" if self.missing else "done"
 
 
-def read_matrix(file: Path) -> Matrix:
-    """Read a matrix, and check what train.py and evaluate.py would check only hours later; UserError if it is wrong."""
+def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
+    """Read a matrix, and check what train.py and evaluate.py would check only hours later; UserError if it is wrong.
+
+    Its tasks may be those that ``task_files`` register, which are imported.
+    """
     from legged_torque.envs.base.asset import load_asset
 
-    matrix = read_plan(file)
+    task_registry.import_files(task_files)
+    matrix = replace(read_plan(file), task_files=tuple(str(Path(name).resolve()) for name in task_files))
     for key, source in CELL_SETTINGS.items():
         if key in matrix.train:
             raise UserError(f"train.{key} cannot be set: it comes from {source}")
@@ -171,7 +178,7 @@ def read_plan(file: Path) -> Matrix:
     if not file.is_file():
         raise UserError(f"there is no file '{file}'")
     values = parse_yaml(file.read_text(encoding="utf-8", errors="replace"), f"'{file}'")
-    keys = [entry.name for entry in fields(Matrix)]
+    keys = [entry.name for entry in fields(Matrix) if entry.name != "task_files"]  # a file names no code to run
     if not isinstance(values, dict):
         raise UserError(f"'{file}' must hold the keys {', '.join(keys)}")
     for key in values:
@@ -211,7 +218,7 @@ def read_plan(file: Path) -> Matrix:
 def step_words(matrix: Matrix, cell: Cell, state: CellState, device: str) -> list[str]:
     """Return the script of a cell's next step and its arguments, for a device named as ``--device`` takes it."""
     words = [f"--task={cell.task}", f"--log_root={cell.folder.parent}", f"--experiment_name={cell.name}"]
-    words.append(f"--device={device}")
+    words += [f"--device={device}", *task_file_words(matrix.task_files)]
     if state.step == "evaluate":
         name, numbers = state.missing[0], matrix.evaluation
         if name == ROUGH_GROUND:

@@ -86,7 +86,7 @@ def join_cluster(address: str) -> Any:
     try:
         import ray
     except ImportError:
-        raise UserError("--launcher ray needs the extra: pip install -e .[ray]") from None
+        raise UserError("--launcher ray needs the extra: pip install 'legged_torque[ray]'") from None
     host, _, port = address.rpartition(":")
     if address != "auto" and not (host and port.isdecimal()):
         raise UserError(f"--address must be auto or HOST:PORT, not '{address}'")

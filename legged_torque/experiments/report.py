@@ -9,13 +9,14 @@ from pathlib import Path
 
 import yaml
 
-from legged_torque.experiments.against_paper import MEANINGS, best_torque, count, judge, marked, number_text
+from legged_torque.experiments.against_paper import MEANINGS, best_torque, count, marked, number_text
 from legged_torque.experiments.blocks import VIDEO_TYPES, Block, Bullets, Code, Grid, Heading, Paragraph, Picture
 from legged_torque.experiments.curves import MILLION
-from legged_torque.experiments.figures import FIGURES, file_name, rough_figures
+from legged_torque.experiments.figures import file_name, planned_figures, rough_figures
+from legged_torque.experiments.figures_style import method, name_of, seeds_text
 from legged_torque.experiments.grounds import MEASURES, kinds_of, over_levels
 from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE, Matrix
-from legged_torque.experiments.paper_values import MODELS, PAPER_METRICS, PAPER_TASKS, paper_value
+from legged_torque.experiments.paper_values import PAPER_METRICS
 from legged_torque.experiments.results import (
     EVALUATIONS_FILE,
     GROUNDS_FILE,
@@ -29,13 +30,12 @@ from legged_torque.experiments.results import (
     compare,
     is_of_paper,
 )
+from legged_torque.experiments.tables import SIGNIFICANT, metric_table
 from legged_torque.experiments.times import add_up, describe, read_times
 from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.metrics import Metric
 from legged_torque.utils.paths import portable_path, without_machine
 
-SIGNIFICANT = 0.05
 BASELINES = ("a1_position", "a1_torque")
 
 
@@ -52,15 +52,15 @@ def report(
         "Table I": table_one(experiment, table, from_step),
         "Best torque method against the paper's best": best_torque(table),
     }
-    walking: dict[str, list[Block]] = {"While training": own_table(table, from_step)}
+    walking: dict[str, list[Block]] = {"While training": own_table(experiment, table, from_step)}
     sections: dict[str, list[Block]] = {
         "Rough ground": rough_blocks(experiment, figures, out),
-        **(of_paper if set(PAPER_TASKS) & set(experiment.plan.tasks) else walking),
+        **(of_paper if experiment.is_like_paper() else walking),
         "What is missing": [Bullets(missing) if missing else complete],
-        "In other environments than those of training": other_table(table),
+        "In other environments than those of training": other_table(experiment, table),
         "Differences": differences(table),
-        "Figures": figure_blocks([title for title in figures if title in FIGURES], out),
-        "Videos": [Picture(MODELS.get(task, task), file) for task, file in videos.items()],
+        "Figures": figure_blocks(experiment, table, figures, out),
+        "Videos": [Picture(name_of(task), file) for task, file in videos.items()],
         "How it was made": setup_blocks(experiment, from_step, out),
     }
     return [block for title, section in sections.items() if section for block in (Heading(title), *section)]
@@ -68,13 +68,13 @@ def report(
 
 def missing_lines(experiment: Experiment, from_step: float) -> list[str]:
     """Return a line for everything planned that is missing, unfinished or unreadable."""
-    lines, plan = [], experiment.plan
+    lines, plan = list(experiment.notes), experiment.plan
     for task, environment in ((task, environment) for environment in plan.environments for task in plan.tasks):
         place, runs = f"`{task}` in {environment}", experiment.runs_of(task, environment)
         begun = [run.cell.seed for run in runs]
-        if not runs:
+        if not runs and experiment.is_planned:
             lines.append(f"{place}: no data, no training has begun.")
-        elif len(begun) < len(plan.seeds):
+        elif len(begun) < experiment.num_expected(task, environment):
             absent = ", ".join(str(seed) for seed in plan.seeds if seed not in begun)
             lines.append(f"{place}: no training has begun with seed {absent}.")
         problems = {run.cell.seed: "; ".join(run_problems(run, from_step)) for run in runs}
@@ -112,67 +112,46 @@ def run_problems(run: CellResult, from_step: float) -> list[str]:
     return problems
 
 
-def number(cells: Cells, task: str, metric: Metric, paper: float | None) -> str:
-    """Return an entry of Table I: sign, mean, standard error, seeds, and by how much it is better than the paper's."""
-    summary = cells[task].get(metric.name)
-    if summary is None:
-        return "–"
-    text = marked(number_text(summary, metric.digits), is_best(cells, task, metric), summary)
-    if paper is None:
-        return text
-    verdict = judge(metric, summary, paper)
-    return f"{verdict.sign} {text}, {verdict.share:+.1%}"
-
-
-def is_best(cells: Cells, task: str, metric: Metric) -> bool:
-    """Return whether a task is significantly better than every other task that has a value."""
-    means = {name: cell[metric.name].mean for name, cell in cells.items() if metric.name in cell}
-    pairs = list(combinations(means, 2))
-    own = [p for pair, p in zip(pairs, compare(cells, metric.name, pairs), strict=True) if task in pair]
-    best = max(means.values(), key=lambda mean: metric.gain(mean, 0.0))
-    return means[task] == best and bool(own) and all(p is not None and p < SIGNIFICANT for p in own)
-
-
-def metric_table(table: Table, columns: list[str], beside_paper: bool) -> Grid:
-    """Return a table with a row per metric and task, and if asked for the paper's values beside ours."""
-    header = ["metric", "task"]
-    for column in columns:
-        header += [column, "paper"] if beside_paper else [column]
-    rows = []
-    for metric, task in ((metric, task) for metric in PAPER_METRICS for task in table[columns[0]]):
-        row = [metric.label, f"`{task}` ({MODELS[task]})" if task in MODELS else f"`{task}`"]
-        for column in columns:
-            paper = paper_value(task, column, metric.name)
-            row.append(number(table[column], task, metric, paper))
-            if beside_paper:
-                row.append("–" if paper is None else f"{paper:.{metric.digits}f}")
-        rows.append(row)
-    return Grid(header, rows)
-
-
 def table_one(experiment: Experiment, table: Table, from_step: float) -> list[Block]:
     """Return Table I next to the paper's."""
     texts = (
         count(table),
-        f"Mean ± standard error over seeds (number of seeds, of {len(experiment.plan.seeds)} that were planned), and "
-        f"by how much it is better than the paper's. {what_counts(from_step)} `doubled` is trained in `high_frequency` "
-        "and evaluated in `doubled` as well while it trains, or else has the number of the last checkpoint. The "
+        f"Mean ± standard error over {seeds_text(len(experiment.plan.seeds))} (how many, if not all), "
+        f"{experiment.ranges()} ranges. {what_counts(from_step)} `doubled` is trained in `high_frequency` and "
+        "evaluated in `doubled` as well while it trains, or else has the number of the last checkpoint. The "
         "paper's numbers are means of four seeds and of all evaluations after step 90 million; it prints no errors, "
         "and no numbers of default torque control.",
         "**Bold**: significantly better than every other task of the column (see Differences). †: seeds are missing or "
         "trainings are not finished, so the number will change. With one seed, the standard error counts as 0.",
+        methods_text(experiment),
+        *(
+            ["With other ranges than `default`, it is not the paper's task."]
+            if experiment.ranges() != "default"
+            else []
+        ),
     )
     legend = Grid(["sign", "meaning"], list(MEANINGS.items()))
-    return [*map(Paragraph, texts), legend, metric_table(table, [name for name in table if is_of_paper(name)], True)]
+    columns = [name for name in table if is_of_paper(name)]
+    return [*map(Paragraph, texts), legend, metric_table(experiment, table, columns)]
 
 
-def own_table(table: Table, from_step: float) -> list[Block]:
-    """Return the metrics of tasks that the paper does not have."""
+def own_table(experiment: Experiment, table: Table, from_step: float) -> list[Block]:
+    """Return the metrics of an experiment of the user's own."""
+    planned = f"{seeds_text(len(experiment.plan.seeds))} (how many, if not all)"
+    seeds = planned if experiment.is_planned else "seeds (how many)"
     text = (
-        f"Mean ± standard error over seeds (number of seeds). {what_counts(from_step)} **Bold**: significantly better "
-        "than every other task of the column. †: seeds are missing or trainings are not finished."
+        f"Mean ± standard error over {seeds}, {experiment.ranges()} ranges. {what_counts(from_step)} **Bold**: "
+        "significantly better than every other task of the column. †: seeds are missing or trainings are not finished."
     )
-    return [Paragraph(text), metric_table(table, [name for name in table if is_of_paper(name)], False)]
+    grid = metric_table(experiment, table, [name for name in table if is_of_paper(name)])
+    beside = " The paper's numbers, beside ours, are means of four seeds after step 90 million."
+    return [Paragraph(text + (beside if "paper" in grid.header else "")), Paragraph(methods_text(experiment)), grid]
+
+
+def methods_text(experiment: Experiment) -> str:
+    """Return which task each method is."""
+    named = [task for task in experiment.plan.tasks if name_of(task) != task]
+    return f"Methods: {', '.join(f'{name_of(task)} is `{task}`' for task in named)}." if named else ""
 
 
 def what_counts(from_step: float) -> str:
@@ -195,7 +174,7 @@ def rough_blocks(experiment: Experiment, figures: list[str], out: Path) -> list[
         "means over all difficulties, ± standard errors over seeds, in brackets how many if not all. All tiles "
         f"are in `{GROUNDS_FILE}`."
     )
-    titles = [title for title in rough_figures(plan) if title in figures]
+    titles = [title for title in rough_figures(experiment) if title in figures]
     blocks: list[Block] = [Paragraph(text), *(Picture(title, out / file_name(title)) for title in titles)]
     for environment in plan.environments:
         seeds = {task: [run.crossings for run in experiment.runs_of(task, environment)] for task in plan.tasks}
@@ -205,7 +184,7 @@ def rough_blocks(experiment: Experiment, figures: list[str], out: Path) -> list[
             rows = []
             for task, some in seeds.items():
                 means = [[over_levels(each, measure, kind) for each in some] for kind in [*kinds, None]]
-                rows.append([MODELS.get(task, f"`{task}`"), *(mean_text(part, digits, plan) for part in means)])
+                rows.append([method(task), *(mean_text(part, digits, plan) for part in means)])
             blocks += [Paragraph(f"{meaning}:"), Grid(["task", *kinds, "all"], rows)]
     return blocks
 
@@ -213,14 +192,16 @@ def rough_blocks(experiment: Experiment, figures: list[str], out: Path) -> list[
 def mean_text(values: list[float], digits: int, plan: Matrix) -> str:
     """Return mean and standard error of the finite values of seeds, and how many they are if not all."""
     finite = [value for value in values if math.isfinite(value)]
-    return number_text(Summary(finite), digits).removesuffix(f" ({len(plan.seeds)})") if finite else "–"
+    return number_text(Summary(finite), digits, len(plan.seeds)) if finite else "–"
 
 
-def other_table(table: Table) -> list[Block]:
+def other_table(experiment: Experiment, table: Table) -> list[Block]:
     """Return the metrics in environments other than those of training, which the paper does not have."""
     columns = [name for name in table if not is_of_paper(name)]
     text = "Trained -> evaluated, over seeds and evaluations as above. The paper has no such numbers."
-    return [Paragraph(text), metric_table(table, columns, False)] if columns else [Paragraph("None were planned.")]
+    if not columns:
+        return [Paragraph("None were planned.")] if experiment.is_planned else []
+    return [Paragraph(text), metric_table(experiment, table, columns)]
 
 
 def differences(table: Table) -> list[Block]:
@@ -238,7 +219,7 @@ def differences(table: Table) -> list[Block]:
         tasks = [task for task in cells if cells[task]]
         families = {"All pairs": list(combinations(tasks, 2))}
         for baseline in (task for task in BASELINES if task in tasks):
-            families[f"Against `{baseline}`"] = [(task, baseline) for task in tasks if task != baseline]
+            families[f"Against {method(baseline)}"] = [(task, baseline) for task in tasks if task != baseline]
         for title, pairs in families.items():
             if all(p is None for metric in PAPER_METRICS for p in compare(cells, metric.name, pairs)):
                 blocks.append(Paragraph(f"{title}: no test is possible; it takes at least two seeds of two tasks."))
@@ -249,7 +230,7 @@ def differences(table: Table) -> list[Block]:
 
 def difference_table(cells: Cells, pairs: list[tuple[str, str]]) -> Grid:
     """Return the differences of pairs of tasks in all metrics, with their p values."""
-    rows = [[f"`{first}` - `{second}`"] for first, second in pairs]
+    rows = [[f"{method(first)} − {method(second)}"] for first, second in pairs]
     for metric in PAPER_METRICS:
         p_values = compare(cells, metric.name, pairs)
         for row, (first, second), p in zip(rows, pairs, p_values, strict=True):
@@ -263,10 +244,11 @@ def difference_table(cells: Cells, pairs: list[tuple[str, str]]) -> Grid:
     return Grid(["pair", *(metric.label for metric in PAPER_METRICS)], rows)
 
 
-def figure_blocks(figures: list[str], out: Path) -> list[Block]:
+def figure_blocks(experiment: Experiment, table: Table, figures: list[str], out: Path) -> list[Block]:
     """Return the figures, and which of them are absent."""
-    blocks: list[Block] = [Picture(title, out / file_name(title)) for title in figures]
-    absent = [title for title in FIGURES if title not in figures]
+    titles = list(planned_figures(experiment, table))
+    blocks: list[Block] = [Picture(title, out / file_name(title)) for title in titles if title in figures]
+    absent = [title for title in titles if title not in figures]
     if absent:
         blocks.append(Paragraph(f"No {', '.join(absent)}: there are no data for it."))
     return [*blocks, Paragraph(f"The numbers are in `{TABLE_FILE}`, all evaluations in `{EVALUATIONS_FILE}`.")]
@@ -287,20 +269,36 @@ def setup_blocks(experiment: Experiment, from_step: float, out: Path) -> list[Bl
     configs = [config for run in experiment.runs for config in run.configs]
     packages = [config["versions"] for config in configs if isinstance(config.get("versions"), dict)]
     versions = {", ".join(f"{name} {version}" for name, version in entry.items()) for entry in packages}
-    plan = (experiment.folder / SETTINGS_FILE).read_text(encoding="utf-8", errors="replace")
-    folder, report_folder = portable_path(experiment.folder), portable_path(out)
     items = [f"Devices, as named in settings and results: {', '.join(devices) or 'unknown'}"]
     items += [f"Versions: {text}" for text in sorted(versions) or ["unknown"]]
+    items += time_texts(experiment)
+    origin = plan_blocks(experiment, from_step, out) if experiment.is_planned else run_blocks(experiment)
+    return [Bullets(items), *origin, *settings_blocks(experiment)]
+
+
+def plan_blocks(experiment: Experiment, from_step: float, out: Path) -> list[Block]:
+    """Return the plan, and the commands that repeat it."""
+    plan = (experiment.folder / SETTINGS_FILE).read_text(encoding="utf-8", errors="replace")
+    folder, report_folder = portable_path(experiment.folder), portable_path(out)
     commands = f"python scripts/experiment.py {folder}/experiment.yaml --out {folder}_again\n"
     commands += f"python scripts/report.py {folder}_again --out {report_folder}_again --from_step {from_step:.0f}"
-    return [
-        Bullets([*items, *time_texts(experiment)]),
-        Paragraph("Plan (`experiment.yaml`):"),
-        Code(plan, "yaml"),
-        Paragraph("To repeat it:"),
-        Code(commands, "bash"),
-        *settings_blocks(experiment),
+    blocks: list[Block] = [Paragraph("Plan (`experiment.yaml`):"), Code(plan, "yaml")]
+    return [*blocks, Paragraph("To repeat it:"), Code(commands, "bash")]
+
+
+def run_blocks(experiment: Experiment) -> list[Block]:
+    """Return what the trainings without a plan are, and what counts as one of them."""
+    text = (
+        "There is no `experiment.yaml`, so these are the trainings that the folder holds. Runs of the same "
+        "task, `--run_name`, random events and seed are one training that was resumed; of two that both begin at 0, "
+        "the later counts."
+    )
+    steps = [f"{run.steps / MILLION:.4g} of {run.total_steps / MILLION:.4g}" for run in experiment.runs]
+    rows = [
+        [f"`{run.cell.task}`", run.cell.environment, str(run.cell.seed), run.cell.name, done]
+        for run, done in zip(experiment.runs, steps, strict=True)
     ]
+    return [Paragraph(text), Grid(["task", "environment", "seed", "last run", "million steps"], rows)]
 
 
 def time_texts(experiment: Experiment) -> list[str]:

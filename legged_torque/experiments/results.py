@@ -16,7 +16,8 @@ from typing import Any
 from legged_torque.experiments.curves import CURVE_METRICS, Row, read_rows, to_row
 from legged_torque.experiments.grounds import MEASURES, Crossings, read_crossings
 from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE, Cell, Matrix, read_plan
-from legged_torque.experiments.paper_values import ENVIRONMENTS, paper_value
+from legged_torque.experiments.paper_values import ENVIRONMENTS, PAPER_TASKS, paper_value
+from legged_torque.experiments.report_runs import find_trainings, plan_of, ranges_of
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import CONFIG_FILE, load_config, steps_per_iteration
 
@@ -73,16 +74,32 @@ class CellResult:
 
 @dataclass
 class Experiment:
-    """The folder of an experiment."""
+    """The folder of an experiment, or of runs that nobody has planned together."""
 
     folder: Path
-    plan: Matrix
+    plan: Matrix  # what was planned, or else what there is
     runs: list[CellResult]  # trainings that have begun, in the plan's order
     unplanned: list[str]  # folders of trainings that the plan does not name
+    is_planned: bool = True  # whether it has an experiment.yaml
+    notes: list[str] = field(default_factory=list)  # problems with files of no training
 
     def runs_of(self, task: str, environment: str) -> list[CellResult]:
         """Return the trainings of a task in an environment that have begun."""
         return [run for run in self.runs if (run.cell.task, run.cell.environment) == (task, environment)]
+
+    def num_expected(self, task: str, environment: str) -> int:
+        """Return how many seeds of a task an environment should have: those planned, or else those there are."""
+        return len(self.plan.seeds if self.is_planned else self.runs_of(task, environment))
+
+    def is_like_paper(self) -> bool:
+        """Return whether it was planned with tasks and environments of Table I."""
+        pairs = ((self.plan.tasks, PAPER_TASKS), (self.plan.environments, ENVIRONMENTS))
+        return self.is_planned and all(set(ours) & set(papers) for ours, papers in pairs)
+
+    def ranges(self) -> str:
+        """Return the names of the ranges of random parameters that its trainings have."""
+        configs = [run.configs[-1] for run in self.runs if run.configs]
+        return self.plan.ranges or " and ".join(sorted(set(map(ranges_of, configs)))) or "unknown"
 
     def last_part(self) -> float:
         """Return the step at which the last :data:`LAST_SHARE` of the longest training begins, in whole millions."""
@@ -132,20 +149,29 @@ def is_of_paper(column: str) -> bool:
 
 
 def read_experiment(folder: Path) -> Experiment:
-    """Read the folder of an experiment; UserError if there is none, or its plan cannot be read."""
+    """Read the folder of an experiment, or one with runs of train.py.
+
+    UserError if there is none, its plan cannot be read, or without a plan, there is no run.
+    """
     if not folder.is_dir():
         raise UserError(f"there is no folder '{folder}'")
+    if not (folder / SETTINGS_FILE).is_file():
+        notes: list[str] = []
+        trainings = find_trainings(folder, notes)
+        runs = [read_cell(cell, parts) for cell, parts in trainings.items()]
+        return Experiment(folder, plan_of(trainings), runs, [], is_planned=False, notes=notes)
     plan = read_plan(folder / SETTINGS_FILE)
     cells = plan.cells(folder)
     others = {path.name for path in folder.iterdir() if path.is_dir()} - {cell.name for cell in cells}
     unplanned = sorted(name for name in others if re.fullmatch(r".+-.+-s\d+", name))
-    return Experiment(folder, plan, [read_cell(cell) for cell in cells if cell.folder.is_dir()], unplanned)
+    runs = [read_cell(cell, sorted(cell.folder.glob("*/"))) for cell in cells if cell.folder.is_dir()]
+    return Experiment(folder, plan, runs, unplanned)
 
 
-def read_cell(cell: Cell) -> CellResult:
-    """Read the files of a cell's folder. A run's rows replace those of earlier runs from its first evaluation on."""
+def read_cell(cell: Cell, runs: list[Path]) -> CellResult:
+    """Read the files of a training and its runs. A run's rows replace those of earlier ones from its first one on."""
     result = CellResult(cell)
-    for run_dir in sorted(cell.folder.glob("*/")):
+    for run_dir in runs:
         if (run_dir / CONFIG_FILE).is_file():
             try:
                 result.configs.append(load_config(run_dir))
@@ -186,7 +212,7 @@ def summarize(experiment: Experiment, from_step: float) -> Table:
                 finite = [[row[name] for row in rows if math.isfinite(row[name])] for _, rows in counted]
                 values = [fmean(numbers) for numbers in finite if numbers]
                 if values:
-                    cell[name] = Summary(values, are_finished and len(values) == len(experiment.plan.seeds))
+                    cell[name] = Summary(values, are_finished and len(values) == experiment.num_expected(task, trained))
     return table
 
 
@@ -201,7 +227,7 @@ def welch(first: list[float], second: list[float]) -> float | None:
     try:
         from scipy.stats import ttest_ind_from_stats
     except ImportError:
-        raise UserError("reports need the extra: pip install -e .[plots]") from None
+        raise UserError("reports need the extra: pip install 'legged_torque[plots]'") from None
     if min(len(first), len(second)) < 2 or stdev(first) == stdev(second) == 0.0:
         return None
     one, other = ((fmean(values), stdev(values), len(values)) for values in (first, second))

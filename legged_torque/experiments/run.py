@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import subprocess
 import sys
 import time
 from collections import Counter
-from datetime import datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 from statistics import fmean
 from types import FrameType
 from typing import BinaryIO
 
+from legged_torque.experiments.experiment_display import ExperimentDisplay
 from legged_torque.experiments.job import LOST, Job, Launcher, Worker, try_lock
 from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, check_same
 from legged_torque.experiments.times import add_up, describe, read_times
+from legged_torque.utils.display import duration, time_left_text
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import held
 from legged_torque.utils.interrupt import StopRequest
 
 POLL = 0.2  # seconds between checks of the processes
-SHOW_EVERY = 1.0  # seconds between updates of the live line
 RETRIES = 1  # of a step that has failed, from its last checkpoint, before its cell is given up
 MAX_LOST = 10  # machines that a step may lose before its cell is given up
 
@@ -54,14 +54,13 @@ class ExperimentRun:
         self._lost: Counter[Cell] = Counter()  # how often its machine was lost
         self._durations: list[float] = []  # of cells finished here [s]
         self._start = self._counted = time.monotonic()
-        self._shown = 0.0  # when the live line was last updated [s]
 
     def run(self) -> int:
         """Work until all cells are done or have failed; return the exit status. Asked to stop: KeyboardInterrupt."""
         print(f"{self._num_done} of {self._num_cells} cells are done in {self.out}", flush=True)
         passed_on, stop = 0, CountedStop()
         try:
-            with stop:
+            with stop, ExperimentDisplay(self.out.name) as display:
                 while self._jobs() or (self.queue and not stop.requested):
                     if stop.count > passed_on:
                         passed_on = stop.count
@@ -69,7 +68,7 @@ class ExperimentRun:
                     self._count_time()
                     for worker in list(self._launcher.workers()):
                         self._attend(worker, stop.requested)
-                    self._show_live_line()
+                    self._show(display)
                     time.sleep(POLL)
         finally:
             self._ask_to_stop()  # after an exception too no process is left running
@@ -135,7 +134,7 @@ class ExperimentRun:
             self._durations.append(time.monotonic() - job.cell_start)
         if not problem:
             self._failed[job.cell] = self._lost[job.cell] = 0
-            took = timedelta(seconds=round(time.monotonic() - job.start))
+            took = duration(time.monotonic() - job.start)
             self._print(f"{job.cell.name}: {job.step_text()} on {worker.name} took {took} | {self._progress()}")
         if is_done or stopping:
             job.lock.close()
@@ -190,23 +189,24 @@ class ExperimentRun:
 
     def _progress(self) -> str:
         """Describe the progress of all cells and the time left; cells in training count in part."""
+        elapsed, left = duration(time.monotonic() - self._start), time_left_text(self._time_left())
+        return f"{self._num_done} of {self._num_cells} cells done, {elapsed}, {left}"
+
+    def _time_left(self) -> float | None:
+        """Return the time for all cells that are left [s]; None if unknown."""
         cells = self._num_cells - self._num_done - len(self._failures) - sum(job.fraction() for job in self._jobs())
-        left = time_left(self._durations, cells, len(self._launcher.workers()))
-        text = "time left unknown yet" if left is None else f"{timedelta(seconds=round(left))} left"
-        elapsed = timedelta(seconds=round(time.monotonic() - self._start))
-        return f"{self._num_done} of {self._num_cells} cells done, {elapsed}, {text}"
+        return time_left(self._durations, cells, len(self._launcher.workers()))
 
     def _print(self, text: str) -> None:
-        """Print a line with the time, over the live line if there is one."""
-        line = f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}"
-        print(line.ljust(columns() if sys.stdout.isatty() else 0), flush=True)
+        """Print a line with the time."""
+        print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}", flush=True)
 
-    def _show_live_line(self) -> None:
-        """Update the live line, if there is a terminal and the update is due."""
-        if sys.stdout.isatty() and time.monotonic() - self._shown >= SHOW_EVERY:
-            self._shown = time.monotonic()
-            line = " | ".join([self._progress(), *map(str, self._jobs())])
-            print(line[: columns()].ljust(columns()), end="\r", flush=True)
+    def _show(self, display: ExperimentDisplay) -> None:
+        """Update the display, if it is shown and the update is due."""
+        if display.is_due():
+            rows = [worker.job.row(worker.name) for worker in self._launcher.workers() if worker.job is not None]
+            share = (self._num_done + sum(job.fraction() for job in self._jobs())) / self._num_cells
+            display.show(f"{self._num_done} of {self._num_cells} cells done", share, self._time_left(), rows)
 
 
 def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
@@ -227,8 +227,3 @@ def time_left(durations: list[float], cells: float, num_workers: int) -> float |
     if cells <= 0:
         return 0.0
     return fmean(durations) * max(cells / num_workers, min(cells, 1.0)) if durations else None
-
-
-def columns() -> int:
-    """Return the usable width of the terminal, in characters."""
-    return shutil.get_terminal_size().columns - 1

@@ -22,6 +22,7 @@ from legged_torque.envs.base.metrics import WalkingMetrics
 from legged_torque.learning.evaluator import evaluation_cfg
 from legged_torque.terrain.rough import RoughGround
 from legged_torque.terrain.selection import COLUMNS, named_kinds, rising_levels, select_tiles
+from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.math import quat_rotate_yaw
 from legged_torque.utils.metrics import Estimate, estimate, estimates
@@ -106,14 +107,16 @@ def cross(task: LeggedRobot, policy: Callable[[TensorDict], Tensor], grounds: Gr
     obs = _start(task, ground, grounds.command)
     starts = task.base_pos[:, :2].clone()
     crossed, fell = (torch.zeros_like(task.reset_buf) for _ in range(2))
-    with torch.inference_mode():
-        for _ in range(math.ceil(grounds.time_limit(ground.layout.tile_size) / task.dt)):
+    num_steps = math.ceil(grounds.time_limit(ground.layout.tile_size) / task.dt)
+    with torch.inference_mode(), Counter("crossing tiles, step", num_steps) as counter:
+        for _ in range(num_steps):
             commands, is_trying = task.commands.clone(), ~(crossed | fell)
             obs = task.step(policy(obs))[0]
             walking.add_step(commands, is_trying)
             distance = (task.base_pos[:, :2] - starts).abs().amax(dim=1)
             fell |= is_trying & task.reset_buf
             crossed |= is_trying & ~task.reset_buf & (distance > half)
+            counter.add()
     return _results(ground, grounds, walking, crossed, fell)
 
 

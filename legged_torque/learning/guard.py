@@ -6,6 +6,7 @@ from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning.ppo import OnDevicePPO
 from legged_torque.sim.health import Watched
 from legged_torque.utils import distributed
+from legged_torque.utils.display import warn
 from legged_torque.utils.errors import TrainingError
 
 PATIENCE = 5  # iterations in a row without learning
@@ -33,7 +34,7 @@ class TrainingGuard:
         share, found = self._task.health.read()
         for tensor, count in found.items():
             if tensor not in self._told and distributed.rank() == 0:
-                print(f"Warning: {tensor} was not finite; resets of worlds for it: {count}.", flush=True)
+                warn(f"{tensor} was not finite; resets of worlds for it: {count}")
         self._told.update(found)
         self._without_update = self._without_update + 1 if skipped_updates >= self._num_updates else 0
         self._diverging = self._diverging + 1 if share > MAX_DIVERGED else 0

@@ -38,6 +38,8 @@ SPACES = {
     ),
 }
 """Settings of task and training, if they have them, in which a pre-trained policy must agree: what it sees and does."""
+OF_TRAINING = ("file", "critic_warmup_iterations")
+"""Settings of ``pretraining`` that say how a training starts from a policy, not how the policy is made."""
 PRETRAINED = "pretrained"  # folder of pre-trained policies, in that of all experiments
 STANDARD_DEVIATION = "distribution."
 """Start of the names of parameters that are not taken over: how much a training explores is its own setting."""
@@ -53,6 +55,8 @@ def pretrained_file(task: str, train_cfg: Any, log_root: str | None = None) -> P
 def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> None:
     """Make a task's pre-trained policy if its file is missing; a UserError if the file's does not fit the task.
 
+    Neither does one that was made with other settings of ``pretraining``: it may not even stand.
+
     Of trainings that start at the same time one makes it, and the others wait.
     """
     if not file.exists():
@@ -62,6 +66,7 @@ def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device:
                 print(f"There is no pre-trained policy '{file}' yet; making it.", flush=True)
                 make_pretrained(file, task, env_cfg, train_cfg, device)
     check_spaces(file, env_cfg, train_cfg)
+    check_making(file, train_cfg)
     print(f"Starting from the pre-trained policy '{file}'.")
 
 
@@ -102,6 +107,20 @@ def check_spaces(file: Path, env_cfg: Any, train_cfg: Any) -> None:
             raise UserError(
                 f"the pre-trained policy '{file}' does not fit this task: its {name} is {of_file[name]!r}, here it "
                 f"is {value!r}; make another one in a file of its own: --set pretraining.file=FILE"
+            )
+
+
+def check_making(file: Path, train_cfg: Any) -> None:
+    """Refuse a pre-trained policy that was made with other settings of ``pretraining``, naming the first one."""
+    settings = read_pretrained(file)["report"].get("settings")  # a function of the user's own may report none
+    made_with = flat(settings) if isinstance(settings, dict) else {}
+    for name, value in flat(to_dict(train_cfg.pretraining)).items():
+        if name not in OF_TRAINING and repr(made_with.get(name, value)) != repr(value):
+            before = made_with[name]
+            raise UserError(
+                f"the pre-trained policy '{file}' was made with pretraining.{name} {before!r}, here it is {value!r}: "
+                f"remove the file to make it anew, make another one in a file of its own with --set "
+                f"pretraining.file=FILE, or take it as it is with --set pretraining.{name}={before}"
             )
 
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import re
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -17,6 +22,7 @@ from legged_torque.learning.evaluator import TrainingEvaluators, append_row
 from legged_torque.learning.guard import TrainingGuard
 from legged_torque.learning.log_writer import NoLogWriter
 from legged_torque.learning.ppo import OnDevicePPO
+from legged_torque.learning.training_display import TrainingDisplay
 from legged_torque.learning.worlds import (
     check_identity,
     identity,
@@ -29,11 +35,15 @@ from legged_torque.learning.worlds import (
 )
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils import distributed
+from legged_torque.utils.devices import device_name
+from legged_torque.utils.display import Pace, warn
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.files import told_by_name
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.random_state import random_state, restore_random_state
 from legged_torque.utils.runs import checkpoint_file, claim_run_dir, evaluations_file, tagged
+
+_STYLES = re.compile("\033\\[[0-9;]*m")  # what makes text bold or colored on a terminal
 
 
 class OnPolicyRunner(runners.OnPolicyRunner):
@@ -65,6 +75,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self.logger.device = "cpu"  # where numbers are averaged that are on the host anyway
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         self.log_dir = log_dir
+        self.on_checkpoint: Callable[[Path], None] | None = None  # called with each checkpoint of a training
         self.stopped_by = 0  # number of the signal that has ended the last training; 0: none
         self._seconds_before = 0.0  # training time before this process
         self._saved_iteration = -1  # that of the last checkpoint
@@ -72,6 +83,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self._unwritten_log: dict | None = None
         self._log_is_broken = False
         self._nobody_reads: BrokenPipeError | None = None  # why nothing can be printed any more
+        self.verbose = False  # whether rsl_rl's block of every iteration is printed, in place of the display
+        self._display = self._new_display(0)
         env.num_processes = self.gpu_world_size
         env.step_graph.enabled = self.alg.update_graph.enabled = self.cfg["capture"]
         enabled = self.cfg["capture"] and self.cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS
@@ -91,13 +104,15 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self.alg.train_mode()
         if self.is_distributed:
             self.alg.broadcast_parameters()
-        with told_by_name(Path(self.log_dir or "")):
+        with told_by_name(Path(self.log_dir or "")), contextlib.redirect_stdout(io.StringIO()):  # it lists its files
             self.logger.init_logging_writer()
         start_it = self.current_learning_iteration
         total_it = start_it + num_learning_iterations
         guard = TrainingGuard(self.env, self.alg)
         warmup = self.cfg["pretraining"]["critic_warmup_iterations"]
-        with StopRequest() as stop:
+        self.save_checkpoint()  # so that there is something to see at once
+        self._display = self._new_display(total_it)
+        with self._display, StopRequest(self._display.tell) as stop:
             for _ in range(num_learning_iterations):
                 if distributed.any_process(stop.requested or self._nobody_reads is not None, self.device):
                     break
@@ -117,8 +132,8 @@ class OnPolicyRunner(runners.OnPolicyRunner):
                 if guard.problem:
                     break
                 if self.current_learning_iteration % self.cfg["save_interval"] == 0:
-                    self._save_checkpoint()
-            self._save_checkpoint()  # writes the last log too
+                    self.save_checkpoint()
+            self.save_checkpoint()  # writes the last log too
         self.stopped_by = stop.number
         self.logger.stop_logging_writer()
         if self._nobody_reads:
@@ -244,6 +259,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         due = self._evaluators.due(before, steps)
         if self.logger.writer is None or not due:
             return {}
+        self._display.activity = "evaluating"
         start = time.perf_counter()
         seconds = self._seconds_before + self.logger.tot_time + start - iteration_start
         when = {"steps": steps, "iteration": self.current_learning_iteration + 1, "seconds": seconds}
@@ -257,8 +273,19 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             try:
                 append_row(evaluations_file(Path(self.log_dir), name), row)
             except UserError as error:  # training goes on: what is learned is worth more
-                print(f"Warning: an evaluation is not kept: {error}.", file=sys.stderr)
+                warn(f"an evaluation is not kept: {error}")
+        self._display.activity = ""
         return {**logged, "Perf/evaluation_time": time.perf_counter() - start}
+
+    def _new_display(self, total_it: int) -> TrainingDisplay:
+        """Return what shows a training; it is quiet where nothing is kept, and if rsl_rl's block is printed."""
+        num_worlds = self.gpu_world_size * self.env.num_envs
+        place = device_name(self.env.device)
+        title = f"{self.cfg.get('task') or 'training'}: {num_worlds} worlds on {place}"
+        pace = Pace(total_it, self.current_learning_iteration)
+        is_quiet = self.verbose or self.logger.writer is None
+        steps = num_worlds * self.cfg["num_steps_per_env"]
+        return TrainingDisplay(title, str(self.log_dir), pace, steps, is_quiet)
 
     def _prepare_log(self, start_it: int, total_it: int, times: dict, losses: dict, measured: dict) -> None:
         """Read the numbers of one iteration from the device, for :meth:`_write_log`."""
@@ -281,17 +308,27 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         log, self._unwritten_log = self._unwritten_log, None
         if not log:
             return
+        numbers = {**self.logger.ep_extras[-1], **log["loss_dict"], "learning_rate": log["learning_rate"]}
+        numbers["noise"] = log["action_std"].mean().item()
         try:
-            self.logger.log(**log)
-        except BrokenPipeError as error:  # | head: as good as Ctrl-C
-            self._nobody_reads = error
+            with contextlib.redirect_stdout(io.StringIO()) as block:
+                self.logger.log(**log)
         except Exception as error:  # what writes curves raises about anything
             if not self._log_is_broken:
-                print(f"Warning: logs end here: {checkpoint.last_line(error)}. Training goes on.", file=sys.stderr)
+                warn(f"logs end here: {checkpoint.last_line(error)}. Training goes on")
             self._log_is_broken, self.logger.writer = True, NoLogWriter("")
             self.logger.ep_extras.clear()
+        if self.logger.rewbuffer:
+            numbers["reward"] = fmean(self.logger.rewbuffer)
+            numbers["length"] = fmean(self.logger.lenbuffer) * self.env.dt
+        try:
+            if self.verbose:
+                print(block.getvalue() if sys.stdout.isatty() else _STYLES.sub("", block.getvalue()), flush=True)
+            self._display.add_iteration(log["it"] + 1, self.logger.tot_timesteps, numbers)
+        except BrokenPipeError as error:  # | head: as good as Ctrl-C
+            self._nobody_reads = error
 
-    def _save_checkpoint(self) -> None:
+    def save_checkpoint(self) -> None:
         """Save into the run's folder with all that was logged, and warn if the simulator had too little room."""
         self._write_log()
         if self.log_dir is not None and self._saved_iteration != self.current_learning_iteration:
@@ -301,9 +338,11 @@ class OnPolicyRunner(runners.OnPolicyRunner):
             self._saved_iteration = self.current_learning_iteration
             if digest:
                 remove_other_worlds(file)
+            if self.on_checkpoint:
+                self.on_checkpoint(file)
         warning = self.env.sim.check_buffers()
         if warning:
-            print(f"Warning: {warning}.")
+            warn(warning)
 
     def _save_worlds(self, file: Path) -> str:
         """Write the worlds of all processes, which belong to a checkpoint, and return their digest.
@@ -322,7 +361,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         try:
             return write_worlds(file, {**identity(self.env, self.cfg["evaluation"]), "processes": processes})
         except UserError as error:
-            print(f"Warning: worlds would start anew in a resumed run: {error}.", file=sys.stderr)
+            warn(f"worlds would start anew in a resumed run: {error}")
             return ""
 
     def _restore_worlds(self, file: Path, digest: str | None) -> None:

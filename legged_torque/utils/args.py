@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from collections.abc import Iterable
+from typing import Any
 
-from legged_torque.utils.cli import Parser
+from legged_torque.utils.cli import Parser, importing
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import describe, types_of, without_null
 from legged_torque.utils.options import Options
+from legged_torque.utils.task_registry import task_registry
 
-_SETTINGS = ("task", "seed", "perturbation", "ranges", "device", "set")
+_SETTINGS = ("task", "task_file", "seed", "perturbation", "ranges", "device", "set")
 _RUNS = ("log_root", "experiment_name", "load_run", "checkpoint")
-_TRAINING = ("max_iterations", "resume", "run_name", "preset", "logger")
+_TRAINING = ("max_iterations", "resume", "run_name", "preset", "logger", "verbose")
+_GROUPS = {"task and settings": (*_SETTINGS, "num_envs"), "runs": _RUNS, "training": _TRAINING}
 
 
 def add_settings_args(parser: Parser) -> None:
@@ -27,28 +32,59 @@ def add_build_args(parser: Parser) -> None:
 def add_task_args(parser: Parser) -> None:
     """Add what all scripts take that build a task and keep or load runs of it."""
     add_options(parser, *_SETTINGS, "num_envs", *_RUNS)
+    hint = "for legged_gym's sake: no window is opened, which none is unless it is asked for"
+    parser.add_argument("--headless", action="store_true", help=hint)
 
 
 def add_train_args(parser: Parser) -> None:
     """Add what only training takes."""
     add_options(parser, *_TRAINING)
-    hint = "accepted for legged_gym's sake: training has no window"
-    parser.add_argument("--headless", action="store_true", help=hint)
 
 
 def add_options(parser: Parser, *names: str) -> None:
-    """Add fields of :class:`Options`, which tell their help, type, limits and default."""
+    """Add fields of :class:`Options`, which tell their help, type, limits and default, in groups of ``--help``."""
     hints = types_of(Options)
-    for field in dataclasses.fields(Options):
-        if field.name in names:
+    fields = {field.name: field for field in dataclasses.fields(Options)}
+    for title, members in _GROUPS.items():
+        chosen = [name for name in members if name in names]
+        group = parser.add_argument_group(title) if chosen else parser
+        for name in chosen:
+            field = fields[name]
             default = field.default if field.default is not dataclasses.MISSING else []
             how = {"default": default, **field.metadata}
             if "type" in how:
-                how["help"] += f"; {describe(without_null(hints[field.name]))}"
-            parser.add_argument(f"--{field.name}", **how)
+                how["help"] += f"; {describe(without_null(hints[name]))}"
+            aliases = how.pop("aliases", ())
+            action = group.add_argument(f"--{name}", *aliases, **how | ({"action": _OneValue} if aliases else {}))
+            if name == "task":
+                action.completer = lambda **_: task_registry.names()  # type: ignore[attr-defined] # argcomplete asks
+
+
+class _OneValue(argparse.Action):
+    """What several options of a command line may give if they agree; of one that is repeated, the last counts."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        """Keep the value of an option; a UserError if another one has given another value."""
+        self.given = {**getattr(self, "given", {}), option_string: values}
+        if len(set(self.given.values())) > 1:
+            told = ", ".join(f"{option}={value}" for option, value in self.given.items())
+            raise UserError(f"these options mean the same, but differ: {told}")
+        setattr(namespace, self.dest, values)
 
 
 def options_of(args: argparse.Namespace) -> Options:
-    """Return the shared options of a parsed command line; those that its parser does not have are not given."""
+    """Return the shared options of a parsed command line; those that its parser does not have are not given.
+
+    Files of tasks that it names are loaded.
+    """
     names = [field.name for field in dataclasses.fields(Options)]
-    return Options(**{name: getattr(args, name) for name in names if hasattr(args, name)})
+    options = Options(**{name: getattr(args, name) for name in names if hasattr(args, name)})
+    if options.task_file:
+        with importing():
+            task_registry.import_files(options.task_file)
+    return options
+
+
+def task_file_words(files: Iterable[str]) -> list[str]:
+    """Return the words with which another script loads the same files of tasks."""
+    return [f"--task_file={file}" for file in files]

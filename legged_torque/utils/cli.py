@@ -9,31 +9,65 @@ import gc
 import json
 import math
 import os
+import re
+import shutil
 import sys
 import tempfile
+import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
+from legged_torque import SCRIPTS_DIR
 from legged_torque.utils.errors import TrainingError, UserError, is_out_of_memory, unknown_name
 from legged_torque.utils.interrupt import end_on_interrupt, raise_on_interrupt
 
 MAX_NAME = 255  # bytes of the name of a file, on the usual systems
+COMMAND = "legged-torque"  # the console command that runs every script
+_SCRIPT = re.compile(r"python scripts/(\w+)\.py")
+_EXAMPLE = re.compile(r": ``(python scripts/[^`]+)``")
+
+
+def script_command(script: str) -> str:
+    """Return how a script is started: as this one was, by the command, from a clone or as a part of the package."""
+    if sys.argv[0].startswith(f"{COMMAND} "):
+        return f"{COMMAND} {script}"
+    in_package = SCRIPTS_DIR.parent == Path(__file__).resolve().parents[1]
+    return f"python -m legged_torque.scripts.{script}" if in_package else f"python scripts/{script}.py"
 
 
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line with the nearest valid name."""
 
     def __init__(self, description: str) -> None:
-        """Create a parser; abbreviations of options are not accepted."""
-        super().__init__(description=description, allow_abbrev=False)
+        """Create a parser; abbreviations of options are not accepted.
+
+        ``description`` is the docstring of a script. The example in its first line, or those below a line "Examples:",
+        stand at the end of the help.
+        """
+        text, _, examples = description.partition("\nExamples:\n")
+        examples += "".join(f"    {example}\n" for example in _EXAMPLE.findall(text))
+        width = shutil.get_terminal_size().columns - 2  # argparse's own
+        super().__init__(
+            description="\n\n".join(textwrap.fill(part, width) for part in _EXAMPLE.sub("", text).split("\n\n")),
+            epilog=examples and "examples:\n" + _SCRIPT.sub(lambda found: script_command(found[1]), examples.rstrip()),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
 
     def error(self, message: str) -> NoReturn:
         """Report a mistake in the arguments."""
         raise UserError(message)
 
     def parse_args(self, args=None, namespace=None):
-        """Parse the command line; an option that does not exist, or a value that is empty, is a UserError."""
+        """Parse the command line; an option that does not exist, or a value that is empty, is a UserError.
+
+        When a shell asks how a command line may go on, it is told so, and the script ends.
+        """
+        if "_ARGCOMPLETE" in os.environ:
+            import argcomplete
+
+            argcomplete.autocomplete(self)
         words = sys.argv[1:] if args is None else list(args)
         for before, word in zip(["", *words], words, strict=False):
             name, equals, value = word.partition("=") if word.startswith("--") else (before, "", word)
@@ -116,7 +150,7 @@ def finite(text: str) -> float:
 
 def add_command_arg(parser: Parser) -> None:
     """Add a fixed command of the robots."""
-    hint = "fixed command [m/s, m/s, rad/s]; default: drawn as in training"
+    hint = "fixed command: forwards, to the left [m/s], yaw rate [rad/s]; default: drawn as in training"
     parser.add_argument("--command", type=finite, nargs=3, metavar=("X", "Y", "YAW"), help=hint)
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import os
-import sys
 from collections.abc import Callable
 from typing import Any
 
 import torch
 import warp as wp
 
+from legged_torque.utils.display import warn
 from legged_torque.utils.progress import TORCH_FOLDER, torch_compiles
 
 SETTINGS: dict[str, Any] = {
@@ -75,7 +75,7 @@ class Compiled:
                     self._run()
             except dynamo.exc.TorchDynamoException as error:  # nothing has run yet
                 name = getattr(self._function, "__qualname__", str(self._function))
-                print(f"Warning: {name} runs uncompiled, which is slower: {reason(error)}.", file=sys.stderr)
+                warn(f"{name} runs uncompiled, which is slower: {reason(error)}")
                 self._run = self._function
                 self._run()
 

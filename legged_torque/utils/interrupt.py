@@ -7,6 +7,7 @@ import os
 import signal
 import stat
 import threading
+from collections.abc import Callable
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -21,6 +22,10 @@ class StopRequest:
 
     requested = False  # whether a signal has asked to stop
     number = 0  # of that signal
+
+    def __init__(self, tell: Callable[[str], None] | None = None) -> None:
+        """Prepare; ``tell`` says that the end has been asked for, on standard error unless given."""
+        self._tell = tell or write_error
 
     def __enter__(self) -> StopRequest:
         """Take over the signals; only a process's main thread can do so."""
@@ -47,8 +52,12 @@ class StopRequest:
         if self.requested and number != signal.SIGHUP:
             raise KeyboardInterrupt
         self.requested, self.number = True, self.number or number
-        # print fails inside another print
-        os.write(2, b"\nStopping after this iteration and saving; once more to stop at once.\n")
+        self._tell("Stopping after this iteration and saving; once more to stop at once.")
+
+
+def write_error(text: str) -> None:
+    """Write a line to standard error from a signal's handler, where print fails inside another print."""
+    os.write(2, f"\n{text}\n".encode())
 
 
 def leave_terminal() -> None:

@@ -14,9 +14,9 @@ DEFAULT_PRESET = "parallel"
 _SET = "change a setting by its dotted path, e.g. rewards.scales.torques=-1e-4; may be repeated"
 
 
-def _option(help: str, default: Any = None, **how: Any) -> Any:  # noqa: A002 (argparse's word)
+def _option(help: str, default: Any = None, aliases: tuple[str, ...] = (), **how: Any) -> Any:  # noqa: A002 (argparse's word)
     """Return a field that is also an argument of the command line; ``how`` is what ``add_argument`` takes."""
-    return field(default=default, metadata={"help": help, **how})
+    return field(default=default, metadata={"help": help, "aliases": aliases, **how})
 
 
 @dataclass
@@ -28,7 +28,9 @@ class Options:
 
     task: str = _option("name of the task, see train.py --list; default: %(default)s", DEFAULT_TASK)
     device: str = _option(
-        "auto, cpu or cuda:N; auto takes the GPU if there is one, with torchrun one for each process", "auto"
+        "auto, cpu or cuda:N; auto takes the GPU if there is one, with torchrun one for each process",
+        "auto",
+        aliases=("--sim_device", "--rl_device"),  # of legged_gym, where they may differ
     )
     num_envs: Worlds | None = _option(
         "number of worlds, with torchrun those of each process; default: that of the task", type=int
@@ -42,15 +44,31 @@ class Options:
     ranges: str | None = _option(
         "how far random parameters go: default or hard; default: those of the task, or what a loaded run has"
     )
+    task_file: list[str] = field(
+        default_factory=list,
+        metadata={
+            "help": "Python file that registers tasks of your own, which runs as your code; may be repeated",
+            "action": "append",
+            "metavar": "FILE",
+        },
+    )
     set: list[str] = field(default_factory=list, metadata={"help": _SET, "action": "append", "metavar": "KEY=VALUE"})
     log_root: str | None = _option("folder that keeps all experiments; default: ./logs")
     experiment_name: str | None = _option("folder of the runs below that; default: name of the task")
     run_name: str | None = _option("added to the name of the run's folder")
     logger: str | None = _option("where curves are written: tensorboard, wandb or none")
-    load_run: str | None = _option("run to load: name of its folder or a path; default: the last one")
-    checkpoint: Number | None = _option("checkpoint to load; default: the last one", type=int)
+    load_run: str | None = _option("run to load: name of its folder or a path; default, and -1: the last one")
+    checkpoint: Number | None = _option("checkpoint to load; default, and -1: the last one", type=int)
     resume: bool = _option("continue a run, with its settings", False, action="store_true")
-    max_iterations: Count | None = _option("iterations in all; default: 110e6 environment steps", type=int)
+    verbose: bool = _option("print rsl_rl's block of numbers after every iteration", False, action="store_true")
+    max_iterations: Count | None = _option(
+        "iterations in all, with those before a resume; default: 110e6 environment steps", type=int
+    )
+
+    def __post_init__(self) -> None:
+        """Take -1 for the last run and the last checkpoint, as legged_gym does."""
+        self.load_run = None if str(self.load_run) == "-1" else self.load_run
+        self.checkpoint = None if self.checkpoint == -1 else self.checkpoint
 
 
 def apply_options(

@@ -21,7 +21,7 @@ def load_pyplot() -> ModuleType:
         matplotlib.use("agg")
         from matplotlib import pyplot
     except ImportError:
-        raise UserError("plots need the extra: pip install -e .[plots]") from None
+        raise UserError("plots need the extra: pip install 'legged_torque[plots]'") from None
     return pyplot
 
 

@@ -14,6 +14,8 @@ from typing import TextIO
 
 import warp as wp
 
+from legged_torque.utils.display import Display
+
 SHOW_AFTER = 2.0  # seconds of compilation before a line is shown; shorter compilations are not reported
 QUIET_AFTER = 5.0  # seconds without compilation after which the line is finished
 END_AFTER = 120.0  # seconds without compilation after which watching ends, so that it costs a long training nothing
@@ -27,7 +29,8 @@ class CompileProgress:
     """While this context is open, a line on standard error (or ``stream``) reports that kernels are being compiled.
 
     The line reads "compiling kernels, once per machine: 12 modules, 34 s". It is rewritten every second in a
-    terminal and repeated every ten seconds elsewhere. Nothing is shown if all kernels are in Warp's cache. A thread
+    terminal, or part of the picture that a :class:`~legged_torque.utils.display.Display` shows there, and repeated
+    every ten seconds elsewhere. Nothing is shown if all kernels are in Warp's cache. A thread
     watches the folder of the cache, so Warp needs no change. The context may stay open for a whole training.
     """
 
@@ -93,8 +96,12 @@ class CompileProgress:
         return is_ours or TORCH_COMPILES.is_set()
 
     def _write(self, text: str, end: str) -> None:
-        """Write a line with the progress."""
-        self._stream.write(f"{text}: {self.modules} modules, {self._seconds:.0f} s{end}")
+        """Write a line with the progress, or let it be part of a picture."""
+        line = f"{text}: {self.modules} modules, {self._seconds:.0f} s"
+        if self._terminal and Display.shown is not None:
+            Display.shown.activity = "" if end.endswith("\n") else line
+            return
+        self._stream.write(line + end)
         self._stream.flush()
 
     def _finish_line(self) -> None:

@@ -31,6 +31,7 @@ from legged_torque.utils.runs import (
     load_config,
     new_run_dir,
 )
+from legged_torque.utils.task_files import import_installed_tasks, import_task_files
 from legged_torque.utils.train_validation import check_train_cfg
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ class TaskRegistry:
     def __init__(self) -> None:
         """Start empty."""
         self._tasks: dict[str, tuple[type[VecEnv] | str, Any, Any]] = {}
+        self._looks_for_installed = True  # whether nothing has asked yet for tasks that other packages may have
 
     def register(self, name: str, task_class: type[VecEnv] | str, env_cfg: BaseConfig, train_cfg: BaseConfig) -> None:
         """Make a task known that is created as ``task_class(env_cfg, device)``.
@@ -68,8 +70,13 @@ class TaskRegistry:
         """
         self._tasks[name] = (task_class, env_cfg, train_cfg)
 
+    def import_files(self, files: Iterable[str | Path]) -> None:
+        """Import files that register tasks, see :func:`~legged_torque.utils.task_files.import_task_files`."""
+        import_task_files(self._tasks, files)
+
     def names(self) -> list[str]:
-        """Return the names of all tasks, in the order of their registration."""
+        """Return the names of all tasks, in the order of their registration, those of installed packages last."""
+        self._import_installed()
         return list(self._tasks)
 
     def get_task_class(self, name: str) -> type[VecEnv]:
@@ -131,7 +138,7 @@ class TaskRegistry:
         default = experiment_dir(train_cfg, args.log_root if args else None)
         root = default if log_root == "default" else log_root and Path(log_root)
         if root and train_cfg.runner.logger == "wandb" and importlib.util.find_spec("wandb") is None:
-            raise UserError("--logger wandb needs the extra: pip install -e .[wandb]")
+            raise UserError("--logger wandb needs the extra: pip install 'legged_torque[wandb]'")
         log_dir = str(new_run_dir(root, train_cfg.runner.run_name)) if root else None
         from rsl_rl.utils import resolve_callable
 
@@ -186,8 +193,16 @@ class TaskRegistry:
     def _get(self, name: str) -> tuple[type[VecEnv] | str, Any, Any]:
         """Return what was registered under a name."""
         if name not in self._tasks:
+            self._import_installed()
+        if name not in self._tasks:
             raise unknown_name("task", name, self._tasks)
         return self._tasks[name]
+
+    def _import_installed(self) -> None:
+        """Make the tasks of installed packages known, the first time that one may be meant."""
+        if self._looks_for_installed:
+            self._looks_for_installed = False
+            import_installed_tasks(self._tasks)
 
 
 def print_notes(notes: Iterable[str]) -> None:

@@ -53,14 +53,19 @@ class Guard:
         return response
 
     @contextlib.contextmanager
-    def at_the_door(self) -> Iterator[None]:
-        """Let every server that is started meanwhile ask this guard first: viser has no setting for it."""
+    def at_the_door(self, change: Callable[[Callable], Callable] = lambda serve: serve) -> Iterator[None]:
+        """Let every server that is started meanwhile ask this guard first: viser has no setting for it.
+
+        ``change`` returns what serves requests that are let in, in place of the server's own function.
+        """
         module: Any = websockets.asyncio.server  # for mypy, to which its attributes are fixed
         start = module.serve
 
         def guarded(*args: Any, process_request: Callable[..., Any], **settings: Any) -> Any:
+            serve = change(process_request)
+
             def ask(connection: ServerConnection, request: Request) -> Response | None:
-                return self.answer(connection, request, process_request)
+                return self.answer(connection, request, serve)
 
             return start(*args, process_request=ask, **settings)
 

@@ -44,6 +44,9 @@ def connect(
     on_user_change(automatic, toggle)
 
 
+KEYS = "or hold W A S D, arrows, or a gamepad's sticks"
+
+
 class Controls:
     """The panel with all controls."""
 
@@ -51,7 +54,7 @@ class Controls:
         """Build the panel."""
         self._gui, self._session, self._scene = server.gui, session, scene
         self._ground = scene.ground
-        self._loaded: tuple[int, str, int] | None = None
+        self._loaded: tuple[int, str, int, bool] | None = None
         self._weights: dict[str, viser.GuiInputHandle[float]] = {}
         self.status = self._gui.add_html("")
         self._add_command()
@@ -68,24 +71,36 @@ class Controls:
         limits = {"x [m/s]": ranges.lin_vel_x, "y [m/s]": ranges.lin_vel_y, "yaw [rad/s]": ranges.ang_vel_yaw}
         hints = ("forward", "to the left", "turning to the left")
         with gui.add_folder("Command"):
-            automatic = gui.add_checkbox("random", True, hint="drawn as in training, for each world")
-            sliders = [
+            self._random = automatic = gui.add_checkbox("random", True, hint="drawn as in training, for each world")
+            self._sliders = sliders = [
                 gui.add_slider(label, low, max(high, low + 0.05), 0.05, min(max(0.0, low), high), hint=hint)
                 for (label, (low, high)), hint in zip(limits.items(), hints, strict=True)
             ]
+            gui.add_html(f'<div style="font-size:12px;padding:0 12px">{KEYS}</div>')
             stand = gui.add_button("Stand still", icon="hand-stop")
 
         def ask(values: list[float] | None) -> None:
             session.set_command(None if values is None else (values[0], values[1], values[2]))
 
-        def stop(event: viser.GuiEvent) -> None:
-            automatic.value = False
-            for slider in sliders:
-                slider.value = 0.0
-            ask([0.0, 0.0, 0.0])
-
         connect(sliders, automatic, ask)
-        stand.on_click(stop)
+        stand.on_click(lambda event: self.steer((0.0, 0.0, 0.0)))
+
+    def steer(self, shares: Sequence[float]) -> None:
+        """Command shares, -1 to 1, of the sliders' ends, as keys and gamepads do."""
+        ends = [slider.max if share > 0.0 else -slider.min for slider, share in zip(self._sliders, shares, strict=True)]
+        x, y, yaw = (share * end for share, end in zip(shares, ends, strict=True))
+        self._show_command((x, y, yaw))
+        self._session.set_command((x, y, yaw))
+
+    def _show_command(self, command: Sequence[float]) -> None:
+        """Let the sliders show a command that is not random."""
+        self._random.value = False
+        self._follow(command)
+
+    def _follow(self, command: Sequence[float]) -> None:
+        """Move the sliders to a command, as far as they go."""
+        for slider, value in zip(self._sliders, command, strict=True):
+            set_value(slider, round(min(max(value, slider.min), slider.max), 2))
 
     def _add_time(self) -> None:
         """Add pause, reset and speed."""
@@ -114,7 +129,13 @@ class Controls:
         with gui.add_folder("Run"):
             names = tuple(map(str, state.checkpoints)) or (str(state.checkpoint),)
             self.checkpoints = gui.add_dropdown("checkpoint", names, initial_value=str(state.checkpoint))
-            newest = gui.add_checkbox("follow training", False, hint="load each new checkpoint as soon as it is saved")
+            hint = "load each new checkpoint as soon as it is saved"
+            self.newest = newest = gui.add_checkbox("follow training", False, hint=hint)
+            companion = session.companion
+            if companion:
+                others = tuple(map(str, companion.state.checkpoints))
+                other = gui.add_dropdown("beside", others, initial_value=str(companion.state.checkpoint))
+                on_user_change(other, lambda: companion.load_checkpoint(int(other.value)))
             hint = "random parameters, pushes and noise; rebuilds the worlds"
             self.perturbation = gui.add_dropdown("perturbation", tuple(session.perturbations()), hint=hint)
 
@@ -170,6 +191,14 @@ class Controls:
                 on_user_change(world, lambda: self._session.follow_world(int(world.value)))
                 others = gui.add_checkbox("all worlds", True, hint="draw the other worlds too")
                 others.on_update(lambda event: setattr(scene, "shows_others", others.value))
+            layers = scene.layers
+            for label, name, hint in (
+                ("contacts", "shows_contacts", "points and forces, 1 m for 500 N"),
+                ("collision geoms", "shows_collision", "what touches the ground in the simulator"),
+                ("ghost", "shows_ghost", "where the commands of the last second lead"),
+            ):
+                box = gui.add_checkbox(label, getattr(layers, name), hint=hint)
+                box.on_update(lambda event, name=name: setattr(layers, name, event.target.value))
             if self._ground:
                 scan = gui.add_checkbox("height scan", scene.shows_scan, hint="where the ground is measured")
                 scan.on_update(lambda event: setattr(scene, "shows_scan", scan.value))
@@ -179,16 +208,21 @@ class Controls:
         names = tuple(map(str, sorted({*state.checkpoints, state.checkpoint})))
         if names != tuple(self.checkpoints.options):
             self.checkpoints.options = names
-        loaded = (state.checkpoint, state.perturbation, state.message_number)
+        loaded = (state.checkpoint, state.perturbation, state.message_number, state.follows_newest)
+        if self._loaded is None and state.command is not None:  # one that was there before the page
+            self._show_command(state.command)
         if loaded != self._loaded:  # otherwise a choice that is not carried out yet would jump back
             self._loaded = loaded
             set_value(self.checkpoints, str(state.checkpoint))
             set_value(self.perturbation, state.perturbation)
+            set_value(self.newest, state.follows_newest)
         tile = [] if state.reading is None else state.reading.tile.astype(int).tolist()
         if tile != self._tile:  # as above
             self._tile = tile
             set_value(self.level, tile[0])
             set_value(self.kind, self._kinds[tile[1]])
+        if self._random.value and state.reading is not None:
+            self._follow(state.reading.commands[state.world].tolist())
         if not state.is_mixing_set:
             for name, weight in state.mixing.items():
                 set_value(self._weights[name], round(weight, 2))

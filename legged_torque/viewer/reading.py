@@ -29,6 +29,10 @@ class Reading:
     resets: np.ndarray  # number of worlds whose episode ended: [fallen or diverged, timed out]
     tile: np.ndarray  # level and column of the followed world's tile; empty on a plane
     scan: np.ndarray  # where its height scan meets the ground [m]; (points, 3), without any on a plane
+    age: np.ndarray  # control steps of its episode; (1,)
+    feet: np.ndarray  # 1 for each of its feet on the ground, else 0; (feet,)
+    forces: np.ndarray  # of the ground on its collision geoms, in the world [N]; (geoms, 3)
+    targets: np.ndarray  # its joint positions that PD control wants [rad]; (num_dof,), empty without PD control
 
 
 class WatchedRobot(LeggedRobot):
@@ -96,8 +100,21 @@ class TaskReader:
             torch.stack([task.reset_buf.sum() - timeouts, timeouts]),
             tile,
             scan,
+            task.episode_length_buf[world : world + 1],
+            task.feet_contact[world],
+            task.sim.contact_force[world],
+            self._targets(world),
         ]
         flat = torch.cat([part.reshape(-1).float() for part in parts]).cpu().numpy()
         arrays = np.split(flat, np.cumsum([part.numel() for part in parts])[:-1])
         shaped = [array.reshape(tuple(part.shape)) for array, part in zip(arrays, parts, strict=True)]
         return Reading(time, world, *shaped)
+
+    def _targets(self, world: int) -> Tensor:
+        """Return where PD control wants the joints of a world, see :class:`Reading`."""
+        task = self._task
+        for place, term in enumerate(task.action_terms()):
+            if term.name == "position_residual":
+                actions = task.actions[world, place * task.num_dof :][: task.num_dof]
+                return task.default_dof_pos + task.joint_offset[world] + term.scale[world] * actions
+        return task.actions.new_zeros(0)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
-import trimesh
 import viser
-from PIL import Image
 from viser import transforms
 
-from legged_torque.utils.mjcf import DRAWN_GROUPS
 from legged_torque.viewer.framing import size_of
 from legged_torque.viewer.ground import Ground, Smooth
+from legged_torque.viewer.lane import Lane
+from legged_torque.viewer.layers import Layers
+from legged_torque.viewer.meshes import body_glb, ground_glb
 from legged_torque.viewer.reading import Reading
 
 COMMAND_COLOR, VELOCITY_COLOR, SCAN_COLOR = (10, 150, 50), (20, 90, 230), (214, 51, 108)
-GROUND_FACTOR = (0.45, 0.45, 0.45, 1.0)  # of the colors of rough ground: the light is bright
+PHONE = 0.6  # width by height of a view below which it is that of a phone
 SPACING = 2.0  # distance between neighbouring worlds [m]
 LIFTING = 0.2  # share of the way to where it sees the robot by which a camera moves up in a frame
 ARROW_LENGTH = 0.5  # length of the arrow of a velocity of 1 m/s [m]
@@ -30,9 +32,22 @@ class Scene:
     """
 
     def __init__(
-        self, server: viser.ViserServer, robot: mujoco.MjModel, num_envs: int, ground: Ground | None = None
+        self,
+        server: viser.ViserServer,
+        robot: mujoco.MjModel,
+        num_envs: int,
+        geoms: Sequence[str],
+        ground: Ground | None = None,
     ) -> None:
-        """Build everything; ``robot`` has visual geoms and the order of the states, ``ground`` is None for a plane."""
+        """Build everything.
+
+        Args:
+            server: Of the page.
+            robot: With visual geoms, and joints in the order of the states.
+            num_envs: Number of worlds.
+            geoms: Names of the collision geoms, in the order of the readings.
+            ground: None for a plane.
+        """
         self._server, self.ground = server, ground
         self._model = robot
         self._data = mujoco.MjData(self._model)
@@ -55,17 +70,38 @@ class Scene:
         sizes = {"shaft_radius": 0.009, "head_radius": 0.024, "head_length": 0.05}
         nowhere = np.zeros((1, 2, 3))
         self._arrows = [server.scene.add_arrows(name, nowhere, color, **sizes) for name, color in colors.items()]
+        self.layers = Layers(server, self._model, geoms)
+        self._lane = Lane()
+        self._labels: list[viser.LabelHandle] = []
+        self._seen: set[int] = set()  # browsers that have taken the page's camera
 
-    def update(self, reading: Reading, world: int) -> None:
-        """Draw a state, and command, velocity and height scan of a world to follow."""
-        positions, quats = self._poses(reading.qpos)
-        shown = slice(None) if self.shows_others else slice(world, world + 1)
+    def name_robots(self, first: str, second: str) -> None:
+        """Write names above the followed robot and the one beside it."""
+        self._labels = [self._server.scene.add_label(f"/name/{i}", name) for i, name in enumerate((first, second))]
+
+    def update(self, reading: Reading, world: int, ghost: np.ndarray, beside: np.ndarray | None = None) -> None:
+        """Draw a state, and all that is shown of a world to follow.
+
+        Args:
+            reading: The state.
+            world: The followed one.
+            ghost: Positions of its ghost, like a row of the reading's.
+            beside: Likewise of the robot beside it, in a simulation of its own; None if there is none.
+        """
+        num_envs, lane = len(reading.qpos), []
+        if beside is not None:
+            lane = [self._lane.place(reading.qpos[world], beside)]
+        rows = np.vstack([reading.qpos, *lane, ghost])
+        positions, quats = self._poses(rows, [*range(num_envs)] + [world] * (len(lane) + 1))
+        shown = [*(range(num_envs) if self.shows_others else [world]), *range(num_envs, num_envs + len(lane))]
         if self.is_following:
             self._offset[:2] = -positions[world, 1, :2]
             if self.ground:
                 self._offset[2] = -self._height.follow(float(self.ground.height(positions[world, 1])))
                 self._lift_cameras()
+        self._frame_phones()
         positions += self._offset
+        is_current = world == reading.world
         trunk, rotation = positions[world, 1], transforms.SO3(quats[world, 1]).as_matrix()
         with self._server.atomic():
             self._floor.position = self._offset
@@ -73,8 +109,11 @@ class Scene:
                 handle.batched_positions = positions[shown, body]
                 handle.batched_wxyzs = quats[shown, body]
             if self._scan:
-                self._scan.visible = self.shows_scan and world == reading.world
+                self._scan.visible = self.shows_scan and is_current
                 self._scan.points = (reading.scan + self._offset + [0.0, 0.0, 0.01]).astype(np.float32)
+            self.layers.update(reading, positions[[world, -1]], quats[[world, -1]], is_current)
+            for label, robot in zip(self._labels, (world, num_envs), strict=False):
+                label.position = positions[robot, 1] + [0.0, 0.0, 0.35 * self._size]
             velocities = (reading.commands[world], reading.velocities[world])
             for handle, vector, height in zip(self._arrows, velocities, (0.22, 0.17), strict=True):
                 start = trunk + np.array([0.0, 0.0, height * self._size])
@@ -82,16 +121,31 @@ class Scene:
                 handle.points = np.stack([start, end])[None].astype(np.float32)
                 handle.visible = bool(np.hypot(vector[0], vector[1]) > 0.05)
 
-    def _poses(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions and quaternions of all bodies. Shapes: (num_envs, nbody, 3), (num_envs, nbody, 4)."""
+    def _poses(self, qpos: np.ndarray, worlds: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and quaternions of all bodies of robots that are drawn where their worlds are.
+
+        Shapes: (robots, nq) to (robots, nbody, 3) and (robots, nbody, 4).
+        """
         positions = np.zeros((len(qpos), self._model.nbody, 3), np.float32)
         quats = np.zeros((len(qpos), self._model.nbody, 4), np.float32)
-        for world, row in enumerate(qpos):
+        for i, (world, row) in enumerate(zip(worlds, qpos, strict=True)):
             self._data.qpos[:] = row
             mujoco.mj_kinematics(self._model, self._data)
-            positions[world] = self._data.xpos + self._places[world]
-            quats[world] = self._data.xquat
+            positions[i] = self._data.xpos + self._places[world]
+            quats[i] = self._data.xquat
         return positions, quats
+
+    def _frame_phones(self) -> None:
+        """Let new browsers on phones see the robot above the sheet with the controls."""
+        for number, client in self._server.get_clients().items():
+            camera = client.camera
+            if number in self._seen or not np.any(camera.look_at):
+                continue
+            self._seen.add(number)
+            if camera.aspect < PHONE:
+                with client.atomic():
+                    camera.position = self._size * np.array([1.85, -1.85, 1.0])  # this moves what it looks at, too
+                    camera.look_at = (0.0, 0.0, -0.4 * self._size)
 
     def _lift_cameras(self) -> None:
         """Let the cameras of all browsers look over the ground between them and what they look at."""
@@ -148,68 +202,3 @@ def places(num_envs: int) -> np.ndarray:
     centers = SPACING * (cells - (side - 1) // 2)
     order = np.argsort(np.linalg.norm(centers, axis=1), kind="stable")
     return np.pad(centers[order][:num_envs], ((0, 0), (0, 1)))
-
-
-def ground_glb(ground: Ground) -> bytes:
-    """Return rough ground as a binary glTF. It has no normals: browsers draw its triangles flat, with sharp edges."""
-    picture = Image.fromarray(ground.picture()[::-1])
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=picture, baseColorFactor=GROUND_FACTOR, metallicFactor=0.0, roughnessFactor=0.95
-    )
-    visual = trimesh.visual.TextureVisuals(ground.uv, material=material)
-    mesh = trimesh.Trimesh(ground.vertices, ground.faces, visual=visual, process=False)
-    return trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=False)
-
-
-def body_glb(model: mujoco.MjModel, body: int) -> bytes | None:
-    """Return a body's visual geoms as a binary glTF in its frame, one mesh per material; None if it has none."""
-    by_material: dict[int, list[trimesh.Trimesh]] = {}
-    for geom in range(model.ngeom):
-        if model.geom_bodyid[geom] == body and model.geom_group[geom] in DRAWN_GROUPS:
-            by_material.setdefault(int(model.geom_matid[geom]), []).append(geom_mesh(model, geom))
-    if not by_material:
-        return None
-    drawing = trimesh.Scene()
-    for material, meshes in by_material.items():
-        mesh = trimesh.util.concatenate(meshes)
-        mesh.visual = trimesh.visual.TextureVisuals(material=pbr_material(model, material))
-        drawing.add_geometry(mesh)
-    return drawing.export(file_type="glb")
-
-
-def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
-    """Return a geom as triangles in its body's frame; edges of more than 40 degrees stay sharp."""
-    kinds, creation = mujoco.mjtGeom, trimesh.creation
-    kind, size = kinds(model.geom_type[geom]), model.geom_size[geom]
-    if kind == kinds.mjGEOM_MESH:
-        part = model.mesh(model.geom_dataid[geom])
-        vertices = model.mesh_vert[part.vertadr[0] :][: part.vertnum[0]]
-        faces = model.mesh_face[part.faceadr[0] :][: part.facenum[0]]
-        mesh = trimesh.Trimesh(vertices, faces)
-    else:
-        makers = {
-            kinds.mjGEOM_SPHERE: lambda: creation.icosphere(subdivisions=3, radius=size[0]),
-            kinds.mjGEOM_CAPSULE: lambda: creation.capsule(height=2.0 * size[1], radius=size[0], count=(16, 16)),
-            kinds.mjGEOM_CYLINDER: lambda: creation.cylinder(radius=size[0], height=2.0 * size[1], sections=40),
-            kinds.mjGEOM_ELLIPSOID: lambda: creation.icosphere(subdivisions=3).apply_scale(size),
-        }
-        mesh = makers.get(kind, lambda: creation.box(extents=2.0 * size))()
-    mesh = trimesh.graph.smooth_shade(mesh, angle=np.radians(40.0))
-    pose = np.eye(4)
-    pose[:3, :3] = transforms.SO3(model.geom_quat[geom]).as_matrix()
-    pose[:3, 3] = model.geom_pos[geom]
-    return mesh.apply_transform(pose)
-
-
-def pbr_material(model: mujoco.MjModel, material: int) -> trimesh.visual.material.PBRMaterial:
-    """Return a material of the model for glTF; -1 stands for none."""
-    if material < 0:
-        return trimesh.visual.material.PBRMaterial(baseColorFactor=(0.5, 0.5, 0.5, 1.0), roughnessFactor=0.7)
-    color, shininess = model.mat_rgba[material].copy(), float(model.mat_shininess[material])
-    color[:3] **= 2.2  # colors of glTF are linear
-    return trimesh.visual.material.PBRMaterial(
-        baseColorFactor=tuple(color),
-        emissiveFactor=tuple(color[:3] * model.mat_emission[material]),
-        metallicFactor=0.2 * float(model.mat_specular[material]),
-        roughnessFactor=0.9 - 0.6 * shininess,
-    )

@@ -73,6 +73,7 @@ class Session:
         self._clock, self._sleep = clock, sleep
         self.requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # not carried out yet
         self._stop = threading.Event()
+        self.companion: Session | None = None  # steps with this one, under the command of its followed world
         self._refused: dict[int, float] = {}
         self._next_scan = -math.inf
         # The last steps of the followed world; copy it before iterating in another thread.
@@ -80,8 +81,9 @@ class Session:
         self.state = SessionState()  # what is shown
         self.task = self._make_task(self._cfg)  # only the stepping thread may touch its tensors
         self._obs = self.task.get_observations()
-        name = run.config.get("task")
-        self._runner, _ = task_registry.make_alg_runner(self.task, name, train_cfg=run.train_cfg, log_root=None)
+        task = run.config.get("task")
+        self.name = f"{task}, {run.folder.name}"  # of the run, for users
+        self._runner, _ = task_registry.make_alg_runner(self.task, task, train_cfg=run.train_cfg, log_root=None)
         self._pacer = Pacer(self.task.dt, clock, sleep)
         self._load(run.iterations)
         self._policy = self._runner.get_inference_policy(device)
@@ -105,6 +107,25 @@ class Session:
 
     def tick(self) -> None:
         """Carry out the requests, then make one step when it is due, or none while paused."""
+        self._prepare()
+        if self.state.is_paused:
+            self._sleep(IDLE)
+            return
+        self._pacer.wait()
+        self._step()
+        if self.companion and self.state.reading:
+            v_x, v_y, yaw_rate = self.state.reading.commands[self.state.world].tolist()
+            self.companion.follow((v_x, v_y, yaw_rate))
+
+    def follow(self, command: Command) -> None:
+        """Make one step under a command, as the companion of another session."""
+        if command != self.state.command:
+            self.set_command(command)
+        self._prepare()
+        self._step()
+
+    def _prepare(self) -> None:
+        """Carry out the requests, and look for new checkpoints."""
         while not self.requests.empty():
             try:
                 self.requests.get()()
@@ -112,11 +133,6 @@ class Session:
                 self._tell(str(error), is_error=True)
         if self._clock() >= self._next_scan:
             self._scan()
-        if self.state.is_paused:
-            self._sleep(IDLE)
-            return
-        self._pacer.wait()
-        self._step()
 
     @torch.no_grad()
     def _step(self) -> None:
@@ -189,6 +205,8 @@ class Session:
         velocity = speed * torch.stack([heading.cos(), heading.sin(), torch.zeros_like(heading)], dim=1)
         everywhere = torch.ones_like(self.task.reset_buf)
         self.task.sim.push(everywhere, velocity, everywhere)
+        if self.companion:
+            self.companion.push(angle, speed)
         self._tell(f"pushed with {speed:.1f} m/s")
 
     @request
@@ -202,6 +220,8 @@ class Session:
         """Start a new episode in every world."""
         with torch.no_grad():
             self._obs = self.task.reset()
+        if self.companion:
+            self.companion.reset()
         self._tell("reset")
 
     @request

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import math
+import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -15,7 +18,9 @@ from legged_torque import resource_path
 from legged_torque.deploy.simulation import Simulation
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.layout import Layout
+from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import write_whole
 from legged_torque.utils.rendering import INSTALL_HINT
 from legged_torque.viewer.framing import size_of
 from legged_torque.viewer.ground import Ground, Smooth, drawn_model, ground_of
@@ -50,15 +55,20 @@ class VideoRecorder:
         self._model, self._trunk, self._control_step, self._ground = model, trunk, control_step, ground
         self._steps: list[list[Moment]] = []
 
-    def save(self, file: Path, no_renderer: str | None) -> None:
-        """Draw and write an mp4 and print where it is, or why there is none; ``no_renderer`` is one such reason."""
+    def save(self, file: Path, no_renderer: str | None) -> bool:
+        """Draw and write an mp4 and print where it is, or why there is none; ``no_renderer`` is one such reason.
+
+        What is returned is whether there is one.
+        """
         try:
             if no_renderer:
                 raise UserError(no_renderer)
             write_video(file, self._model, self._trunk, self._steps, self._control_step, self._ground)
             print(f"video: {file}")
+            return True
         except UserError as error:
             print(f"no video: {error}")
+            return False
 
 
 class SimulationRecorder(VideoRecorder):
@@ -130,7 +140,7 @@ def write_video(
         import imageio_ffmpeg  # noqa: F401
         import PIL  # noqa: F401
     except ImportError:
-        raise UserError("videos need the extra: pip install -e .[video]") from None
+        raise UserError("videos need the extra: pip install 'legged_torque[video]'") from None
     side = math.isqrt(len(steps[0]))
     width, height = SIZE if side == 1 else (length // side // 2 * 2 for length in GRID_SIZE)  # mp4 wants even numbers
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
@@ -139,19 +149,44 @@ def write_video(
         renderer = mujoco.Renderer(model, height, width)
     except Exception as error:  # whatever the graphics driver raises
         raise UserError(f"the renderer does not start: {error} ({INSTALL_HINT})") from None
-    file.parent.mkdir(parents=True, exist_ok=True)
-    writer = imageio.get_writer(file, fps=round(0.5 / control_step), macro_block_size=1)
     size = size_of(model)
     cameras = [Camera(ground, size) for _ in steps[0]]
-    with renderer, writer:
-        for number, moments in list(enumerate(steps, start=1))[::2]:
-            tiles = []
-            for moment, camera in zip(moments, cameras, strict=True):
-                image = _draw(renderer, data, trunk, moment, camera, size)
-                rows = _table(number * control_step, moment) if side == 1 else _line(moment)
-                tiles.append(add_overlay(image, rows))
-            rows_of_tiles = [np.hstack(tiles[i : i + side]) for i in range(0, len(tiles), side)]
-            writer.append_data(np.vstack(rows_of_tiles))
+    with tempfile.TemporaryDirectory() as folder:
+        part = Path(folder) / file.name
+        writer = imageio.get_writer(part, fps=round(0.5 / control_step), macro_block_size=1)
+        shown = list(enumerate(steps, start=1))[::2]
+        with renderer, writer, Counter("rendering, frame", len(shown)) as counter:
+            for number, moments in shown:
+                tiles = []
+                for moment, camera in zip(moments, cameras, strict=True):
+                    image = _draw(renderer, data, trunk, moment, camera, size)
+                    rows = _table(number * control_step, moment) if side == 1 else _line(moment)
+                    tiles.append(add_overlay(image, rows))
+                rows_of_tiles = [np.hstack(tiles[i : i + side]) for i in range(0, len(tiles), side)]
+                writer.append_data(np.vstack(rows_of_tiles))
+                counter.add()
+        write_whole(file, part.read_bytes())
+
+
+def show_in_tensorboard(video: Path, iterations: int) -> None:
+    """Add a video to those that tensorboard shows beside the curves of a run, as events in the video's folder."""
+    import imageio
+    from PIL import Image
+    from tensorboard.compat.proto.event_pb2 import Event
+    from tensorboard.compat.proto.summary_pb2 import Summary
+    from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+    reader: Any = imageio.get_reader(video)
+    with reader:
+        duration = 2000.0 / reader.get_meta_data()["fps"]  # of every second frame [ms]
+        frames = [Image.fromarray(frame[::2, ::2]) for number, frame in enumerate(reader) if number % 2 == 0]
+    gif = io.BytesIO()
+    frames[0].save(gif, "GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
+    size = {"width": frames[0].width, "height": frames[0].height, "colorspace": 3}
+    value = Summary.Value(tag="video", image=Summary.Image(**size, encoded_image_string=gif.getvalue()))
+    writer = EventFileWriter(str(video.parent))
+    writer.add_event(Event(wall_time=time.time(), step=iterations, summary=Summary(value=[value])))
+    writer.close()
 
 
 class Camera:

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-import errno
 import html
-import socket
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import viser
 
-from legged_torque.utils.errors import UserError
 from legged_torque.viewer.access import Guard
 from legged_torque.viewer.controls import Controls
 from legged_torque.viewer.ground import Ground, drawn_model, ground_of
+from legged_torque.viewer.layers import commanded_pose
 from legged_torque.viewer.pacing import stopping_on_ctrl_c
-from legged_torque.viewer.plots import Plots
+from legged_torque.viewer.plots import WIDTH, Plots
+from legged_torque.viewer.ports import free_port
+from legged_torque.viewer.recording import Recording
 from legged_torque.viewer.scene import Scene
 from legged_torque.viewer.session import Session
 from legged_torque.viewer.state import SessionState
+from legged_torque.viewer.steering import Steering
 
 FRAME_INTERVAL = 1.0 / 30.0  # seconds between drawings of the robots
 PLOT_INTERVAL = 0.2  # seconds between drawings of the plots and the status
@@ -36,18 +39,34 @@ class PrivateServer(viser.ViserServer):
 class Page:
     """Draws a session in a thread of its own, which never touches the task's tensors."""
 
-    def __init__(self, session: Session, robot: Path, title: str, host: str, port: int) -> None:
-        """Serve the page at a port or the next free one; ``robot`` is its MJCF, visual geoms included."""
+    def __init__(
+        self, session: Session, robot: Path, title: str, host: str, port: int, no_renderer: str | None = None
+    ) -> None:
+        """Serve the page at a port or the next free one.
+
+        Args:
+            session: What is shown.
+            robot: Its MJCF, visual geoms included.
+            title: Of the page.
+            host: Address that is served at.
+            port: The first one to try.
+            no_renderer: Why no videos can be drawn here; None if they can.
+        """
         self._session, self.guard = session, Guard(host)
-        with self.guard.at_the_door():
+        self._steering = Steering()
+        with self.guard.at_the_door(self._steering.around):
             self.server = PrivateServer(host, free_port(host, port), label=title, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 125, 246))
         self._ground = ground_of(session.task)
-        model = drawn_model(robot, None, session.task.dof_names)
-        self._scene = Scene(self.server, model, session.task.num_envs, self._ground)
+        model, geoms = drawn_model(robot, None, session.task.dof_names), session.task.asset.geom_names
+        self._scene = Scene(self.server, model, session.task.num_envs, geoms, self._ground)
+        if session.companion:
+            self._scene.name_robots(session.name, session.companion.name)
         self.controls = Controls(self.server, session, self._scene)
         self._plots = Plots(self.server, session)
+        self._recording = Recording(self.server, session.task, no_renderer)
         self.server.gui.main_panel.dock_right()
+        self.server.gui.main_panel.set_width(WIDTH)
         self._message_shown = 0
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
@@ -70,16 +89,29 @@ class Page:
         """Draw until closed; plots and status less often than the robots."""
         next_plots = 0.0
         while not self._closed.wait(FRAME_INTERVAL):
-            state = self._session.state
+            state, shares = self._session.state, self._steering.take()
+            if shares:
+                self.controls.steer(shares)
             if state.reading is not None:
-                self._scene.update(state.reading, state.world)
+                past = list(self._session.history) or [state.reading]
+                self._recording.update(past)
+                ghost = commanded_pose(past, self._session.task.dt)
+                self._scene.update(state.reading, state.world, ghost, self._beside())
             if time.perf_counter() >= next_plots:
                 next_plots = time.perf_counter() + PLOT_INTERVAL
                 with self.server.atomic():
                     self._plots.update(state)
-                    self.controls.status.content = status_html(state, self._ground)
+                    companion = self._session.companion
+                    beside = [(companion.name, companion.state)] if companion else []
+                    self.controls.status.content = status_html(state, self._ground, beside)
                     self.controls.update(state)
                     self._notify(state)
+
+    def _beside(self) -> np.ndarray | None:
+        """Return the positions of the companion's robot, as a row of ``sim.qpos``; None without one."""
+        companion = self._session.companion
+        reading = companion.state.reading if companion else None
+        return reading.qpos[0] if reading else None
 
     def _notify(self, state: SessionState) -> None:
         """Show an error as a notification on the page."""
@@ -89,37 +121,31 @@ class Page:
         self._message_shown = state.message_number
 
 
-def free_port(host: str, port: int) -> int:
-    """Return the first free port from a port on, or raise a UserError: at a wrong address viser would wait forever."""
-    for candidate in range(port, min(port + 100, 65536)):
-        try:
-            (family, _, _, _, address), *_ = socket.getaddrinfo(host, candidate, type=socket.SOCK_STREAM)
-            with socket.socket(family, socket.SOCK_STREAM) as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind(address)
-            return candidate
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise UserError(f"cannot serve at {host}:{candidate}: {error.strerror or error}") from None
-    raise UserError(f"no port from {port} on is free")
+def status_html(
+    state: SessionState, ground: Ground | None = None, beside: Sequence[tuple[str, SessionState]] = ()
+) -> str:
+    """Return the status line by line: checkpoint, time, tile of the followed robot on rough ground, last message.
 
-
-def status_html(state: SessionState, ground: Ground | None = None) -> str:
-    """Return the status line by line: checkpoint, time, tile of the followed robot on rough ground, last message."""
+    ``beside`` are names and states of companions, with a line each.
+    """
     running = "paused" if state.is_paused else f"{state.real_time:.2f} x real time"
     color = "#e03131" if state.is_error else "inherit"
     lines = [
         f"<b>model_{state.checkpoint}</b>, after {state.trained_steps / 1e6:,.1f} million steps",
         f"{state.time:.1f} s simulated, {running}, {state.falls} falls",
+        *(
+            f"beside: <b>{html.escape(name)}</b>, model_{other.checkpoint}, {other.falls} falls"
+            for name, other in beside
+        ),
         *([ground.tile_text(*state.reading.tile.astype(int))] if ground and state.reading else []),
         f'<span style="color:{color}">{html.escape(state.message) or "&nbsp;"}</span>',
     ]
     return f'<div style="font-size:13px;line-height:1.5;padding:4px 12px">{"<br>".join(lines)}</div>'
 
 
-def watch(session: Session, robot: Path, title: str, host: str, port: int) -> None:
+def watch(session: Session, robot: Path, title: str, host: str, port: int, no_renderer: str | None = None) -> None:
     """Serve a :class:`Page` and step until Ctrl-C."""
-    page = Page(session, robot, title, host, port)
+    page = Page(session, robot, title, host, port, no_renderer)
     if page.server.get_port() != port:
         print(f"Port {port} is taken.")
     if page.guard.token:

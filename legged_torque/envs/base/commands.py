@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 import warp as wp
@@ -14,6 +15,12 @@ from legged_torque.utils.math import yaw
 
 HEADING_GAIN = 0.5
 """Commanded yaw rate per angle that is left to a heading [1/s], as in legged_gym."""
+
+
+def fix_command(cfg: LeggedRobotCfg, command: Sequence[float]) -> None:
+    """Let a task with these settings draw nothing but one command: v_x, v_y [m/s] and a yaw rate [rad/s]."""
+    ranges = cfg.commands.ranges
+    ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw = ([value, value] for value in command)
 
 
 class UniformCommands:

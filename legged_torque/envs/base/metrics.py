@@ -11,6 +11,7 @@ from torch import Tensor
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.utils import metrics
+from legged_torque.utils.display import Counter
 
 COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")
 NUM_BINS = 4  # into how many equal parts the range of each command is split
@@ -133,10 +134,11 @@ def measure(
     """
     walking = WalkingMetrics(task)
     obs = task.reset()
-    with torch.inference_mode():
+    with torch.inference_mode(), Counter("evaluating, step", num_steps) as counter:
         for _ in range(num_steps):
             commands = task.commands.clone()
             obs = task.step(policy(obs))[0]
             walking.add_step(commands)
             on_step(commands)
+            counter.add()
     return walking

@@ -1,0 +1,100 @@
+"""What is installed on a machine, and what is missing for which purpose."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+from pathlib import Path
+
+import torch
+import warp as wp
+from packaging.requirements import Requirement
+
+import legged_torque
+import legged_torque.sim  # lets Warp print no banner
+from legged_torque.utils.runs import package_versions
+
+PURPOSES = {
+    "video": "videos of play.py and sim2sim.py",
+    "viewer": "play.py --viewer web",
+    "export": "export.py, sim2sim.py",
+    "plots": "figures and report.py",
+    "wandb": "--logger wandb",
+    "ray": "experiment.py --launcher ray",
+}
+"""What the extras are for that users need."""
+
+
+def topics() -> dict[str, list[str]]:
+    """Return lines to print, by their titles."""
+    versions = [f"{name:<14} {version}" for name, version in package_versions().items()]
+    return {
+        f"legged_torque {legged_torque.__version__}": [f"in {Path(legged_torque.__file__).parent}"],
+        "versions": versions,
+        "machine": [platform.platform(), f"{os.cpu_count()} cores, {torch.get_num_threads()} threads of torch"],
+        "GPU": gpus(driver()),
+        "caches": caches(),
+        "extras": extras(installed_requirements()),
+    }
+
+
+def driver() -> list[str]:
+    """Return a line per GPU as NVIDIA's driver tells it; none without a driver."""
+    command = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return []
+    return [line.strip() for line in done.stdout.splitlines() if line.strip()]
+
+
+def gpus(of_driver: list[str]) -> list[str]:
+    """Return the GPUs and, if there are some that cannot be used, why."""
+    lines = [f"{line} (name, driver, memory)" for line in of_driver] or ["none with a driver of NVIDIA"]
+    if torch.version.cuda is None:
+        lines.append("torch is a build for the CPU" + (": install one for CUDA to use the GPU" if of_driver else ""))
+    else:
+        usable = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
+        lines.append(f"torch, for CUDA {torch.version.cuda}, can use: {', '.join(usable) or 'none'}")
+    return lines
+
+
+def caches() -> list[str]:
+    """Return the folder of compiled kernels, with its number of modules and its size."""
+    wp.init()
+    folder = Path(wp.config.kernel_cache_dir or "")
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    modules = sum(1 for path in folder.glob("wp_*"))
+    return [f"compiled kernels: {folder}, {modules} modules, {size / 2**20:.0f} MiB; WARP_CACHE_PATH chooses it"]
+
+
+def installed_requirements() -> list[Requirement] | None:
+    """Return what the installed package requires, with its extras; None if it is used without being installed."""
+    try:
+        return [Requirement(text) for text in importlib.metadata.requires("legged_torque") or []]
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def extras(requirements: list[Requirement] | None) -> list[str]:
+    """Return for each extra whether all that it needs is there, or what is missing and the command that installs it."""
+    if requirements is None:
+        return ["unknown, as the package is not installed: pip install -e ."]
+    lines = []
+    for extra, purpose in PURPOSES.items():
+        wanted = [need for need in requirements if need.marker and need.marker.evaluate({"extra": extra})]
+        missing = [problem for problem in map(lacking, wanted) if problem]
+        hint = f"missing {', '.join(missing)}: pip install 'legged_torque[{extra}]'"
+        lines.append(f"{extra:<7} {hint if missing else 'ok'} ({purpose})")
+    return lines
+
+
+def lacking(need: Requirement) -> str:
+    """Return what is wrong with a required package: its name, and the version if that is not allowed; or nothing."""
+    try:
+        version = importlib.metadata.version(need.name)
+    except importlib.metadata.PackageNotFoundError:
+        return need.name
+    return "" if need.specifier.contains(version, prereleases=True) else f"{need.name}{need.specifier} (here {version})"

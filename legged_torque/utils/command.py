@@ -1,0 +1,67 @@
+"""The console command ``legged-torque``: every script by its name, from any folder."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import os
+import sys
+from pathlib import Path
+
+import legged_torque
+from legged_torque import SCRIPTS_DIR, __version__
+from legged_torque.utils.cli import COMMAND, Parser, run_script
+from legged_torque.utils.errors import unknown_name
+
+USUAL = ("train", "play", "evaluate", "export", "sim2sim", "experiment", "report", "import_robot", "info")
+"""What most users need, in the order of ``--help``."""
+
+
+def main() -> None:
+    """Run the script that the first word names, with the other words as its own."""
+    if "_ARGCOMPLETE" in os.environ:
+        words = os.environ["COMP_LINE"][: int(os.environ["COMP_POINT"])].split(" ")[1:-1]
+        os.environ["_ARGCOMPLETE"] = str(1 + bool(words))  # how many words of the line are the command's name
+    else:
+        words = sys.argv[1:]
+    if words and not words[0].startswith("-"):
+        run_script(lambda: start(*words))
+    else:
+        run_script(tell)
+
+
+def start(name: str, *words: str) -> None:
+    """Run a script as ``python scripts/<name>.py`` does; a UserError if there is none."""
+    if name not in scripts():
+        raise unknown_name("command", name, scripts())
+    sys.argv = [f"{COMMAND} {name}", *words]
+    spec = importlib.util.spec_from_file_location("__main__", SCRIPTS_DIR / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = sys.modules["__main__"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+
+def tell() -> None:
+    """Answer ``--help`` and ``--version``, and complete the name of a script."""
+    parser = Parser(f"{legged_torque.__doc__}\n\nExamples:\n{overview()}")
+    parser.prog = COMMAND
+    parser.add_argument("--version", action="version", version=f"{COMMAND} {__version__}")
+    parser.add_argument("command", choices=scripts(), metavar="command", help="one of those below, with its options")
+    parser.parse_args(sys.argv[1:] or ["--help"])
+
+
+def scripts() -> list[str]:
+    """Return the names of all scripts, the usual ones first."""
+    others = sorted(file.stem for file in SCRIPTS_DIR.glob("[!_]*.py"))
+    return [*USUAL, *(name for name in others if name not in USUAL)]
+
+
+def overview() -> str:
+    """Return a line per script, with what it does by the first line of its docstring."""
+    return "\n".join(f"  {name:<20} {purpose(SCRIPTS_DIR / f'{name}.py')}" for name in scripts())
+
+
+def purpose(file: Path) -> str:
+    """Return what a script does."""
+    text = ast.get_docstring(ast.parse(file.read_text("utf-8"))) or ""
+    return text.partition("\n")[0].partition(":")[0].rstrip(".")

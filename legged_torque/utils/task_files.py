@@ -1,0 +1,79 @@
+"""Tasks from outside the package: files that a command line names, and entry points of installed packages.
+
+Both run their author's code, so the user names or installs them; nothing that a run or an experiment has written does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.metadata
+import importlib.util
+import sys
+import traceback
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from legged_torque.utils.errors import UserError
+
+ENTRY_POINTS = "legged_torque.tasks"
+"""Group of the entry points, each of a module that registers tasks."""
+
+
+def import_task_files(tasks: dict[str, Any], files: Iterable[str | Path]) -> None:
+    """Import Python files that register tasks, each once; ``tasks`` are those of the registry, by name.
+
+    A file is imported by the name that it has, with its folder as a place to import from: it may use files beside it,
+    and settings may name its classes, ``"my_task:MyRobot"``. A UserError says why a file is of no use.
+    """
+    for file in map(Path, files):
+        name, path = file.stem, file.resolve()
+        if not path.is_file() or path.suffix != ".py" or not name.isidentifier():
+            raise UserError(f"--task_file takes a Python file with the name of a module, not '{file}'")
+        other = importlib.util.find_spec(name)
+        if other is not None and Path(other.origin or "").resolve() != path:
+            raise UserError(f"'{file}' cannot be imported: there is another module '{name}'; rename the file")
+        if name not in sys.modules:
+            sys.path.insert(0, str(path.parent))
+            with _adding_tasks(tasks, f"'{file}'"):
+                importlib.import_module(name)
+
+
+def import_installed_tasks(tasks: dict[str, Any]) -> None:
+    """Import what installed packages offer as :data:`ENTRY_POINTS`; ``tasks`` are those of the registry, by name.
+
+    One that is broken does not take the others with it: what is wrong is told, and its tasks are missing.
+    """
+    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        if point.module not in sys.modules:
+            try:
+                with _adding_tasks(tasks, f"the entry point '{point.name} = {point.value}'"):
+                    point.load()
+            except UserError as error:
+                print(f"Note: {error}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _adding_tasks(tasks: dict[str, Any], source: str) -> Iterator[None]:
+    """Import inside what adds tasks; a UserError says what went wrong, and in which line, and the tasks are as before.
+
+    What registers no task is refused, and so is what registers one by a name that another task has.
+    """
+    before = dict(tasks)
+    try:
+        yield
+        taken = [name for name, task in before.items() if tasks[name] is not task]
+        if taken:
+            raise UserError(f"{source} registers '{taken[0]}', which is a task already; choose another name")
+        if len(tasks) == len(before):
+            raise UserError(f"{source} registers no task: it must call task_registry.register")
+    except Exception as error:
+        tasks.clear()
+        tasks.update(before)
+        if isinstance(error, UserError):
+            raise
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        file, line = (error.filename, error.lineno) if isinstance(error, SyntaxError) else (last.filename, last.lineno)
+        place = f"line {line} of '{Path(file or '?').name}'"
+        raise UserError(f"{source} cannot be imported: {place}: {type(error).__name__}: {error}") from error

@@ -1,0 +1,67 @@
+"""Links between the pages lead somewhere, on the site as in the repository, and the site has every page."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+OTHERS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+PAGES = [*OTHERS, *sorted(DOCS.rglob("*.md"))]
+
+
+def without_code(page):
+    """A page's text without its code."""
+    return re.sub(r"^```.*?^```|`[^`\n]*`", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+def anchors(page):
+    """The anchors of a page's headings, as GitHub and the site make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+    headings = [re.sub(r"[^\w\s-]", "", line).strip().lower() for line in re.findall(r"^#+ (.+)$", text, re.MULTILINE)]
+    return {re.sub(r"\s", "-", heading) for heading in headings}
+
+
+def broken_links(page):
+    """Links of a page to files or headings that are not there, and of the site's pages to what the site lacks."""
+    broken = []
+    for link in re.findall(r"\]\(\s*([^)\s]+)\s*\)", without_code(page)):
+        if re.match(r"[a-z]+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        is_missing = not file.is_file() or (DOCS in page.parents and DOCS not in file.parents)
+        if is_missing or (anchor and anchor not in anchors(file)):
+            broken.append(link)
+    return broken
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links(page):
+    """Every link within the repository has its file and heading."""
+    assert not broken_links(page)
+
+
+def test_broken_links_are_found(tmp_path):
+    """A file, an image, a heading of another page and one of the page itself that are not there."""
+    (tmp_path / "other.md").write_text("# A heading: of `two` words\n```bash\n# no heading\n```\n")
+    good = "[a](other.md#a-heading-of-two-words) [b](https://x.org) `[c](code.md)` [d](#here)\n# Here\n"
+    bad = ["none.md", "none.png", "other.md#no-heading", "#there"]
+    page = tmp_path / "page.md"
+    page.write_text(good + " ".join(f"[x]({link})" for link in bad))
+    assert broken_links(page) == bad
+
+
+def test_navigation_has_every_page():
+    """The site's navigation names each page of docs/ once."""
+    settings = yaml.safe_load((ROOT / "mkdocs.yml").read_text("utf-8"))
+
+    def files(entry):
+        return [entry] if isinstance(entry, str) else [file for part in values(entry) for file in files(part)]
+
+    def values(entry):
+        return entry.values() if isinstance(entry, dict) else entry
+
+    assert sorted(files(settings["nav"])) == sorted(str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md"))

@@ -1,0 +1,81 @@
+"""docs/paper.md: what it names exists, and nothing of the paper is left out. CITATION.cff and the README's badges."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+import legged_torque
+from legged_torque.envs.base.reward_terms import RewardTerms
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = (ROOT / "docs" / "paper.md").read_text()
+NAMED = sorted(set(re.findall(r"`([\w.]+)` \(`([\w./]+\.py)`\)", PAGE)))
+ROMAN = ("I", "II", "III")
+
+
+def defined(file):
+    """What a module defines: classes, functions, constants, and what classes define, with a dot."""
+    names = set()
+    for node in ast.parse(file.read_text()).body:
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef)):
+            names.add(node.name)
+        elif isinstance(node, (ast.Assign, ast.AnnAssign)):
+            names |= {ast.unparse(target) for target in getattr(node, "targets", [getattr(node, "target", None)])}
+        if isinstance(node, ast.ClassDef):
+            names |= {f"{node.name}.{inner.name}" for inner in node.body if isinstance(inner, ast.FunctionDef)}
+    return names
+
+
+def rows(title):
+    """The first cells of the table below a heading."""
+    section = PAGE.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
+    return [line.split("|")[1].strip() for line in section.splitlines() if line.startswith("| ")]
+
+
+@pytest.mark.parametrize(("name", "file"), NAMED)
+def test_names_exist(name, file):
+    """Every class, function and method is defined in the file that stands behind it."""
+    assert name in defined(ROOT / file)
+
+
+def test_files_exist():
+    """So are other files; tests/test_docs.py looks at links."""
+    files = re.findall(r"`((?:\w+/)+[\w.]+)`", PAGE)
+    assert len(files) > len(NAMED) > 40
+    assert not [file for file in files if not (ROOT / file).exists()]
+
+
+def test_nothing_is_left_out():
+    """All equations, tables, figures, sections with something to implement, and reward terms have a row."""
+    numbers = {int(number) for cell in rows("Equations") for number in re.findall(r"\b\d+\b", cell)}
+    assert numbers == set(range(1, 12))
+    assert {cell for cell in rows("Tables") if cell in ROMAN} == set(ROMAN)
+    assert {number for cell in rows("Figures") for number in re.findall(r"\d", cell)} == set("1234567")
+    sections = " ".join(rows("Sections"))
+    parts = ("II-A", "II-B", "II-C", "II-D", "II-E", "II-F", "III-A", "III-B", "III-C", "IV-A", "IV-D", "IV-E", "V")
+    assert all(re.search(rf"\b{part}\b", sections) for part in parts)
+    terms = re.findall(r"`RewardTerms\.(_reward_\w+)`", PAGE.partition("rows of Table III")[2].partition("## ")[0])
+    assert len(terms) == len(set(terms)) == 13 and all(hasattr(RewardTerms, term) for term in terms)
+
+
+def test_citation():
+    """It names software, of this version and license, and the paper with its authors."""
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["cff-version"] == "1.2.0" and citation["message"] and citation["type"] == "software"
+    assert (citation["title"], citation["version"]) == ("legged_torque", legged_torque.__version__)
+    paper = citation["preferred-citation"]
+    assert paper["title"] == "Learning torque control for quadrupeds"
+    assert [author["family-names"] for author in paper["authors"]] == ["Schmidt", "Gaumann", "Bohlinger"]
+    assert citation["license"] == "BSD-3-Clause" and (ROOT / "LICENSE").read_text().startswith("BSD 3-Clause License")
+
+
+def test_badges():
+    """The versions of Python, and the license, are those of the package and of the guide."""
+    readme, project = ((ROOT / name).read_text() for name in ("README.md", "pyproject.toml"))
+    badges = dict(re.findall(r"!\[[^\]]*\]\(https://img\.shields\.io/badge/(\w+)-(\S+)-\w+\)", readme))
+    assert badges == {"python": "3.10_to_3.13", "license": "BSD--3--Clause"}
+    assert 'requires-python = ">=3.10"' in project and 'license = "BSD-3-Clause"' in project
+    assert "Python 3.10 to 3.13" in (ROOT / "docs" / "getting_started.md").read_text()
