@@ -1,5 +1,6 @@
 """The package as it is installed: without the repository, and run from any directory."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -48,17 +49,22 @@ def installed(tmp_path_factory):
     return site
 
 
-def start(installed, folder, script, *words):
-    """Start an installed script in a folder."""
+RUN = """import json, runpy, sys
+for script, *sys.argv[1:] in json.loads(sys.argv[1]):
+    runpy.run_module(f"legged_torque.scripts.{script}", run_name="__main__", alter_sys=True)"""
+
+
+def start(installed, folder, *commands):
+    """Start installed scripts in a folder, one after the other in a process: names and words of each."""
     environment = os.environ | {"PYTHONPATH": str(installed), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-m", f"legged_torque.scripts.{script}", *map(str, words)]
+    command = [sys.executable, "-c", RUN, json.dumps(commands)]
     return subprocess.Popen(
         command, cwd=folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
     )
 
 
 def finish(process):
-    """Wait for a script that must end well; return what it has printed."""
+    """Wait for scripts that must end well; return what they have printed."""
     with process:
         output, _ = process.communicate(timeout=200)
     assert process.returncode == 0, output
@@ -98,16 +104,14 @@ def test_command_and_experiments(installed, tmp_path):
 def test_scripts_from_another_directory(installed, tmp_path):
     """Train, play, export, let the exported policy walk, run an experiment: all files land in the current directory."""
     (tmp_path / "tiny.yaml").write_text(EXPERIMENT)
-    experiment = start(installed, tmp_path, "experiment", "tiny.yaml", "--device=cpu")
+    experiment = start(installed, tmp_path, ["experiment", "tiny.yaml", "--device=cpu"])
     task = ["--task=a1_torque_multihead", "--device=cpu"]
-    finish(start(installed, tmp_path, "train", *task, *SMALL))
+    play = ["play", *task, "--num_envs=2", "--steps=3", "--video=walk.mp4"]
+    output = finish(start(installed, tmp_path, ["train", *task, *SMALL], play, ["export", *task]))
     (run,) = (tmp_path / "logs" / "a1_torque_multihead").iterdir()
-    assert (run / "model_1.pt").is_file()
-    playing = start(installed, tmp_path, "play", *task, "--num_envs=2", "--steps=3", "--video=walk.mp4")
-    finish(start(installed, tmp_path, "export", *task))
-    walking = finish(start(installed, tmp_path, "sim2sim", run / "exported_1", "--robots=1", "--steps=3"))
+    assert (run / "model_1.pt").is_file() and "cost_of_transport" in output
+    walking = finish(start(installed, tmp_path, ["sim2sim", f"{run}/exported_1", "--robots=1", "--steps=3"]))
     assert str(installed / "legged_torque" / "resources" / "robots") in walking
-    assert "cost_of_transport" in finish(playing)
     finish(experiment)
     (result,) = (tmp_path / "logs" / "experiments" / "tiny").glob("*/result_*.json")
     assert result.is_file()

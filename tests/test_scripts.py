@@ -438,7 +438,7 @@ def test_train_stop_resume_play(tmp_path):
     assert configs[0]["env"] == configs[1]["env"] and configs[0]["train"] == configs[1]["train"]
     assert configs[1]["env"]["env"]["num_envs"] == 2 and torch.__version__.startswith(configs[1]["versions"]["torch"])
 
-    status, output, error = finish(start("play.py", *task, "--num_envs=2", "--steps=10", root=tmp_path))
+    status, output, error = run_here("play.py", *task, "--num_envs=2", "--steps=10", root=tmp_path)
     assert status == 0 and "Traceback" not in error
     assert f"model_{count + 2}.pt, after {(count + 2) * 8:,} steps of training:" in output
     for name in ("track_xy", "track_angular", "cost_of_transport", "falls_per_minute"):
