@@ -85,7 +85,7 @@ def test_a_run_names_no_file(tmp_path):
 
 def test_answers_come_before_torch(tmp_path):
     """A file whose class is only named is listed without anything heavy."""
-    assert_light("train.py", "--list", f"--task_file={FILE}", root=tmp_path)
+    assert_light({("train.py", "--list", f"--task_file={FILE}"): 0}, tmp_path)
 
 
 @pytest.mark.parametrize(

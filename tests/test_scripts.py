@@ -274,6 +274,17 @@ HEAVY = {"torch", "warp", "mujoco", "mujoco_warp", "rsl_rl", "tensordict", "matp
 """Packages that take long to import."""
 
 
+def assert_light(answers, root):
+    """Scripts with words, one after the other in a process, end with the status of each and import nothing heavy."""
+    commands = json.dumps([[str(ROOT / "scripts" / script), *words] for script, *words in answers])
+    command, environment = [sys.executable, "-c", LIGHT, commands], {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
+    results = [json.loads(line[8:]) for line in done.stdout.splitlines() if line.startswith("result: ")]
+    for (words, expected), (status, *imported) in zip(answers.items(), results, strict=True):
+        assert (status, HEAVY & set(imported)) == (expected, set()), words
+        assert "legged_torque" in imported
+
+
 def test_answers_need_nothing_heavy(tmp_path):
     """Help of every script, lists, and mistakes that settings show come before anything that takes long to import."""
     answers = {
@@ -289,15 +300,7 @@ def test_answers_need_nothing_heavy(tmp_path):
         ("train.py", "--set=runner.class_name=Other"): 2,
         ("train.py", "--resume", "--load_run=2026"): 2,
     }
-    commands = json.dumps([[str(ROOT / "scripts" / script), *words] for script, *words in answers])
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(  # one after the other in a process, so that Python starts once
-        [sys.executable, "-c", LIGHT, commands], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
-    results = [json.loads(line[8:]) for line in done.stdout.splitlines() if line.startswith("result: ")]
-    for (command, expected), (status, *imported) in zip(answers.items(), results, strict=True):
-        assert (status, HEAVY & set(imported)) == (expected, set()), command
-        assert "legged_torque" in imported
+    assert_light(answers, tmp_path)
 
 
 def test_run_folder(root):

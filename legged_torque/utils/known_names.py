@@ -18,15 +18,17 @@ NAMING = ("class_name", "function", "_func")
 
 def check_names(train_cfg: BaseConfig, registered: Iterable[Any]) -> None:
     """Refuse, by UserError, what training settings name but none of the ``registered`` ones nor their presets do."""
-    known: dict[str, list[str]] = {}
+    unknown, known = named(to_dict(train_cfg)), dict[str, list[Any]]()
     for cfg in registered:
+        if not unknown:  # with tasks of the package, after the first ones: there are many
+            return
         for settings in (to_dict(cfg), *cfg.presets().values()):
             for path, name in named(settings):
                 known.setdefault(path, []).append(name)
-    for path, name in named(to_dict(train_cfg)):
-        if name not in known.get(path, []):
-            error = unknown_name(path, str(name), {str(other) for other in known.get(path, []) if other})
-            raise UserError(f"{error}; these are the names that registered tasks have, register a task to add one")
+        unknown = [(path, name) for path, name in unknown if name not in known.get(path, [])]
+    for path, name in unknown:
+        error = unknown_name(path, str(name), {str(other) for other in known.get(path, []) if other})
+        raise UserError(f"{error}; these are the names that registered tasks have, register a task to add one")
 
 
 def import_names(train_cfg: BaseConfig) -> None:
