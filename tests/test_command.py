@@ -69,7 +69,10 @@ def test_completion(tmp_path):
 def test_command_of_other_scripts(monkeypatch):
     """What a script prints for the user to type is how the script itself was started."""
     monkeypatch.setattr(sys, "argv", ["scripts/train.py"])
+    monkeypatch.chdir(ROOT)
     assert script_command("play") == "python scripts/play.py"
+    monkeypatch.chdir("/")
+    assert script_command("play") == f"python {ROOT}/scripts/play.py"  # as it can be typed there
     monkeypatch.setattr(sys, "argv", ["legged-torque train"])
     assert script_command("play") == "legged-torque play"
     monkeypatch.setattr("legged_torque.utils.cli.SCRIPTS_DIR", ROOT / "legged_torque" / "scripts")
@@ -82,7 +85,7 @@ def test_help_has_examples(script, tmp_path):
     """Options are in groups, and the help ends with examples of the script itself."""
     _, output, _ = run_here(f"{script}.py", "--help", root=tmp_path)
     head, _, examples = output.partition("\nexamples:\n")
-    assert all(line.startswith(f"    python scripts/{script}.py") for line in examples.splitlines()) and examples
+    assert all(line.startswith(f"    python {ROOT}/scripts/{script}.py") for line in examples.splitlines()) and examples
     if "--set KEY" in head:
         assert head.index("\noptions:\n") < head.index("\ntask and settings:\n") < head.index("\n  --set KEY=VALUE")
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 from settings import COMBINATIONS, OTHER_ROBOTS, ROUGH, TASKS, error_of, flatten, parse
 
-from legged_torque.envs import task_registry
+from legged_torque.envs import TorqueRobot, task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.utils.config import BaseConfig, section_keys, to_dict, update_from_dict
-from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import TaskRegistry
 
@@ -52,6 +52,15 @@ def test_unknown_task(function, name):
 def test_name_without_a_near_match():
     """Nothing is proposed where nothing is near."""
     assert str(unknown_name("task", "xyz", ["b", "a"])) == "unknown task 'xyz'; allowed: a, b"
+
+
+def test_a_name_is_given_once():
+    """Another task under a name in use is refused, and the first one stays."""
+    registry = TaskRegistry()
+    registry.register("mine", LeggedRobot, A1Cfg(), A1CfgPPO())
+    with pytest.raises(UserError, match="'mine' is a task already"):
+        registry.register("mine", TorqueRobot, A1Cfg(), A1CfgPPO())
+    assert registry.get_task_class("mine") is LeggedRobot
 
 
 def test_settings_are_independent_copies():

@@ -32,8 +32,10 @@ def script_command(script: str) -> str:
     """Return how a script is started: as this one was, by the command, from a clone or as a part of the package."""
     if sys.argv[0].startswith(f"{COMMAND} "):
         return f"{COMMAND} {script}"
-    in_package = SCRIPTS_DIR.parent == Path(__file__).resolve().parents[1]
-    return f"python -m legged_torque.scripts.{script}" if in_package else f"python scripts/{script}.py"
+    if SCRIPTS_DIR.parent == Path(__file__).resolve().parents[1]:
+        return f"python -m legged_torque.scripts.{script}"
+    file = SCRIPTS_DIR / f"{script}.py"
+    return f"python {file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file}"
 
 
 class Parser(argparse.ArgumentParser):
