@@ -66,12 +66,12 @@ def test_completion(tmp_path):
     assert complete("legged-torque train --task a1_torque_mul", tmp_path / "3") == ["a1_torque_multihead"]
 
 
-def test_command_of_other_scripts(monkeypatch):
+def test_command_of_other_scripts(monkeypatch, tmp_path):
     """What a script prints for the user to type is how the script itself was started."""
     monkeypatch.setattr(sys, "argv", ["scripts/train.py"])
     monkeypatch.chdir(ROOT)
     assert script_command("play") == "python scripts/play.py"
-    monkeypatch.chdir("/")
+    monkeypatch.chdir(tmp_path)
     assert script_command("play") == f"python {ROOT}/scripts/play.py"  # as it can be typed there
     monkeypatch.setattr(sys, "argv", ["legged-torque train"])
     assert script_command("play") == "legged-torque play"

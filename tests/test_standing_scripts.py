@@ -59,7 +59,9 @@ def test_who_stands(made, tmp_path):
 def test_standing_of_a_missing_policy(tmp_path):
     """It is told in one line where the policy should be; nothing is made."""
     result = run_here("check_standing.py", *SMALL, root=tmp_path)
-    told = f"no pre-trained policy 'logs/pretrained/{TASK}.pt'; make it first: python {ROOT}/scripts/pretrain_gravity.py"
+    told = (
+        f"no pre-trained policy 'logs/pretrained/{TASK}.pt'; make it first: python {ROOT}/scripts/pretrain_gravity.py"
+    )
     assert_told_in_one_line(result, told)
     assert result[1] == "" and not list(tmp_path.iterdir())
 

@@ -237,7 +237,7 @@ def to_rsl_rl(train_cfg: Any) -> dict[str, Any]:
     settings, runner = to_dict(train_cfg), train_cfg.runner
     loggers = {
         "tensorboard": {"class_name": "tensorboard"},
-        "wandb": {"class_name": "WandbLogWriter", "project_name": runner.wandb_project},
+        "wandb": {"class_name": "legged_torque.learning.log_writer:WandbWriter", "project_name": runner.wandb_project},
         "none": {"class_name": "legged_torque.learning.log_writer:NoLogWriter"},
     }
     if runner.logger not in loggers:
