@@ -369,7 +369,7 @@ def test_script(tmp_path, monkeypatch, capsys):
     (found,) = [parts for parts in tasks.further_robots() if parts[0] in ("dog", "legs_of_many")]
     assert [name for name, *_ in tasks.tasks_of(*found)][:2] == ["dog_position", "dog_torque"]
     (tmp_path / "new" / "two.py").write_text((tmp_path / "new" / "dog.py").read_text() + "class B(DogCfg): pass\n")
-    with pytest.raises(UserError, match="'two.py' in envs/robots must have one class of this kind, not DogCfg, B"):
+    with pytest.raises(UserError, match=r"'two\.py' in envs/robots must have one class of this kind, not DogCfg, B"):
         list(tasks.further_robots())
     monkeypatch.chdir("/")
     assert len(load_asset(found[1]()).feet) == 4
