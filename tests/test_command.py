@@ -1,5 +1,6 @@
 """The console command, completion by the shell, the layout of ``--help`` and the flags that legged_gym's users know."""
 
+import importlib
 import os
 import re
 import runpy
@@ -17,7 +18,7 @@ from legged_torque.checks.installation import extras, gpus
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.commands import UniformCommands, fix_command
 from legged_torque.utils.args import Parser, add_task_args, task_file_words
-from legged_torque.utils.cli import script_command
+from legged_torque.utils.cli import run_script, script_command
 
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("[!_]*.py"))
 CODE = "import sys; sys.argv[0] = '/bin/legged-torque'; from legged_torque.utils.command import main; "
@@ -177,6 +178,13 @@ def test_info(tmp_path):
     for title in ("versions", "machine", "GPU", "caches", "extras", "rendering"):
         assert f"\n{title}\n  " in output
     assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_package(capsys):
+    """A package that should have come along is told in one line."""
+    with pytest.raises(SystemExit, match="2"):
+        run_script(lambda: importlib.import_module("nothing.of_this_name"))
+    assert capsys.readouterr().err == "error: 'nothing' is not installed; pip install legged_torque brings it along\n"
 
 
 def test_missing_extras():

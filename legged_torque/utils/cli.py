@@ -125,6 +125,8 @@ def run_script(main: Callable[[], None]) -> None:
     except Exception as error:
         if isinstance(error, OSError) and error.filename is not None:
             print(f"error: {error.strerror}: {str(error.filename)!r}", file=sys.stderr)
+        elif isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("legged_torque"):
+            print(f"error: '{error.name}' is not installed; pip install legged_torque brings it along", file=sys.stderr)
         elif is_out_of_memory(error):
             reason = str(error).strip().splitlines() or ["nothing is left"]
             print("error: this does not fit in memory, lower --num_envs:", reason[0], file=sys.stderr)
