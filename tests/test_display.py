@@ -92,7 +92,7 @@ def lines_of(output):
 def test_panel(columns, variables):
     """All numbers are there, nothing is wider than the terminal, and what is printed meanwhile is kept above.
 
-    It is redrawn about twice a second, however often there is something new.
+    It is redrawn about once a second, however often there is something new.
     """
     start = time.monotonic()
     status, output = in_a_terminal(columns, **variables)
