@@ -26,7 +26,8 @@ from legged_torque.utils.interrupt import write_error
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-REDRAW_EVERY = 1.0  # seconds between two pictures, each of which takes about 5 ms
+REDRAW_EVERY = 1.0  # seconds between two pictures while the work goes on; one takes about 5 ms
+REDRAW_WAITING = 2.0  # likewise while nothing is new, so that the clock goes on; longer, or it would take the turns
 LINE_EVERY = 10.0  # seconds between two plain lines
 _POLL = 0.25
 _UNKNOWN = "time left unknown"
@@ -143,7 +144,7 @@ class Display:
     def _watch(self) -> None:
         """Redraw while nobody calls :meth:`update`, and after a notice."""
         while not self._end.wait(_POLL):
-            is_late = time.monotonic() - self._drawn >= REDRAW_EVERY
+            is_late = time.monotonic() - self._drawn >= REDRAW_WAITING
             if is_late or self.notice != self._drawn_notice:
                 self._draw()
 
