@@ -3,6 +3,7 @@
 import os
 import resource
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -177,6 +178,14 @@ def test_a_full_disk(tmp_path):
     line = limited_write(tmp_path / "file", 50_000)
     assert line == f"cannot write '{tmp_path / 'file'}': File too large"
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
+
+
+def test_a_device_is_not_replaced(tmp_path):
+    """What is written to /dev/null is gone, and /dev/null is still there."""
+    link = tmp_path / "link"
+    link.symlink_to("/dev/null")
+    write_whole(link, b"1")
+    assert link.is_symlink() and link.read_bytes() == b"" and Path("/dev/null").is_char_device()
 
 
 @pytest.mark.parametrize("marks", [True, False])

@@ -43,8 +43,8 @@ def start(name: str, *words: str) -> None:
 
 def tell() -> None:
     """Answer ``--help`` and ``--version``, and complete the name of a script."""
-    parser = Parser(f"{legged_torque.__doc__}\n\nExamples:\n{overview()}")
-    parser.prog = COMMAND
+    parser = Parser(str(legged_torque.__doc__))
+    parser.prog, parser.epilog = COMMAND, f"commands:\n{overview()}"
     parser.add_argument("--version", action="version", version=f"{COMMAND} {__version__}")
     parser.add_argument("command", choices=scripts(), metavar="command", help="one of those below, with its options")
     parser.parse_args(sys.argv[1:] or ["--help"])

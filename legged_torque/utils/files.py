@@ -35,6 +35,9 @@ def write_whole(file: Path, content: bytes) -> None:
     part = part_of(file)
     with told_by_name(file):
         file.parent.mkdir(parents=True, exist_ok=True)
+        if file.exists() and not file.is_file():  # a device such as /dev/null is not to be replaced
+            file.write_bytes(content)
+            return
         try:
             with part.open("wb") as stream:
                 stream.write(content)
