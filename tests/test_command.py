@@ -45,7 +45,7 @@ def test_command_without_a_script():
     """The overview names every script and says what it does; a mistake is one line."""
     status, output, error = command()
     assert (status, error) == (0, "")
-    told = dict(re.findall(r"^  (\w+) +(\S.*)$", output.partition("examples:")[2], flags=re.MULTILINE))
+    told = dict(re.findall(r"^  (\w+) +(\S.*)$", output.partition("commands:")[2], flags=re.MULTILINE))
     assert sorted(told) == SCRIPTS and told["train"] == "Train a policy" and next(iter(told)) == "train"
     assert_told_in_one_line(command("trian"), "unknown command 'trian'; did you mean 'train'?")
 
