@@ -8,7 +8,8 @@ from pathlib import Path
 
 from legged_torque import RESOURCES_DIR
 from legged_torque import __file__ as package
-from legged_torque.utils.cli import Parser, check_output, finite, importing, run_script
+from legged_torque.envs import task_registry
+from legged_torque.utils.cli import Parser, check_output, finite, importing, run_script, script_command
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.rendering import choose_offscreen_renderer, without_renderer
 
@@ -39,6 +40,9 @@ def main() -> None:
         check_output(file)
         if file.exists() and not args.force:
             raise UserError(f"'{file}' exists; --force writes over it, --name and --out write elsewhere")
+    taken = [task for task in task_registry.names() if task.startswith(f"{robot.name}_")]
+    if taken and not args.out and not code_file.exists():
+        raise UserError(f"tasks of a robot '{robot.name}' may get names that are taken, as '{taken[0]}'; see --name")
     path = str(model_file.absolute()) if args.out else f"resources/robots/{robot.name}/{robot.name}.xml"
     text = mjcf(robot)
     model = parse(text, args.file)
@@ -61,7 +65,7 @@ def main() -> None:
             print(f"wrote {folder / robot.name}.png")
     if args.out:
         print(f"To have its tasks, put {code_file.name} into {Path(package).parent / 'envs' / 'robots'}")
-    print(f"Train it: python scripts/train.py --task={robot.name}_position")
+    print(f"Train it: {script_command('train')} --task={robot.name}_position")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The console command, completion by the shell, the layout of ``--help`` and the flags that legged_gym's users know."""
 
+import importlib
 import os
 import re
 import runpy
@@ -17,7 +18,7 @@ from legged_torque.checks.installation import extras, gpus, size_of
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.commands import UniformCommands, fix_command
 from legged_torque.utils.args import Parser, add_task_args, task_file_words
-from legged_torque.utils.cli import script_command
+from legged_torque.utils.cli import run_script, script_command
 
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("[!_]*.py"))
 CODE = "import sys; sys.argv[0] = '/bin/legged-torque'; from legged_torque.utils.command import main; "
@@ -66,10 +67,13 @@ def test_completion(tmp_path):
     assert complete("legged-torque train --task a1_torque_mul", tmp_path / "3") == ["a1_torque_multihead"]
 
 
-def test_command_of_other_scripts(monkeypatch):
+def test_command_of_other_scripts(monkeypatch, tmp_path):
     """What a script prints for the user to type is how the script itself was started."""
     monkeypatch.setattr(sys, "argv", ["scripts/train.py"])
+    monkeypatch.chdir(ROOT)
     assert script_command("play") == "python scripts/play.py"
+    monkeypatch.chdir(tmp_path)
+    assert script_command("play") == f"python {ROOT}/scripts/play.py"  # as it can be typed there
     monkeypatch.setattr(sys, "argv", ["legged-torque train"])
     assert script_command("play") == "legged-torque play"
     monkeypatch.setattr("legged_torque.utils.cli.SCRIPTS_DIR", ROOT / "legged_torque" / "scripts")
@@ -82,7 +86,7 @@ def test_help_has_examples(script, tmp_path):
     """Options are in groups, and the help ends with examples of the script itself."""
     _, output, _ = run_here(f"{script}.py", "--help", root=tmp_path)
     head, _, examples = output.partition("\nexamples:\n")
-    assert all(line.startswith(f"    python scripts/{script}.py") for line in examples.splitlines()) and examples
+    assert all(line.startswith(f"    python {ROOT}/scripts/{script}.py") for line in examples.splitlines()) and examples
     if "--set KEY" in head:
         assert head.index("\noptions:\n") < head.index("\ntask and settings:\n") < head.index("\n  --set KEY=VALUE")
 
@@ -184,6 +188,13 @@ def test_size_of_a_cache(tmp_path):
     assert size_of(tmp_path) == 1234
     (tmp_path / "gone").symlink_to("nowhere")
     assert size_of(tmp_path) == 1234 + len("nowhere") and size_of(tmp_path / "missing") == 0
+
+
+def test_a_missing_package(capsys):
+    """A package that should have come along is told in one line."""
+    with pytest.raises(SystemExit, match="2"):
+        run_script(lambda: importlib.import_module("nothing.of_this_name"))
+    assert capsys.readouterr().err == "error: 'nothing' is not installed; pip install legged_torque brings it along\n"
 
 
 def test_missing_extras():

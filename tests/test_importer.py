@@ -362,12 +362,15 @@ def test_script(tmp_path, monkeypatch, capsys):
     runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
     told = capsys.readouterr().out
     assert "sim.engine 'fused' simulates it" in told
-    assert told.endswith("Train it: python scripts/train.py --task=dog_position\n")
+    assert told.endswith(f"Train it: python {ROOT}/scripts/train.py --task=dog_position\n")
     helper = "from legged_torque.envs.robots.a1 import A1Cfg\ndef half(number):\n    return number / 2\n"
     (tmp_path / "new" / "legs_of_many.py").write_text(helper)
     monkeypatch.setattr(robots, "__path__", [*robots.__path__, str(tmp_path / "new")])
     (found,) = [parts for parts in tasks.further_robots() if parts[0] in ("dog", "legs_of_many")]
     assert [name for name, *_ in tasks.tasks_of(*found)][:2] == ["dog_position", "dog_torque"]
+    (tmp_path / "new" / "two.py").write_text((tmp_path / "new" / "dog.py").read_text() + "class B(DogCfg): pass\n")
+    with pytest.raises(UserError, match=r"'two\.py' in envs/robots must have one class of this kind, not DogCfg, B"):
+        list(tasks.further_robots())
     monkeypatch.chdir("/")
     assert len(load_asset(found[1]()).feet) == 4
     monkeypatch.chdir(tmp_path)
@@ -375,3 +378,7 @@ def test_script(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
         runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
     assert "exists" in capsys.readouterr().err
+    monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--name", "go2_torque"])
+    with pytest.raises(SystemExit, match="2"):
+        runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
+    assert "names that are taken, as 'go2_torque_gravity'" in capsys.readouterr().err

@@ -91,8 +91,8 @@ def test_answers_come_before_torch(tmp_path):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("x = 1\n", "'theirs.py' registers no task"),
-        (REGISTER.format("a1_torque"), "'theirs.py' registers 'a1_torque', which is a task already"),
+        ("x = 1\n", "'theirs.py': it registers no task"),
+        (REGISTER.format("a1_torque"), "'theirs.py': 'a1_torque' is a task already"),
         ("x = 1\ny = z\n", "'theirs.py' cannot be imported: line 2 of 'theirs.py': NameError: name 'z' is not"),
         ("def f(:\n", "'theirs.py' cannot be imported: line 1 of 'theirs.py': SyntaxError"),
         ("import sys\nsys.exit()\n", "'theirs.py' cannot be imported: line 2 of 'theirs.py': SystemExit"),

@@ -2,16 +2,17 @@
 
 import copy
 import inspect
+import re
 
 import pytest
 import torch
 from settings import COMBINATIONS, OTHER_ROBOTS, ROUGH, TASKS, error_of, flatten, parse
 
-from legged_torque.envs import task_registry
+from legged_torque.envs import TorqueRobot, task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.utils.config import BaseConfig, section_keys, to_dict, update_from_dict
-from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import TaskRegistry
 
@@ -43,15 +44,26 @@ def test_registered_tasks():
 @pytest.mark.parametrize("name", ["a1_positon", "a1-position", "A1_position"])
 @pytest.mark.parametrize("function", ["get_task_class", "get_cfgs", "make_env"])
 def test_unknown_task(function, name):
-    """The nearest task is proposed and all are listed."""
+    """The nearest task is proposed, and of so many only the nearest are listed."""
     line = error_of(getattr(task_registry, function), name)
     assert line.startswith(f"unknown task '{name}'; did you mean 'a1_position'? allowed: ")
-    assert line.split("allowed: ")[1].split(", ") == sorted(TASKS + COMBINATIONS + ROUGH + OTHER_ROBOTS)
+    listed, others = re.fullmatch(r"(.*) and (\d+) others", line.partition("allowed: ")[2]).groups()
+    names = TASKS + COMBINATIONS + ROUGH + OTHER_ROBOTS
+    assert set(listed.split(", ")) < set(names) and len(listed.split(", ")) + int(others) == len(names)
 
 
 def test_name_without_a_near_match():
     """Nothing is proposed where nothing is near."""
     assert str(unknown_name("task", "xyz", ["b", "a"])) == "unknown task 'xyz'; allowed: a, b"
+
+
+def test_a_name_is_given_once():
+    """Another task under a name in use is refused, and the first one stays."""
+    registry = TaskRegistry()
+    registry.register("mine", LeggedRobot, A1Cfg(), A1CfgPPO())
+    with pytest.raises(UserError, match="'mine' is a task already"):
+        registry.register("mine", TorqueRobot, A1Cfg(), A1CfgPPO())
+    assert registry.get_task_class("mine") is LeggedRobot
 
 
 def test_settings_are_independent_copies():

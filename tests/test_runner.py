@@ -4,7 +4,9 @@ import errno
 import math
 import os
 import signal
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,6 +14,7 @@ from settings import COMBINATIONS, TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.envs import task_registry
+from legged_torque.learning.log_writer import WandbWriter
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import UserError
 
@@ -378,3 +381,18 @@ def test_signal_during_an_iteration(make_runner, tmp_path):
     assert {path.name for path in folder(runner).glob("model*")} == {"model_0.pt", "model_1.pt"}
     runner.learn(1)
     assert (folder(runner) / "model_2.pt").is_file()
+
+
+def test_wandb(monkeypatch, tmp_path):
+    """It gets the settings as plain values; what it refuses is told in one line."""
+    uploaded = {}
+    wandb = SimpleNamespace(
+        Error=ArithmeticError, config=SimpleNamespace(update=uploaded.update), init=lambda **_: None
+    )
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    monkeypatch.setattr("rsl_rl.utils.wandb_log_writer.wandb", wandb)
+    WandbWriter(str(tmp_path), "project").store_config(task_registry.get_cfgs("a1_torque")[0], {"seed": 1})
+    assert uploaded["env_cfg"]["control"]["torque_scale"] == 8.0 and uploaded["train_cfg"] == {"seed": 1}
+    wandb.init = lambda **_: 1 / 0
+    with pytest.raises(UserError, match="--logger wandb: division by zero"):
+        WandbWriter(str(tmp_path), "project")

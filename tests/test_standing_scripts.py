@@ -6,7 +6,7 @@ import sys
 
 import pytest
 import torch
-from test_scripts import assert_told_in_one_line, contents, run_here
+from test_scripts import ROOT, assert_told_in_one_line, contents, run_here
 
 from legged_torque.control import gravity_pretraining
 
@@ -59,9 +59,10 @@ def test_who_stands(made, tmp_path):
 def test_standing_of_a_missing_policy(tmp_path):
     """It is told in one line where the policy should be; nothing is made."""
     result = run_here("check_standing.py", *SMALL, root=tmp_path)
-    assert_told_in_one_line(
-        result, f"no pre-trained policy 'logs/pretrained/{TASK}.pt'; make it first: python scripts/pretrain_gravity.py"
+    told = (
+        f"no pre-trained policy 'logs/pretrained/{TASK}.pt'; make it first: python {ROOT}/scripts/pretrain_gravity.py"
     )
+    assert_told_in_one_line(result, told)
     assert result[1] == "" and not list(tmp_path.iterdir())
 
 

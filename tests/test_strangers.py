@@ -159,8 +159,8 @@ def test_names_of_a_users_own_task():
         registry.get_cfgs, "own", parse("--set=actor.class_name=RNNModel")
     )
     Cfg.critic.class_name = "RNModel"
-    registry.register("own", LeggedRobot, A1Cfg(), Cfg())
-    assert error_of(registry.get_cfgs, "own", parse()).startswith("critic.class_name: ")
+    registry.register("another", LeggedRobot, A1Cfg(), Cfg())
+    assert error_of(registry.get_cfgs, "another", parse()).startswith("critic.class_name: ")
 
 
 @pytest.mark.parametrize("words", [[], ["--dry-run"]])

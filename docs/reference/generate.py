@@ -148,6 +148,7 @@ def scripts_page() -> str:
 
 
 if __name__ == "__main__":
+    os.chdir(SCRIPTS_DIR.parent)  # whence examples are written
     for name, text in {"settings.md": settings_page(), "scripts.md": scripts_page()}.items():
         (HERE / name).write_text(text, encoding="utf-8")
         print(HERE / name)

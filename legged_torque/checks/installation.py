@@ -34,7 +34,7 @@ def topics() -> dict[str, list[str]]:
     return {
         f"legged_torque {legged_torque.__version__}": [f"in {Path(legged_torque.__file__).parent}"],
         "versions": versions,
-        "machine": [platform.platform(), f"{os.cpu_count()} cores, {torch.get_num_threads()} threads of torch"],
+        "machine": [platform.platform(), f"{os.cpu_count()} cores, threads of torch: {torch.get_num_threads()}"],
         "GPU": gpus(driver()),
         "caches": caches(),
         "extras": extras(installed_requirements()),

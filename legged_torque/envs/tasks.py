@@ -18,6 +18,7 @@ from legged_torque.envs.approaches import torque_gravity
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 from legged_torque.envs.grounds.rough import RoughCfg, RoughCfgPPO, RoughScanCfg
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import task_registry
 
 
@@ -144,13 +145,20 @@ def tasks_of(name: str, cfg: Any, train_cfg: Any) -> list[tuple[str, str, Any, A
 
 
 def further_robots() -> Iterator[tuple[str, Any, Any]]:
-    """Yield name, settings and training of the robots in ``envs/robots`` but the A1: modules with two such classes."""
+    """Yield name, settings and training of the robots in ``envs/robots`` but the A1: modules with two such classes.
+
+    A UserError if a module has several settings, of which none is the robot's for certain.
+    """
     for module in pkgutil.iter_modules(robots.__path__):
         if module.name != "a1":
             parts = vars(importlib.import_module(f"{robots.__name__}.{module.name}"))
             own = [c for c in parts.values() if isinstance(c, type) and c.__module__ == parts["__name__"]]
             settings = [part for part in own if issubclass(part, LeggedRobotCfg)]
             training = [part for part in own if issubclass(part, LeggedRobotCfgPPO)]
+            for classes in (settings, training) if settings and training else ():
+                if len(classes) > 1:
+                    names = ", ".join(part.__name__ for part in classes)
+                    raise UserError(f"'{module.name}.py' in envs/robots must have one class of this kind, not {names}")
             if settings and training:
                 yield module.name, settings[0], training[0]
 

@@ -109,7 +109,7 @@ class TrainingDisplay(Display):
         notices = [Text(text, "bold yellow") for text in (self.activity, self.notice) if text]
         seconds, left = time.monotonic() - self.start, self._pace.left()
         progress = bar(f"{WHAT} {self._pace}", self._pace.share, seconds, left)
-        content = Group(progress, *tables, *notices)
+        content = Group(progress, *notices, *tables)  # the end is cut off where a terminal is low
         return Panel(content, title=Text(self._title, "bold"), title_align="left", border_style="dim")
 
     def _speed(self) -> str:

@@ -32,8 +32,10 @@ def script_command(script: str) -> str:
     """Return how a script is started: as this one was, by the command, from a clone or as a part of the package."""
     if sys.argv[0].startswith(f"{COMMAND} "):
         return f"{COMMAND} {script}"
-    in_package = SCRIPTS_DIR.parent == Path(__file__).resolve().parents[1]
-    return f"python -m legged_torque.scripts.{script}" if in_package else f"python scripts/{script}.py"
+    if SCRIPTS_DIR.parent == Path(__file__).resolve().parents[1]:
+        return f"python -m legged_torque.scripts.{script}"
+    file = SCRIPTS_DIR / f"{script}.py"
+    return f"python {file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file}"
 
 
 class Parser(argparse.ArgumentParser):
@@ -123,6 +125,8 @@ def run_script(main: Callable[[], None]) -> None:
     except Exception as error:
         if isinstance(error, OSError) and error.filename is not None:
             print(f"error: {error.strerror}: {str(error.filename)!r}", file=sys.stderr)
+        elif isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("legged_torque"):
+            print(f"error: '{error.name}' is not installed; pip install legged_torque brings it along", file=sys.stderr)
         elif is_out_of_memory(error):
             reason = str(error).strip().splitlines() or ["nothing is left"]
             print("error: this does not fit in memory, lower --num_envs:", reason[0], file=sys.stderr)

@@ -26,8 +26,8 @@ from legged_torque.utils.interrupt import write_error
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-REDRAW_EVERY = 0.5  # seconds between two pictures while the work goes on
-REDRAW_WAITING = 1.0  # seconds between two pictures during a long part of the work, so that the clock goes on
+REDRAW_EVERY = 1.0  # seconds between two pictures while the work goes on; one takes about 5 ms
+REDRAW_WAITING = 2.0  # likewise while nothing is new, so that the clock goes on; longer, or it would take the turns
 LINE_EVERY = 10.0  # seconds between two plain lines
 _POLL = 0.25
 _UNKNOWN = "time left unknown"
@@ -78,7 +78,9 @@ class Display:
         self._printed = self.start = time.monotonic()
         if is_terminal(self._stream) and Display.shown is None:
             Display.shown = self
-            console = Console(file=self._stream, force_terminal=True, force_interactive=True, highlight=False)
+            console = Console(
+                file=self._stream, force_terminal=True, force_interactive=True, highlight=False, markup=False
+            )
             self._live = Live(
                 console=console,
                 auto_refresh=False,

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator
 
 OUT_OF_MEMORY = ("out of memory", "Failed to allocate", "can't allocate memory")
 """Parts of the messages of CUDA, Warp and torch on the CPU when memory has run out."""
+MANY = 40  # names, of which an error lists only the nearest
+NEAREST = 5  # how many those are
 
 
 class UserError(Exception):
@@ -26,12 +28,17 @@ class TrainingError(Exception):
 
 
 def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
-    """Return the error for a name that does not exist; ``kind`` is what it stands for, e.g. "task"."""
+    """Return the error for a name that does not exist; ``kind`` is what it stands for, e.g. "task".
+
+    It lists what is allowed, or of more than :data:`MANY` names the nearest ones.
+    """
     allowed = sorted(allowed)
     by_lower_case = {name.lower(): name for name in allowed}
-    match = difflib.get_close_matches(given.lower(), by_lower_case, n=1, cutoff=0.5)
-    hint = f" did you mean '{by_lower_case[match[0]]}'?" if match else ""
-    return UserError(f"unknown {kind} '{given}';{hint} allowed: {', '.join(allowed)}")
+    near = difflib.get_close_matches(given.lower(), by_lower_case, n=NEAREST, cutoff=0.5)
+    hint = f" did you mean '{by_lower_case[near[0]]}'?" if near else ""
+    shown = [by_lower_case[name] for name in near] if near and len(allowed) > MANY else allowed
+    others = f" and {len(allowed) - len(shown)} others" if len(shown) < len(allowed) else ""
+    return UserError(f"unknown {kind} '{given}';{hint} allowed: {', '.join(shown)}{others}")
 
 
 @contextlib.contextmanager

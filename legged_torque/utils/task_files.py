@@ -66,21 +66,18 @@ def _file_of_module(name: str) -> str | None:
 def _adding_tasks(tasks: dict[str, Any], source: str) -> Iterator[None]:
     """Import inside what adds tasks; a UserError says what went wrong, and in which line, and the tasks are as before.
 
-    What registers no task is refused, and so is what registers one by a name that another task has.
+    What registers no task is refused.
     """
     before = dict(tasks)
     try:
         yield
-        taken = [name for name, task in before.items() if tasks[name] is not task]
-        if taken:
-            raise UserError(f"{source} registers '{taken[0]}', which is a task already; choose another name")
         if len(tasks) == len(before):
-            raise UserError(f"{source} registers no task: it must call task_registry.register")
+            raise UserError("it registers no task: it must call task_registry.register")
     except (Exception, SystemExit) as error:  # some read the command line themselves, and end the process
         tasks.clear()
         tasks.update(before)
         if isinstance(error, UserError):
-            raise
+            raise UserError(f"{source}: {error}") from error
         last = traceback.extract_tb(error.__traceback__)[-1]
         file, line = (error.filename, error.lineno) if isinstance(error, SyntaxError) else (last.filename, last.lineno)
         place = f"line {line} of '{Path(file or '?').name}'"

@@ -66,8 +66,11 @@ class TaskRegistry:
     def register(self, name: str, task_class: type[VecEnv] | str, env_cfg: BaseConfig, train_cfg: BaseConfig) -> None:
         """Make a task known that is created as ``task_class(env_cfg, device)``.
 
-        The class may be named instead, ``"module:Class"``: it is imported when the task is built.
+        The class may be named instead, ``"module:Class"``: it is imported when the task is built. A UserError if
+        another task has the name.
         """
+        if name in self._tasks:
+            raise UserError(f"'{name}' is a task already; choose another name")
         self._tasks[name] = (task_class, env_cfg, train_cfg)
 
     def import_files(self, files: Iterable[str | Path]) -> None:
@@ -234,7 +237,7 @@ def to_rsl_rl(train_cfg: Any) -> dict[str, Any]:
     settings, runner = to_dict(train_cfg), train_cfg.runner
     loggers = {
         "tensorboard": {"class_name": "tensorboard"},
-        "wandb": {"class_name": "WandbLogWriter", "project_name": runner.wandb_project},
+        "wandb": {"class_name": "legged_torque.learning.log_writer:WandbWriter", "project_name": runner.wandb_project},
         "none": {"class_name": "legged_torque.learning.log_writer:NoLogWriter"},
     }
     if runner.logger not in loggers:
