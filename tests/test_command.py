@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from settings import error_of, get_cfgs, parse
 from test_scripts import ROOT, assert_told_in_one_line, run_here
 
-from legged_torque.checks.installation import extras, gpus
+from legged_torque.checks.installation import extras, gpus, size_of
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.commands import UniformCommands, fix_command
 from legged_torque.utils.args import Parser, add_task_args, task_file_words
@@ -178,6 +178,16 @@ def test_info(tmp_path):
     for title in ("versions", "machine", "GPU", "caches", "extras", "rendering"):
         assert f"\n{title}\n  " in output
     assert not list(tmp_path.iterdir())
+
+
+def test_size_of_a_cache(tmp_path):
+    """All files in all folders count; a name behind which there is nothing, as of a file that has gone, is no error."""
+    (tmp_path / "wp_a" / "deep").mkdir(parents=True)
+    (tmp_path / "wp_a" / "kernel.o").write_bytes(bytes(1000))
+    (tmp_path / "wp_a" / "deep" / "kernel.o").write_bytes(bytes(234))
+    assert size_of(tmp_path) == 1234
+    (tmp_path / "gone").symlink_to("nowhere")
+    assert size_of(tmp_path) == 1234 + len("nowhere") and size_of(tmp_path / "missing") == 0
 
 
 def test_a_missing_package(capsys):

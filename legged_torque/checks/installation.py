@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import os
 import platform
@@ -65,9 +66,18 @@ def caches() -> list[str]:
     """Return the folder of compiled kernels, with its number of modules and its size."""
     wp.init()
     folder = Path(wp.config.kernel_cache_dir or "")
-    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    modules = sum(1 for path in folder.glob("wp_*"))
-    return [f"compiled kernels: {folder}, {modules} modules, {size / 2**20:.0f} MiB; WARP_CACHE_PATH chooses it"]
+    modules, size = sum(1 for path in folder.glob("wp_*")), size_of(folder) / 2**20
+    return [f"compiled kernels: {folder}, {modules} modules, {size:.0f} MiB; WARP_CACHE_PATH chooses it"]
+
+
+def size_of(folder: Path) -> int:
+    """Return the size of all files in a folder [bytes]; those that another process moves meanwhile may be left out."""
+    size = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(OSError):
+                size += os.lstat(os.path.join(place, name)).st_size
+    return size
 
 
 def installed_requirements() -> list[Requirement] | None:

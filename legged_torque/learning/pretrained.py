@@ -55,9 +55,8 @@ def pretrained_file(task: str, train_cfg: Any, log_root: str | None = None) -> P
 def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> None:
     """Make a task's pre-trained policy if its file is missing; a UserError if the file's does not fit the task.
 
-    Neither does one that was made with other settings of ``pretraining``: it may not even stand.
-
-    Of trainings that start at the same time one makes it, and the others wait.
+    A policy that was made with other settings of ``pretraining`` does not fit: it may not even stand. Of trainings that
+    start at the same time one makes the policy, and the others wait.
     """
     if not file.exists():
         check_output(file)

@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 
 COUNTS = Path("/proc/stat")
-TICKS = os.sysconf("SC_CLK_TCK")  # counts per second of a core
 LEAST = 1.0  # seconds of observation that say something
 MANY = 0.3  # busy cores from which others are in the way
 
@@ -40,5 +39,6 @@ class BusyCores:
             numbers = [int(number) for number in self._counts.read_text().split("\n", 1)[0].split()[1:]]
         except (OSError, ValueError):
             return 0.0, 0.0, 0.0
-        cores, idle = sum(numbers[:8]) / TICKS, sum(numbers[3:5]) / TICKS  # what guests use is in others already
+        ticks = os.sysconf("SC_CLK_TCK")  # counts per second of a core
+        cores, idle = sum(numbers[:8]) / ticks, sum(numbers[3:5]) / ticks  # what guests use is in others already
         return cores / (os.cpu_count() or 1), cores - idle, sum(os.times()[:4])

@@ -28,11 +28,11 @@ def import_task_files(tasks: dict[str, Any], files: Iterable[str | Path]) -> Non
     and settings may name its classes, ``"my_task:MyRobot"``. A UserError says why a file is of no use.
     """
     for file in map(Path, files):
-        name, path = file.stem, file.resolve()
+        name, path = file.stem, file.absolute()
         if not path.is_file() or path.suffix != ".py" or not name.isidentifier():
             raise UserError(f"--task_file takes a Python file with the name of a module, not '{file}'")
-        other = importlib.util.find_spec(name)
-        if other is not None and Path(other.origin or "").resolve() != path:
+        other = _file_of_module(name)
+        if other and Path(other).resolve() != path.resolve():
             raise UserError(f"'{file}' cannot be imported: there is another module '{name}'; rename the file")
         if name not in sys.modules:
             sys.path.insert(0, str(path.parent))
@@ -54,6 +54,14 @@ def import_installed_tasks(tasks: dict[str, Any]) -> None:
                 print(f"Note: {error}", file=sys.stderr)
 
 
+def _file_of_module(name: str) -> str | None:
+    """Return the file that an import of a name has given or would give; None if there is none, or just a folder."""
+    if name in sys.modules:
+        return getattr(sys.modules[name], "__file__", None) or name  # Python's own have none
+    spec = importlib.util.find_spec(name)
+    return spec.origin if spec else None
+
+
 @contextlib.contextmanager
 def _adding_tasks(tasks: dict[str, Any], source: str) -> Iterator[None]:
     """Import inside what adds tasks; a UserError says what went wrong, and in which line, and the tasks are as before.
@@ -65,7 +73,7 @@ def _adding_tasks(tasks: dict[str, Any], source: str) -> Iterator[None]:
         yield
         if len(tasks) == len(before):
             raise UserError("it registers no task: it must call task_registry.register")
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # some read the command line themselves, and end the process
         tasks.clear()
         tasks.update(before)
         if isinstance(error, UserError):
