@@ -158,7 +158,7 @@ def what_counts(from_step: float) -> str:
     """Return in words what the number of a seed is."""
     return (
         "Tracking % is better when higher, all else when lower. A seed's number is the mean of its evaluations during "
-        f"training from step {from_step / MILLION:g} million on, or of the last {LAST_SHARE:.0%} if training has not "
+        f"training from step {from_step / MILLION:.4g} million on, or of the last {LAST_SHARE:.0%} if training has not "
         "come that far."
     )
 
@@ -170,9 +170,9 @@ def rough_blocks(experiment: Experiment, figures: list[str], out: Path) -> list[
         return []
     text = (
         f"On each kind and difficulty, {plan.grounds.get('num_envs', 'some')} robots start in the middle of a tile, "
-        "are told to walk straight on, and cross it if the trunk gets over its edge in time, see docs/terrain.md. In tables are "
-        "means over all difficulties, ± standard errors over seeds, in brackets how many if not all. All tiles "
-        f"are in `{GROUNDS_FILE}`."
+        "are told to walk straight on, and cross it if the trunk gets over its edge in time, see docs/terrain.md. "
+        "In tables are means over all difficulties, ± standard errors over seeds, in brackets how many if not all. "
+        f"All tiles are in `{GROUNDS_FILE}`."
     )
     titles = [title for title in rough_figures(experiment) if title in figures]
     blocks: list[Block] = [Paragraph(text), *(Picture(title, out / file_name(title)) for title in titles)]
