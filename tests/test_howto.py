@@ -10,11 +10,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from test_command import command
 from test_scripts import run_here
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.utils.cli import Parser
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import Options
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -23,16 +25,10 @@ FILES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROO
 PAGES = [name for name in (str(file.relative_to(ROOT)) for file in FILES) if not name.startswith(GENERATED)]
 RUN_PYTHON = {"README.md", "docs/terrain.md"} | {page for page in PAGES if page.startswith("docs/howto/")}
 """Pages whose Python is run: that of docs/terrain.md in tests/test_terrain.py, all else here."""
-TINY = {
-    "train.py": [
-        "--device=cpu",
-        "--num_envs=2",
-        "--max_iterations=2",
-        "--set=runner.num_steps_per_env=4",
-        "--set=evaluation.interval=0",
-    ]
-}
-"""What makes the commands of a page short."""
+TINY = ["--device=cpu", "--num_envs=2", "--max_iterations=2", "--set=runner.num_steps_per_env=4"]
+"""What makes the trainings of a page short."""
+YOURS = "yours"
+"""Word in the mark of a block whose tasks and files a reader has made."""
 
 
 def blocks(page, language):
@@ -193,50 +189,78 @@ def test_robot(run_page):
 
 
 def fences(page):
-    """Each Bash and Python block of a page: line, whether it is marked as not run, language, text."""
+    """Each Bash and Python block of a page: line, why it is not run if it is marked so, language, text."""
     text = (ROOT / page).read_text("utf-8")
-    pattern = r"^(<!-- not run: \S[^\n]* -->\n)?```(bash|python)\n(.*?)^```"
+    pattern = r"^(?:<!-- not run: (\S[^\n]*) -->\n)?```(bash|python)\n(.*?)^```"
     found = re.finditer(pattern, text, flags=re.MULTILINE | re.DOTALL)
-    return [(text.count("\n", 0, match.start(2)) + 1, bool(match[1]), match[2], match[3]) for match in found]
+    return [(text.count("\n", 0, match.start(2)) + 1, match[1] or "", match[2], match[3]) for match in found]
 
 
 def script_calls(block):
     """(script, words) of each call of a script in a Bash block, also behind ``&&`` and ``torchrun``."""
+    for name, value in re.findall(r"^for (\w+) in (\S+)", block, flags=re.MULTILINE):
+        block = block.replace(f"${name}", value)
     lines = re.split(r"\n|&&", block.replace("\\\n", " "))
-    words = [shlex.split(line, comments=True) for line in lines if "$(" not in line]
-    places = [(line, place) for line in words for place, word in enumerate(line) if re.match(r"scripts/\w+\.py$", word)]
-    return [(line[place].removeprefix("scripts/"), line[place + 1 :]) for line, place in places]
+    calls = []
+    for words in (shlex.split(line, comments=True) for line in lines if "$(" not in line):
+        for place, word in enumerate(words):
+            if re.match(r"scripts/\w+\.py$", word):
+                calls.append((word.removeprefix("scripts/"), words[place + 1 :]))
+        if words[:1] == ["legged-torque"]:
+            calls.append((f"{words[1]}.py", words[2:]) if words[1:] else ("", []))
+    return calls
+
+
+def told_calls(page):
+    """(mark, script, words) of each call of a page, in its Bash blocks and as code within sentences."""
+    calls = [
+        (mark, *call) for _, mark, language, block in fences(page) if language == "bash" for call in script_calls(block)
+    ]
+    prose = re.sub(r"^```.*?^```", "", (ROOT / page).read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for code in re.findall(r"`((?:legged-torque|python\s+scripts/|\w+\.py)\s[^`]*)`", prose):
+        code = re.sub(r"^(\w+\.py)", r"scripts/\1", " ".join(code.split()))
+        calls += [(YOURS, *call) for call in script_calls(code) if not call[1] or not call[1][-1].startswith("--")]
+    return calls
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_python_is_run_or_marked(page):
-    """Python that no test runs says so in the line above, ``<!-- not run: why -->``, and no other does."""
-    for line, is_marked, language, _ in fences(page):
-        assert language == "bash" or is_marked != (page in RUN_PYTHON), f"{page}:{line}"
+def test_marks(page):
+    """Python that no test runs says so in the line above, and no other does; tests that marks name are there."""
+    for line, mark, language, block in fences(page):
+        assert language == "bash" or bool(mark) != (page in RUN_PYTHON), f"{page}:{line}"
+        for test in re.findall(r"tests/\w+\.py", mark + block):
+            assert (ROOT / test).is_file(), f"{page}:{line}"
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_commands(page, tmp_path):
-    """Bash that is not marked is run, in its order and with few worlds and steps, so it calls nothing but scripts."""
-    for line, is_marked, language, block in fences(page):
-        if language == "bash" and not is_marked:
+    """Bash that is not marked is run, in its order, trainings with few worlds; so it calls nothing but scripts."""
+    (tmp_path / "experiments").symlink_to(ROOT / "experiments")
+    for line, mark, language, block in fences(page):
+        if language == "bash" and not mark:
             calls = script_calls(block)
             lines = block.replace("\\\n", " ").strip().splitlines()
             assert len(calls) == len(lines), f"{page}:{line}"
             for script, words in calls:
-                status, output, error = run_here(script, *words, *TINY[script], root=tmp_path)
-                assert (status, error) == (0, "") and output, [script, *words]
+                is_training = script == "train.py" and not {"--list", "--help"} & set(words)
+                if script:
+                    result = run_here(script, *words, *(TINY if is_training else []), root=tmp_path)
+                else:
+                    result = command()
+                assert (result[0], result[2]) == (0, "") and result[1], [script, *words]
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_options_of_commands(page, monkeypatch, tmp_path):
-    """Each script that a page calls, marked or not, has these options, tasks and settings; here it ends once parsed."""
+    """Each call of a script, marked or not, has these options, tasks, settings and files; it ends once parsed."""
     parse = Parser.parse_args
 
     def parse_only(parser, *words):
         args = parse(parser, *words)
-        if getattr(args, "set", None) is not None and args.task in task_registry.names():
-            task_registry.get_cfgs(args.task, Options(set=args.set, perturbation=args.perturbation))
+        is_yours = YOURS in calls[len(parsed)][0]
+        if getattr(args, "set", None) is not None and (args.task in task_registry.names() or not is_yours):
+            named = {name: getattr(args, name, None) for name in ("preset", "perturbation", "ranges")}
+            task_registry.get_cfgs(args.task, Options(set=args.set, **named))
         parsed.append(args)
         raise SystemExit(0)
 
@@ -244,10 +268,30 @@ def test_options_of_commands(page, monkeypatch, tmp_path):
     monkeypatch.setattr(Parser, "parse_args", parse_only)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MUJOCO_GL", "disable")
-    calls = [call for _, _, language, block in fences(page) if language == "bash" for call in script_calls(block)]
-    for script, words in calls:
+    calls = [call for call in told_calls(page) if call[1] and "--help" not in call[2]]
+    for _, script, words in calls:
+        files = [word for word in words if re.match(r"experiments/\w+\.yaml$", word)]
+        assert all((ROOT / file).is_file() for file in files), files
         monkeypatch.setattr(sys, "argv", [script, *words])
         with pytest.raises(SystemExit) as stop:
             runpy.run_path(str(ROOT / "scripts" / script), run_name="__main__")
         assert stop.value.code == 0, [script, *words]
     assert len(parsed) == len(calls)
+
+
+def test_wrong_commands_are_found(monkeypatch, tmp_path):
+    """A wrong option, task, setting, preset, experiment or script in a page fails the test above."""
+    page = tmp_path / "page.md"
+    monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
+    (tmp_path / "scripts").symlink_to(Path(__file__).resolve().parents[1] / "scripts")
+    for words in (
+        "train.py --tsk=a1_torque",
+        "train.py --task=a1_torqe",
+        "train.py --set rewards.scales.torqes=1",
+        "train.py --preset=papr",
+        "experiment.py experiments/papr.yaml",
+        "trian.py",
+    ):
+        page.write_text(f"```bash\npython scripts/{words}\n```\n")
+        with pytest.MonkeyPatch.context() as patch, pytest.raises((AssertionError, UserError, FileNotFoundError)):
+            test_options_of_commands("page.md", patch, tmp_path)

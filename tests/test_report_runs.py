@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 import yaml
-from test_report import HEADER, line, run_script, whole_run
+from test_report import HEADER, line, run_script, whole_run, write_grounds
 from test_report_page import Page
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
@@ -22,7 +22,7 @@ def settings(task, seed, perturbation, ranges="default", run_name=""):
     update_from_dict(cfg, cfg.perturbations().get(perturbation, {}))
     update_from_dict(cfg, cfg.parameter_ranges()[ranges])
     if perturbation == "own":
-        cfg.domain_rand.push_velocity = [-0.123, 0.123]
+        cfg.domain_rand.push_robots, cfg.domain_rand.push_velocity = True, [-0.123, 0.123]
     train = {"seed": seed, "runner": {"num_steps_per_env": 1000, "run_name": run_name}, "evaluation": {"also": []}}
     return {"task": task, "env": to_dict(cfg), "train": train, "max_iterations": 110, "versions": {"torch": "2"}}
 
@@ -39,6 +39,9 @@ def test_names_of_settings():
     for perturbation in ("none", "low", "high", "high_frequency", "doubled", "own"):
         assert environment_of(settings("no_such_task", 1, perturbation)) == perturbation
     assert [ranges_of(settings("no_such_task", 1, "low", name)) for name in ("default", "hard")] == ["default", "hard"]
+    no_pushes = settings("no_such_task", 1, "none")
+    no_pushes["env"]["domain_rand"]["push_velocity"] = [-0.3, 0.3]  # as a task has them by default
+    assert environment_of(no_pushes) == "none"
     older = settings("no_such_task", 1, "high")
     del older["env"]["domain_rand"]["foot_radius_share"], older["env"]["noise"]  # entries that it does not have yet
     assert (environment_of(older), ranges_of(older)) == ("high", "default")
@@ -92,6 +95,29 @@ def test_page_of_own_runs(logs, monkeypatch, capsys):
     assert "| `mine wide` | low | 1 | 2026-01-04_00-00-00_wide | 110 of 110 |" in text
     assert "- the run 'bad' cannot be read: " in text
     assert len(list(csv.DictReader((logs / "report" / "table.csv").read_text().splitlines()))) == 3 * 2 * 9
+
+
+def test_runs_with_other_settings(tmp_path):
+    """Runs of one task and seed that differ in settings are two, named by these; a resumed one with them stays one."""
+    for day, scale, lines in ((1, -1.0, whole_run(0.5)[:3]), (2, -2.0, whole_run(0.6)), (3, -1.0, whole_run(0.7)[3:])):
+        config = settings("mine", 1, "low")
+        config["env"]["rewards"]["scales"]["torques"] = scale
+        config["train"]["evaluation"]["interval"] = day  # this does not change what is learned
+        write_run(tmp_path / f"2026-01-0{day}_00-00-00", lines, config)
+    experiment = read_experiment(tmp_path)
+    names = [f"mine rewards.scales.torques={scale}" for scale in (-1.0, -2.0)]
+    assert experiment.plan.tasks == names
+    first, second = (experiment.runs_of(name, "low")[0] for name in names)
+    assert len(first.rows) == len(second.rows) == 5 and len(first.configs) == 2
+
+
+def test_rough_ground_without_a_plan(logs):
+    """What evaluate.py has measured on tiles and written beside a run as grounds.json is in the report."""
+    write_grounds(logs / "other" / "2026-01-07_00-00-00", {("pits", 0.0): 1.0, ("pits", 0.5): 0.5})
+    assert run_script(logs) == 0
+    text = (logs / "report" / "report.md").read_text()
+    assert "| task | pits | all |\n| --- | --- | --- |\n| `mine` | – | – |\n| `other` | 0.75 (1) | 0.75 (1) |" in text
+    assert len((logs / "report" / "grounds.csv").read_text().splitlines()) == 3
 
 
 def test_one_run(logs):

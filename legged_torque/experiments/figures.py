@@ -79,7 +79,7 @@ def planned_figures(experiment: Experiment, table: Table) -> dict[str, Draw]:
 
 def rough_figures(experiment: Experiment) -> dict[str, Draw]:
     """Return what draws figures on rough ground: levels, and success for each environment of training."""
-    if not experiment.plan.grounds:
+    if not experiment.has_grounds():
         return {}
     figures: dict[str, Draw] = {LEVELS: partial(draw_curves, experiment, CurveFigure(LEVEL.name))}
     names = experiment.plan.environments

@@ -161,7 +161,10 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
     named_kinds(matrix.grounds.get("kinds", []))
     rising_levels(matrix.grounds.get("levels", []))
     ranges, words = str(matrix.ranges) if matrix.ranges else None, matrix.set_words()
-    for cell in matrix.cells(Path()):
+    cells = matrix.cells(Path())
+    for cell in cells:
+        if cell.seed != matrix.seeds[0] and (cell.task, cell.environment) != (cells[0].task, cells[0].environment):
+            continue  # no other setting depends on the seed
         options = Options(device="cpu", seed=cell.seed, perturbation=cell.environment, ranges=ranges, set=words)
         env_cfg, _ = task_registry.get_cfgs(cell.task, options)
         check_env_cfg(env_cfg)

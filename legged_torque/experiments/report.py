@@ -158,28 +158,29 @@ def what_counts(from_step: float) -> str:
     """Return in words what the number of a seed is."""
     return (
         "Tracking % is better when higher, all else when lower. A seed's number is the mean of its evaluations during "
-        f"training from step {from_step / MILLION:g} million on, or of the last {LAST_SHARE:.0%} if training has not "
+        f"training from step {from_step / MILLION:.4g} million on, or of the last {LAST_SHARE:.0%} if training has not "
         "come that far."
     )
 
 
 def rough_blocks(experiment: Experiment, figures: list[str], out: Path) -> list[Block]:
-    """Return what came out on rough ground; nothing if that was not planned."""
+    """Return what came out on rough ground; nothing if there is no plan for it nor a result."""
     plan = experiment.plan
-    if not plan.grounds:
+    if not experiment.has_grounds():
         return []
     text = (
-        f"On each kind and difficulty, {plan.grounds['num_envs']} robots start in the middle of a tile, are told to "
-        "walk straight on, and cross it if the trunk gets over its edge in time, see docs/terrain.md. In tables are "
-        "means over all difficulties, ± standard errors over seeds, in brackets how many if not all. All tiles "
-        f"are in `{GROUNDS_FILE}`."
+        f"On each kind and difficulty, {plan.grounds.get('num_envs', 'some')} robots start in the middle of a tile, "
+        "are told to walk straight on, and cross it if the trunk gets over its edge in time, see docs/terrain.md. "
+        "In tables are means over all difficulties, ± standard errors over seeds, in brackets how many if not all. "
+        f"All tiles are in `{GROUNDS_FILE}`."
     )
     titles = [title for title in rough_figures(experiment) if title in figures]
     blocks: list[Block] = [Paragraph(text), *(Picture(title, out / file_name(title)) for title in titles)]
     for environment in plan.environments:
-        seeds = {task: [run.crossings for run in experiment.runs_of(task, environment)] for task in plan.tasks}
+        runs = {task: experiment.runs_of(task, environment) for task in plan.tasks}
+        seeds = {task: [run.crossings for run in some] for task, some in runs.items() if some or experiment.is_planned}
         kinds = kinds_of([each for some in seeds.values() for each in some])
-        blocks.append(Heading(environment, 3))
+        blocks += [Heading(environment, 3)] if kinds or experiment.is_planned else []
         for measure, (meaning, digits) in MEASURES.items() if kinds else []:
             rows = []
             for task, some in seeds.items():
@@ -290,8 +291,8 @@ def run_blocks(experiment: Experiment) -> list[Block]:
     """Return what the trainings without a plan are, and what counts as one of them."""
     text = (
         "There is no `experiment.yaml`, so these are the trainings that the folder holds. Runs of the same "
-        "task, `--run_name`, random events and seed are one training that was resumed; of two that both begin at 0, "
-        "the later counts."
+        "task, `--run_name`, settings, random events and seed are one training that was resumed; of two that both "
+        "begin at 0, the later counts. Settings that differ between runs of a task stand behind its name."
     )
     steps = [f"{run.steps / MILLION:.4g} of {run.total_steps / MILLION:.4g}" for run in experiment.runs]
     rows = [

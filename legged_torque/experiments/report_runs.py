@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,12 @@ from legged_torque.utils.runs import CONFIG_FILE, load_config
 OWN = "own"
 """Name of random events or ranges that have none of the published names."""
 
+PUSHES = ("push_velocity", "push_probability")
+"""Settings of pushes, which without any may have any value."""
+
+FREE = ("seed", "evaluation.", "runner.save_interval", "runner.total_steps", "runner.logger")
+"""Settings that may differ between the runs of one training, and those that do not change what is learned."""
+
 Trainings = dict[Cell, list[Path]]
 """Folders of runs by training: the first one and those that have continued it, in the order of their names."""
 
@@ -24,25 +31,37 @@ Trainings = dict[Cell, list[Path]]
 def find_trainings(folder: Path, notes: list[str]) -> Trainings:
     """Return the trainings in a folder; each run that cannot be read adds a note. UserError if there is none.
 
-    Runs of the same task, run name, random events and seed are one training that was interrupted and resumed; of two
-    that both began at 0, the later one counts.
+    Runs of the same task, run name, settings, random events and seed are one training that was interrupted and resumed;
+    of two that both began at 0, the later one counts. Settings that differ between runs of a task follow its name.
     """
-    found: dict[tuple[str, str, int], list[Path]] = {}
-    also: dict[tuple[str, str, int], tuple[str, ...]] = {}
+    keys: dict[Path, tuple[str, str, int]] = {}
+    configs: dict[Path, dict[str, Any]] = {}
     for run in sorted({file.parent for file in folder.rglob(CONFIG_FILE)}, key=lambda path: path.name):
         try:
             config = load_config(run)
             train = config["train"]
             task = " ".join(filter(None, [str(config["task"]), str(train["runner"].get("run_name") or "")]))
-            key = (task, environment_of(config), int(train["seed"]))
-            also[key] = tuple(map(str, train.get("evaluation", {}).get("also") or ()))
+            keys[run] = (task, environment_of(config), int(train["seed"]))
+            configs[run] = flat({**config["env"], **train})
         except (UserError, LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
             notes.append(f"the run '{run.relative_to(folder)}' cannot be read: {error}")
-            continue
-        found.setdefault(key, []).append(run)
-    if not found:
+    if not keys:
         raise UserError(f"there is neither a file '{folder / SETTINGS_FILE}' nor a run with its {CONFIG_FILE}")
-    return {Cell(found[key][-1], *key, tuple(dict.fromkeys([key[1], *also[key]]))): found[key] for key in sorted(found)}
+    found: Trainings = {}
+    cells: dict[tuple[str, str, int], list[Path]] = {}
+    for run, (task, environment, seed) in keys.items():
+        alike = [configs[other] for other, key in keys.items() if key[:2] == (task, environment)]
+        cells.setdefault((" ".join([task, *own_values(configs[run], alike)]), environment, seed), []).append(run)
+    for key in sorted(cells):
+        also = configs[cells[key][-1]].get("evaluation.also") or ()
+        found[Cell(cells[key][-1], *key, tuple(dict.fromkeys([key[1], *map(str, also)])))] = cells[key]
+    return found
+
+
+def own_values(settings: Mapping[str, Any], others: list[dict[str, Any]]) -> list[str]:
+    """Return "path=value" of each setting, but those of :data:`FREE`, in which not all ``others`` agree with it."""
+    paths = [path for path in settings if not path.startswith(FREE)]
+    return [f"{path}={settings[path]}" for path in paths if any(other.get(path) != settings[path] for other in others)]
 
 
 def plan_of(trainings: Trainings) -> Matrix:
@@ -57,7 +76,11 @@ def plan_of(trainings: Trainings) -> Matrix:
 
 def environment_of(config: Mapping[str, Any]) -> str:
     """Return the name of the random events that a run was trained with, or :data:`OWN`."""
-    return _named(config, settings_of(config).perturbations())
+    sets = settings_of(config).perturbations()
+    if not config["env"]["domain_rand"].get("push_robots"):  # then their size means nothing
+        for changes, name in product(sets.values(), PUSHES):
+            del changes["domain_rand"][name]
+    return _named(config, sets)
 
 
 def ranges_of(config: Mapping[str, Any]) -> str:

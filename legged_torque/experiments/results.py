@@ -91,6 +91,10 @@ class Experiment:
         """Return how many seeds of a task an environment should have: those planned, or else those there are."""
         return len(self.plan.seeds if self.is_planned else self.runs_of(task, environment))
 
+    def has_grounds(self) -> bool:
+        """Return whether rough ground was planned, or measured without a plan."""
+        return bool(self.plan.grounds) or (not self.is_planned and any(run.crossings for run in self.runs))
+
     def is_like_paper(self) -> bool:
         """Return whether it was planned with tasks and environments of Table I."""
         pairs = ((self.plan.tasks, PAPER_TASKS), (self.plan.environments, ENVIRONMENTS))
@@ -247,7 +251,7 @@ def holm(p_values: list[float | None]) -> list[float | None]:
 def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
     """Write all summaries as CSV, and every evaluation during training as compressed CSV, with four digits.
 
-    If rough ground was planned, what came out there is a third file.
+    If there is rough ground, what came out there is a third file.
     """
     names = [metric.name for metric in CURVE_METRICS]
     summaries: list[list[Any]] = [["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean"]]
@@ -263,7 +267,7 @@ def write_tables(experiment: Experiment, table: Table, out: Path) -> None:
         for row in rows:
             values = [f"{row[name]:.4g}" if math.isfinite(row[name]) else None for name in ("seconds", *names)]
             evaluations.append([cell.task, column, cell.seed, row["steps"], *values])
-    if experiment.plan.grounds:
+    if experiment.has_grounds():
         tiles: list[list[Any]] = [["task", "environment", "seed", "kind", "level", *MEASURES]]
         for cell, crossings in ((run.cell, run.crossings) for run in runs):
             tiles += [[cell.task, cell.environment, cell.seed, *tile, *crossings[tile].values()] for tile in crossings]
