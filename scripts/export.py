@@ -16,7 +16,7 @@ from pathlib import Path
 from legged_torque.deploy.description import DESCRIPTION_FILE
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, check_output, importing, run_script
+from legged_torque.utils.cli import Parser, check_output, importing, run_script, script_command
 
 
 def main() -> None:
@@ -40,6 +40,7 @@ def main() -> None:
     print(f"{run.checkpoint}, after {training['total_steps']:,} steps of training:")
     print(f"  exported to {out}: policy.onnx, policy.pt, policy.yaml")
     print(f"  largest difference to the checkpoint's network: {difference:.2g}")
+    print(f"See it in plain MuJoCo: {script_command('sim2sim')} {out}")
 
 
 if __name__ == "__main__":

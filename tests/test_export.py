@@ -372,6 +372,7 @@ def test_script(tmp_path):
     status, output, error = run_here("export.py", *words, root=tmp_path)
     assert (status, error) == (0, "")
     assert f"exported to logs/a1_position/{run.name}/exported_2" in output
+    assert f"scripts/sim2sim.py logs/a1_position/{run.name}/exported_2\n" in output
     policy = Policy(run / "exported_2")
     assert policy.description["training"] == {
         "run": run.name,
