@@ -77,7 +77,10 @@ def main() -> None:
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options, env_cfg)
     torch.manual_seed(args.seed)  # building and loading have drawn numbers too
-    measured = cross_tiles(run, env, runner, grounds) if grounds else walk(run, env, runner, args.steps)
+    if grounds:
+        measured = cross_tiles(run, env, runner, grounds)
+    else:
+        measured = walk(run, env, runner, args.steps, bool(args.command))
     if args.json:
         write_json(args.json, circumstances(args, run, env, runner) | measured)
 
@@ -106,8 +109,8 @@ def parse_args() -> argparse.Namespace:
     return args
 
 
-def walk(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, num_steps: int) -> dict[str, Any]:
-    """Roll a policy out, print its metrics, and return them."""
+def walk(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, num_steps: int, is_fixed: bool) -> dict[str, Any]:
+    """Roll a policy out, print its metrics, and return them; a fixed command has no ranges to be told apart."""
     from legged_torque.envs.base.metrics import CommandBreakdown, measure
 
     breakdown = CommandBreakdown(env)
@@ -116,7 +119,11 @@ def walk(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, num_steps: in
     print(f"{run.checkpoint}, after {trained:,} steps of training, {env.num_envs} worlds x {num_steps} steps:")
     for name, estimate in metrics.items():
         print(f"  {name:<18} {estimate.mean:10.4f} +- {estimate.standard_error:.4f} {UNITS[name]}")
-    print_breakdown(breakdown)
+    if is_fixed:
+        for name, parts in breakdown.table().items():
+            print(f"  error of {name:<12}", *(f"{part['error']:7.3f}" for part in parts))
+    else:
+        print_breakdown(breakdown)
     shown = {name: asdict(estimate) for name, estimate in metrics.items()}
     return {"num_steps": num_steps, "metrics": shown, "by_command": breakdown.table()}
 

@@ -121,7 +121,7 @@ def show(args: argparse.Namespace, run: LoadedRun) -> None:
     with importing():
         from legged_torque.viewer.session import Session
     session = Session(task_registry.get_task_class(args.task), run, device)
-    session.follow_newest(args.checkpoint is None)
+    session.follow_newest(args.checkpoint in (None, -1))
     if compared:
         session.companion = Session(task_registry.get_task_class(compared.config["task"]), compared, device)
     if args.command:
@@ -133,6 +133,7 @@ def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
     """Return the run of ``--compare``; a UserError if its robot cannot walk beside that of another run."""
     task = load_config(Path(args.compare))["task"]
     options = Options(task, args.device, num_envs=1, load_run=args.compare, perturbation=args.perturbation)
+    options.ranges, options.set = args.ranges, args.set
     compared = task_registry.load_run(options)
     if compared.env_cfg.asset.file != run.env_cfg.asset.file:
         raise UserError(

@@ -3,6 +3,7 @@
 The policy is kept where ``train.py`` looks for it, which also makes it itself if it is missing.
 """
 
+import shlex
 from pathlib import Path
 
 from legged_torque.utils.interrupt import end_on_interrupt
@@ -45,8 +46,10 @@ def main() -> None:
     if args.json:
         write_json(args.json, without_machine(report))
     print(f"The policy is in {file}")
-    words = [script_command("train"), *task_file_words(args.task_file), f"--task={args.task}"]
-    print(f"Train from it: {' '.join(words)}")
+    words = [*task_file_words(args.task_file), f"--task={args.task}"]
+    words += [f"--log_root={args.log_root}"] if args.log_root else []
+    words += [word for change in args.set for word in ("--set", change)]  # another policy would be made otherwise
+    print(f"Train from it: {script_command('train')} {shlex.join(words)}")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,9 @@ from legged_torque.utils.rendering import without_renderer
 end_on_interrupt()
 without_renderer()  # before anything imports mujoco
 
+import contextlib
 import functools
+import shlex
 import sys
 from typing import TYPE_CHECKING, Any
 
@@ -84,7 +86,7 @@ def main() -> None:
     is_first = distributed.rank() == 0
     beside = Beside(is_first and args.viewer == "web", args.video_interval if is_first else 0)
     set_seed(train_cfg.seed)
-    with CompileProgress():
+    with CompileProgress() if is_first else contextlib.nullcontext():  # one line for all processes
         train(options, env_cfg, train_cfg, cores, beside)
 
 
@@ -120,11 +122,12 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, cores: BusyCores, besi
         runner.on_checkpoint = functools.partial(beside.show, task_words(options))
     try:
         runner.learn(remaining, init_at_random_ep_len=True)
-    except TrainingError:
-        runner.close()
+    except BaseException as error:
+        beside.close(is_waiting=False)
+        if isinstance(error, TrainingError):
+            runner.close()
         raise
-    finally:
-        beside.close(is_waiting=sys.exc_info()[0] is None and not runner.stopped_by)
+    beside.close(is_waiting=not runner.stopped_by)
     if is_first:
         print(f"The run is in {runner.log_dir}")
         for what, script in {"See it walk": "play", "Measure it": "evaluate", "Take it elsewhere": "export"}.items():
@@ -154,7 +157,7 @@ def task_words(options: Options) -> list[str]:
 
 def run_words(options: Options, run_dir: str) -> str:
     """Return the options with which other scripts find a run."""
-    return " ".join([*task_words(options), f"--load_run={run_dir}"])
+    return shlex.join([*task_words(options), f"--load_run={run_dir}"])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """What is seen beside a training: real processes, of a script that stands in for play.py."""
 
 import os
+import signal
 import time
 
 import pytest
@@ -76,6 +77,27 @@ def test_videos(run, capsys, outcome, warnings):
     made = {path.name for path in (run / "videos").iterdir()}
     assert made == {"model_0.log", "model_0.mp4", "model_200.log"} | ({"model_200.mp4"} if outcome == "well" else set())
     assert capsys.readouterr().err.count("Warning: there is no video of model_200") == warnings
+
+
+def test_what_cannot_be_started(run, capsys):
+    """It is told, and the training goes on."""
+    shown = beside.Beside(has_page=True, video_interval=0)
+    (run / "page.log").mkdir()  # where a file should be
+    shown.show(["--task=a1_torque"], run / "model_0.pt")
+    shown.close(is_waiting=True)
+    assert "Warning: nothing is shown of model_0: " in capsys.readouterr().err
+
+
+def test_a_page_that_ends(run, capsys):
+    """It is told once."""
+    shown = beside.Beside(has_page=True, video_interval=0)
+    shown.show(["--task=a1_torque"], run / "model_0.pt")
+    os.kill(int(wait_for(run / "page")), signal.SIGKILL)
+    shown._page.wait()
+    for number in (50, 100):
+        shown.show(["--task=a1_torque"], run / f"model_{number}.pt")
+    shown.close(is_waiting=True)
+    assert capsys.readouterr().err.count("Warning: the page has ended; ") == 1
 
 
 def test_interrupted_training_does_not_wait(run):

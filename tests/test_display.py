@@ -3,6 +3,7 @@
 import contextlib
 import fcntl
 import io
+import math
 import os
 import pty
 import re
@@ -213,6 +214,17 @@ def test_an_error_ends_the_picture(monkeypatch):
         raise ValueError("mine")
     assert sys.stdout is terminal and Display.shown is None and not shown._thread.is_alive()
     assert terminal.getvalue().endswith("\033[?25h")
+
+
+def test_a_picture_that_cannot_be_drawn(monkeypatch):
+    """It says why, and the work goes on."""
+    monkeypatch.setenv("TERM", "xterm")
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stdout", terminal)
+    monkeypatch.setattr(display, "REDRAW_EVERY", 0.0)
+    with TrainingDisplay("title", "folder", Pace(2), 32, False) as shown:
+        shown.add_iteration(1, 32, {**NUMBERS, **EVALUATED, "Evaluation/track_percentage": math.inf})
+    assert "no picture: " in terminal.getvalue() and Display.shown is None
 
 
 def test_a_terminal_that_is_gone(monkeypatch):

@@ -97,6 +97,14 @@ def test_page_of_own_runs(logs, monkeypatch, capsys):
     assert len(list(csv.DictReader((logs / "report" / "table.csv").read_text().splitlines()))) == 3 * 2 * 9
 
 
+def test_runs_in_doubled_alone(tmp_path, monkeypatch):
+    """They have their table, although the paper trains nothing there."""
+    monkeypatch.setattr(figures, "draw_all", lambda *_: [])
+    write_run(tmp_path / "2026-01-01_00-00-00", whole_run(0.5), settings("mine", 1, "doubled"))
+    assert run_script(tmp_path) == 0
+    assert "| Track % [share] | mine | 0.5000 (1) |" in (tmp_path / "report" / "report.md").read_text()
+
+
 def test_runs_with_other_settings(tmp_path):
     """Runs of one task and seed that differ in settings are two, named by these; a resumed one with them stays one."""
     for day, scale, lines in ((1, -1.0, whole_run(0.5)[:3]), (2, -2.0, whole_run(0.6)), (3, -1.0, whole_run(0.7)[3:])):

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.viewer import video
+from legged_torque.viewer.arrows import add_velocities
 from legged_torque.viewer.video import Moment, TaskRecorder, add_overlay, write_video
 
 XML = Path(__file__).resolve().parents[1] / "resources" / "robots" / "a1" / "a1.xml"
@@ -126,6 +128,20 @@ def test_recorded_worlds(make_task, monkeypatch):
                 assert kept.command[0] == pytest.approx([-0.9 if world == 3 else 0.1, 0.2][number])
                 velocity = [*task.base_lin_vel[world, :2].tolist(), float(task.base_ang_vel[world, 2])]
                 assert kept.velocity == pytest.approx(velocity)
+
+
+def test_arrows_of_velocities():
+    """They point where the trunk, turned to the left by a quarter, is told to go and goes; 0 has none."""
+    body = "<body pos='0 0 1'><freejoint/><geom size='0.1'/></body>"
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    data, scene = mujoco.MjData(model), mujoco.MjvScene(model, 10)
+    data.qpos[3:] = np.sqrt([0.5, 0.0, 0.0, 0.5])
+    mujoco.mj_forward(model, data)
+    add_velocities(scene, data, 1, np.array([1.0, 0.0, 0.3]), np.array([0.0, 0.5, 0.0]), 1.0)
+    add_velocities(scene, data, 1, np.zeros(3), np.zeros(3), 1.0)
+    ways = [geom.mat[:, 2] for geom in scene.geoms[: scene.ngeom]]
+    np.testing.assert_allclose(ways, [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]], atol=1e-6)
+    assert scene.geoms[0].size[2] == pytest.approx(2.0 * scene.geoms[1].size[2])
 
 
 def test_missing_extra(monkeypatch, tmp_path):

@@ -31,6 +31,7 @@ STYLES: dict[str, Style] = {
 MARKERS = ("o", "s", "^", "D", "v", "P")  # of approaches, where lines are many
 SEED_MARK: dict[str, Any] = {"marker": "o", "markersize": 4.0, "markeredgecolor": "white", "markeredgewidth": 0.6}
 SETTINGS = {"font.size": 10, "hatch.linewidth": 0.6, "axes.axisbelow": True, "savefig.dpi": 150}
+SETTINGS |= {"text.parse_math": False}  # a "$" in a name is a "$"
 
 
 def style(tasks: Sequence[str], task: str) -> Style:

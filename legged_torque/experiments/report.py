@@ -131,7 +131,7 @@ def table_one(experiment: Experiment, table: Table, from_step: float) -> list[Bl
         ),
     )
     legend = Grid(["sign", "meaning"], list(MEANINGS.items()))
-    columns = [name for name in table if is_of_paper(name)]
+    columns = [name for name in table if is_of_paper(name)] or list(table)
     return [*map(Paragraph, texts), legend, metric_table(experiment, table, columns)]
 
 
@@ -143,7 +143,7 @@ def own_table(experiment: Experiment, table: Table, from_step: float) -> list[Bl
         f"Mean ± standard error over {seeds}, {experiment.ranges()} ranges. {what_counts(from_step)} **Bold**: "
         "significantly better than every other task of the column. †: seeds are missing or trainings are not finished."
     )
-    grid = metric_table(experiment, table, [name for name in table if is_of_paper(name)])
+    grid = metric_table(experiment, table, [name for name in table if is_of_paper(name)] or list(table))
     beside = " The paper's numbers, beside ours, are means of four seeds after step 90 million."
     return [Paragraph(text + (beside if "paper" in grid.header else "")), Paragraph(methods_text(experiment)), grid]
 

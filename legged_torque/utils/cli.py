@@ -49,7 +49,7 @@ class Parser(argparse.ArgumentParser):
         """
         text, _, examples = description.partition("\nExamples:\n")
         examples += "".join(f"    {example}\n" for example in _EXAMPLE.findall(text))
-        width = shutil.get_terminal_size().columns - 2  # argparse's own
+        width = max(shutil.get_terminal_size().columns - 2, 20)  # argparse's own
         super().__init__(
             description="\n\n".join(textwrap.fill(part, width) for part in _EXAMPLE.sub("", text).split("\n\n")),
             epilog=examples and "examples:\n" + _SCRIPT.sub(lambda found: script_command(found[1]), examples.rstrip()),

@@ -87,7 +87,7 @@ class Display:
                 transient=not self._stays,
                 redirect_stdout=is_terminal(sys.stdout),
                 redirect_stderr=is_terminal(sys.stderr),
-                get_renderable=lambda: Constrain(self.picture(), self.width),
+                get_renderable=self._shown_picture,
             )
             self._live.start()
             self._draw()
@@ -132,6 +132,13 @@ class Display:
         self.notice = text
         if self._live is None:
             write_error(text)
+
+    def _shown_picture(self) -> RenderableType:
+        """Return the picture as wide as it may be, or why there is none: that must not end the work."""
+        try:
+            return Constrain(self.picture(), self.width)
+        except Exception as error:  # whatever a number or a name brings about
+            return Text(f"no picture: {type(error).__name__}: {error}")
 
     def _draw(self) -> None:
         """Redraw the picture."""
@@ -258,8 +265,9 @@ def duration(seconds: float) -> str:
 def warn(text: str) -> None:
     """Print a warning on standard error; a picture that is shown counts it."""
     print(f"Warning: {text}.", file=sys.stderr, flush=True)
-    if Display.shown is not None:
-        Display.shown.warnings += (text,)
+    shown = Display.shown
+    if shown is not None:
+        shown.warnings += (text,)
 
 
 def is_terminal(stream: TextIO) -> bool:

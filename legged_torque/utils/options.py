@@ -36,7 +36,9 @@ class Options:
         "number of worlds, with torchrun those of each process; default: that of the task", type=int
     )
     seed: Number | None = _option("random seed; default: that of the training settings", type=int)
-    preset: str | None = _option("training settings: parallel (the default) or paper (Table II)")
+    preset: str | None = _option(
+        "training settings: parallel (the default), thorough (three times as long) or paper (Table II)"
+    )
     perturbation: str | None = _option(
         "random parameters, pushes and noise: none, low, high, high_frequency or doubled; default: none, or what a "
         "loaded run has"

@@ -98,8 +98,9 @@ class CompileProgress:
     def _write(self, text: str, end: str) -> None:
         """Write a line with the progress, or let it be part of a picture."""
         line = f"{text}: {self.modules} modules, {self._seconds:.0f} s"
-        if self._terminal and Display.shown is not None:
-            Display.shown.activity = "" if end.endswith("\n") else line
+        shown = Display.shown
+        if self._terminal and shown is not None:
+            shown.activity = "" if end.endswith("\n") else line
             return
         self._stream.write(line + end)
         self._stream.flush()

@@ -44,6 +44,7 @@ class Beside:
         self.page = f"http://127.0.0.1:{self._port}" if has_page else ""
         self._video_interval, self._next_video = video_interval, 0
         self._page: subprocess.Popen[bytes] | None = None
+        self._page_has_ended = False  # by itself, which has been told
         self._video: subprocess.Popen[bytes] | None = None
         self._video_log = Path()
 
@@ -52,9 +53,19 @@ class Beside:
 
         ``words_of_task`` are those with which scripts find its task.
         """
-        number, words = checkpoint_number(checkpoint), [*words_of_task, f"--load_run={checkpoint.parent}"]
+        try:
+            self._show([*words_of_task, f"--load_run={checkpoint.parent}"], checkpoint)
+        except OSError as error:  # training goes on: what is learned is worth more
+            warn(f"nothing is shown of {checkpoint.stem}: {error}")
+
+    def _show(self, words: list[str], checkpoint: Path) -> None:
+        """Do so; ``words`` are those with which scripts find the run."""
+        number = checkpoint_number(checkpoint)
         if self.page and not self._page:
             self._page = start([*words, "--viewer=web", f"--port={self._port}"], checkpoint.parent / "page.log")
+        if self._page and self._page.poll() is not None and not self._page_has_ended:
+            self._page_has_ended = True
+            warn(f"the page has ended; {checkpoint.parent / 'page.log'} tells why")
         is_busy = self._video is not None and self._video.poll() is None
         if self._video_interval and number >= self._next_video and not is_busy:
             self._check_video()
@@ -67,13 +78,16 @@ class Beside:
         """End the page, and the video too unless it is waited for."""
         if self._page:
             end(self._page)
-        if self._video and is_waiting:
-            if self._video.poll() is None:
+        if not self._video:
+            return
+        try:
+            if is_waiting and self._video.poll() is None:
                 print(f"Waiting for the video of {self._video_log.stem}.", flush=True)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._video.wait(LAST_VIDEO_TIMEOUT)
-            self._check_video()
-        if self._video:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._video.wait(LAST_VIDEO_TIMEOUT)
+            if is_waiting:
+                self._check_video()
+        finally:  # Ctrl-C gives it up
             end(self._video)
 
     def _check_video(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+TRUNK = 1  # the trunk's body in the MJCF of a task
 A1_HEIGHT = 0.485  # from the feet of the A1 to its top where all angles are 0 [m]; pictures are laid out for it
 
 

@@ -18,7 +18,8 @@ import mujoco
 
 from legged_torque.deploy.simulation import Simulation
 from legged_torque.utils.errors import UserError
-from legged_torque.viewer.framing import size_of
+from legged_torque.viewer.arrows import add_velocities
+from legged_torque.viewer.framing import TRUNK, size_of
 from legged_torque.viewer.ground import Ground, drawn_model, ground_of
 from legged_torque.viewer.pacing import Pacer, stopping_on_ctrl_c
 from legged_torque.viewer.state import SessionState
@@ -103,13 +104,14 @@ def watch(session: Session, robot: Path) -> None:
     drawing = set(threading.enumerate()) - before
     with window:
         window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-        window.cam.trackbodyid = 1
-        window.cam.distance, window.cam.azimuth, window.cam.elevation = 1.8 * size_of(model), 130.0, -18.0
+        window.cam.trackbodyid = TRUNK
+        size = size_of(model)
+        window.cam.distance, window.cam.azimuth, window.cam.elevation = 1.8 * size, 130.0, -18.0
         stepping = threading.Thread(target=session.run, name="session")  # drawing must not hold up the steps
         stepping.start()
         with stopping_on_ctrl_c(session.stop):
             while window.is_running() and stepping.is_alive():
-                draw(session.state, window, model, data, ground)
+                draw(session.state, window, model, data, size, ground)
                 stepping.join(FRAME_INTERVAL)
             session.stop()
             stepping.join()
@@ -122,16 +124,19 @@ def draw(
     window: mujoco.viewer.Handle,
     model: mujoco.MjModel,
     data: mujoco.MjData,
+    size: float,
     ground: Ground | None = None,
 ) -> None:
     """Show the first world, and its command, velocity and tile as text; the window draws ``data``."""
     if state.reading is None:
         return
+    command, velocity = state.reading.commands[0], state.reading.velocities[0]
     with window.lock():
         window.opt.geomgroup[0] = 1  # MuJoCo's own key 0 hides this group, which contains the floor
         data.qpos[:] = state.reading.qpos[0]
         mujoco.mj_forward(model, data)
-    command, velocity = state.reading.commands[0], state.reading.velocities[0]
+        window.user_scn.ngeom = 0
+        add_velocities(window.user_scn, data, TRUNK, command, velocity, size)
     names = ("v_x [m/s]", "v_y [m/s]", "yaw [rad/s]")
     rows = [f"{wanted:+.2f}   {actual:+.2f}" for wanted, actual in zip(command, velocity, strict=True)]
     running = "paused" if state.is_paused else f"{state.real_time:.2f} x real time"

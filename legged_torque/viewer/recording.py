@@ -12,9 +12,10 @@ import viser
 from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.utils.errors import UserError
+from legged_torque.viewer.framing import TRUNK
 from legged_torque.viewer.ground import drawn_model, ground_of
 from legged_torque.viewer.reading import Reading
-from legged_torque.viewer.video import TRUNK, Moment, write_video
+from legged_torque.viewer.video import Moment, write_video
 
 LONGEST = 60.0  # seconds of a video
 

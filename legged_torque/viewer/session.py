@@ -288,6 +288,8 @@ class Session:
         cfg = copy.deepcopy(self._cfg)
         if name != AS_LOADED:
             apply_perturbation(cfg, name)
+        if self.companion:
+            self.companion.set_perturbation(name)
         self._tell(f"building the worlds with perturbation '{name}' ...")
         old = self.task
         task = self._make_task(cfg)

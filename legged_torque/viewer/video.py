@@ -22,7 +22,8 @@ from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_whole
 from legged_torque.utils.rendering import INSTALL_HINT
-from legged_torque.viewer.framing import size_of
+from legged_torque.viewer.arrows import add_velocities
+from legged_torque.viewer.framing import TRUNK, size_of
 from legged_torque.viewer.ground import Ground, Smooth, drawn_model, ground_of
 
 if TYPE_CHECKING:
@@ -30,10 +31,7 @@ if TYPE_CHECKING:
 
 SIZE = (960, 540)  # width and height of a video of one robot [pixels]
 GRID_SIZE = (1280, 720)  # about the width and height of a video of several robots [pixels]
-COMMAND_COLOR = (0.1, 0.8, 0.2, 0.9)
-VELOCITY_COLOR = (0.1, 0.4, 1.0, 0.9)
 DISTANCE, TARGET = 1.6, 0.25  # of the camera from what it looks at on level ground, which is so high [m]; of an A1
-TRUNK = 1  # the trunk's body in the MJCF of a task
 _TEXT_COLORS = {"plain": (255, 255, 255), "command": (110, 240, 130), "velocity": (130, 190, 255)}
 _BOX_COLOR = (20, 24, 30, 190)
 
@@ -219,22 +217,9 @@ def _draw(
     """Return the image of a robot of a :func:`size_of` and the arrows of its velocities. Shape: (height, width, 3)."""
     data.qpos[:] = moment.qpos
     mujoco.mj_forward(renderer.model, data)
-    position, rotation = data.xpos[trunk], data.xmat[trunk].reshape(3, 3)
-    renderer.update_scene(data, camera.look_at(position))
-    for vector, color, height in ((moment.command, COMMAND_COLOR, 0.24), (moment.velocity, VELOCITY_COLOR, 0.2)):
-        start = position + np.array([0.0, 0.0, size * height])
-        _add_arrow(renderer.scene, start, rotation @ [vector[0], vector[1], 0.0], color)
+    renderer.update_scene(data, camera.look_at(data.xpos[trunk]))
+    add_velocities(renderer.scene, data, trunk, moment.command, moment.velocity, size)
     return renderer.render()
-
-
-def _add_arrow(scene: mujoco.MjvScene, start: np.ndarray, vector: np.ndarray, color: tuple[float, ...]) -> None:
-    """Draw a velocity [m/s] as an arrow, 0.5 m long for 1 m/s."""
-    if np.linalg.norm(vector) < 1e-3 or scene.ngeom >= scene.maxgeom:
-        return
-    geom, kind = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_ARROW
-    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(color, np.float32))
-    mujoco.mjv_connector(geom, kind, 0.012, start, start + 0.5 * vector)
-    scene.ngeom += 1
 
 
 # ---- numbers in the corner -------------------------------------------------------------------------------------------
