@@ -2,7 +2,10 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -60,6 +63,30 @@ def test_page(run, capsys):
     with pytest.raises(ProcessLookupError):
         os.kill(process, 0)
     assert not capsys.readouterr().out and not (run / "videos").exists()
+
+
+KILLED = """
+import os, signal, sys, time
+from pathlib import Path
+from legged_torque.viewer import beside
+run = Path(sys.argv[1])
+beside.SCRIPTS_DIR = run.parent / "scripts"
+beside.start([f"--load_run={run}", "--port=1"], run / "page.log")
+while not ((run / "page").exists() and (run / "page").read_text()):
+    time.sleep(0.02)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process that its parent is gone")
+def test_killed_training(run):
+    """Nothing stays of a training that is killed and cannot end its page."""
+    training = subprocess.run([sys.executable, "-c", KILLED, str(run)], check=False)
+    assert training.returncode == -signal.SIGKILL
+    status, end = Path("/proc", wait_for(run / "page"), "stat"), time.monotonic() + 10.0
+    while status.exists() and status.read_text().split()[2] != "Z":
+        assert time.monotonic() < end, "the page is still there"
+        time.sleep(0.02)
 
 
 @pytest.mark.parametrize(("outcome", "warnings"), [("well", 0), ("badly", 1)])

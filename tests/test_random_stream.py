@@ -38,7 +38,7 @@ def trained(tmp_path_factory):
     """A run of two iterations, and which numbers were next at its start and after each checkpoint."""
     root = tmp_path_factory.mktemp("logs")
     runner = start(root)
-    run = SimpleNamespace(root=root, runner=runner, numbers={0: upcoming()}, saving_draws=[])
+    run = SimpleNamespace(root=root, runner=runner, start=upcoming(), numbers={}, saving_draws=[])
     save = runner.save
 
     def noted_save(path, infos=None):
@@ -104,7 +104,7 @@ def test_the_last_checkpoint_is_the_default(trained):
 
 def test_saving_draws_nothing(trained):
     """A run goes on alike whether it saves or not."""
-    assert trained.saving_draws == [False] * 2
+    assert trained.saving_draws == [False] * 3
 
 
 def random_actions(runner):
@@ -118,10 +118,10 @@ def random_actions(runner):
 def test_a_resumed_run_does_not_repeat_the_start(trained):
     """The seed alone leads back to the start of the run; resumed, numbers and actions are others."""
     again = start(trained.root)
-    assert torch.equal(upcoming(), trained.numbers[0])
+    assert torch.equal(upcoming(), trained.start)
     first = random_actions(again)
     resumed = start(trained.root, "--resume")
-    assert not torch.isclose(upcoming(), trained.numbers[0]).any()
+    assert not torch.isclose(upcoming(), trained.start).any()
     assert not torch.isclose(random_actions(resumed), first).any()
     assert torch.equal(random_actions(start(trained.root)), first)
 

@@ -102,7 +102,7 @@ def test_runs_in_doubled_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "draw_all", lambda *_: [])
     write_run(tmp_path / "2026-01-01_00-00-00", whole_run(0.5), settings("mine", 1, "doubled"))
     assert run_script(tmp_path) == 0
-    assert "| Track % [share] | mine | 0.5000 (1) |" in (tmp_path / "report" / "report.md").read_text()
+    assert (tmp_path / "report" / "report.md").read_text().count("| Track % [share] | `mine` | 0.5000 (1) |") == 1
 
 
 def test_runs_with_other_settings(tmp_path):

@@ -131,19 +131,22 @@ def table_one(experiment: Experiment, table: Table, from_step: float) -> list[Bl
         ),
     )
     legend = Grid(["sign", "meaning"], list(MEANINGS.items()))
-    columns = [name for name in table if is_of_paper(name)] or list(table)
+    columns = [name for name in table if is_of_paper(name)]
     return [*map(Paragraph, texts), legend, metric_table(experiment, table, columns)]
 
 
 def own_table(experiment: Experiment, table: Table, from_step: float) -> list[Block]:
-    """Return the metrics of an experiment of the user's own."""
+    """Return the metrics of an experiment of the user's own; nothing if all are in :func:`other_table`."""
+    columns = [name for name in table if is_of_paper(name)]
+    if not columns:
+        return []
     planned = f"{seeds_text(len(experiment.plan.seeds))} (how many, if not all)"
     seeds = planned if experiment.is_planned else "seeds (how many)"
     text = (
         f"Mean ± standard error over {seeds}, {experiment.ranges()} ranges. {what_counts(from_step)} **Bold**: "
         "significantly better than every other task of the column. †: seeds are missing or trainings are not finished."
     )
-    grid = metric_table(experiment, table, [name for name in table if is_of_paper(name)] or list(table))
+    grid = metric_table(experiment, table, columns)
     beside = " The paper's numbers, beside ours, are means of four seeds after step 90 million."
     return [Paragraph(text + (beside if "paper" in grid.header else "")), Paragraph(methods_text(experiment)), grid]
 

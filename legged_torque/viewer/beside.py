@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -24,6 +25,12 @@ PORT = 8080  # of the page, or the next free one
 VIDEO_STEPS = 250  # control steps of a video: 5 s
 LAST_VIDEO_TIMEOUT = 300.0  # seconds that the end of a training waits for its last video
 OWN_VARIABLES = ("MUJOCO_GL", "RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")  # of the training itself
+END_WITH_PARENT = f"""
+import ctypes, os, sys
+ctypes.CDLL(None).prctl(1, {int(signal.SIGTERM)}, 0, 0, 0)  # PR_SET_PDEATHSIG of linux/prctl.h
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+"""Runs a command that ends with a parent that is killed; elsewhere than on Linux it would stay."""
 
 
 class Beside:
@@ -102,6 +109,7 @@ def start(words: list[str], log: Path) -> subprocess.Popen[bytes]:
     variables = {name: value for name, value in os.environ.items() if name not in OWN_VARIABLES}
     variables |= {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
     command = [sys.executable, str(SCRIPTS_DIR / "play.py"), *words, "--device=cpu"]
+    command = [sys.executable, "-c", END_WITH_PARENT, *command] if sys.platform == "linux" else command
     with log.open("wb") as file:
         process = subprocess.Popen(
             command,
