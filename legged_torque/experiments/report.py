@@ -48,14 +48,17 @@ def report(
     """
     missing = missing_lines(experiment, from_step)
     complete = Paragraph("Nothing: all trainings and evaluations are complete.")
-    of_paper: dict[str, list[Block]] = {
-        "Table I": table_one(experiment, table, from_step),
-        "Best torque method against the paper's best": best_torque(table),
-    }
-    walking: dict[str, list[Block]] = {"While training": own_table(experiment, table, from_step)}
+    walking: dict[str, list[Block]]
+    if experiment.is_like_paper():
+        walking = {
+            "Table I": table_one(experiment, table, from_step),
+            "Best torque method against the paper's best": best_torque(table),
+        }
+    else:
+        walking = {"While training": own_table(experiment, table, from_step)}
     sections: dict[str, list[Block]] = {
         "Rough ground": rough_blocks(experiment, figures, out),
-        **(of_paper if experiment.is_like_paper() else walking),
+        **walking,
         "What is missing": [Bullets(missing) if missing else complete],
         "In other environments than those of training": other_table(experiment, table),
         "Differences": differences(table),
