@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 SIDE = 0.8  # distance between the two at the start, to the right of the first one [m]
-FARTHEST = 3.0  # distance at which the second one is put beside the first one again [m]
+FARTHEST = 2.0  # distance at which the second one is put beside the first one again [m]
 
 
 class Lane:

@@ -19,6 +19,7 @@ from legged_torque.viewer.reading import Reading
 COMMAND_COLOR, VELOCITY_COLOR, SCAN_COLOR = (10, 150, 50), (20, 90, 230), (214, 51, 108)
 PHONE = 0.6  # width by height of a view below which it is that of a phone
 SPACING = 2.0  # distance between neighbouring worlds [m]
+TWO_ROBOTS = 1.5  # how much further away the camera is from two robots side by side than from one
 LIFTING = 0.2  # share of the way to where it sees the robot by which a camera moves up in a frame
 ARROW_LENGTH = 0.5  # length of the arrow of a velocity of 1 m/s [m]
 
@@ -27,8 +28,8 @@ class Scene:
     """The robots of all worlds, their ground and light.
 
     On a plane, worlds are drawn side by side, though all start at the same place in the simulator. Everything is moved
-    such that the followed robot, or the rough ground below it, stays where the page's camera looks; so users can turn
-    and zoom freely. Rough ground does not get between camera and robot.
+    such that the followed robot, the middle of two that are compared, or the rough ground below it stays where the
+    page's camera looks; so users can turn and zoom freely. Rough ground does not get between camera and robot.
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class Scene:
         self._server, self.ground = server, ground
         self._model = robot
         self._data = mujoco.MjData(self._model)
-        self._size = size_of(robot)
+        self._size = self._distance = size_of(robot)  # in those of an A1, as are distances of cameras
         self.is_following, self.shows_others = True, True  # the camera follows; the other worlds are drawn
         self.shows_scan = True  # where the height scan of the followed robot meets the ground
         self._scan: viser.PointCloudHandle | None = None
@@ -76,7 +77,9 @@ class Scene:
         self._seen: set[int] = set()  # browsers that have taken the page's camera
 
     def name_robots(self, first: str, second: str) -> None:
-        """Write names above the followed robot and the one beside it."""
+        """Write names above the followed robot and the one beside it, and let new browsers see both."""
+        self._distance *= TWO_ROBOTS
+        self._server.initial_camera.position = TWO_ROBOTS * np.array(self._server.initial_camera.position)
         self._labels = [self._server.scene.add_label(f"/name/{i}", name) for i, name in enumerate((first, second))]
 
     def update(self, reading: Reading, world: int, ghost: np.ndarray, beside: np.ndarray | None = None) -> None:
@@ -95,7 +98,8 @@ class Scene:
         positions, quats = self._poses(rows, [*range(num_envs)] + [world] * (len(lane) + 1))
         shown = [*(range(num_envs) if self.shows_others else [world]), *range(num_envs, num_envs + len(lane))]
         if self.is_following:
-            self._offset[:2] = -positions[world, 1, :2]
+            followed = [world, *range(num_envs, num_envs + len(lane))]
+            self._offset[:2] = -positions[followed, 1, :2].mean(axis=0)
             if self.ground:
                 self._offset[2] = -self._height.follow(float(self.ground.height(positions[world, 1])))
                 self._lift_cameras()
@@ -144,8 +148,8 @@ class Scene:
             self._seen.add(number)
             if camera.aspect < PHONE:
                 with client.atomic():
-                    camera.position = self._size * np.array([1.85, -1.85, 1.0])  # this moves what it looks at, too
-                    camera.look_at = (0.0, 0.0, -0.4 * self._size)
+                    camera.position = self._distance * np.array([1.85, -1.85, 1.0])  # moves what it looks at, too
+                    camera.look_at = (0.0, 0.0, -0.4 * self._distance)
 
     def _lift_cameras(self) -> None:
         """Let the cameras of all browsers look over the ground between them and what they look at."""
