@@ -279,10 +279,10 @@ def test_layers(opened, page):
 
     before = shares()
     click(opened, control(opened, "collision geoms"))
-    wait_for(lambda: shares()[0] > before[0] + 0.005)
+    wait_for(lambda: shares()[0] > before[0] + 0.002)
     click(opened, control(opened, "collision geoms"))
     click(opened, control(opened, "ghost"))
-    wait_for(lambda: shares()[1] > before[1] + 0.005)
+    wait_for(lambda: shares()[1] > before[1] + 0.002)
     click(opened, control(opened, "ghost"))
 
 
