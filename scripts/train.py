@@ -120,14 +120,15 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, cores: BusyCores, besi
         print_notes(filter(None, [cores.note(torch.get_num_threads()) if env.device == "cpu" else None]))
         announce(runner, options, env_cfg, train_cfg, total, beside.page)
         runner.on_checkpoint = functools.partial(beside.show, task_words(options))
+    is_complete = False
     try:
         runner.learn(remaining, init_at_random_ep_len=True)
-    except BaseException as error:
-        beside.close(is_waiting=False)
-        if isinstance(error, TrainingError):
-            runner.close()
+        is_complete = not runner.stopped_by
+    except TrainingError:
+        runner.close()
         raise
-    beside.close(is_waiting=not runner.stopped_by)
+    finally:
+        beside.close(is_waiting=is_complete)
     if is_first:
         print(f"The run is in {runner.log_dir}")
         for what, script in {"See it walk": "play", "Measure it": "evaluate", "Take it elsewhere": "export"}.items():

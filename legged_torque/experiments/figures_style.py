@@ -30,8 +30,13 @@ STYLES: dict[str, Style] = {
 """Those of each task; tasks of your own have those that no other task of the figure has."""
 MARKERS = ("o", "s", "^", "D", "v", "P")  # of approaches, where lines are many
 SEED_MARK: dict[str, Any] = {"marker": "o", "markersize": 4.0, "markeredgecolor": "white", "markeredgewidth": 0.6}
-SETTINGS = {"font.size": 10, "hatch.linewidth": 0.6, "axes.axisbelow": True, "savefig.dpi": 150}
-SETTINGS |= {"text.parse_math": False}  # a "$" in a name is a "$"
+SETTINGS = {
+    "font.size": 10,
+    "hatch.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "savefig.dpi": 150,
+    "text.parse_math": False,  # a "$" in a name is a "$"
+}
 
 
 def style(tasks: Sequence[str], task: str) -> Style:
