@@ -11,6 +11,7 @@ from legged_torque import __file__ as package
 from legged_torque.envs import task_registry
 from legged_torque.utils.cli import Parser, check_output, finite, importing, run_script, script_command
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import write_whole
 from legged_torque.utils.rendering import choose_offscreen_renderer, without_renderer
 
 
@@ -48,9 +49,9 @@ def main() -> None:
     model = parse(text, args.file)
     problem = fused_problem(model)
     code = settings(robot, path, is_fused=not problem)
-    folder.mkdir(parents=True, exist_ok=True)
-    model_file.write_text(text, encoding="utf-8")
-    code_file.write_text(code, encoding="utf-8")
+    compile(code, code_file, "exec")  # a file with a mistake would be in every later command's way
+    write_whole(model_file, text.encode())
+    write_whole(code_file, code.encode())
     for note in robot.notes:
         print(f"- {note}")
     print(f"wrote {model_file}\nwrote {code_file}")

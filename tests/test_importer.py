@@ -354,6 +354,45 @@ def test_refusals(tmp_path, text, reason):
         import_robot(file)
 
 
+HARMFUL = ["FL_'+str(open('PWNED', 'w'))+'", "FL_&quot;+str(open('PWNED', 'w'))+&quot;", "FL_&#10;x", "FL_\\", "FL_é"]
+
+
+@pytest.mark.parametrize("name", HARMFUL)
+@pytest.mark.parametrize("place", ["FL_calf", "LF_HAA", "LF_hip", "base"])
+def test_names_that_are_code(tmp_path, name, place):
+    """Names of bodies, joints and links are refused before they can become parts of a settings module."""
+    source = as_mjcf("") if place == "FL_calf" else urdf()
+    assert f'"{place}"' in source
+    file = tmp_path / "robot.xml"
+    file.write_text(source.replace(f'"{place}"', f'"{name}"'), encoding="utf-8")
+    with pytest.raises(UserError, match="names may have letters, digits"):
+        import_robot(file)
+
+
+def test_files_whose_names_are_code(tmp_path, monkeypatch):
+    """The name of the file, and that of the folder of its MJCF, are no code either, and its MJCF stays XML."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "a\"+str(open('PWNED', 'w'))+\"\nopen('PWNED', 'w')"
+    folder.mkdir()
+    file = folder / 'dog\nopen("PWNED", "w")#""" --->.urdf'
+    file.write_text(urdf())
+    robot = import_robot(file, "dog")
+    parse(mjcf(robot), file)
+    parts: dict = {"__name__": "dog"}
+    exec(compile(settings(robot, str(folder / "dog.xml")), "dog.py", "exec"), parts)
+    assert parts["DogCfg"]().asset.file == str(folder / "dog.xml")
+    assert not (tmp_path / "PWNED").exists()
+
+
+def test_a_broken_module(tmp_path, monkeypatch, capsys):
+    """It is reported in a line, and the other robots are there."""
+    (tmp_path / "broken.py").write_text("class Cfg(:\n")
+    before = [parts[0] for parts in tasks.further_robots()]
+    monkeypatch.setattr(robots, "__path__", [*robots.__path__, str(tmp_path)])
+    assert [parts[0] for parts in tasks.further_robots()] == before
+    assert "Note: the robot 'broken' is missing: SyntaxError" in capsys.readouterr().err
+
+
 def test_script(tmp_path, monkeypatch, capsys):
     """The script writes both files once, says what simulates the robot, and writes over nothing."""
     monkeypatch.chdir(tmp_path)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -147,11 +148,16 @@ def tasks_of(name: str, cfg: Any, train_cfg: Any) -> list[tuple[str, str, Any, A
 def further_robots() -> Iterator[tuple[str, Any, Any]]:
     """Yield name, settings and training of the robots in ``envs/robots`` but the A1: modules with two such classes.
 
-    A UserError if a module has several settings, of which none is the robot's for certain.
+    A module that cannot be imported is reported, and its robot is missing. A UserError if a module has several
+    settings, of which none is the robot's for certain.
     """
     for module in pkgutil.iter_modules(robots.__path__):
         if module.name != "a1":
-            parts = vars(importlib.import_module(f"{robots.__name__}.{module.name}"))
+            try:
+                parts = vars(importlib.import_module(f"{robots.__name__}.{module.name}"))
+            except Exception as error:  # a user's own file may raise anything
+                print(f"Note: the robot '{module.name}' is missing: {type(error).__name__}: {error}", file=sys.stderr)
+                continue
             own = [c for c in parts.values() if isinstance(c, type) and c.__module__ == parts["__name__"]]
             settings = [part for part in own if issubclass(part, LeggedRobotCfg)]
             training = [part for part in own if issubclass(part, LeggedRobotCfgPPO)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 
 import mujoco
@@ -51,14 +52,19 @@ def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{0.0 if abs(value) < 1e-12 else value:.9g}" for value in values)
 
 
+def _comment(text: str) -> str:
+    """Return a text without the end of a comment, which XML forbids inside of one."""
+    return re.sub("-(?=-)", "- ", text)
+
+
 def mjcf(robot: Robot) -> str:
     """Return the text of a robot's MJCF."""
     model, height = robot.source.model, robot.stance.height
-    notes = "\n".join(f"       - {note.replace('--', '- -')}" for note in robot.notes)
+    notes = "\n".join(f"       - {_comment(note)}" for note in robot.notes)
     head = HEAD.format(
         title=robot.name,
         name=robot.name,
-        file=robot.source.file.name.replace("--", "- -"),
+        file=_comment(ascii(robot.source.file.name)),
         notes=notes,
         center=_numbers([round(0.8 * height, 3)]),
         extent=_numbers([round(2.3 * height, 3)]),

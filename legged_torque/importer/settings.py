@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
+
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.importer.pose import BANDWIDTH, DAMPING_RATIO, SAG
 from legged_torque.importer.robot import FOOT, TRUNK, Robot
 
 WEIGHT_TIMES_HEIGHT = 37.0  # [N m] of an A1 with its trunk at 0.303 m
 
-TEMPLATE = '''"""{title}: settings of ``{file}``, imported; each number is a proposal to look at."""
+TEMPLATE = '''"""{title}: imported settings; each number is a proposal to look at."""
+
+# Source: {file}
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ class {cls}Cfg(LeggedRobotCfg):
     """Settings of the robot; alone, of position control on a plane."""
 
     class asset:
-        file = "{path}"
+        file = {path}
         foot_name = "{foot}"
         penalize_contacts_on = {penalized}
         terminate_after_contacts_on = ["{trunk}"]
@@ -64,7 +68,7 @@ def class_name(name: str) -> str:
 
 
 def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
-    """Return the text of the module with a robot's settings.
+    """Return the text of the module with a robot's settings. What comes from the file is written as literals.
 
     ``path`` is that of its MJCF, as it is to be found; ``is_fused`` says whether the fused step can simulate it.
     """
@@ -72,14 +76,14 @@ def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
     kept = {shape.name for found in robot.shapes.values() for shape in found}
     return TEMPLATE.format(
         title=robot.name,
-        file=robot.source.file.name,
+        file=ascii(robot.source.file.name),
         cls=class_name(robot.name),
-        path=path,
+        path=_literal(path),
         engine="" if is_fused else ENGINE,
         foot=FOOT,
         trunk=TRUNK,
-        penalized=_quoted(_penalized(robot, kept)),
-        mirrored=_quoted(robot.mirrored),
+        penalized=_literal(_penalized(robot, kept)),
+        mirrored=_literal(robot.mirrored),
         speed=f"{robot.speed:.4g}" if "." in f"{robot.speed:.4g}" else f"{robot.speed:.1f}",
         drop=round(1.3 * stance.height, 2),
         angles=_angles(robot),
@@ -111,9 +115,9 @@ def _penalized(robot: Robot, geoms: set[str]) -> list[str]:
     return parts
 
 
-def _quoted(value: object) -> str:
-    """Return a list as ruff formats it."""
-    return repr(value).replace("'", '"')
+def _literal(value: str | list) -> str:
+    """Return a text, or lists of texts, as a Python literal in double quotes."""
+    return json.dumps(value, ensure_ascii=False)
 
 
 def _table(numbers: dict[str, float]) -> str:
@@ -121,7 +125,7 @@ def _table(numbers: dict[str, float]) -> str:
     if len(set(numbers.values())) == 1:
         return str(next(iter(numbers.values())))
     ordered = sorted(numbers, key=len, reverse=True)  # the first part that matches counts
-    entries = [f'"{kind}": {numbers[kind]}' for kind in ordered]
+    entries = [f"{_literal(kind)}: {numbers[kind]}" for kind in ordered]
     line = "{" + ", ".join(entries) + "}"
     return line if len(line) < 90 else "{\n" + "".join(f"            {entry},\n" for entry in entries) + "        }"
 
@@ -133,7 +137,7 @@ def _angles(robot: Robot) -> str:
         leg = joint.removesuffix(kind)
         if not groups or groups[-1][0] != leg or (not leg and len(groups[-1][1]) > 3):
             groups.append((leg, []))
-        groups[-1][1].append(f'"{joint}": {round(float(angle), 3) + 0.0}')
+        groups[-1][1].append(f"{_literal(joint)}: {round(float(angle), 3) + 0.0}")
     rows: list[str] = []
     for _, entries in groups:
         for start in range(0, len(entries), 3):

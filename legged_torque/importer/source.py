@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ MESH_TYPES = (".stl", ".obj", ".msh")  # what MuJoCo reads
 VISUAL_GROUP = 3  # in which Menagerie keeps collision geoms, also those that one of its files switches off
 TINY = 1e-6  # [kg m^2], [kg] what counts as no inertia or mass of a fixed link; MuJoCo refuses less
 GRAVITY = 9.81  # [m/s^2], whatever the file has
+NAME = re.compile(r"[A-Za-z0-9_.:/-]*")  # names of bodies and joints, which become parts of settings and of a MJCF
 SITE = "link:"  # with which the names of sites begin that say where fixed links were
 
 
@@ -56,6 +58,7 @@ def read_source(file: Path) -> Source:
             root = ET.parse(file).getroot()
             _refuse_macros(root, file)
             spec = mujoco.MjSpec.from_file(str(file))
+            _check_names(spec, file)
             notes = _prepare(spec, file, root.tag == "robot")
             model = _compile(spec, notes)
             speed_limits = _speed_limits(root)
@@ -69,6 +72,14 @@ def read_source(file: Path) -> Source:
     pose = model.key_qpos[_home(model)][7:].copy() if model.nkey else None
     limits = _torque_limits(model, notes)
     return Source(file, model, sites, pose, limits, speed_limits, notes)
+
+
+def _check_names(spec: mujoco.MjSpec, file: Path) -> None:
+    """Raise a UserError that lists all names of bodies and joints that are not plain."""
+    names = dict.fromkeys(part.name for part in [*spec.bodies, *spec.joints])
+    odd = [repr(name) for name in names if not NAME.fullmatch(name)]
+    if odd:
+        raise UserError(f"cannot import '{file}': names may have letters, digits and _ . : / -, not {', '.join(odd)}")
 
 
 def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
