@@ -19,12 +19,12 @@ from legged_torque.utils.cli import Parser
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import Options
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 GENERATED = ("docs/reference/", "docs/results/")
 FILES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [name for name in (str(file.relative_to(ROOT)) for file in FILES) if not name.startswith(GENERATED)]
 RUN_PYTHON = {"README.md", "docs/terrain.md"} | {page for page in PAGES if page.startswith("docs/howto/")}
-"""Pages whose Python is run: that of docs/terrain.md in tests/test_terrain.py, all else here."""
+"""Pages whose Python is run: that of docs/terrain.md in tests/terrain/test_terrain.py, all else here."""
 TINY = ["--device=cpu", "--num_envs=2", "--max_iterations=2", "--set=runner.num_steps_per_env=4"]
 """What makes the trainings of a page short."""
 YOURS = "yours"
@@ -283,7 +283,7 @@ def test_wrong_commands_are_found(monkeypatch, tmp_path):
     """A wrong option, task, setting, preset, experiment or script in a page fails the test above."""
     page = tmp_path / "page.md"
     monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
-    (tmp_path / "scripts").symlink_to(Path(__file__).resolve().parents[1] / "scripts")
+    (tmp_path / "scripts").symlink_to(Path(__file__).resolve().parents[2] / "scripts")
     for words in (
         "train.py --tsk=a1_torque",
         "train.py --task=a1_torqe",

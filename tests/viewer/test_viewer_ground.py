@@ -13,7 +13,7 @@ from legged_torque.viewer.framing import size_of
 from legged_torque.viewer.ground import CLEARANCE, Ground, drawn_model, patches
 from legged_torque.viewer.video import DISTANCE, Camera
 
-XML = Path(__file__).resolve().parents[1] / "resources" / "robots" / "a1" / "a1.xml"
+XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
 KINDS = {"stairs_up": 0.25, "rough_slope": 0.25, "stepping_stones": 0.25, "pits": 0.25}
 
 

@@ -27,7 +27,7 @@ from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Events, Simulation, quaternion
 from legged_torque.viewer import video
 
-XML = Path(__file__).resolve().parents[1] / "resources" / "robots" / "a1" / "a1.xml"
+XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from legged_torque.importer.settings import settings
 from legged_torque.importer.standing import fused_problem, measure, parse
 from legged_torque.utils.errors import UserError
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 LINK = """
   <link name="{name}">
     <inertial><origin xyz="{com}"/><mass value="{mass}"/>

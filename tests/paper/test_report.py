@@ -19,7 +19,7 @@ from legged_torque.experiments.paper_values import ENVIRONMENTS, PAPER_METRICS, 
 from legged_torque.experiments.report import run_problems
 from legged_torque.experiments.results import CellResult, Experiment, compare, holm, read_experiment, summarize, welch
 
-SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "report.py"
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "report.py"
 HEADER = (
     "steps,iteration,seconds,track_percentage,track_xy,track_angular,collision_force,cost_of_transport,height,speed,"
     "falls_per_minute,critic_gradient_norm"

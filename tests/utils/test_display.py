@@ -22,7 +22,7 @@ from legged_torque.learning.training_display import TrainingDisplay, blocks, rea
 from legged_torque.utils import display
 from legged_torque.utils.display import Counter, Display, Pace, is_terminal, progress_text, read_progress, warn
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 STYLES = re.compile(r"\033\[[\d;?]*[A-Za-z]")
 NUMBERS = {"kl": 0.0123, "skipped_updates": 0.0, "noise": 0.5, "learning_rate": 1e-3, "Health/diverged_worlds": 0.0}
 EVALUATED = {"Evaluation/track_percentage": 0.5, "Evaluation/falls_per_minute": 1.5, "Curriculum/mixing_pd": 0.75}

@@ -220,7 +220,7 @@ class RampCfg(A1Cfg):
 def test_example_of_a_kind_of_ones_own(monkeypatch):
     """The page's own text: a ramp that is level up to 1 m and rises by 0.3 d from there, in a fifth of the columns."""
     monkeypatch.setitem(TILES, "ramp", None)  # to be forgotten afterwards
-    page = (Path(__file__).parents[1] / "docs" / "terrain.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "terrain.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
     names = {"__name__": "page"}
     exec(code, names)

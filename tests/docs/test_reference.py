@@ -11,7 +11,7 @@ from legged_torque.envs import task_registry
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.options import Options
 
-REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "reference"
+REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
 
 
 @pytest.fixture(scope="module")

@@ -94,7 +94,7 @@ def test_a_terminal_that_closes(tmp_path, before):
     """It asks to stop, and what is printed afterwards harms nothing; under nohup it does not even ask."""
     code = f"import signal; {before}{IN_A_TERMINAL}"
     master, slave = pty.openpty()
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
     command = [sys.executable, "-c", code, str(tmp_path / "number")]
     streams = {"stdin": slave, "stdout": slave, "stderr": slave}
     process = subprocess.Popen(command, **streams, env=environment, preexec_fn=take_terminal)
@@ -136,7 +136,7 @@ def main():
     mujoco.mj_step(model, data)
 run_script(main)
 """
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
     command = [sys.executable, "-c", code]
     result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
     assert "MuJoCo: Nan, Inf or huge value in QVEL" in result.stderr and not list(tmp_path.iterdir())

@@ -19,7 +19,7 @@ from legged_torque.viewer import video
 from legged_torque.viewer.arrows import add_velocities
 from legged_torque.viewer.video import Moment, TaskRecorder, add_overlay, write_video
 
-XML = Path(__file__).resolve().parents[1] / "resources" / "robots" / "a1" / "a1.xml"
+XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
 
 DRAW = """
 import sys

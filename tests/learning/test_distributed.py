@@ -27,7 +27,7 @@ from legged_torque.utils.errors import TrainingError
 from legged_torque.utils.runs import checkpoint_number, find_checkpoint
 from legged_torque.utils.task_registry import set_seed
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 WORLDS, STEPS = 2, 4
 ALL_STEPS = 2 * WORLDS * STEPS
 """Environment steps of an iteration of both processes."""

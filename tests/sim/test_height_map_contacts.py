@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from test_fused import assert_alike, compiled, draw_states, invariants, make_a1, put, step_mujoco
 
 from legged_torque.envs import task_registry
 from legged_torque.sim.fused.surface import Surface, Touch, make_surface, touch_map
 from legged_torque.sim.simulator import Simulator
 from legged_torque.terrain.rough import RoughGround
 from legged_torque.utils.errors import UserError
-from tests.test_fused import assert_alike, compiled, draw_states, invariants, make_a1, put, step_mujoco
 
 BALL = """<mujoco><compiler angle="radian" autolimits="true"/>
 <option cone="pyramidal" integrator="implicitfast" impratio="1" timestep="0.005"/>

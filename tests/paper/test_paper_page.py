@@ -10,7 +10,7 @@ import yaml
 import legged_torque
 from legged_torque.envs.base.reward_terms import RewardTerms
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "paper.md").read_text()
 NAMED = sorted(set(re.findall(r"`([\w.]+)` \(`([\w./]+\.py)`\)", PAGE)))
 ROMAN = ("I", "II", "III")
@@ -42,7 +42,7 @@ def test_names_exist(name, file):
 
 
 def test_files_exist():
-    """So are other files; tests/test_docs.py looks at links."""
+    """So are other files; tests/docs/test_docs.py looks at links."""
     files = re.findall(r"`((?:\w+/)+[\w.]+)`", PAGE)
     assert len(files) > len(NAMED) > 40
     assert not [file for file in files if not (ROOT / file).exists()]

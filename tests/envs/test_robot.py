@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-A1_XML = Path(__file__).resolve().parents[1] / "resources" / "robots" / "a1" / "a1.xml"
+A1_XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
 
 LEGS = ("FR", "FL", "RR", "RL")
 LINKS = ("hip", "thigh", "calf")

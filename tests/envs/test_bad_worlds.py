@@ -262,7 +262,7 @@ def test_training_with_a_bad_world(make_runner, tmp_path, capsys):
     values = {tag: [event.value for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
     assert values["Loss/skipped_updates"] == [0.0] * (PATIENCE + 1)
     assert values["Health/not_finite/reward_ratio"] == values["Health/diverged_worlds"] == [4.0] * (PATIENCE + 1)
-    page = (Path(__file__).parents[1] / "docs/reference/logs.md").read_text()
+    page = (Path(__file__).parents[2] / "docs/reference/logs.md").read_text()
     assert "`Health/not_finite/<kind>_<name>`" in page
     assert {tag for tag in values if "not_finite" in tag} == {"Health/not_finite/reward_ratio"}
 

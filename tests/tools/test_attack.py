@@ -14,7 +14,7 @@ from legged_torque.checks.attack_cases import Setting, all_cases, bad_values, se
 from legged_torque.checks.attack_fixture import make_fixture, parsers
 from legged_torque.utils.limits import Count, Interval
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_a_part_of_the_attack(tmp_path):
