@@ -9,6 +9,8 @@ BESIDE = {
     "legged_torque.descriptions": "experiments",
 }
 
+BESIDE |= {f"legged_torque.{name}": name.replace(".", "/") for name in find_packages(include=["paper", "paper.*"])}
+
 setup(
     packages=[*find_packages(include=["legged_torque", "legged_torque.*"]), *BESIDE],
     package_dir=BESIDE,

@@ -17,10 +17,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from legged_torque.checks.attack import attack, table
-from legged_torque.checks.attack_cases import all_cases
-from legged_torque.checks.attack_fixture import make_fixture, parsers, warm_up
 from legged_torque.utils.cli import Parser, check_at_least, check_output, run_script, write_json
+from tools.attack import attack, table
+from tools.attack_cases import all_cases
+from tools.attack_fixture import make_fixture, parsers, warm_up
 
 WORKERS = 2  # cases at a time
 SHOW_EVERY = 200  # cases

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from legged_torque import SCRIPTS_DIR
-from legged_torque.checks.baseline import Baseline
+from legged_torque.benchmark.baseline import Baseline
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.args import Parser, add_settings_args, options_of, task_file_words
@@ -29,7 +29,7 @@ from legged_torque.utils.paths import without_machine
 from legged_torque.utils.runs import package_versions
 
 if TYPE_CHECKING:
-    from legged_torque.checks.benchmark import MemoryMeter
+    from legged_torque.benchmark.measure import MemoryMeter
 
 COLUMNS = {
     "num_envs": (" worlds", 0),
@@ -70,7 +70,7 @@ REACHED = """\
     tracking {share:.0%} after {steps:,} steps: {training_s:.1f} s from there, {command_s:.1f} s from the command"""
 NOT_REACHED = "    tracking {share:.0%} was not reached"
 PEAKS = """
-Counted FLOP and bytes per second (checks/roofline.py says which), and shares of what the device reaches here:
+Counted FLOP and bytes per second (benchmark/roofline.py says which), and shares of what the device reaches here:
   matrix products {peak_gflop_per_s:,.0f} GFLOP/s, copies {peak_gbytes_per_s:,.1f} GB/s"""
 
 
@@ -85,9 +85,9 @@ def main() -> None:
             sizes.append(task_registry.get_cfgs(args.task, options))
             check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
         device = resolve_device(args.device)
-        from legged_torque.checks import roofline
-        from legged_torque.checks.benchmark import MemoryMeter
-        from legged_torque.checks.learning_time import time_training
+        from legged_torque.benchmark import roofline
+        from legged_torque.benchmark.learning_time import time_training
+        from legged_torque.benchmark.measure import MemoryMeter
     for file in filter(None, (args.json, args.profile)):
         check_output(file)
     result = {
@@ -158,7 +158,7 @@ def parse_args() -> argparse.Namespace:
 
 def measure_size(args: argparse.Namespace, cfgs: tuple, memory: MemoryMeter) -> dict[str, Any]:
     """Measure one size, which may not fit in memory, and give the memory back."""
-    from legged_torque.checks.benchmark import measure
+    from legged_torque.benchmark.measure import measure
 
     try:
         row = measure(args.task, cfgs, memory, args.rounds, args.endurance, args.profile)
@@ -195,7 +195,7 @@ def print_row(row: dict[str, Any], trace: Path, memory: MemoryMeter) -> None:
     if "endurance" in row:
         print(ENDURANCE.format(**row["endurance"]))
     if "kernels" in row:
-        from legged_torque.checks.benchmark import TRACED
+        from legged_torque.benchmark.measure import TRACED
 
         kind = "kernels" if memory.is_gpu else "torch operators (Warp's kernels show on a GPU only)"
         print(f"  most expensive {kind} of {TRACED} iterations, see {trace}:")

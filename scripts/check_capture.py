@@ -39,7 +39,7 @@ def main() -> None:
     with importing():
         check_env_cfg(task_registry.get_cfgs(options.task, options)[0])  # mistakes are told before anything is built
         device = resolve_device(args.device)
-        from legged_torque.checks.capture import KERNEL_TOLERANCE, compare_capture, compare_kernels
+        from tools.capture import KERNEL_TOLERANCE, compare_capture, compare_kernels
     print(f"{args.task} on {device_name(device)}: with CUDA graphs against without")
     if device == "cpu":
         print("a CPU has no graphs: this compares two runs that are the same")
@@ -63,7 +63,7 @@ def main() -> None:
 
 def build_runner(options: Options, capture: bool) -> OnPolicyRunner:
     """Build the task and its runner from the seed of the settings, and let everything that can be captured be so."""
-    from legged_torque.checks.capture import warm_up
+    from tools.capture import warm_up
 
     env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     train_cfg.runner.capture = capture

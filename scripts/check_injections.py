@@ -26,10 +26,10 @@ def main() -> None:
     check_at_least(args, 1, "count")
     with importing():
         device = resolve_device(args.device)
-        from legged_torque.checks import injections
         from legged_torque.sim.model import build_model, collision_geoms
         from legged_torque.sim.simulator import ENGINES
         from legged_torque.utils.mjcf import read_spec
+        from tools import injections
     spec = read_spec(RESOURCES_DIR / "robots/a1/a1.xml")
     model = build_model(spec, collision_geoms(spec))
     is_good = True

@@ -45,7 +45,7 @@ def main() -> None:
 
 def check(args: argparse.Namespace, folder: Path) -> bool:
     """Print a line per comparison; return whether nothing differs and nothing is broken."""
-    from legged_torque.checks.reproducible import Training, compare, kill_often
+    from tools.reproducible import Training, compare, kill_often
 
     words = train_words(args)
     first, again, resumed, killed, straight = (

@@ -1,6 +1,6 @@
 """Count how often controller and pre-trained policy stand up: ``python scripts/check_standing.py --num_envs 1000``.
 
-Robots start from random states with the lowest foot just above the ground (``legged_torque.control.standing``).
+Robots start from random states with the lowest foot just above the ground (``legged_torque.paper.gravity.standing``).
 """
 
 import copy
@@ -28,10 +28,10 @@ def main() -> None:
     options = options_of(args)
     with importing():
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
-        from legged_torque.control.dynamics import RobotDynamics
-        from legged_torque.control.gravity_pretraining import act_by_controller, act_by_policy, make_controller
-        from legged_torque.control.standing import measure_standing, place_on_ground, use_standing_trials
         from legged_torque.learning.pretrained import check_spaces, pretrained_file, start_from
+        from legged_torque.paper.gravity.dynamics import RobotDynamics
+        from legged_torque.paper.gravity.pretraining import act_by_controller, act_by_policy, make_controller
+        from legged_torque.paper.gravity.standing import measure_standing, place_on_ground, use_standing_trials
         from legged_torque.utils.progress import CompileProgress
     file = pretrained_file(options.task, train_cfg, options.log_root)
     if not file.exists():

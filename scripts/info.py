@@ -19,7 +19,7 @@ def main() -> None:
     """Print a block of lines per topic."""
     Parser(__doc__).parse_args()
     with importing():
-        from legged_torque.checks.installation import topics
+        from legged_torque.benchmark.installation import topics
         from legged_torque.viewer.native import check_display
     no_window: list[str] = []
     with told_in(no_window):

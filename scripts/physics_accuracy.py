@@ -35,7 +35,10 @@ def main() -> None:
         run = task_registry.load_run(options)
         import torch
 
-        from legged_torque.checks.accuracy import (
+        from legged_torque.envs.base.asset import load_asset
+        from legged_torque.sim.simulator import ENGINES, Simulator
+        from legged_torque.utils.mjcf import read_spec
+        from tools.accuracy import (
             KINDS,
             ON_ANY_GROUND,
             TOLERANCE,
@@ -46,10 +49,7 @@ def main() -> None:
             open_motors,
             reference_step,
         )
-        from legged_torque.checks.planes import PlanePerFoot
-        from legged_torque.envs.base.asset import load_asset
-        from legged_torque.sim.simulator import ENGINES, Simulator
-        from legged_torque.utils.mjcf import read_spec
+        from tools.planes import PlanePerFoot
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options)
     policy = runner.get_inference_policy(env.device)

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from legged_torque.experiments.curves import read_curves
-from legged_torque.experiments.figures_curves import draw_single_curves
+from legged_torque.paper.report.curves import read_curves
+from legged_torque.paper.report.figures_curves import draw_single_curves
 from legged_torque.utils.args import Parser
 from legged_torque.utils.cli import check_output, run_script
 from legged_torque.utils.plotting import save_figure

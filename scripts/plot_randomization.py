@@ -30,7 +30,7 @@ def main() -> None:
     options = options_of(args)
     with importing():
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
-        from legged_torque.checks.distributions import draw_distributions
+        from tools.distributions import draw_distributions
     set_seed(train_cfg.seed)
     fixed_cfg = copy.deepcopy(env_cfg)
     fixed_cfg.env.num_envs, fixed_cfg.domain_rand.randomize_parameters = 1, False

@@ -11,10 +11,10 @@ without_renderer()  # before anything imports mujoco
 
 from pathlib import Path
 
-from legged_torque.experiments.blocks import to_html, to_markdown
-from legged_torque.experiments.figures import draw_all
-from legged_torque.experiments.report import find_videos, missing_lines, report
-from legged_torque.experiments.results import read_experiment, summarize, write_tables
+from legged_torque.paper.report.blocks import to_html, to_markdown
+from legged_torque.paper.report.figures import draw_all
+from legged_torque.paper.report.report import find_videos, missing_lines, report
+from legged_torque.paper.report.results import read_experiment, summarize, write_tables
 from legged_torque.utils.args import Parser
 from legged_torque.utils.cli import check_at_least, check_output, run_script
 

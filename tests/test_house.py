@@ -13,8 +13,9 @@ LEVELS = [
     ("envs.robots", "envs.approaches", "envs.grounds", "importer"),
     ("envs",),
     ("learning",),
-    ("control", "deploy"),
-    ("viewer", "experiments", "checks"),
+    ("deploy", "benchmark"),
+    ("viewer", "experiments"),
+    ("paper",),
 ]
 """Folders of the package from low to high: one imports those of lower levels, no others. Scripts are above all."""
 LEVEL_OF = {f"legged_torque.{folder}": number for number, level in enumerate(LEVELS) for folder in level}
@@ -64,6 +65,7 @@ def folder_of(module):
 def house():
     """What each module of the package imports, see :func:`imports`."""
     files = {module_name(file): file for file in sorted((ROOT / "legged_torque").rglob("*.py"))}
+    files |= {f"legged_torque.{module_name(file)}": file for file in sorted((ROOT / "paper").rglob("*.py"))}
     return {name: imports(ast.parse(file.read_text("utf-8")), files) for name, file in files.items()}
 
 

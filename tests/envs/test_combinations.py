@@ -12,17 +12,17 @@ from test_control import CONVERGED, NOMINAL, TORQUE_LIMIT, pd_by_hand, random_st
 from test_resume import content, differences, start, train
 from test_symmetry import mirror_policy
 
-from legged_torque.control import gravity_pretraining
-from legged_torque.control.gravity_pretraining import (
+from legged_torque.envs import A1TorqueCfg, task_registry
+from legged_torque.envs.approaches.torque import TorqueRobot
+from legged_torque.paper.gravity import pretraining as gravity_pretraining
+from legged_torque.paper.gravity.pretraining import (
     act_by_policy,
     follow,
     make_controller,
     pretrain,
 )
-from legged_torque.control.standing import check_torques, use_standing_trials
-from legged_torque.control.whole_body import WholeBodySettings
-from legged_torque.envs import A1TorqueCfg, task_registry
-from legged_torque.envs.approaches.torque import TorqueRobot
+from legged_torque.paper.gravity.standing import check_torques, use_standing_trials
+from legged_torque.paper.gravity.whole_body import WholeBodySettings
 from legged_torque.utils.config import to_dict
 
 CURRICULUM, GRAVITY_CURRICULUM = "a1_torque_curriculum_multihead", "a1_torque_gravity_curriculum"

@@ -9,12 +9,12 @@ import pytest
 import torch
 from settings import error_of, get_cfgs
 
-from legged_torque.checks import distributions
 from legged_torque.envs.base.domain_rand import of_model
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.sim.randomization import Parameter, Randomization, changes_legs
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
+from tools import distributions
 
 RANGES = {
     "trunk_mass_offset": ("body_mass", (-1.0, 1.0)),

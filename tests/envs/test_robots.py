@@ -12,8 +12,8 @@ import torch
 from settings import error_of
 
 from legged_torque import resource_path
-from legged_torque.control.gravity_pretraining import make_controller
 from legged_torque.envs import task_registry
+from legged_torque.paper.gravity.pretraining import make_controller
 from legged_torque.utils.options import Options
 
 PUBLISHED = {

@@ -7,10 +7,10 @@ import torch
 from settings import error_of, get_cfgs
 from test_scripts import run_here
 
-from legged_torque.checks.capture import compare_capture, warm_up
 from legged_torque.envs import task_registry
 from legged_torque.sim import graph
 from legged_torque.utils.config import set_by_path
+from tools.capture import compare_capture, warm_up
 
 SMALL = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--set=runner.num_steps_per_env=4"]
 
@@ -190,7 +190,7 @@ def test_check_capture(tmp_path, words, status, message):
 
 def test_check_capture_tells_a_difference(tmp_path, monkeypatch):
     """Beyond the tolerance, the exit status is not 0 and the quantities are named."""
-    monkeypatch.setattr("legged_torque.checks.capture.Difference.within", lambda self, tolerance: False)
+    monkeypatch.setattr("tools.capture.Difference.within", lambda self, tolerance: False)
     status, output, _ = run_here("check_capture.py", *SMALL, root=tmp_path)
     assert str(status).startswith("beyond the tolerance of 0.01: observations policy of iteration 0, ")
     assert "all within" not in output

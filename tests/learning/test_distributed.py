@@ -19,13 +19,13 @@ from settings import parse
 from test_ppo import make_ppo, record_rollout, state_of
 from test_random_stream import upcoming
 
-from legged_torque.checks.reproducible import equal, values
 from legged_torque.envs import task_registry
 from legged_torque.learning.guard import PATIENCE
 from legged_torque.utils import distributed
 from legged_torque.utils.errors import TrainingError
 from legged_torque.utils.runs import checkpoint_number, find_checkpoint
 from legged_torque.utils.task_registry import set_seed
+from tools.reproducible import equal, values
 
 ROOT = Path(__file__).resolve().parents[2]
 WORLDS, STEPS = 2, 4
@@ -141,7 +141,8 @@ def main(folder):
 
 def torchrun(*words, launch=("--standalone", "--nproc_per_node=2")):
     """Start processes that find each other, two on this machine unless ``launch`` says otherwise."""
-    environment = os.environ | {"PYTHONUNBUFFERED": "1", "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    paths = os.pathsep.join([str(ROOT), *map(str, Path(__file__).parents[:2]), *sys.path])
+    environment = os.environ | {"PYTHONUNBUFFERED": "1", "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "torch.distributed.run", *launch, *map(str, words)]
     return subprocess.Popen(
         command, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT

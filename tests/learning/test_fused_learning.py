@@ -26,10 +26,10 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 
-from legged_torque.checks.capture import KERNEL_TOLERANCE, compare_kernels
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.multi_head import MultiHeadModel
 from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, can_be_fused
+from tools.capture import KERNEL_TOLERANCE, compare_kernels
 
 pytest.importorskip("triton", reason="Triton is there for Linux only")
 if os.environ.get("TRITON_INTERPRET") != "1":

@@ -7,7 +7,7 @@ import pytest
 import torch
 from test_scripts import run_here
 
-from legged_torque.checks.reproducible import Training, compare, kill_often, values
+from tools.reproducible import Training, compare, kill_often, values
 
 SMALL = ["--task=a1_torque", "--device=cpu", "--num_envs=3", "--perturbation=low", "--logger=none"]
 SMALL += ["--set=runner.num_steps_per_env=4", "--set=algorithm.num_mini_batches=1", "--set=actor.hidden_dims=[8]"]

@@ -11,7 +11,6 @@ import torch
 import warp as wp
 from settings import error_of, parse
 
-from legged_torque.checks.reproducible import equal, values
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning import checkpoint
@@ -20,6 +19,7 @@ from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import set_seed
+from tools.reproducible import equal, values
 
 WORLDS = 6
 WORDS = ["--task=a1_torque_multihead", f"--num_envs={WORLDS}", "--perturbation=low", "--logger=none", "--seed=3"]

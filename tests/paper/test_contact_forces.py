@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from legged_torque.control.contact_forces import ForceDistribution, ForceLimits
+from legged_torque.paper.gravity.contact_forces import ForceDistribution, ForceLimits
 from legged_torque.utils.errors import UserError
 
 LIMITS = ForceLimits(friction=0.6, lowest=4.0, highest=160.0)

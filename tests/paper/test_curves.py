@@ -11,7 +11,7 @@ from settings import error_of
 from test_report import HEADER, line
 from test_scripts import assert_told_in_one_line, run_here
 
-from legged_torque.experiments.curves import CURVE_METRICS, read_curves
+from legged_torque.paper.report.curves import CURVE_METRICS, read_curves
 
 METRICS = [metric.name for metric in CURVE_METRICS]
 

@@ -8,9 +8,11 @@ import torch
 from settings import error_of, get_cfgs, parse
 from test_scripts import run_here
 
-from legged_torque.control import gravity_pretraining
-from legged_torque.control.dynamics import RobotDynamics
-from legged_torque.control.gravity_pretraining import (
+from legged_torque.envs import task_registry
+from legged_torque.learning.pretrained import read_pretrained
+from legged_torque.paper.gravity import pretraining as gravity_pretraining
+from legged_torque.paper.gravity.dynamics import RobotDynamics
+from legged_torque.paper.gravity.pretraining import (
     Collection,
     Followed,
     Pairs,
@@ -26,10 +28,8 @@ from legged_torque.control.gravity_pretraining import (
     select,
     supervise,
 )
-from legged_torque.control.standing import use_standing_trials
-from legged_torque.control.whole_body import WholeBodyController, WholeBodySettings
-from legged_torque.envs import task_registry
-from legged_torque.learning.pretrained import read_pretrained
+from legged_torque.paper.gravity.standing import use_standing_trials
+from legged_torque.paper.gravity.whole_body import WholeBodyController, WholeBodySettings
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.config import to_dict
 

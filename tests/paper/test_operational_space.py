@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from legged_torque import RESOURCES_DIR
-from legged_torque.control import operational_space as osc
-from legged_torque.control.dynamics import RobotDynamics
+from legged_torque.paper.gravity import operational_space as osc
+from legged_torque.paper.gravity.dynamics import RobotDynamics
 from legged_torque.sim.model import build_model, collision_geoms
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import read_spec

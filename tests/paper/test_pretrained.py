@@ -8,8 +8,8 @@ from test_gravity_pretraining import made as made  # a fixture
 from test_ppo import make_ppo, record_rollout, shift_policy, state_of
 from test_scripts import assert_told_in_one_line, contents, run_here
 
-from legged_torque.control import gravity_pretraining
 from legged_torque.learning.pretrained import check_making, check_spaces, read_pretrained
+from legged_torque.paper.gravity import pretraining as gravity_pretraining
 
 
 @pytest.fixture(scope="module")

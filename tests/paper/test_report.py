@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from legged_torque.experiments import figures, figures_curves, figures_style
-from legged_torque.experiments.curves import CURVE_METRICS, read_rows
 from legged_torque.experiments.matrix import Cell, Matrix
-from legged_torque.experiments.paper_values import ENVIRONMENTS, PAPER_METRICS, TABLE_I, paper_value
-from legged_torque.experiments.report import run_problems
-from legged_torque.experiments.results import CellResult, Experiment, compare, holm, read_experiment, summarize, welch
+from legged_torque.paper.report import figures, figures_curves, figures_style
+from legged_torque.paper.report.curves import CURVE_METRICS, read_rows
+from legged_torque.paper.report.report import run_problems
+from legged_torque.paper.report.results import CellResult, Experiment, compare, holm, read_experiment, summarize, welch
+from legged_torque.paper.values import ENVIRONMENTS, PAPER_METRICS, TABLE_I, paper_value
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "report.py"
 HEADER = (

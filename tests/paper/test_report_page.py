@@ -9,12 +9,12 @@ from html.parser import HTMLParser
 import pytest
 from test_report import HEADER, SETTINGS, line, run_script, write_experiment, write_part
 
-from legged_torque.experiments import figures, figures_curves, figures_style
-from legged_torque.experiments.against_paper import best_torque, count, judge
-from legged_torque.experiments.blocks import Code, Grid, Paragraph
-from legged_torque.experiments.paper_values import ENVIRONMENTS, PAPER_METRICS, PAPER_TASKS, paper_column
-from legged_torque.experiments.results import Summary, read_experiment, summarize
 from legged_torque.experiments.times import Times, write_times
+from legged_torque.paper.report import figures, figures_curves, figures_style
+from legged_torque.paper.report.against_paper import best_torque, count, judge
+from legged_torque.paper.report.blocks import Code, Grid, Paragraph
+from legged_torque.paper.report.results import Summary, read_experiment, summarize
+from legged_torque.paper.values import ENVIRONMENTS, PAPER_METRICS, PAPER_TASKS, paper_column
 from legged_torque.utils.metrics import METRICS
 
 METRIC = {metric.name: metric for metric in METRICS}

@@ -9,9 +9,9 @@ from test_report import HEADER, line, run_script, whole_run, write_grounds
 from test_report_page import Page
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.experiments import figures, figures_bars, figures_curves
-from legged_torque.experiments.report_runs import environment_of, ranges_of
-from legged_torque.experiments.results import read_experiment, summarize
+from legged_torque.paper.report import figures, figures_bars, figures_curves
+from legged_torque.paper.report.report_runs import environment_of, ranges_of
+from legged_torque.paper.report.results import read_experiment, summarize
 from legged_torque.utils.config import to_dict, update_from_dict
 
 

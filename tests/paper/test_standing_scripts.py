@@ -8,7 +8,7 @@ import pytest
 import torch
 from test_scripts import ROOT, assert_told_in_one_line, contents, run_here
 
-from legged_torque.control import gravity_pretraining
+from legged_torque.paper.gravity import pretraining as gravity_pretraining
 
 TASK = "a1_torque_gravity"
 SMALL = ["--device=cpu", "--num_envs=6"]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from legged_torque.control.dynamics import RobotDynamics
-from legged_torque.control.gravity_pretraining import act_by_controller
-from legged_torque.control.standing import is_standing, measure_standing, place_on_ground, use_standing_trials
-from legged_torque.control.whole_body import WholeBodyController, WholeBodySettings
 from legged_torque.envs import task_registry
+from legged_torque.paper.gravity.dynamics import RobotDynamics
+from legged_torque.paper.gravity.pretraining import act_by_controller
+from legged_torque.paper.gravity.standing import is_standing, measure_standing, place_on_ground, use_standing_trials
+from legged_torque.paper.gravity.whole_body import WholeBodyController, WholeBodySettings
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import Options
 

@@ -20,9 +20,9 @@ from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Events, Simulation
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
-from legged_torque.experiments.curves import CURVE_METRICS
 from legged_torque.learning import checkpoint
 from legged_torque.learning.pretrained import start_from
+from legged_torque.paper.report.curves import CURVE_METRICS
 from legged_torque.utils.config import parse_yaml, set_by_path
 from legged_torque.utils.task_registry import TaskRegistry, task_registry
 

@@ -9,7 +9,10 @@ import torch
 from test_fused import compiled, make_a1
 from test_scripts import SMALL, run_here
 
-from legged_torque.checks.accuracy import (
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.terrain.height_map import HeightMap
+from tools.accuracy import (
     KINDS,
     copy_state,
     make_states,
@@ -18,10 +21,7 @@ from legged_torque.checks.accuracy import (
     put_on_floor,
     reference_step,
 )
-from legged_torque.checks.planes import PlanePerFoot
-from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.sim.simulator import ENGINES, Simulator
-from legged_torque.terrain.height_map import HeightMap
+from tools.planes import PlanePerFoot
 
 WORLDS = 120
 SETTINGS = (LeggedRobotCfg.sim.solver_iterations, LeggedRobotCfg.sim.ls_iterations)

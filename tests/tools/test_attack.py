@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from legged_torque.checks.attack import ACCEPTED, ENDED, REFUSED, Case, Result, classify, table
-from legged_torque.checks.attack_cases import Setting, all_cases, bad_values, settings
-from legged_torque.checks.attack_fixture import make_fixture, parsers
 from legged_torque.utils.limits import Count, Interval
+from tools.attack import ACCEPTED, ENDED, REFUSED, Case, Result, classify, table
+from tools.attack_cases import Setting, all_cases, bad_values, settings
+from tools.attack_fixture import make_fixture, parsers
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -8,7 +8,7 @@ import pytest
 from settings import error_of
 from test_scripts import assert_told_in_one_line, run_here
 
-from legged_torque.checks.baseline import Baseline
+from legged_torque.benchmark.baseline import Baseline
 
 RESULT = {
     "task": "a1_position",

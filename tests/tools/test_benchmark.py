@@ -11,8 +11,8 @@ import pytest
 import torch
 from test_scripts import assert_told_in_one_line, run_here
 
-from legged_torque.checks import benchmark
-from legged_torque.checks.benchmark import MemoryMeter, most_expensive, summarize
+from legged_torque.benchmark import measure as benchmark
+from legged_torque.benchmark.measure import MemoryMeter, most_expensive, summarize
 from legged_torque.envs import LeggedRobot, task_registry
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import is_out_of_memory

@@ -5,8 +5,8 @@ import torch
 from test_fused import compiled, make_a1
 from test_scripts import run_here
 
-from legged_torque.checks import injections
 from legged_torque.sim.simulator import ENGINES, Simulator
+from tools import injections
 
 
 @pytest.mark.parametrize("engine", ENGINES)

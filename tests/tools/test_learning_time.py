@@ -4,8 +4,8 @@ import sys
 
 import pytest
 
-from legged_torque.checks import learning_time
-from legged_torque.checks.learning_time import first_reaching, time_training
+from legged_torque.benchmark import learning_time
+from legged_torque.benchmark.learning_time import first_reaching, time_training
 from legged_torque.utils.errors import TrainingError
 
 NAN = float("nan")

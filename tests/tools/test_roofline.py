@@ -3,8 +3,8 @@
 import pytest
 from torch.utils.flop_counter import FlopCounterMode
 
-from legged_torque.checks import roofline
-from legged_torque.checks.roofline import Peaks
+from legged_torque.benchmark import roofline
+from legged_torque.benchmark.roofline import Peaks
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.options import Options

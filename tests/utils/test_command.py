@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from settings import error_of, get_cfgs, parse
 from test_scripts import ROOT, assert_told_in_one_line, run_here
 
-from legged_torque.checks.installation import extras, gpus, size_of
+from legged_torque.benchmark.installation import extras, gpus, size_of
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.commands import UniformCommands, fix_command
 from legged_torque.utils.args import Parser, add_task_args, task_file_words

@@ -60,15 +60,6 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.fixture
-def terminal(monkeypatch):
-    """A terminal as standard output."""
-    monkeypatch.setenv("TERM", "xterm")
-    made = Terminal()
-    monkeypatch.setattr(sys, "stdout", made)
-    return made
-
-
 def in_a_terminal(columns, after="", **variables):
     """Run A_TRAINING in a terminal of that width, and press Ctrl-C if ``after`` that text has come.
 
@@ -213,8 +204,11 @@ def test_counter(monkeypatch):
     assert read_progress(texts[1]) == ("evaluating, step", 5, 10, "0:00:30")
 
 
-def test_an_error_ends_the_picture(terminal):
+def test_an_error_ends_the_picture(monkeypatch):
     """The streams are given back, and the cursor too."""
+    monkeypatch.setenv("TERM", "xterm")
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stdout", terminal)
     with pytest.raises(ValueError, match="mine"), TrainingDisplay("title", "folder", Pace(2), 32, False) as shown:
         assert sys.stdout is not terminal
         raise ValueError("mine")
@@ -222,16 +216,22 @@ def test_an_error_ends_the_picture(terminal):
     assert terminal.getvalue().endswith("\033[?25h")
 
 
-def test_a_picture_that_cannot_be_drawn(monkeypatch, terminal):
+def test_a_picture_that_cannot_be_drawn(monkeypatch):
     """It says why, and the work goes on."""
+    monkeypatch.setenv("TERM", "xterm")
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stdout", terminal)
     monkeypatch.setattr(display, "REDRAW_EVERY", 0.0)
     with TrainingDisplay("title", "folder", Pace(2), 32, False) as shown:
         shown.add_iteration(1, 32, {**NUMBERS, **EVALUATED, "Evaluation/track_percentage": math.inf})
     assert "no picture: " in terminal.getvalue() and Display.shown is None
 
 
-def test_a_terminal_that_is_gone(monkeypatch, terminal):
+def test_a_terminal_that_is_gone(monkeypatch):
     """Work goes on without pictures."""
+    monkeypatch.setenv("TERM", "xterm")
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stdout", terminal)
     monkeypatch.setattr(display, "REDRAW_EVERY", 0.0)
     with TrainingDisplay("title", "folder", Pace(2), 32, False) as shown:
         monkeypatch.setattr(Terminal, "write", lambda *_: (_ for _ in ()).throw(OSError(5, "Input/output error")))

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from legged_torque.experiments.results import holm, welch
+from legged_torque.paper.report.results import holm, welch
 
 
 def test_welch_by_hand():

@@ -11,7 +11,7 @@ class TorqueGravityCfgPPO(TorqueCfgPPO):
     """Training of torque control from a pre-trained policy; the task is that of default torque control."""
 
     class pretraining:
-        function = "legged_torque.control.gravity_pretraining:pretrain"
+        function = "legged_torque.paper.gravity.pretraining:pretrain"
         critic_warmup_iterations = 10
         seed: Number = 1  # of the pre-training alone
         num_configurations: Count = 20_000  # random initial states, each followed for

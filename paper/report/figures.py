@@ -8,13 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from legged_torque.experiments.curves import LEVEL
-from legged_torque.experiments.figures_bars import draw_bars
-from legged_torque.experiments.figures_curves import CurveFigure, draw_curves
-from legged_torque.experiments.figures_rough import draw_success
-from legged_torque.experiments.figures_style import SETTINGS, seeds_text
-from legged_torque.experiments.paper_values import ENVIRONMENTS
-from legged_torque.experiments.results import Experiment, Table
+from legged_torque.paper.report.curves import LEVEL
+from legged_torque.paper.report.figures_bars import draw_bars
+from legged_torque.paper.report.figures_curves import CurveFigure, draw_curves
+from legged_torque.paper.report.figures_rough import draw_success
+from legged_torque.paper.report.figures_style import SETTINGS, seeds_text
+from legged_torque.paper.report.results import Experiment, Table
+from legged_torque.paper.values import ENVIRONMENTS
 from legged_torque.utils.plotting import load_pyplot
 
 if TYPE_CHECKING:

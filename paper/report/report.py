@@ -9,15 +9,15 @@ from pathlib import Path
 
 import yaml
 
-from legged_torque.experiments.against_paper import MEANINGS, best_torque, count, marked, number_text
-from legged_torque.experiments.blocks import VIDEO_TYPES, Block, Bullets, Code, Grid, Heading, Paragraph, Picture
-from legged_torque.experiments.curves import MILLION
-from legged_torque.experiments.figures import file_name, planned_figures, rough_figures
-from legged_torque.experiments.figures_style import method, name_of, seeds_text
-from legged_torque.experiments.grounds import MEASURES, kinds_of, over_levels
 from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE, Matrix
-from legged_torque.experiments.paper_values import PAPER_METRICS
-from legged_torque.experiments.results import (
+from legged_torque.experiments.times import add_up, describe, read_times
+from legged_torque.paper.report.against_paper import MEANINGS, best_torque, count, marked, number_text
+from legged_torque.paper.report.blocks import VIDEO_TYPES, Block, Bullets, Code, Grid, Heading, Paragraph, Picture
+from legged_torque.paper.report.curves import MILLION
+from legged_torque.paper.report.figures import file_name, planned_figures, rough_figures
+from legged_torque.paper.report.figures_style import method, name_of, seeds_text
+from legged_torque.paper.report.grounds import MEASURES, kinds_of, over_levels
+from legged_torque.paper.report.results import (
     EVALUATIONS_FILE,
     GROUNDS_FILE,
     LAST_SHARE,
@@ -30,8 +30,8 @@ from legged_torque.experiments.results import (
     compare,
     is_of_paper,
 )
-from legged_torque.experiments.tables import SIGNIFICANT, metric_table
-from legged_torque.experiments.times import add_up, describe, read_times
+from legged_torque.paper.report.tables import SIGNIFICANT, metric_table
+from legged_torque.paper.values import PAPER_METRICS
 from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.paths import portable_path, without_machine

@@ -17,14 +17,14 @@ from typing import Any
 
 import yaml
 
-from legged_torque.checks import attack_fixture as fixtures
-from legged_torque.checks.attack import Case
-from legged_torque.checks.attack_fixture import WORDS
 from legged_torque.envs import task_registry
 from legged_torque.utils.cli import Parser, finite
 from legged_torque.utils.config import Section, section_keys
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import check_value, types_of
+from tools import attack_fixture as fixtures
+from tools.attack import Case
+from tools.attack_fixture import WORDS
 
 NOT_FINITE = (".nan", ".inf", "-.inf")
 LONG = "x" * 300

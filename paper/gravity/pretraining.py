@@ -17,8 +17,9 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque.control.dynamics import RobotDynamics
-from legged_torque.control.standing import (
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.paper.gravity.dynamics import RobotDynamics
+from legged_torque.paper.gravity.standing import (
     Act,
     actions_for,
     check_torques,
@@ -26,8 +27,7 @@ from legged_torque.control.standing import (
     place_on_ground,
     use_standing_trials,
 )
-from legged_torque.control.whole_body import WholeBodyController, WholeBodySettings, WholeBodyTorques
-from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.paper.gravity.whole_body import WholeBodyController, WholeBodySettings, WholeBodyTorques
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.display import Counter

@@ -9,10 +9,10 @@ import mujoco
 import torch
 from torch import Tensor
 
-from legged_torque.control.dynamics import RobotDynamics
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.paper.gravity.dynamics import RobotDynamics
 from legged_torque.terrain.selection import select_tiles
 from legged_torque.utils.config import update_from_dict
 from legged_torque.utils.errors import UserError

@@ -13,11 +13,11 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from legged_torque.experiments.curves import CURVE_METRICS, Row, read_rows, to_row
-from legged_torque.experiments.grounds import MEASURES, Crossings, read_crossings
 from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE, Cell, Matrix, read_plan
-from legged_torque.experiments.paper_values import ENVIRONMENTS, PAPER_TASKS, paper_value
-from legged_torque.experiments.report_runs import find_trainings, plan_of, ranges_of
+from legged_torque.paper.report.curves import CURVE_METRICS, Row, read_rows, to_row
+from legged_torque.paper.report.grounds import MEASURES, Crossings, read_crossings
+from legged_torque.paper.report.report_runs import find_trainings, plan_of, ranges_of
+from legged_torque.paper.values import ENVIRONMENTS, PAPER_TASKS, paper_value
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import CONFIG_FILE, load_config, steps_per_iteration
 

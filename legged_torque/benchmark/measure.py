@@ -19,7 +19,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from legged_torque.checks import roofline
+from legged_torque.benchmark import roofline
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning.runner import OnPolicyRunner

@@ -17,10 +17,10 @@ import yaml
 
 import legged_torque
 from legged_torque import RESOURCES_DIR, SCRIPTS_DIR
-from legged_torque.checks.attack import ACCEPTED, Case, attack
 from legged_torque.envs import task_registry
 from legged_torque.utils.cli import Parser
 from legged_torque.utils.options import Options
+from tools.attack import ACCEPTED, Case, attack
 
 RUN = "logs/a1_position/run"
 CONFIG, CHECKPOINT, EVALUATIONS = f"{RUN}/config.yaml", f"{RUN}/model_1.pt", f"{RUN}/evaluations.csv"

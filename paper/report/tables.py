@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from itertools import combinations
 
-from legged_torque.experiments.against_paper import judge, marked, number_text
-from legged_torque.experiments.blocks import Grid
-from legged_torque.experiments.figures_style import method
-from legged_torque.experiments.paper_values import PAPER_METRICS, PAPER_TASKS, paper_value
-from legged_torque.experiments.results import Cells, Experiment, Table, compare
+from legged_torque.paper.report.against_paper import judge, marked, number_text
+from legged_torque.paper.report.blocks import Grid
+from legged_torque.paper.report.figures_style import method
+from legged_torque.paper.report.results import Cells, Experiment, Table, compare
+from legged_torque.paper.values import PAPER_METRICS, PAPER_TASKS, paper_value
 from legged_torque.utils.metrics import Metric
 
 SIGNIFICANT = 0.05

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from legged_torque.experiments.curves import CURVE_METRICS, LEVEL, MILLION, LearningCurve, Row
-from legged_torque.experiments.figures_style import Style, draw_seeds, name_of, style
-from legged_torque.experiments.paper_values import ENVIRONMENTS
-from legged_torque.experiments.results import LAST_SHARE, Experiment
+from legged_torque.paper.report.curves import CURVE_METRICS, LEVEL, MILLION, LearningCurve, Row
+from legged_torque.paper.report.figures_style import Style, draw_seeds, name_of, style
+from legged_torque.paper.report.results import LAST_SHARE, Experiment
+from legged_torque.paper.values import ENVIRONMENTS
 from legged_torque.utils.plotting import load_pyplot
 
 if TYPE_CHECKING:

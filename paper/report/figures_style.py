@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from legged_torque.experiments.paper_values import MODELS, task_on_plane
+from legged_torque.paper.values import MODELS, task_on_plane
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 
-from legged_torque.experiments.blocks import BETTER, WITHIN, WORSE, Block, Grid, Paragraph
-from legged_torque.experiments.figures_style import method
-from legged_torque.experiments.paper_values import ENVIRONMENTS, MODELS, PAPER_METRICS, paper_column
-from legged_torque.experiments.results import Cells, Summary, Table
+from legged_torque.paper.report.blocks import BETTER, WITHIN, WORSE, Block, Grid, Paragraph
+from legged_torque.paper.report.figures_style import method
+from legged_torque.paper.report.results import Cells, Summary, Table
+from legged_torque.paper.values import ENVIRONMENTS, MODELS, PAPER_METRICS, paper_column
 from legged_torque.utils.metrics import Metric
 
 TARGET = 0.05

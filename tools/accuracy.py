@@ -21,7 +21,7 @@ Arrays = dict[str, np.ndarray]
 PhysicsState = dict[str, torch.Tensor]
 """A batch of states: "qpos", "qvel", "qacc_warmstart", "ctrl", each (worlds, size)."""
 Pose = Callable[[mujoco.MjModel, mujoco.MjData], bool]
-"""Makes a model fit a state, and says whether it does, as :meth:`~legged_torque.checks.planes.PlanePerFoot.pose`."""
+"""Makes a model fit a state, and says whether it does, as :meth:`~tools.planes.PlanePerFoot.pose`."""
 
 
 def copy_state(sim: Simulator) -> PhysicsState:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from legged_torque.experiments.figures_style import SEED_MARK, Style, draw_seeds, name_of, style
-from legged_torque.experiments.paper_values import ENVIRONMENTS, PAPER_METRICS, paper_value
-from legged_torque.experiments.results import Experiment, Summary, Table
+from legged_torque.paper.report.figures_style import SEED_MARK, Style, draw_seeds, name_of, style
+from legged_torque.paper.report.results import Experiment, Summary, Table
+from legged_torque.paper.values import ENVIRONMENTS, PAPER_METRICS, paper_value
 from legged_torque.utils.metrics import Metric
 from legged_torque.utils.plotting import load_pyplot
 

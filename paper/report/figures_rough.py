@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from legged_torque.experiments.figures_style import MARKERS, name_of, style
-from legged_torque.experiments.grounds import by_level, kinds_of
-from legged_torque.experiments.paper_values import ENVIRONMENTS, task_on_plane
-from legged_torque.experiments.results import Experiment
+from legged_torque.paper.report.figures_style import MARKERS, name_of, style
+from legged_torque.paper.report.grounds import by_level, kinds_of
+from legged_torque.paper.report.results import Experiment
+from legged_torque.paper.values import ENVIRONMENTS, task_on_plane
 from legged_torque.utils.plotting import load_pyplot
 
 if TYPE_CHECKING:

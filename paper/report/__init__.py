@@ -1,0 +1,1 @@
+"""Reports of experiments and runs: tables, figures and one HTML page."""

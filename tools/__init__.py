@@ -1,0 +1,1 @@
+"""What maintainers run in a checkout; not a part of the package."""
