@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from settings import TASKS, error_of, torques_in_torch
-from test_scripts import SMALL, assert_told_in_one_line, run_here
+from support.exports import TRAINING, change, export_random
+from support.scripts import SMALL, assert_told_in_one_line, run_here
+from support.settings import TASKS, error_of, torques_in_torch
 
 from legged_torque.deploy import description as description_module
 from legged_torque.envs import ObservationTerm, task_registry
@@ -23,7 +24,6 @@ for package in ("onnx", "onnxruntime", "jsonschema"):
 from legged_torque.deploy.export import export_policy, nominal_cfg
 from legged_torque.deploy.policy import Policy, State
 
-TRAINING = {"run": "run", "checkpoint": "model_7.pt", "iterations": 7, "total_steps": 20_000_000}
 CHANGED = {
     "env.history_length": 3,
     "control.stiffness": 35.0,
@@ -43,24 +43,6 @@ CHANGED = {
 SETTINGS = {"default": {}, "changed": CHANGED, "torques_once": {"control.refresh_torques": False}}
 
 
-def export_random(make_task, name, folder, normalization=False, **overrides):
-    """Export a small random network of a task after 20 million steps; return the task and the model."""
-    task = make_task(name, num_envs=3, **overrides)
-    task.load_state_dict({"total_steps": torch.tensor(TRAINING["total_steps"]), "num_diverged": torch.tensor(0)})
-    _, train_cfg = task_registry.get_cfgs(name)
-    train_cfg.actor.hidden_dims = [16, 16]
-    train_cfg.actor.obs_normalization = normalization
-    torch.manual_seed(3)
-    runner, _ = task_registry.make_alg_runner(task, name, train_cfg=train_cfg, log_root=None)
-    model = runner.alg.get_policy()
-    if normalization:
-        model.obs_normalizer._mean.normal_()
-        model.obs_normalizer._std.uniform_(0.5, 2.0)
-    model.eval()
-    assert export_policy(task, model, folder, name, TRAINING) < 1e-5
-    return task, model
-
-
 def scramble(task, generator):
     """Put a task's robots into random states, in place of its physics."""
     qpos = torch.randn(task.sim.qpos.shape, generator=generator)
@@ -77,6 +59,20 @@ def measured(task, world):
 
 TWO_RATES = "a1_multihead_two_rates"
 PARITY = [(name, settings) for name in [*TASKS, TWO_RATES] for settings in ("default", "changed")]
+
+
+@pytest.fixture(scope="module")
+def exported(make_task, tmp_path_factory):
+    """Folder of an export with two kinds of actions."""
+    folder = tmp_path_factory.mktemp("export") / "out"
+    export_random(make_task, "a1_torque_multihead", folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def description(exported):
+    """What the export has written."""
+    return yaml.safe_load((exported / "policy.yaml").read_text())
 
 
 @pytest.mark.parametrize(("name", "settings"), [*PARITY, ("a1_torque_multihead", "torques_once")])
@@ -129,20 +125,6 @@ def test_mixing_weights(make_task, tmp_path, name, end):
     assert [term["name"] for term in terms] == ["position_residual", "torque"]
     assert [term["mixing_weight"] for term in terms] == pytest.approx([theta, 1.0])
     assert 0.5 < theta < 0.7
-
-
-@pytest.fixture(scope="module")
-def exported(make_task, tmp_path_factory):
-    """Folder of an export with two kinds of actions."""
-    folder = tmp_path_factory.mktemp("export") / "out"
-    export_random(make_task, "a1_torque_multihead", folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def description(exported):
-    """What the export has written."""
-    return yaml.safe_load((exported / "policy.yaml").read_text())
 
 
 def test_description(exported, description):
@@ -201,21 +183,6 @@ def test_double_precision(exported):
         assert {part.dtype for part in results[-1]} == {np.dtype(policy.dtype)}
     for first, second in zip(*results, strict=True):
         np.testing.assert_allclose(first, second, rtol=1e-5, atol=1e-5)
-
-
-def change(path, value):
-    """A change of one entry by its dotted path; None deletes it."""
-
-    def apply(description):
-        *parents, last = [int(key) if key.isdigit() else key for key in path.split(".")]
-        for key in parents:
-            description = description[key]
-        if value is None:
-            del description[last]
-        else:
-            description[last] = value
-
-    return apply
 
 
 DAMAGE = [
@@ -279,9 +246,9 @@ def test_other_tasks_are_refused(make_task, exported, tmp_path, monkeypatch):
         "torques": ("_compute_torques", lambda task, actions: 1.1 * own_torques(task, actions)),
         "observations": ("observation_terms", shifted_terms),
     }
-    for message, change in changes.items():
+    for message, attribute in changes.items():
         with monkeypatch.context() as patch:
-            patch.setattr(robot, *change)
+            patch.setattr(robot, *attribute)
             error = error_of(export_random, make_task, "a1_position", folder)
         assert re.match(f"the {message} of LeggedRobot are not what policy.yaml can describe: they differ by", error)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
@@ -304,9 +271,9 @@ def test_unknown_terms_are_refused(make_task, tmp_path, monkeypatch):
             lambda task: [ActionTerm("impedance", task.action_scale, "rad", "")],
         ),
     }
-    for message, change in changes.items():
+    for message, attribute in changes.items():
         with monkeypatch.context() as patch:
-            patch.setattr(robot, *change)
+            patch.setattr(robot, *attribute)
             error = error_of(export_random, make_task, "a1_position", tmp_path / "out")
         assert error == f"policy.yaml has no {message}"
     assert not list(tmp_path.iterdir())

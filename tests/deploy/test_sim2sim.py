@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import mujoco
@@ -14,20 +13,19 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from settings import error_of
-from test_scripts import assert_told_in_one_line, run_here
+from support.exports import XML, changed_xml
+from support.scripts import assert_told_in_one_line, run_here
+from support.settings import error_of
 
 for package in ("onnx", "onnxruntime", "jsonschema"):
     pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
 
-from test_export import export_random
+from support.exports import export_random
 
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Events, Simulation, quaternion
 from legged_torque.viewer import video
-
-XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +40,6 @@ def exported(make_task, tmp_path_factory):
 def policy(exported):
     """The policy; whoever uses it resets it."""
     return Policy(exported[0])
-
-
-def changed_xml(folder, change):
-    """The A1's MJCF with a change of its tree, as a file."""
-    tree = ElementTree.parse(XML)
-    change(tree.getroot())
-    tree.write(folder / "robot.xml")
-    return folder / "robot.xml"
 
 
 def permute(root):

@@ -2,13 +2,22 @@
 
 import numpy as np
 import pytest
-from settings import error_of
-from test_robot_files import EVEN_TRUNK, changed, joint, servo, setting, shuffle_motors, turn_left_hips, unitree_order
+from support.robot_files import (
+    EVEN_TRUNK,
+    changed,
+    joint,
+    servo,
+    setting,
+    shuffle_motors,
+    turn_left_hips,
+    unitree_order,
+)
+from support.settings import error_of
 
 for package in ("onnx", "onnxruntime", "jsonschema"):
     pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
 
-from test_export import export_random
+from support.exports import export_random
 
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot

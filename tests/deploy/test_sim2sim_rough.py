@@ -8,15 +8,14 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from settings import error_of, flatten
-from test_scripts import assert_told_in_one_line, run_here
-from test_terrain import ground_cfg
+from support.ground import ground_cfg
+from support.scripts import assert_told_in_one_line, run_here
+from support.settings import error_of, flatten
 
 for package in ("onnx", "onnxruntime", "jsonschema"):
     pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
 
-from test_export import change, export_random
-from test_sim2sim import XML, changed_xml
+from support.exports import XML, change, changed_xml, export_random
 
 from legged_torque.deploy import hfield_contacts
 from legged_torque.deploy.description import check

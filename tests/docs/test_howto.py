@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from test_command import command
-from test_scripts import run_here
+from support.command import command
+from support.scripts import run_here
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.curriculum import LinearCurriculum

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from support.bad_worlds import WORLDS, Run, check
+from support.scripts import run_here
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_robustness import WORLDS, Run, check
-from test_scripts import run_here
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.approaches.torque_curriculum import TorqueCurriculumRobot

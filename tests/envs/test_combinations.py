@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from settings import error_of, get_cfgs, parse, torques_in_torch
-from test_action_delay import HIGH_UP, time_out
-from test_control import CONVERGED, NOMINAL, TORQUE_LIMIT, pd_by_hand, random_state
-from test_resume import content, differences, start, train
-from test_symmetry import mirror_policy
+from support.control import CONVERGED, NOMINAL, TORQUE_LIMIT, pd_by_hand, random_state
+from support.episodes import HIGH_UP, time_out
+from support.resume import content, differences, start, train
+from support.settings import error_of, get_cfgs, parse, torques_in_torch
+from support.symmetry import mirror_policy
 
 from legged_torque.envs import A1TorqueCfg, task_registry
 from legged_torque.envs.approaches.torque import TorqueRobot

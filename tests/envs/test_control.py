@@ -4,41 +4,17 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from support.control import CONVERGED, IN_THE_AIR, NOMINAL, TORQUE_LIMIT, pd_by_hand, random_state
 
-JOINTS = [f"{leg}_{link}" for leg in ("FR", "FL", "RR", "RL") for link in ("hip", "thigh", "calf")]
-NOMINAL = np.array([-0.1, 0.8, -1.5, 0.1, 0.8, -1.5, -0.1, 1.0, -1.5, 0.1, 1.0, -1.5])
-RANGE = {"hip": (-0.802851, 0.802851), "thigh": (-1.0472, 4.18879), "calf": (-2.69653, -0.916298)}
-LOW, HIGH = np.array([RANGE[name[3:]] for name in JOINTS]).T
-TORQUE_LIMIT = 33.5
-FEET = [4, 8, 12, 16]
-"""Columns of the feet in the contact buffers: after the trunk, each leg has hip, thigh, calf, foot."""
 POSITION_TASKS, TORQUE_TASKS = ["a1_position"], ["a1_torque", "a1_torque_curriculum"]
 MULTI_HEAD_TASKS = ["a1_torque_multihead", "a1_multihead"]
-IN_THE_AIR = {"init_state.pos": [0.0, 0.0, 2.0]}
-CONVERGED = {"sim.solver_iterations": 100, "sim.ls_iterations": 50}
 KEEP_COMMANDS = {"commands.resampling_probability": 0.0}
-
-
-def pd_by_hand(action, q, qd, kp=20.0, kd=0.5, scale=0.25):
-    """Eq. 8 in numpy."""
-    return kp * (NOMINAL + scale * action - q) - kd * qd
 
 
 def theta_by_hand(total_steps, end):
     """PD weight of eq. 7: from 1 to ``end`` over 50e6 steps, at the last multiple of 64k steps."""
     done = total_steps // 64_000 * 64_000
     return 1.0 + (end - 1.0) * min(done / 50e6, 1.0)
-
-
-def random_state(task, seed=0):
-    """Put joints into random angles and speeds; return them with random actions, in double precision."""
-    rng = np.random.default_rng(seed)
-    q = rng.uniform(LOW, HIGH, (task.num_envs, 12))
-    qd = rng.uniform(-5, 5, q.shape)
-    action = rng.normal(size=(task.num_envs, task.num_actions))
-    task.dof_pos.copy_(torch.tensor(q))
-    task.dof_vel.copy_(torch.tensor(qd))
-    return q, qd, action
 
 
 @pytest.mark.parametrize(("kp", "kd", "scale"), [(20.0, 0.5, 0.25), (35.0, 1.5, 0.5)])

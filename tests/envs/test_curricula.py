@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from test_rewards import TABLE_III
+from support.rewards import TABLE_III
 
 MILLION = 1_000_000
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from test_control import HIGH, IN_THE_AIR, LOW, NOMINAL
+from support.control import HIGH, IN_THE_AIR, LOW, NOMINAL
 
 
 def euler_by_hand(quat):

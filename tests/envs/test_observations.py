@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from test_control import FEET, IN_THE_AIR, NOMINAL, random_state
+from support.control import FEET, IN_THE_AIR, NOMINAL, random_state
 
 
 @pytest.mark.parametrize(("name", "num_actions"), [("a1_position", 12), ("a1_torque", 12), ("a1_multihead", 24)])

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from settings import error_of, get_cfgs
+from support.settings import error_of, get_cfgs
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.robots.a1 import A1Cfg

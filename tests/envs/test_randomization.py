@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from settings import error_of, get_cfgs
+from support.settings import error_of, get_cfgs
 
 from legged_torque.envs.base.domain_rand import of_model
 from legged_torque.envs.base.legged_robot import LeggedRobot

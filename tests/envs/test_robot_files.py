@@ -7,10 +7,21 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from settings import error_of
-from test_scripts import run_here
+from support.robot_files import (
+    A1,
+    EVEN_TRUNK,
+    UNITREE_ORDER,
+    joint,
+    servo,
+    setting,
+    shuffle_motors,
+    turn_left_hips,
+    unitree_order,
+)
+from support.robot_files import changed as changed  # a fixture
+from support.scripts import run_here
+from support.settings import error_of
 
-from legged_torque import RESOURCES_DIR
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.held_pose import standing_note
 from legged_torque.envs.robots.a1 import A1Cfg
@@ -19,24 +30,7 @@ from legged_torque.sim.simulator import ENGINES, Simulator
 from legged_torque.utils.mjcf import read_spec, robot_notes
 from legged_torque.viewer.ground import drawn_model
 
-A1 = RESOURCES_DIR / "robots/a1/a1.xml"
 POSE = A1Cfg.init_state.default_joint_angles
-UNITREE_ORDER = ("FL", "FR", "RL", "RR")
-
-
-@pytest.fixture
-def changed(tmp_path):
-    """Factory of files: the A1's MJCF with a change of its tree, without its keyframe."""
-
-    def write(*changes):
-        root = ElementTree.parse(A1).getroot()
-        root.remove(root.find("keyframe"))
-        for change in changes:
-            change(root)
-        ElementTree.ElementTree(root).write(tmp_path / "robot.xml")
-        return str(tmp_path / "robot.xml")
-
-    return write
 
 
 def cfg_of(file):
@@ -44,52 +38,6 @@ def cfg_of(file):
     cfg = A1Cfg()
     cfg.asset.file, cfg.env.num_envs = file, 2
     return cfg
-
-
-def shuffle_motors(root):
-    """Motors in an order that is not that of the joints."""
-    motors = root.find("actuator")
-    motors[:] = motors[7:] + motors[:7]
-
-
-def unitree_order(root):
-    """Joints FL, FR, RL, RR, motors FR, FL, RR, RL, as in Unitree's own go2.xml."""
-    trunk = root.find("worldbody/body")
-    legs = {leg.get("name")[:2]: leg for leg in trunk.findall("body")}
-    for leg in UNITREE_ORDER:
-        trunk.remove(legs[leg])
-        trunk.append(legs[leg])
-
-
-def setting(path, **attributes):
-    """A change of the attributes of all elements of a path; None takes one away."""
-
-    def change(root):
-        found = root.findall(path)
-        assert found
-        for element in found:
-            for name, value in attributes.items():
-                element.set(name, value) if value is not None else element.attrib.pop(name)
-
-    return change
-
-
-def joint(name, **attributes):
-    """A change of a joint."""
-    return setting(f".//joint[@name='{name}']", **attributes)
-
-
-def servo(*numbers):
-    """A change that makes position servos of some actuators."""
-
-    def change(root):
-        for number in numbers:
-            actuator = root.find("actuator")[number]
-            actuator.tag = "position"
-            actuator.attrib.pop("class", None)
-            actuator.set("kp", "50")
-
-    return change
 
 
 def torques_of(file, ctrl):
@@ -380,17 +328,6 @@ def test_another_robot_than_in_training(changed, tmp_path):
 
 
 # --------------------------------------------------------------------------------------------------- symmetry
-
-
-EVEN_TRUNK = setting(
-    "worldbody/body/inertial", pos="0 0 -0.0005", fullinertia="0.0158533 0.0377999 0.0456542 0 -6.11e-05 0"
-)
-
-
-def turn_left_hips(root):
-    """Left hips turn about an axis that points backwards; their range is symmetric."""
-    for leg in ("FL", "RL"):
-        joint(f"{leg}_hip_joint", axis="-1 0 0")(root)
 
 
 def test_mirror_images_follow_axes(changed, make_task):

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from settings import error_of
+from support.settings import error_of
 
 from legged_torque import resource_path
 from legged_torque.envs import task_registry

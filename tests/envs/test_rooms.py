@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from settings import error_of
+from support.settings import error_of
 
 from legged_torque.envs.base.asset import by_joint, nominal_pose
 from legged_torque.envs.base.legged_robot import LeggedRobot

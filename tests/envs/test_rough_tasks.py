@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from settings import COMBINATIONS, TASKS
+from support.settings import COMBINATIONS, TASKS
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import flat, to_dict

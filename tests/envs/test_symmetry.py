@@ -4,7 +4,8 @@ import math
 
 import pytest
 import torch
-from settings import get_cfgs
+from support.settings import get_cfgs
+from support.symmetry import mirror_joints, mirror_policy
 from tensordict import TensorDict
 from torch import nn
 
@@ -23,12 +24,6 @@ DRAWN = 117
 """Numbers of a world that may be drawn at random."""
 
 
-def mirror_joints(values):
-    """Joint by joint: FR and FL change places, RR and RL do, and hips, which turn about x, change their sign."""
-    legs = values.reshape(len(values), -1, 4, 3)[:, :, [1, 0, 3, 2]]
-    return (legs * torch.tensor([-1.0, 1.0, 1.0])).reshape(values.shape)
-
-
 def mirror_qpos(qpos):
     """The plane y = 0 reflects positions in y and turns rotations about x and z around."""
     return torch.cat([qpos[:, :7] * torch.tensor([1.0, -1, 1, 1, -1, 1, -1]), mirror_joints(qpos[:, 7:])], dim=1)
@@ -37,12 +32,6 @@ def mirror_qpos(qpos):
 def mirror_qvel(qvel):
     """Velocities are reflected as positions are; angular velocities about x and z change their sign."""
     return torch.cat([qvel[:, :6] * torch.tensor([1.0, -1, 1, -1, 1, -1]), mirror_joints(qvel[:, 6:])], dim=1)
-
-
-def mirror_policy(obs):
-    """Gravity, angular velocity, command, joint positions, joint velocities, last actions."""
-    signs = torch.tensor([1.0, -1, 1, -1, 1, -1, 1, -1, -1])
-    return torch.cat([obs[:, :9] * signs, *map(mirror_joints, (obs[:, 9:21], obs[:, 21:33], obs[:, 33:]))], dim=1)
 
 
 def mirror_critic(obs):

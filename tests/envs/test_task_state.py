@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from settings import error_of
-from test_rewards import TABLE_III
+from support.rewards import TABLE_III
+from support.settings import error_of
 
 from legged_torque.learning.worlds import check_identity, identity
 from legged_torque.terrain.tiles import TILES

@@ -12,8 +12,8 @@ import time
 
 import pytest
 import torch
-from test_experiment import SMALL, experiment_here, wait_for, write
-from test_scripts import assert_told_in_one_line, contents
+from support.experiments import SMALL, experiment_here, wait_for, write
+from support.scripts import assert_told_in_one_line, contents
 
 from legged_torque.experiments import matrix as experiment
 from legged_torque.experiments import run as experiment_run

@@ -9,9 +9,9 @@ import threading
 from pathlib import Path
 
 import pytest
-from settings import error_of
-from test_experiment import SMALL, experiment_here, wait_for, write
-from test_scripts import ROOT, assert_told_in_one_line
+from support.experiments import SMALL, experiment_here, wait_for, write
+from support.scripts import ROOT, assert_told_in_one_line
+from support.settings import error_of
 
 ray = pytest.importorskip("ray", reason="needs the extra: pip install -e .[ray]")
 

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from settings import error_of, get_cfgs
-from test_scripts import run_here
+from support.scripts import run_here
+from support.settings import error_of, get_cfgs
 
 from legged_torque.envs import task_registry
 from legged_torque.sim import graph

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from settings import error_of
-from test_terrain import ground_cfg, make_ground
+from support.ground import ground_cfg, make_ground
+from support.settings import error_of
 
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.learning.crossing import Grounds, cross

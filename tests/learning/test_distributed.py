@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from settings import parse
-from test_ppo import make_ppo, record_rollout, state_of
-from test_random_stream import upcoming
+from support.random_stream import upcoming
+from support.rollouts import make_ppo, record_rollout, state_of
+from support.settings import parse
 
 from legged_torque.envs import task_registry
 from legged_torque.learning.guard import PATIENCE

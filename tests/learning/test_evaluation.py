@@ -9,10 +9,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from settings import error_of, flatten, get, get_cfgs
+from support.rollouts import make_ppo, record_rollout
+from support.scripts import assert_told_in_one_line, contents, run_here
+from support.settings import error_of, flatten, get, get_cfgs
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_ppo import make_ppo, record_rollout
-from test_scripts import assert_told_in_one_line, contents, run_here
 from torch.nn.functional import elu, linear
 
 from legged_torque.envs import task_registry

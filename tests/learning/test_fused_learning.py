@@ -11,7 +11,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from rollouts import (
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from support.rollouts import (
     POISONS,
     SETTINGS,
     SIZES,
@@ -22,9 +25,6 @@ from rollouts import (
     random_obs,
     record_rollout,
 )
-from rsl_rl.algorithms import PPO
-from rsl_rl.models import MLPModel
-from rsl_rl.storage import RolloutStorage
 
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.multi_head import MultiHeadModel

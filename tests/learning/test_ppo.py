@@ -6,7 +6,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from rollouts import (
+from rsl_rl.algorithms import PPO
+from support.rollouts import (
     NUM_ACTIONS,
     SAMPLES,
     STEPS,
@@ -17,20 +18,13 @@ from rollouts import (
     parameters,
     random_obs,
     record_rollout,
+    shift_policy,
     state_of,
     steps_taken,
 )
-from rsl_rl.algorithms import PPO
 
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.utils.errors import UserError
-
-
-def shift_policy(alg, amount):
-    """Move the policy away from the one that has acted, as earlier updates would."""
-    with torch.no_grad():
-        alg.actor.mlp[-1].bias += amount
-        alg.actor.distribution.log_std_param += amount
 
 
 def pair_with_rollout(shift=0.0, **settings):

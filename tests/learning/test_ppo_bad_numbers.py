@@ -5,7 +5,8 @@ import math
 
 import pytest
 import torch
-from rollouts import (
+from rsl_rl.algorithms import PPO
+from support.rollouts import (
     NUM_ACTIONS,
     POISONS,
     SAMPLES,
@@ -19,7 +20,6 @@ from rollouts import (
     state_of,
     steps_taken,
 )
-from rsl_rl.algorithms import PPO
 
 
 @pytest.mark.parametrize(("field", "value"), POISONS)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from settings import error_of, parse
+from support.settings import error_of, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.utils import distributed

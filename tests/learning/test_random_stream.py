@@ -4,7 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from settings import error_of, parse
+from support.random_stream import upcoming
+from support.settings import error_of, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.learning import runner as runner_module
@@ -14,14 +15,6 @@ from legged_torque.utils.task_registry import set_seed
 WORDS = ["--task=a1_torque", "--num_envs=2", "--seed=3", "--set=runner.num_steps_per_env=3", "--logger=none"]
 WORDS += ["--set=algorithm.num_mini_batches=1", "--set=actor.hidden_dims=[8]", "--set=critic.hidden_dims=[8]"]
 WORDS += ["--set=runner.save_interval=1"]
-
-
-def upcoming():
-    """The next numbers of the stream, which stays where it is."""
-    state = torch.get_rng_state()
-    numbers = torch.rand(5)
-    torch.set_rng_state(state)
-    return numbers
 
 
 def start(log_root, *words):

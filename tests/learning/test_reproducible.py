@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_scripts import run_here
+from support.scripts import run_here
 
 from tools.reproducible import Training, compare, kill_often, values
 

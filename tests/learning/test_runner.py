@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from settings import COMBINATIONS, TASKS
+from support.settings import COMBINATIONS, TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.envs import task_registry

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from settings import error_of, get_cfgs, torques_in_torch
-from test_control import pd_by_hand
+from support.control import pd_by_hand
+from support.episodes import HIGH_UP, time_out
+from support.settings import error_of, get_cfgs, torques_in_torch
 
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.config import set_by_path
 
-HIGH_UP = {"init_state.pos": [0.0, 0.0, 50.0]}
-"""No world falls and starts anew by itself."""
 EXCEEDED = {1: 10.83, 3: 16.27, 5: 20.52, 15: 37.70, 35: 66.62}
 """What 1 in 1000 chi-square numbers exceeds, by degrees of freedom."""
 
@@ -53,13 +52,6 @@ def arrived(sent, decimation, delay):
     at_physics_step = [actions for actions in sent for _ in range(decimation)]
     nothing = np.zeros_like(sent[0])
     return np.stack([nothing if t < delay else at_physics_step[t - delay] for t in range(len(at_physics_step))])
-
-
-def time_out(task, worlds):
-    """Let the episodes of some worlds end with the next control step."""
-    lengths = task.episode_length_buf.clone()
-    lengths[worlds] = task.max_episode_length
-    task.episode_length_buf = lengths
 
 
 def test_off_by_default(make_task):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from settings import torques_in_torch
-from test_action_delay import HIGH_UP, time_out
-from test_control import TORQUE_LIMIT, pd_by_hand
-from test_fused import compiled, make_walker, random
+from support.control import TORQUE_LIMIT, pd_by_hand
+from support.episodes import HIGH_UP, time_out
+from support.fused import compiled, make_walker, random
+from support.settings import torques_in_torch
 
 from legged_torque.envs.base.control_laws import PdControl, pd_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot

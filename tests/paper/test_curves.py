@@ -7,9 +7,9 @@ import shutil
 
 import pytest
 import yaml
-from settings import error_of
-from test_report import HEADER, line
-from test_scripts import assert_told_in_one_line, run_here
+from support.reports import HEADER, line
+from support.scripts import assert_told_in_one_line, run_here
+from support.settings import error_of
 
 from legged_torque.paper.report.curves import CURVE_METRICS, read_curves
 

@@ -1,12 +1,12 @@
 """Gravity pre-training: the pairs, the supervision, the report and the file."""
 
 import copy
-import json
 
 import pytest
 import torch
-from settings import error_of, get_cfgs, parse
-from test_scripts import run_here
+from support.gravity import FEW, SMALL, STD, TASK, words_of
+from support.gravity import made as made  # a fixture
+from support.settings import error_of, get_cfgs, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.learning.pretrained import read_pretrained
@@ -33,13 +33,8 @@ from legged_torque.paper.gravity.whole_body import WholeBodyController, WholeBod
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.config import to_dict
 
-TASK = "a1_torque_gravity"
-SMALL = ["--device=cpu", "--num_envs=16"]
-FEW = {"num_rounds": 2, "num_epochs": 3, "batch_size": 16}
-CONFIGURATIONS, STEPS = 41, 6
 WEIGHT = 12.453 * 9.81
 TORQUE_SCALE, TORQUE_LIMIT = 8.0, 33.5
-STD = "distribution.log_std_param"
 LAST_ACTION = slice(33, 45)
 """Where the last action is in what the policy sees, after 9 numbers of the trunk, 12 angles and 12 velocities."""
 
@@ -49,11 +44,6 @@ OTHER_SIDE = torch.tensor([3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8])
 JOINT_SIGNS = torch.tensor([-1.0, 1.0, 1.0] * 4)
 OTHER_SIDE_SEEN = torch.cat([torch.arange(9), 9 + OTHER_SIDE, 21 + OTHER_SIDE, 33 + OTHER_SIDE])
 SEEN_SIGNS = torch.cat([torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0]), *[JOINT_SIGNS] * 3])
-
-
-def words_of(**changes):
-    """Changes of the settings of pre-training, as words of a command line."""
-    return [f"--set=pretraining.{name}={value}" for name, value in changes.items()]
 
 
 def settings_of(**changes):
@@ -70,17 +60,6 @@ def make_actor(task):
     """The policy of a training, with random weights that are the same every time."""
     torch.manual_seed(0)
     return task_registry.make_alg_runner(task, train_cfg=get_cfgs(task=TASK)[1], log_root=None)[0].alg.actor
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A folder in which pretrain_gravity.py has made a small policy: the folder, its file, the report, the output."""
-    root = tmp_path_factory.mktemp("pretrained")
-    few = [f"--num_configurations={CONFIGURATIONS}", f"--num_steps={STEPS}", *words_of(**FEW)]
-    status, output, error = run_here("pretrain_gravity.py", *SMALL, *few, f"--json={root / 'report.json'}", root=root)
-    assert (status, error) == (0, ""), output + error
-    file = root / "logs" / "pretrained" / f"{TASK}.pt"
-    return root, file, json.loads((root / "report.json").read_text()), output
 
 
 @pytest.fixture(scope="module")

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from settings import error_of, get_cfgs
-from test_gravity_pretraining import CONFIGURATIONS, FEW, SMALL, STD, STEPS, TASK, words_of
-from test_gravity_pretraining import made as made  # a fixture
-from test_ppo import make_ppo, record_rollout, shift_policy, state_of
-from test_scripts import assert_told_in_one_line, contents, run_here
+from support.gravity import CONFIGURATIONS, FEW, SMALL, STD, STEPS, TASK, words_of
+from support.gravity import made as made  # a fixture
+from support.rollouts import make_ppo, record_rollout, shift_policy, state_of
+from support.scripts import assert_told_in_one_line, contents, run_here
+from support.settings import error_of, get_cfgs
 
 from legged_torque.learning.pretrained import check_making, check_spaces, read_pretrained
 from legged_torque.paper.gravity import pretraining as gravity_pretraining

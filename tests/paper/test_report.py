@@ -3,105 +3,39 @@
 import csv
 import gzip
 import io
-import json
 import math
-import runpy
 import sys
 from pathlib import Path
 
 import pytest
 import yaml
+from support.reports import (
+    ALL_METRICS,
+    HEADER,
+    SETTINGS,
+    line,
+    run_script,
+    whole_run,
+    write_experiment,
+    write_grounds,
+    write_part,
+    write_result,
+)
 
 from legged_torque.experiments.matrix import Cell, Matrix
 from legged_torque.paper.report import figures, figures_curves, figures_style
-from legged_torque.paper.report.curves import CURVE_METRICS, read_rows
+from legged_torque.paper.report.curves import read_rows
 from legged_torque.paper.report.report import run_problems
 from legged_torque.paper.report.results import CellResult, Experiment, compare, holm, read_experiment, summarize, welch
 from legged_torque.paper.values import ENVIRONMENTS, PAPER_METRICS, TABLE_I, paper_value
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "report.py"
-HEADER = (
-    "steps,iteration,seconds,track_percentage,track_xy,track_angular,collision_force,cost_of_transport,height,speed,"
-    "falls_per_minute,critic_gradient_norm"
-)
-ALL_METRICS = [metric.name for metric in CURVE_METRICS]
-TASKS = ["a1_position", "a1_torque", "a1_multihead"]
 CELL = Cell(Path("a1_torque-low-s1"), "a1_torque", "low", 1, ("low",))
-SETTINGS = {
-    "env": {"env": {"num_envs": 1000}},
-    "train": {"runner": {"num_steps_per_env": 1000}},  # a million steps per iteration
-    "max_iterations": 110,
-    "device": "cuda:0",
-    "versions": {"python": "3.11.0", "torch": "2.11.0"},
-}
-
-
-def line(million, tracking, **others):
-    """A line of evaluations.csv: all metrics are 10 times the tracking, if they are not given."""
-    values = dict.fromkeys(ALL_METRICS, 10.0 * tracking) | {"track_percentage": tracking} | others
-    return f"{million * 1_000_000},{million},{million}.5," + ",".join(str(values[name]) for name in ALL_METRICS)
-
-
-def write_part(folder, lines, end="\n", **settings):
-    """Write the folder of a run, or of a part of one."""
-    folder.mkdir(parents=True)
-    task, _ = folder.parent.name.split("-")[:2]
-    config = {"task": task, **SETTINGS, **settings}
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
-    (folder / "evaluations.csv").write_text("\n".join([HEADER, *lines]) + end)
-
-
-def write_result(cell, environment, tracking, steps=110_000_000):
-    """Write what evaluate.py has measured in an environment."""
-    metrics = {name: {"mean": tracking, "standard_error": 0.01} for name, _ in TABLE_I}
-    result = {"task": "any", "steps": steps, "device": "NVIDIA H200", "metrics": metrics}
-    (cell / f"result_{environment}.json").write_text(json.dumps(result))
-
-
-def write_experiment(folder, environments=None, seeds=(1, 2), tasks=TASKS):
-    """Write the plan of an experiment."""
-    folder.mkdir(parents=True, exist_ok=True)
-    environments = environments or {"low": ["low", "high"], "high_frequency": ["high_frequency", "doubled"]}
-    plan = {"tasks": list(tasks), "environments": environments, "seeds": list(seeds)}
-    (folder / "experiment.yaml").write_text(yaml.safe_dump(plan, sort_keys=False))
-
-
-def whole_run(tracking):
-    """Lines of a finished training: bad before step 90 million, then around the given value."""
-    return [line(10, 0.1), line(80, 0.2), line(90, tracking - 0.05), line(100, tracking), line(110, tracking + 0.05)]
-
-
-@pytest.fixture
-def folder(tmp_path):
-    """An experiment: position complete in low, torque with one seed, unfinished, and multihead not begun."""
-    folder = tmp_path / "paper"
-    write_experiment(folder)
-    for seed, tracking in ((1, 0.7), (2, 0.8)):
-        cell = folder / f"a1_position-low-s{seed}"
-        write_part(cell / "2026-01-01_00-00-00", whole_run(tracking))
-        write_result(cell, "high", tracking - 0.1)
-        cell = folder / f"a1_position-high_frequency-s{seed}"
-        write_part(cell / "2026-01-01_00-00-00", whole_run(tracking - 0.2))
-        write_result(cell, "doubled", tracking - 0.3)
-    write_part(folder / "a1_torque-low-s1" / "2026-01-01_00-00-00", [line(i, i / 100) for i in range(10, 60, 10)])
-    return folder
 
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
     """Figures of few pixels, which are drawn fast."""
     monkeypatch.setitem(figures_style.SETTINGS, "savefig.dpi", 20)
-
-
-def run_script(*words):
-    """Run the script in this process; return its exit status."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["report.py", *map(str, words)])
-        try:
-            runpy.run_path(str(SCRIPT), run_name="__main__")
-        except SystemExit as stop:
-            return stop.code
-    return 0
 
 
 def rows_of(content):
@@ -120,6 +54,22 @@ def report(folder, tmp_path, monkeypatch):
 
 
 # what the paper says
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """An experiment: position complete in low, torque with one seed, unfinished, and multihead not begun."""
+    folder = tmp_path / "paper"
+    write_experiment(folder)
+    for seed, tracking in ((1, 0.7), (2, 0.8)):
+        cell = folder / f"a1_position-low-s{seed}"
+        write_part(cell / "2026-01-01_00-00-00", whole_run(tracking))
+        write_result(cell, "high", tracking - 0.1)
+        cell = folder / f"a1_position-high_frequency-s{seed}"
+        write_part(cell / "2026-01-01_00-00-00", whole_run(tracking - 0.2))
+        write_result(cell, "doubled", tracking - 0.3)
+    write_part(folder / "a1_torque-low-s1" / "2026-01-01_00-00-00", [line(i, i / 100) for i in range(10, 60, 10)])
+    return folder
 
 
 def test_values_of_the_paper():
@@ -425,19 +375,6 @@ def test_mistakes(tmp_path, capsys, plan, words, message):
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and message in error
     assert not (tmp_path / "out").exists()
-
-
-def write_grounds(cell, crossed):
-    """Write what evaluate.py has measured on tiles: shares of robots by kind and level; tracking is a tenth of it."""
-    cell.mkdir(parents=True, exist_ok=True)
-    estimates = {tile: {"mean": share, "standard_error": 0.1} for tile, share in crossed.items()}
-    tenth = {tile: {"mean": share / 10} for tile, share in crossed.items()}
-    entries = [
-        {"kind": tile[0], "level": tile[1], "crossed": share, "fell": {"mean": 0.25}}
-        | {"metrics": {"track_percentage": tenth[tile], "cost_of_transport": {"mean": None}}}
-        for tile, share in estimates.items()
-    ]
-    (cell / "grounds.json").write_text(json.dumps({"grounds": entries}))
 
 
 def test_rough_ground(tmp_path):

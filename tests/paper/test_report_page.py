@@ -4,10 +4,9 @@ import base64
 import copy
 import itertools
 import re
-from html.parser import HTMLParser
 
 import pytest
-from test_report import HEADER, SETTINGS, line, run_script, write_experiment, write_part
+from support.reports import HEADER, SETTINGS, Page, line, run_script, write_experiment, write_part
 
 from legged_torque.experiments.times import Times, write_times
 from legged_torque.paper.report import figures, figures_curves, figures_style
@@ -19,8 +18,6 @@ from legged_torque.utils.metrics import METRICS
 
 METRIC = {metric.name: metric for metric in METRICS}
 EVIL = "</code></pre><script>alert(1)</script> <img src=http://evil.example/x.png> & `x` | **y**"
-VOID = {"meta", "img", "br"}
-SIGNS = {"✓": "better", "≈": "within", "✗": "worse"}
 
 
 @pytest.mark.parametrize(
@@ -85,42 +82,6 @@ def test_best_torque_methods(papers_table):
     assert force[0] == "135.1 (PD)" and force[1] == "Torque curriculum" and force[3] == "✗ -0.7%"  # 136.0
     assert rows["Track % [share]", "high"][1:] == ["no data", "", ""]
     assert text.text.startswith("**In 1 of 15 rows the best torque method is better than the paper's best by 5%")
-
-
-class Page(HTMLParser):
-    """What a page holds: tags that are balanced, references, tables, and its text."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.open, self.references, self.tables, self.kinds, self.text = [], [], [], [], ""
-        self.feed(text)
-        self.close()
-        assert not self.open
-
-    def handle_starttag(self, tag, attrs):
-        assert tag not in ("script", "link", "iframe", "object", "form")
-        self.references += [value for name, value in attrs if name in ("src", "href", "srcset", "poster", "data")]
-        assert not any(name.startswith("on") for name, _ in attrs)
-        if tag not in VOID:
-            self.open.append(tag)
-        if tag == "table":
-            self.tables.append([])
-        if tag == "tr":
-            self.tables[-1].append([])
-        if tag in ("td", "th"):
-            self.tables[-1][-1].append("")
-            self.kinds.append(dict(attrs).get("class"))
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-        if tag in ("td", "th"):
-            cell = self.tables[-1][-1][-1]
-            assert self.kinds[-1] == (SIGNS.get(cell[:1]) if tag == "td" else None), cell
-
-    def handle_data(self, data):
-        self.text += data
-        if {"td", "th"} & set(self.open):
-            self.tables[-1][-1][-1] += data
 
 
 def markdown_tables(text):

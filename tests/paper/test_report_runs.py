@@ -5,8 +5,7 @@ import csv
 import numpy as np
 import pytest
 import yaml
-from test_report import HEADER, line, run_script, whole_run, write_grounds
-from test_report_page import Page
+from support.reports import HEADER, Page, line, run_script, whole_run, write_grounds
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.paper.report import figures, figures_bars, figures_curves

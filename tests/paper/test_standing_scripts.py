@@ -6,7 +6,7 @@ import sys
 
 import pytest
 import torch
-from test_scripts import ROOT, assert_told_in_one_line, contents, run_here
+from support.scripts import ROOT, assert_told_in_one_line, contents, run_here
 
 from legged_torque.paper.gravity import pretraining as gravity_pretraining
 

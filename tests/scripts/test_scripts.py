@@ -1,12 +1,9 @@
 """The scripts as a user runs them: mistakes are told in one line, and training, stopping, resuming and playing fit."""
 
-import contextlib
-import io
 import json
 import math
 import os
 import re
-import runpy
 import shutil
 import signal
 import subprocess
@@ -17,33 +14,11 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from settings import COMBINATIONS, OTHER_ROBOTS, ROUGH, TASKS
+from support.scripts import ROOT, SMALL, assert_light, assert_told_in_one_line, contents, run_here
+from support.settings import COMBINATIONS, OTHER_ROBOTS, ROUGH, TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers
-
-ROOT = Path(__file__).resolve().parents[2]
-SMALL = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--set=runner.num_steps_per_env=4", "--max_iterations=2"]
-
-
-def run_here(script, *words, root):
-    """Run a script in this process, in the folder ``root``, whose ``logs/`` it writes.
-
-    Returns:
-        Exit status, standard output, standard error without what tells that kernels are being compiled.
-    """
-    output, error, status = io.StringIO(), io.StringIO(), 0
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(output), contextlib.redirect_stderr(error):
-        patch.chdir(root)
-        patch.setattr(sys, "argv", [script, *words])
-        patch.setenv("MUJOCO_GL", "disable")  # given back afterwards: play.py chooses another one
-        try:
-            runpy.run_path(str(ROOT / "scripts" / script), run_name="__main__")
-        except SystemExit as stop:
-            status = stop.code or 0
-    lines = error.getvalue().splitlines(keepends=True)
-    told = [line for line in lines if not line.startswith(("compiling kernels", "compiled kernels"))]
-    return status, output.getvalue(), "".join(told)
 
 
 def start(script, *words, root):
@@ -61,40 +36,6 @@ def finish(process):
     with process:
         output, error = process.communicate(timeout=300)
     return process.returncode, output, error
-
-
-def contents(folder):
-    """Every file and folder below a folder, with what would give away a change."""
-    return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in folder.rglob("*")}
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    """A folder whose logs hold a run of ``a1_position`` and broken copies of it, one experiment each."""
-    root = tmp_path_factory.mktemp("root")
-    status, _, error = run_here("train.py", *SMALL, "--set=runner.save_interval=1", "--run_name=good", root=root)
-    assert (status, error) == (0, "")
-    (run,) = (root / "logs" / "a1_position").iterdir()
-    config = (run / "config.yaml").read_text()
-    broken = {
-        "not_yaml": "task: [a1_position",
-        "no_mapping": "walk",
-        "no_entries": "task: a1_position",
-        "unknown_key": config.replace("num_envs:", "num_env:"),
-        "wrong_type": config.replace("torques: -0.0002", "torques: little"),
-        "no_section": re.sub(r"^env:\n(  .*\n)+", "env: 3\n", config, flags=re.MULTILINE),
-    }
-    for name, text in broken.items():
-        copy = shutil.copytree(run, root / "logs" / name / run.name)
-        assert text != config
-        (copy / "config.yaml").write_text(text)
-    (shutil.copytree(run, root / "logs" / "no_config" / run.name) / "config.yaml").unlink()
-    checkpoint = (run / "model_2.pt").read_bytes()
-    for name, content in {"text": b"this is no checkpoint\n", "half": checkpoint[: len(checkpoint) // 2]}.items():
-        copy = shutil.copytree(run, root / "logs" / f"{name}_checkpoint" / run.name)
-        for number in (0, 1, 2):
-            (copy / f"model_{number}.pt").write_bytes(content)
-    return root
 
 
 MISTAKES = [
@@ -176,12 +117,33 @@ MISTAKES = [
 ]
 
 
-def assert_told_in_one_line(result, message):
-    """The exit status is 2 and standard error one line that begins with ``error:`` and holds the message."""
-    status, _, error = result
-    assert error.startswith("error: ") and error.count("\n") == 1 and error.endswith("\n"), error
-    assert message in error
-    assert status == 2
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """A folder whose logs hold a run of ``a1_position`` and broken copies of it, one experiment each."""
+    root = tmp_path_factory.mktemp("root")
+    status, _, error = run_here("train.py", *SMALL, "--set=runner.save_interval=1", "--run_name=good", root=root)
+    assert (status, error) == (0, "")
+    (run,) = (root / "logs" / "a1_position").iterdir()
+    config = (run / "config.yaml").read_text()
+    broken = {
+        "not_yaml": "task: [a1_position",
+        "no_mapping": "walk",
+        "no_entries": "task: a1_position",
+        "unknown_key": config.replace("num_envs:", "num_env:"),
+        "wrong_type": config.replace("torques: -0.0002", "torques: little"),
+        "no_section": re.sub(r"^env:\n(  .*\n)+", "env: 3\n", config, flags=re.MULTILINE),
+    }
+    for name, text in broken.items():
+        copy = shutil.copytree(run, root / "logs" / name / run.name)
+        assert text != config
+        (copy / "config.yaml").write_text(text)
+    (shutil.copytree(run, root / "logs" / "no_config" / run.name) / "config.yaml").unlink()
+    checkpoint = (run / "model_2.pt").read_bytes()
+    for name, content in {"text": b"this is no checkpoint\n", "half": checkpoint[: len(checkpoint) // 2]}.items():
+        copy = shutil.copytree(run, root / "logs" / f"{name}_checkpoint" / run.name)
+        for number in (0, 1, 2):
+            (copy / f"model_{number}.pt").write_bytes(content)
+    return root
 
 
 @pytest.mark.parametrize(("words", "message"), MISTAKES, ids=[words for words, _ in MISTAKES])
@@ -259,30 +221,6 @@ def test_help(script, tmp_path):
     status, output, error = run_here(script, "--help", root=tmp_path)
     assert (status, error) == (0, "")
     assert "--task" in output and "--num_envs" in output and "--device" in output
-
-
-LIGHT = """import json, runpy, sys
-for path, *words in json.loads(sys.argv[1]):
-    sys.argv, status = [path, *words], 0
-    try:
-        runpy.run_path(path, run_name="__main__")
-    except SystemExit as end:
-        status = end.code or 0
-    print()
-    print("result:", json.dumps([status, *(name for name in sys.modules if "." not in name)]))"""
-HEAVY = {"torch", "warp", "mujoco", "mujoco_warp", "rsl_rl", "tensordict", "matplotlib"}
-"""Packages that take long to import."""
-
-
-def assert_light(answers, root):
-    """Scripts with words, one after the other in a process, end with the status of each and import nothing heavy."""
-    commands = json.dumps([[str(ROOT / "scripts" / script), *words] for script, *words in answers])
-    command, environment = [sys.executable, "-c", LIGHT, commands], {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
-    results = [json.loads(line[8:]) for line in done.stdout.splitlines() if line.startswith("result: ")]
-    for (words, expected), (status, *imported) in zip(answers.items(), results, strict=True):
-        assert (status, HEAVY & set(imported)) == (expected, set()), words
-        assert "legged_torque" in imported
 
 
 def test_answers_need_nothing_heavy(tmp_path):

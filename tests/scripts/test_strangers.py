@@ -11,8 +11,8 @@ import zipfile
 import pytest
 import torch
 import yaml
-from settings import error_of, get_cfgs, parse
-from test_scripts import SMALL, assert_told_in_one_line, contents, run_here
+from support.scripts import SMALL, assert_told_in_one_line, contents, run_here
+from support.settings import error_of, get_cfgs, parse
 
 from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from settings import error_of
+from support.settings import error_of
 
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg

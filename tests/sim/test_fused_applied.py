@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from test_fused import AIR, FIELDS, FLOOR, ROBOTS, compiled, draw_states, put, random
+from support.fused import AIR, FIELDS, FLOOR, ROBOTS, compiled, draw_states, put, random
 
 from legged_torque.sim.simulator import ENGINES, Simulator
 

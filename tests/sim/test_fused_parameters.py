@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from test_fused import FIELDS, assert_alike, compiled, draw_states, make_a1, make_crab, random, step_fused, step_mujoco
+from support.fused import (
+    FIELDS,
+    assert_alike,
+    compiled,
+    draw_states,
+    make_a1,
+    make_crab,
+    random,
+    step_fused,
+    step_mujoco,
+)
 
 from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.simulator import Simulator

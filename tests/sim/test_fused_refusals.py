@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from test_fused import assert_alike, compiled, draw_states, make_a1, put, step_fused, step_mujoco
+from support.fused import assert_alike, compiled, draw_states, make_a1, put, step_fused, step_mujoco
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.envs.base.domain_rand import of_model

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from test_fused import assert_alike, compiled, draw_states, invariants, make_a1, put, step_mujoco
+from support.fused import assert_alike, compiled, draw_states, invariants, make_a1, put, step_mujoco
 
 from legged_torque.envs import task_registry
 from legged_torque.sim.fused.surface import Surface, Touch, make_surface, touch_map

@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from settings import error_of
-from test_fused import assert_alike, put, step_fused, step_mujoco
+from support.fused import assert_alike, put, step_fused, step_mujoco
+from support.settings import error_of
 
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg

@@ -6,20 +6,15 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from support.simulator import CONVERGED, LEGS, SENSED, WEIGHT, contacts_by_hand
 
 from legged_torque.sim import simulator
 from legged_torque.sim.simulator import ENGINES, Simulator
 
-LEGS = ("FR", "FL", "RR", "RL")
-SENSED = ["trunk", *(f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh", "calf", "foot"))]
-"""Columns of the contact buffers: all collision geoms of the robot in the order of the XML."""
 FEET = [i for i, name in enumerate(SENSED) if name.endswith("foot")]
-WEIGHT = 12.453 * 9.81
 LEG_UP = (0.0, 2.6, -0.95)
 """Angles of a leg that points up, away from the floor."""
 
-CONVERGED = {"sim.solver_iterations": 100, "sim.ls_iterations": 50}
-"""Solver limits that neither MuJoCo nor MuJoCo Warp reaches, so that both find the same minimum."""
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "contact_found", "contact_force")
 
 
@@ -27,19 +22,6 @@ def copy_state(sim, world, data):
     """Write one world's state, torques and warm start into plain MuJoCo's data."""
     for field in ("qpos", "qvel", "qacc_warmstart", "ctrl"):
         getattr(data, field)[:] = getattr(sim, field)[world].numpy()
-
-
-def contacts_by_hand(model, data):
-    """Number of contacts with the floor and net world force of each sensed geom, from MuJoCo's list of contacts."""
-    found, force, wrench = np.zeros(len(SENSED)), np.zeros((len(SENSED), 3)), np.zeros(6)
-    for i, contact in enumerate(data.contact):
-        first, second = (model.geom(geom).name for geom in contact.geom)
-        assert first == "floor"
-        if second in SENSED:
-            mujoco.mj_contactForce(model, data, i, wrench)
-            found[SENSED.index(second)] += 1
-            force[SENSED.index(second)] += contact.frame.reshape(3, 3).T @ wrench[:3]
-    return found, force
 
 
 def steep_capsule_touches(model, data):

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from test_fused import compiled, make_a1
-from test_scripts import SMALL, run_here
+from support.fused import compiled, make_a1
+from support.scripts import SMALL, run_here
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.simulator import ENGINES, Simulator

@@ -5,8 +5,8 @@ import json
 import math
 
 import pytest
-from settings import error_of
-from test_scripts import assert_told_in_one_line, run_here
+from support.scripts import assert_told_in_one_line, run_here
+from support.settings import error_of
 
 from legged_torque.benchmark.baseline import Baseline
 

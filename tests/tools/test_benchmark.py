@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from test_scripts import assert_told_in_one_line, run_here
+from support.scripts import assert_told_in_one_line, run_here
 
 from legged_torque.benchmark import measure as benchmark
 from legged_torque.benchmark.measure import MemoryMeter, most_expensive, summarize

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from test_fused import compiled, make_a1
-from test_scripts import run_here
+from support.fused import compiled, make_a1
+from support.scripts import run_here
 
 from legged_torque.sim.simulator import ENGINES, Simulator
 from tools import injections

@@ -3,7 +3,7 @@
 import sys
 
 import pytest
-from test_scripts import assert_told_in_one_line, run_here
+from support.scripts import assert_told_in_one_line, run_here
 
 SCRIPT = "plot_randomization.py"
 

@@ -1,18 +1,17 @@
 """The console command, completion by the shell, the layout of ``--help`` and the flags that legged_gym's users know."""
 
 import importlib
-import os
 import re
 import runpy
-import subprocess
 import sys
 
 import numpy as np
 import pytest
 import torch
 from packaging.requirements import Requirement
-from settings import error_of, get_cfgs, parse
-from test_scripts import ROOT, assert_told_in_one_line, run_here
+from support.command import command
+from support.scripts import ROOT, assert_told_in_one_line, run_here
+from support.settings import error_of, get_cfgs, parse
 
 from legged_torque.benchmark.installation import extras, gpus, size_of
 from legged_torque.envs import task_registry
@@ -21,16 +20,6 @@ from legged_torque.utils.args import Parser, add_task_args, task_file_words
 from legged_torque.utils.cli import run_script, script_command
 
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("[!_]*.py"))
-CODE = "import sys; sys.argv[0] = '/bin/legged-torque'; from legged_torque.utils.command import main; "
-HEAVY = "{'torch', 'warp', 'mujoco', 'rsl_rl', 'matplotlib', 'argcomplete'} & set(sys.modules)"
-
-
-def command(*words, env=None):
-    """Run ``legged-torque`` in a process of its own; its status, standard output and standard error."""
-    code = f"{CODE}\ntry: main()\nfinally: print({HEAVY} or '', end='')"
-    variables = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]])} | (env or {})
-    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, env=variables)
-    return done.returncode, done.stdout, done.stderr
 
 
 def test_command_runs_scripts():

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 import yaml
-from settings import TASKS, error_of, flatten, get, get_cfgs, parse
+from support.settings import TASKS, error_of, flatten, get, get_cfgs, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.cli import run_script

@@ -4,7 +4,7 @@ import math
 from typing import Annotated, Literal
 
 import pytest
-from settings import COMBINATIONS, TASKS, error_of, flatten, get_cfgs
+from support.settings import COMBINATIONS, TASKS, error_of, flatten, get_cfgs
 
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.config import Section, section_keys, set_by_path, to_dict

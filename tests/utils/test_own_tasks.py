@@ -6,8 +6,8 @@ import sys
 
 import pytest
 import yaml
-from settings import error_of
-from test_scripts import ROOT, assert_light, assert_told_in_one_line, contents, run_here
+from support.scripts import ROOT, assert_light, assert_told_in_one_line, contents, run_here
+from support.settings import error_of
 
 from legged_torque.envs import task_registry
 from legged_torque.experiments.matrix import CellState, read_matrix, step_words

@@ -6,7 +6,7 @@ import re
 
 import pytest
 import torch
-from settings import COMBINATIONS, OTHER_ROBOTS, ROUGH, TASKS, error_of, flatten, parse
+from support.settings import COMBINATIONS, OTHER_ROBOTS, ROUGH, TASKS, error_of, flatten, parse
 
 from legged_torque.envs import TorqueRobot, task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from settings import COMBINATIONS, TASKS, error_of, flatten, get_cfgs
+from support.settings import COMBINATIONS, TASKS, error_of, flatten, get_cfgs
 
 from legged_torque.envs import task_registry
 from legged_torque.utils import runs

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from settings import get_cfgs
+from support.settings import get_cfgs
 
 from legged_torque.envs import task_registry
 from legged_torque.utils import rendering, runs

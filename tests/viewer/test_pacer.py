@@ -1,22 +1,9 @@
 """Steps in real time."""
 
 import pytest
+from support.clock import Clock
 
 from legged_torque.viewer.pacing import MAX_LAG, Pacer
-
-
-class Clock:
-    """A clock that only moves when someone sleeps, or by hand."""
-
-    def __init__(self):
-        self.now, self.slept = 100.0, []
-
-    def __call__(self):
-        return self.now
-
-    def sleep(self, seconds):
-        self.slept.append(seconds)
-        self.now += seconds
 
 
 def test_pacer_real_time():

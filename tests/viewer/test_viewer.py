@@ -11,7 +11,7 @@ import threading
 import numpy as np
 import pytest
 import torch
-from test_pacer import Clock
+from support.clock import Clock
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from test_terrain import make_ground, rays
+from support.ground import make_ground, rays
 
 from legged_torque.terrain.colors import NEUTRAL, color_of
 from legged_torque.viewer.framing import size_of

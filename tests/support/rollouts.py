@@ -127,3 +127,10 @@ def assert_same_state(actual, expected, rtol=2e-5, atol=2e-7):
         torch.testing.assert_close(
             actual[name], value, rtol=rtol, atol=atol, check_dtype=False, msg=lambda m, n=name: f"{n}: {m}"
         )
+
+
+def shift_policy(alg, amount):
+    """Move the policy away from the one that has acted, as earlier updates would."""
+    with torch.no_grad():
+        alg.actor.mlp[-1].bias += amount
+        alg.actor.distribution.log_std_param += amount

@@ -1,0 +1,55 @@
+"""Shared by tests: exports."""
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import torch
+
+from legged_torque.deploy.export import export_policy
+from legged_torque.envs import task_registry
+
+TRAINING = {"run": "run", "checkpoint": "model_7.pt", "iterations": 7, "total_steps": 20_000_000}
+
+
+def export_random(make_task, name, folder, normalization=False, **overrides):
+    """Export a small random network of a task after 20 million steps; return the task and the model."""
+    task = make_task(name, num_envs=3, **overrides)
+    task.load_state_dict({"total_steps": torch.tensor(TRAINING["total_steps"]), "num_diverged": torch.tensor(0)})
+    _, train_cfg = task_registry.get_cfgs(name)
+    train_cfg.actor.hidden_dims = [16, 16]
+    train_cfg.actor.obs_normalization = normalization
+    torch.manual_seed(3)
+    runner, _ = task_registry.make_alg_runner(task, name, train_cfg=train_cfg, log_root=None)
+    model = runner.alg.get_policy()
+    if normalization:
+        model.obs_normalizer._mean.normal_()
+        model.obs_normalizer._std.uniform_(0.5, 2.0)
+    model.eval()
+    assert export_policy(task, model, folder, name, TRAINING) < 1e-5
+    return task, model
+
+
+def change(path, value):
+    """A change of one entry by its dotted path; None deletes it."""
+
+    def apply(description):
+        *parents, last = [int(key) if key.isdigit() else key for key in path.split(".")]
+        for key in parents:
+            description = description[key]
+        if value is None:
+            del description[last]
+        else:
+            description[last] = value
+
+    return apply
+
+
+XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
+
+
+def changed_xml(folder, change):
+    """The A1's MJCF with a change of its tree, as a file."""
+    tree = ElementTree.parse(XML)
+    change(tree.getroot())
+    tree.write(folder / "robot.xml")
+    return folder / "robot.xml"
