@@ -20,10 +20,9 @@ import sys
 from pathlib import Path
 
 from legged_torque import experiment_path
-from legged_torque.experiments.job import CPU_JOBS, GPU_JOBS, MPS_JOBS, Launcher
-from legged_torque.experiments.local_launcher import LocalLauncher
+from legged_torque.experiments.job import Launcher
+from legged_torque.experiments.local_launcher import CPU_JOBS, GPU_JOBS, MPS_JOBS, LocalLauncher, multi_process_service
 from legged_torque.experiments.matrix import SETTINGS_FILE, cell_state, check_same, read_matrix
-from legged_torque.experiments.mps import multi_process_service
 from legged_torque.experiments.run import ExperimentRun, claim_folder
 from legged_torque.utils.args import Parser, add_options
 from legged_torque.utils.cli import check_output, importing, run_script
@@ -59,7 +58,9 @@ def main() -> None:
         for cell in matrix.cells(out):
             print(f"{cell.name}: {cell_state(cell)}")
         return
-    with multi_process_service() if args.mps else contextlib.nullcontext():
+    with multi_process_service() if args.mps else contextlib.nullcontext({}) as variables:
+        if isinstance(launcher, LocalLauncher):
+            launcher.variables |= variables
         claim_folder(matrix, experiment_path(args.file), out)
         status = ExperimentRun(matrix, out, launcher).run()
     sys.exit(status)
@@ -80,7 +81,7 @@ def make_launcher(args: argparse.Namespace) -> Launcher:
     if args.address:
         raise UserError("--address is that of a Ray cluster: give --launcher ray as well")
     launcher = LocalLauncher(args.device, MPS_JOBS if args.mps and args.jobs is None else args.jobs)
-    if args.mps and any(worker.device == "cpu" for worker in launcher.workers()):
+    if args.mps and launcher.device == "cpu":
         raise UserError("--mps is for GPUs, and this experiment would run on the CPU")
     return launcher
 

@@ -1,57 +1,46 @@
-"""Steps of an experiment as processes on this machine."""
+"""Steps of an experiment as processes on this machine, several at a time on each device."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
 import subprocess
 import sys
-from typing import BinaryIO
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, BinaryIO
 
-from legged_torque.experiments.job import CPU_JOBS, GPU_JOBS, MAX_JOBS, Worker
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, command_of, step_words
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 
+CPU_JOBS, GPU_JOBS, MPS_JOBS = 1, 2, 4
+"""Steps at a time on the CPU, a GPU, and a GPU with ``--mps``, by default: more are hardly faster."""
+MAX_JOBS = 1000
+MPS = "nvidia-cuda-mps-control"
 _LIBC = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1  # Linux
 
 
-class LocalLauncher:
-    """Starts steps as processes, several at a time on each device."""
+class LocalProcess(subprocess.Popen[bytes]):
+    """A process that gets SIGTERM when this one ends for any reason. Ctrl-C reaches only this one, to be passed on."""
 
-    def __init__(self, device: str, jobs: int | None) -> None:
-        """Choose the devices, see :func:`find_workers`."""
-        self._workers = find_workers(device, jobs)
-
-    def workers(self) -> list[Worker]:
-        """Return all workers, busy or not."""
-        return self._workers
-
-    def start(
-        self, matrix: Matrix, cell: Cell, state: CellState, worker: Worker, log: BinaryIO, lock: BinaryIO
-    ) -> subprocess.Popen[bytes]:
-        """Start a process, which holds the lock too, and gets SIGTERM if this process ends."""
-        command = command_of(step_words(matrix, cell, state, worker.device))
-        return start_process(command, log, worker.variables, [lock.fileno()])
-
-
-def start_process(
-    command: list[str], log: BinaryIO, variables: dict[str, str], pass_fds: list[int], cwd: str | None = None
-) -> subprocess.Popen[bytes]:
-    """Start a process that writes to ``log``, and gets SIGTERM when this process ends for any reason."""
-    return subprocess.Popen(
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=log,
-        stderr=subprocess.STDOUT,
-        env=os.environ | {"PYTHONUNBUFFERED": "1"} | variables,
-        pass_fds=pass_fds,
-        cwd=cwd,
-        start_new_session=True,  # Ctrl-C reaches only this process, which passes it on
-        preexec_fn=end_with_parent if sys.platform == "linux" else None,
-    )
+    def __init__(self, place: str, command: list[str], log: BinaryIO, variables: dict[str, str], **how: Any) -> None:
+        """Start a command with additional environment variables, whose output goes to ``log``."""
+        self.place = place
+        super().__init__(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env=os.environ | {"PYTHONUNBUFFERED": "1"} | variables,
+            start_new_session=True,
+            preexec_fn=end_with_parent if sys.platform == "linux" else None,
+            **how,
+        )
 
 
 def end_with_parent() -> None:
@@ -59,32 +48,81 @@ def end_with_parent() -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
+class LocalLauncher:
+    """Starts each step on the device with the fewest steps.
+
+    Attributes:
+        device: The --device of steps, "cpu" or "cuda:0": a process sees only its own GPU.
+        variables: Additional environment variables of all steps.
+    """
+
+    def __init__(self, device: str, jobs: int | None) -> None:
+        """Use the CPU or one GPU or, with "auto", all GPUs, for ``jobs`` steps each; UserError if not possible."""
+        import torch
+
+        first = resolve_device(device)  # does not create a CUDA context
+        check_jobs(jobs)
+        self.device = "cpu" if first == "cpu" else "cuda:0"
+        self._devices: dict[str, dict[str, str]] = {"cpu": {}}  # environment variables by name of the device
+        if first != "cpu":
+            numbers = range(torch.cuda.device_count()) if device == "auto" else [int(first.removeprefix("cuda:"))]
+            visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(torch.cuda.device_count())))
+            names = [name.strip() for name in visible.split(",")]
+            self._devices = {f"cuda:{number}": {"CUDA_VISIBLE_DEVICES": names[number]} for number in numbers}
+        self._room = len(self._devices) * (jobs or (CPU_JOBS if first == "cpu" else GPU_JOBS))
+        self.variables: dict[str, str] = {}
+        if self._room > 1 and "OMP_NUM_THREADS" not in os.environ:  # steps share the cores
+            self.variables["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // self._room))
+        self._running: list[LocalProcess] = []
+
+    def room(self) -> int:
+        """Return how many steps can run at a time."""
+        return self._room
+
+    def start(self, matrix: Matrix, cell: Cell, state: CellState, log: BinaryIO, lock: BinaryIO) -> LocalProcess:
+        """Start a process, which holds the lock too."""
+        self._running = [process for process in self._running if process.poll() is None]
+        busy = Counter(process.place for process in self._running)
+        place = min(self._devices, key=lambda name: busy[name])
+        command = command_of(step_words(matrix, cell, state, self.device))
+        process = LocalProcess(place, command, log, self.variables | self._devices[place], pass_fds=[lock.fileno()])
+        self._running.append(process)
+        return process
+
+
 def check_jobs(jobs: int | None) -> None:
-    """Refuse, by UserError, a number of runs at a time that makes no sense."""
+    """Refuse, by UserError, a number of steps at a time that makes no sense."""
     if jobs is not None and jobs < 1:
         raise UserError(f"--jobs must be at least 1, not {jobs}")
     if jobs is not None and jobs > MAX_JOBS:
         raise UserError(f"--jobs must be at most {MAX_JOBS}, not {jobs}")
 
 
-def find_workers(device: str, jobs: int | None) -> list[Worker]:
-    """Return ``jobs`` workers for each device, the CPU or one GPU or, with "auto", all GPUs; UserError if not possible.
+@contextlib.contextmanager
+def multi_process_service() -> Iterator[dict[str, str]]:
+    """Start NVIDIA's Multi-Process Service (MPS), by which processes run kernels on a GPU at once instead of in turns.
 
-    The first workers are on different devices. Several share the cores among them.
+    Yields the environment variables of the processes that use it; a UserError if this machine has none.
     """
-    import torch
+    with tempfile.TemporaryDirectory(prefix="mps-", ignore_cleanup_errors=True) as folder:
+        variables = dict.fromkeys(("CUDA_MPS_PIPE_DIRECTORY", "CUDA_MPS_LOG_DIRECTORY"), folder)
+        control_service(variables, ["-d"])
+        try:
+            yield variables
+        finally:
+            control_service(variables, [], "quit\n")
 
-    first = resolve_device(device)  # does not create a CUDA context
-    check_jobs(jobs)
-    if first == "cpu":
-        devices: list[tuple[str, str, dict[str, str]]] = [("cpu", "cpu", {})]
-    else:
-        numbers = range(torch.cuda.device_count()) if device == "auto" else [int(first.removeprefix("cuda:"))]
-        visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-        names = visible.split(",") if visible else [str(i) for i in range(torch.cuda.device_count())]
-        devices = [(f"cuda:{i}", "cuda:0", {"CUDA_VISIBLE_DEVICES": names[i].strip()}) for i in numbers]
-    jobs = jobs or (CPU_JOBS if first == "cpu" else GPU_JOBS)
-    count, shared = jobs * len(devices), {}
-    if count > 1 and "OMP_NUM_THREADS" not in os.environ:
-        shared["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // count))
-    return [Worker(name, kind, variables | shared) for _ in range(jobs) for name, kind, variables in devices]
+
+def control_service(variables: dict[str, str], arguments: list[str], commands: str = "") -> None:
+    """Call NVIDIA's program; a UserError if it is missing or refuses."""
+    environment = os.environ | variables
+    environment.pop("CUDA_VISIBLE_DEVICES", None)  # the service would number the devices anew
+    with tempfile.TemporaryFile("w+") as output:  # no pipe: the service would hold it open
+        how: dict[str, Any] = {"stdout": output, "stderr": subprocess.STDOUT, "start_new_session": True}
+        try:
+            status = subprocess.run([MPS, *arguments], input=commands, text=True, env=environment, **how).returncode
+        except FileNotFoundError:
+            raise UserError(f"--mps needs the program {MPS}, which comes with NVIDIA's driver") from None
+        if status:
+            output.seek(0)
+            raise UserError(f"--mps: {MPS} says: {' '.join(output.read().split())}")

@@ -6,7 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from legged_torque.terrain.selection import named_kinds, rising_levels
 from legged_torque.utils.args import task_file_words
 from legged_torque.utils.config import convert, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.limits import Count, check_value, types_of
 from legged_torque.utils.options import Options
 from legged_torque.utils.runs import (
     checkpoint_number,
@@ -35,17 +36,17 @@ CELL_SETTINGS = {
     "evaluation.also": "environments",
 }
 """Settings that ``train`` must not change, and the keys that they come from."""
-EVALUATION = {"num_envs": 256, "num_steps": 2000}
-"""Worlds and control steps of an evaluation, unless the description has others."""
-GROUNDS = {"kinds": ["all"], "levels": [level / 10 for level in range(10)], "num_envs": 40}
-"""Which tiles are crossed after training, and by how many robots each, unless the description has others."""
+EVALUATION: dict[str, Any] = {"num_envs": 256, "num_steps": 2000}
+"""Worlds and control steps of an evaluation, by default."""
+GROUNDS: dict[str, Any] = {"kinds": ["all"], "levels": [level / 10 for level in range(10)], "num_envs": 40}
+"""Tiles that are crossed after training, and robots on each of them, by default."""
 ROUGH_GROUND = "rough ground"
-"""Stands for the evaluation on :data:`GROUNDS` where others have the name of an environment, which has no space."""
+"""Name of the evaluation on :data:`GROUNDS`. Names of environments have no spaces."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One training, and evaluations while it trains or, in environments without them, of its last checkpoint."""
+    """One training with its evaluations: during training, or else of the last checkpoint."""
 
     folder: Path
     task: str
@@ -59,33 +60,22 @@ class Cell:
         """Name of the cell and of its folder."""
         return self.folder.name
 
-    def result_file(self, environment: str) -> Path:
-        """Return the file with the numbers of an evaluation, in an environment or on :data:`ROUGH_GROUND`."""
-        return self.folder / ("grounds.json" if environment == ROUGH_GROUND else f"result_{environment}.json")
-
     @property
-    def results(self) -> list[Path]:
-        """Files with the numbers of evaluations of the last checkpoint."""
-        return [self.result_file(name) for name in (*self.evaluated_in, ROUGH_GROUND)]
+    def evaluations(self) -> list[str]:
+        """Names of all evaluations: environments, and :data:`ROUGH_GROUND` if the cell ``crosses`` tiles."""
+        return [*self.evaluated_in, *([ROUGH_GROUND] if self.crosses else [])]
 
-    def part_file(self, environment: str) -> Path:
-        """Return the file that an evaluation writes; it becomes the result when the evaluation is complete."""
-        return self.result_file(environment).with_suffix(".json.part")
+    def result_file(self, evaluation: str) -> Path:
+        """Return the file with the numbers of an evaluation of the last checkpoint."""
+        return self.folder / ("grounds.json" if evaluation == ROUGH_GROUND else f"result_{evaluation}.json")
+
+    def part_file(self, evaluation: str) -> Path:
+        """Return the file that an evaluation writes. It is renamed to the result when the evaluation is complete."""
+        return self.result_file(evaluation).with_suffix(".json.part")
 
     def rows_file(self, run_dir: Path, environment: str) -> Path:
-        """Return the file of a run's evaluations in an environment while it trained."""
+        """Return the file of a run's evaluations in an environment during training."""
         return evaluations_file(run_dir, "" if environment == self.environment else environment)
-
-    def missing(self) -> list[str]:
-        """Return the perturbations with neither a readable result nor evaluations during a training that is whole.
-
-        After them comes :data:`ROUGH_GROUND`, if its result is planned and not there.
-        """
-        names = [*self.evaluated_in, *([ROUGH_GROUND] if self.crosses else [])]
-        missing = [name for name in names if not is_json(self.result_file(name))]
-        runs = list(self.folder.glob("*/")) if missing else []
-        measured = [name for name in missing if any(has_rows(self.rows_file(run, name)) for run in runs)]
-        return [name for name in missing if name not in measured] if measured and is_trained(self) else missing
 
 
 @dataclass(frozen=True)
@@ -96,10 +86,10 @@ class Matrix:
     environments: dict[str, list[str]]  # for each perturbation during training, those of the evaluations
     seeds: list[int]
     ranges: str = ""  # of random parameters, as --ranges takes them; empty: the tasks' own
-    train: dict[str, Any] = field(default_factory=dict)  # changed settings, by dotted path
+    train: dict = field(default_factory=dict)  # changed settings, by dotted path
     evaluation: dict[str, int] = field(default_factory=dict)  # as EVALUATION
-    grounds: dict[str, Any] = field(default_factory=dict)  # as GROUNDS; empty: none
-    task_files: tuple[str, ...] = ()  # what --task_file of the command line gives; no description can
+    grounds: dict = field(default_factory=dict)  # as GROUNDS; empty: none
+    task_files: tuple[str, ...] = ()  # --task_file of the command line; a description cannot name any
 
     def cells(self, out: Path) -> list[Cell]:
         """Return all cells in a folder, seed by seed, so that tasks can be compared before all seeds are done."""
@@ -127,7 +117,7 @@ class CellState:
 
     iterations: int  # of training before its last checkpoint
     total: int | None  # of the whole training; None if it has no checkpoint
-    missing: list[str]  # perturbations without a readable result
+    missing: list[str]  # evaluations without a readable result
     steps: int = 0  # of all worlds in these iterations; 0 if the settings of the run do not say
 
     @property
@@ -149,7 +139,7 @@ class CellState:
 def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
     """Read a matrix, and check what train.py and evaluate.py would check only hours later; UserError if it is wrong.
 
-    Its tasks may be those that ``task_files`` register, which are imported.
+    Tasks that ``task_files`` register are allowed; the files are imported.
     """
     from legged_torque.envs.base.asset import load_asset
 
@@ -160,19 +150,18 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
             raise UserError(f"train.{key} cannot be set: it comes from {source}")
     named_kinds(matrix.grounds.get("kinds", []))
     rising_levels(matrix.grounds.get("levels", []))
-    ranges, words = str(matrix.ranges) if matrix.ranges else None, matrix.set_words()
-    cells = matrix.cells(Path())
-    for cell in cells:
-        if cell.seed != matrix.seeds[0] and (cell.task, cell.environment) != (cells[0].task, cells[0].environment):
-            continue  # no other setting depends on the seed
+    of_tasks = {}
+    for cell in matrix.cells(Path()):
+        ranges, words = str(matrix.ranges) if matrix.ranges else None, matrix.set_words()
         options = Options(device="cpu", seed=cell.seed, perturbation=cell.environment, ranges=ranges, set=words)
         env_cfg, _ = task_registry.get_cfgs(cell.task, options)
         check_env_cfg(env_cfg)
-        if cell.seed == matrix.seeds[0]:
-            load_asset(env_cfg)
         for name in cell.evaluated_in:
             if name not in env_cfg.perturbations():
                 raise unknown_name("perturbation", name, env_cfg.perturbations())
+        of_tasks[cell.task] = env_cfg
+    for env_cfg in of_tasks.values():
+        load_asset(env_cfg)
     return matrix
 
 
@@ -181,109 +170,34 @@ def read_plan(file: Path) -> Matrix:
     if not file.is_file():
         raise UserError(f"there is no file '{file}'")
     values = parse_yaml(file.read_text(encoding="utf-8", errors="replace"), f"'{file}'")
-    keys = [entry.name for entry in fields(Matrix) if entry.name != "task_files"]  # a file names no code to run
-    if not isinstance(values, dict):
-        raise UserError(f"'{file}' must hold the keys {', '.join(keys)}")
-    for key in values:
-        if key not in keys:
-            raise unknown_name("experiment key", str(key), keys)
-    for key in ("tasks", "environments", "seeds"):
-        if key not in values:
-            raise UserError(f"'{file}' lacks the key '{key}'")
-    for key in ("environments", "train", "evaluation", "grounds"):
-        if not isinstance(values.setdefault(key, {}), dict):
-            raise UserError(f"experiment key '{key}' must hold entries 'name: value', not {values[key]!r}")
-    for key, value in values["evaluation"].items():
-        if key not in EVALUATION:
-            raise unknown_name("evaluation key", str(key), EVALUATION)
-        if type(value) is not int or value < 1:
-            raise UserError(f"evaluation.{key} must be a whole number of at least 1, not {value!r}")
-    for key, value in values["grounds"].items():
-        if key not in GROUNDS:
-            raise unknown_name("grounds key", str(key), GROUNDS)
-        new = values["grounds"][key] = convert(value, GROUNDS[key], f"grounds.{key}")
-        if not new or (isinstance(new, int) and new < 1):
-            raise UserError(f"grounds.{key} must hold something, not {value!r}")
-    values["grounds"] = values["grounds"] and GROUNDS | values["grounds"]
-    matrix = Matrix(**values | {"evaluation": EVALUATION | values["evaluation"]})
+    hints = types_of(Matrix)
+    del hints["task_files"]
+    if not isinstance(values, dict) or not {"tasks", "environments", "seeds"} <= values.keys():
+        raise UserError(f"'{file}' must hold the keys tasks, environments and seeds, and may hold {', '.join(hints)}")
+    for key, value in values.items():
+        if key not in hints:
+            raise unknown_name("experiment key", str(key), hints)
+        if key in ("environments", "train", "evaluation", "grounds") and not isinstance(value, dict):
+            raise UserError(f"experiment key '{key}' must hold entries 'name: value', not {value!r}")
+        check_value(f"experiment key '{key}'", value, hints[key])
+    for section, defaults in {"evaluation": EVALUATION, "grounds": GROUNDS}.items():
+        for key, value in values.get(section, {}).items():
+            if key not in defaults:
+                raise unknown_name(f"{section} key", str(key), defaults)
+            new = values[section][key] = convert(value, defaults[key], f"{section}.{key}")
+            if isinstance(new, int):
+                check_value(f"{section}.{key}", new, Count)
+            elif not new:
+                raise UserError(f"{section}.{key} must hold one entry or more, not {value!r}")
+    grounds = GROUNDS | values["grounds"] if values.get("grounds") else {}
+    matrix = Matrix(**values | {"evaluation": EVALUATION | values.get("evaluation", {}), "grounds": grounds})
     for key, entries in matrix.lists().items():
-        kind, example = (int, "[1, 2]") if key == "seeds" else (str, "[a, b]")
-        if not isinstance(entries, list) or not entries or any(type(entry) is not kind for entry in entries):
-            raise UserError(f"experiment key '{key}' must be a list like {example}, not {entries!r}")
-        if len(set(entries)) < len(entries):
-            raise UserError(f"experiment key '{key}' holds something twice: {entries}")
+        if not entries or len(set(entries)) < len(entries):
+            raise UserError(f"experiment key '{key}' must hold different entries, one or more, not {entries}")
         for entry in entries:  # they name folders and figures
-            if key != "seeds" and not re.fullmatch(r"\w[\w.-]*", entry):
+            if key != "seeds" and not re.fullmatch(r"\w[\w.-]*", str(entry)):
                 raise UserError(f"experiment key '{key}' must hold names, not {entry!r}")
     return matrix
-
-
-def step_words(matrix: Matrix, cell: Cell, state: CellState, device: str) -> list[str]:
-    """Return the script of a cell's next step and its arguments, for a device named as ``--device`` takes it."""
-    words = [f"--task={cell.task}", f"--log_root={cell.folder.parent}", f"--experiment_name={cell.name}"]
-    words += [f"--device={device}", *task_file_words(matrix.task_files)]
-    if state.step == "evaluate":
-        name, numbers = state.missing[0], matrix.evaluation
-        if name == ROUGH_GROUND:
-            kinds, levels, num_envs = (matrix.grounds[key] for key in GROUNDS)
-            words += [f"--num_envs={num_envs}", "--terrain", *kinds, "--level", *map(str, levels)]
-        else:
-            words += [f"--perturbation={name}", f"--num_envs={numbers['num_envs']}", f"--steps={numbers['num_steps']}"]
-        return ["evaluate.py", *words, f"--json={cell.part_file(name)}"]
-    if state.step == "resume":
-        words.append("--resume")
-    else:
-        words += [f"--seed={cell.seed}", f"--perturbation={cell.environment}"]
-        also = [name for name in cell.evaluated_in if name != cell.environment]
-        words += [f"--set={word}" for word in [*matrix.set_words(), f"evaluation.also={json.dumps(also)}"]]
-        words += [f"--ranges={matrix.ranges}"] if matrix.ranges else []
-    return ["train.py", *words]
-
-
-def command_of(words: list[str]) -> list[str]:
-    """Return the command line that runs a script, given by its name and its arguments, on this machine."""
-    return [sys.executable, str(SCRIPTS_DIR / words[0]), *words[1:]]
-
-
-def cell_state(cell: Cell) -> CellState:
-    """Return the progress of a cell; UserError if its newest run with a checkpoint does not say how long it is."""
-    newest = last_checkpoint(cell)
-    if newest is None:
-        return CellState(0, None, cell.missing())
-    config, iterations = load_config(newest.parent), checkpoint_number(newest)
-    total = config.get("max_iterations")
-    if type(total) is not int:
-        raise UserError(f"the settings of the run '{newest.parent}' lack max_iterations")
-    return CellState(iterations, total, cell.missing(), iterations * (steps_per_iteration(config) or 0))
-
-
-def last_checkpoint(cell: Cell) -> Path | None:
-    """Return the file of a cell's last checkpoint that is not damaged, or None; clocks of machines may differ."""
-    runs = sorted(cell.folder.glob("*/"), reverse=True)
-    return max(filter(None, map(newest_checkpoint, runs)), key=checkpoint_number, default=None)
-
-
-def is_trained(cell: Cell) -> bool:
-    """Return whether the training of a cell is whole; not so if its settings cannot be read, which is told later."""
-    newest = last_checkpoint(cell)
-    try:
-        total = load_config(newest.parent).get("max_iterations") if newest else None
-    except UserError:
-        return False
-    return newest is not None and type(total) is int and checkpoint_number(newest) >= total
-
-
-def has_rows(file: Path) -> bool:
-    """Return whether a CSV file exists and has a whole line after its header."""
-    return file.is_file() and file.read_bytes().count(b"\n") > 1
-
-
-def is_json(file: Path) -> bool:
-    """Return whether a file exists and holds a JSON object."""
-    try:
-        return isinstance(json.loads(file.read_text(encoding="utf-8")), dict)
-    except (OSError, ValueError, RecursionError):  # nested too deeply
-        return False
 
 
 def check_same(matrix: Matrix, out: Path) -> None:
@@ -301,3 +215,71 @@ def check_same(matrix: Matrix, out: Path) -> None:
         lost = [str(value) for value in values if value not in matrix.lists().get(key, [])]
         if lost:
             raise UserError(f"{differs}: {key} had {', '.join(lost)} as well; give another --out")
+
+
+def step_words(matrix: Matrix, cell: Cell, state: CellState, device: str) -> list[str]:
+    """Return the script of a cell's next step and its arguments, for a device named as ``--device`` takes it."""
+    words = [f"--task={cell.task}", f"--log_root={cell.folder.parent}", f"--experiment_name={cell.name}"]
+    words += [f"--device={device}", *task_file_words(matrix.task_files)]
+    if state.step == "evaluate":
+        name, numbers = state.missing[0], matrix.evaluation
+        if name == ROUGH_GROUND:
+            kinds, levels, num_envs = (matrix.grounds[key] for key in GROUNDS)
+            words += [f"--num_envs={num_envs}", "--terrain", *kinds, "--level", *map(str, levels)]
+        else:
+            words += [f"--perturbation={name}", f"--num_envs={numbers['num_envs']}", f"--steps={numbers['num_steps']}"]
+        return ["evaluate.py", *words, f"--json={cell.part_file(name)}"]
+    if state.step == "resume":
+        return ["train.py", *words, "--resume"]
+    words += [f"--seed={cell.seed}", f"--perturbation={cell.environment}"]
+    also = [name for name in cell.evaluated_in if name != cell.environment]
+    words += [f"--set={word}" for word in [*matrix.set_words(), f"evaluation.also={json.dumps(also)}"]]
+    return ["train.py", *words, *([f"--ranges={matrix.ranges}"] if matrix.ranges else [])]
+
+
+def command_of(words: list[str]) -> list[str]:
+    """Return the command line that runs a script, given by its name and its arguments, on this machine."""
+    return [sys.executable, str(SCRIPTS_DIR / words[0]), *words[1:]]
+
+
+def cell_state(cell: Cell) -> CellState:
+    """Return the progress of a cell; UserError if its newest run with a checkpoint does not say how long it is."""
+    missing = [name for name in cell.evaluations if not is_json(cell.result_file(name))]
+    newest = last_checkpoint(cell)
+    if newest is None:
+        return CellState(0, None, missing)
+    config, iterations = load_config(newest.parent), checkpoint_number(newest)
+    total = config.get("max_iterations")
+    if type(total) is not int:
+        raise UserError(f"the settings of the run '{newest.parent}' lack max_iterations")
+    if iterations >= total:  # evaluations during a complete training are results, too
+        runs = list(cell.folder.glob("*/"))
+        missing = [name for name in missing if not any(has_rows(cell.rows_file(run, name)) for run in runs)]
+    return CellState(iterations, total, missing, iterations * (steps_per_iteration(config) or 0))
+
+
+def is_done(cell: Cell) -> bool:
+    """Return whether nothing is left to do in a cell; False if its settings cannot be read."""
+    try:
+        return not cell_state(cell).missing
+    except UserError:
+        return False
+
+
+def last_checkpoint(cell: Cell) -> Path | None:
+    """Return the file of a cell's last checkpoint that is not damaged, or None; clocks of machines may differ."""
+    runs = sorted(cell.folder.glob("*/"), reverse=True)
+    return max(filter(None, map(newest_checkpoint, runs)), key=checkpoint_number, default=None)
+
+
+def has_rows(file: Path) -> bool:
+    """Return whether a CSV file exists and has a complete line after its header."""
+    return file.is_file() and file.read_bytes().count(b"\n") > 1
+
+
+def is_json(file: Path) -> bool:
+    """Return whether a file exists and holds a JSON object."""
+    try:
+        return isinstance(json.loads(file.read_text(encoding="utf-8")), dict)
+    except (OSError, ValueError, RecursionError):  # nested too deeply
+        return False

@@ -1,29 +1,33 @@
-"""Runs a matrix of trainings on the workers of a launcher. Finished steps are skipped, interrupted ones resumed."""
+"""Runs a matrix of trainings on a launcher. Finished steps are skipped, interrupted ones resumed."""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
 from statistics import fmean
 from types import FrameType
 from typing import BinaryIO
 
-from legged_torque.experiments.experiment_display import ExperimentDisplay
-from legged_torque.experiments.job import LOST, Job, Launcher, Worker, try_lock
-from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, check_same
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.table import Column
+
+from legged_torque.experiments.job import LOST, Job, Launcher, try_lock
+from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, check_same, is_done
 from legged_torque.experiments.times import add_up, describe, read_times
-from legged_torque.utils.display import duration, time_left_text
+from legged_torque.utils.display import duration, is_terminal, time_left_text
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.files import held
+from legged_torque.utils.files import held, write_whole
 from legged_torque.utils.interrupt import StopRequest
 
 POLL = 0.2  # seconds between checks of the processes
+REDRAW_EVERY = 1.0  # seconds between updates of the display
 RETRIES = 1  # of a step that has failed, from its last checkpoint, before its cell is given up
 MAX_LOST = 10  # machines that a step may lose before its cell is given up
 
@@ -44,186 +48,179 @@ class ExperimentRun:
 
     def __init__(self, matrix: Matrix, out: Path, launcher: Launcher) -> None:
         """Find the cells that are not done; nothing is written or started yet. ``out`` is an absolute path."""
-        self.matrix, self.out, self._launcher = matrix, out, launcher
+        self._matrix, self._out, self._launcher = matrix, out, launcher
         cells = matrix.cells(out)
-        self.queue = [cell for cell in cells if cell.missing()]
-        self._num_cells, self._num_done = len(cells), len(cells) - len(self.queue)
+        self._queue = [cell for cell in cells if not is_done(cell)]
+        self._num_cells, self._num_done = len(cells), len(cells) - len(self._queue)
+        self._running: dict[Iterator[Job], Job] = {}  # the steps of each cell in work, and the present one
         self._failures: list[str] = []  # a message per failed cell
         self._reported: set[Cell] = set()  # cells reported to be held by another process
-        self._failed: Counter[Cell] = Counter()  # how often a cell's present step has failed
-        self._lost: Counter[Cell] = Counter()  # how often its machine was lost
         self._durations: list[float] = []  # of cells finished here [s]
-        self._start = self._counted = time.monotonic()
+        self._start = self._counted = self._shown = time.monotonic()
+        self._stop = CountedStop()
 
     def run(self) -> int:
         """Work until all cells are done or have failed; return the exit status. Asked to stop: KeyboardInterrupt."""
-        print(f"{self._num_done} of {self._num_cells} cells are done in {self.out}", flush=True)
-        passed_on, stop = 0, CountedStop()
+        print(f"{self._num_done} of {self._num_cells} cells are done in {self._out}", flush=True)
+        passed_on = 0
         try:
-            with stop, ExperimentDisplay(self.out.name) as display:
-                while self._jobs() or (self.queue and not stop.requested):
-                    if stop.count > passed_on:
-                        passed_on = stop.count
+            with self._stop, bars() as display:
+                while self._running or (self._queue and not self._stop.requested):
+                    if self._stop.count > passed_on:
+                        passed_on = self._stop.count
                         self._ask_to_stop()
                     self._count_time()
-                    for worker in list(self._launcher.workers()):
-                        self._attend(worker, stop.requested)
+                    for steps, job in list(self._running.items()):
+                        if job.process.poll() is not None:
+                            self._advance(steps)
+                    self._take_cells()
                     self._show(display)
                     time.sleep(POLL)
         finally:
             self._ask_to_stop()  # after an exception too no process is left running
-            for job in self._jobs():
-                with contextlib.suppress(UserError):  # what one has to tell must not keep others from coming home
-                    job.process.wait()
-        spent = describe(add_up(read_times(cell.folder) for cell in self.matrix.cells(self.out)))
-        if spent:
-            print(spent)
-        print(f"{self._num_done} of {self._num_cells} cells are done.", flush=True)
+            for job in self._running.values():
+                with contextlib.suppress(UserError):  # an error of one must not keep others from saving
+                    while job.process.poll() is None:
+                        time.sleep(POLL)
+        spent = describe(add_up(read_times(cell.folder) for cell in self._matrix.cells(self._out)))
+        print(*filter(None, [spent, f"{self._num_done} of {self._num_cells} cells are done."]), sep="\n", flush=True)
         for failure in self._failures:
             print(failure, file=sys.stderr)
-        if stop.requested:
+        if self._stop.requested:
             raise KeyboardInterrupt
         return 1 if self._failures else 0
 
-    def _jobs(self) -> list[Job]:
-        """Return the jobs that are running."""
-        return [worker.job for worker in self._launcher.workers() if worker.job is not None]
-
-    def _attend(self, worker: Worker, stopping: bool) -> None:
-        """Finish a worker's step if its process has ended, and give it the next step if it is free."""
-        job = worker.job
-        if job is not None and job.process.poll() is not None:
-            worker.job = None
-            self._end_step(worker, job, stopping)
-        if worker.job is None and not stopping:
-            self._take_cell(worker)
-
-    def _take_cell(self, worker: Worker) -> None:
-        """Start the first cell that no other process holds, if there is one."""
-        for cell in list(self.queue):
+    def _take_cells(self) -> None:
+        """Start cells that no other process holds, as long as there is room."""
+        for cell in list(self._queue):
+            if self._stop.requested or len(self._running) >= self._launcher.room():
+                return
             lock = try_lock(cell.folder / "lock")
             if lock is None:
                 if cell not in self._reported:
                     self._reported.add(cell)
                     self._print(f"{cell.name}: another process works on it; left for later")
                 continue
-            self.queue.remove(cell)
-            if cell.missing():
-                self._start_step(worker, cell, lock, time.monotonic())
-                return
-            self._num_done += 1  # finished by another process
-            lock.close()
+            self._queue.remove(cell)
+            if is_done(cell):  # by another process
+                lock.close()
+                self._num_done += 1
+            else:
+                self._advance(self._steps(cell, lock))
 
-    def _start_step(self, worker: Worker, cell: Cell, lock: BinaryIO, cell_start: float) -> None:
-        """Start the next step of a cell."""
-        try:
-            worker.job = Job(self.matrix, cell, lock, cell_start, worker, self._launcher)
-        except (OSError, subprocess.SubprocessError, UserError) as error:
-            self._fail(cell, lock, str(error))
-
-    def _end_step(self, worker: Worker, job: Job, stopping: bool) -> None:
-        """Record the outcome of a step that has ended, and continue with its cell."""
-        problem = job.problem()
-        self._keep_times(job)
-        if problem and not stopping:
-            self._try_again_or_fail(job, problem)
+    def _advance(self, steps: Iterator[Job]) -> None:
+        """Start the next step of a cell, if there is one."""
+        self._running.pop(steps, None)
+        for job in steps:
+            self._running[steps] = job
             return
-        is_done = not job.cell.missing()
-        if is_done:
-            self._num_done += 1
-            self._durations.append(time.monotonic() - job.cell_start)
-        if not problem:
-            self._failed[job.cell] = self._lost[job.cell] = 0
-            took = duration(time.monotonic() - job.start)
-            self._print(f"{job.cell.name}: {job.step_text()} on {worker.name} took {took} | {self._progress()}")
-        if is_done or stopping:
-            job.lock.close()
-            self.queue += [] if is_done else [job.cell]
-        else:
-            self._start_step(worker, job.cell, job.lock, job.cell_start)
 
-    def _try_again_or_fail(self, job: Job, problem: str) -> None:
-        """Let a step that has failed be tried again, from its last checkpoint, or give up its cell."""
-        is_lost = job.process.returncode == LOST
-        tries, most = (self._lost, MAX_LOST) if is_lost else (self._failed, RETRIES)
-        tries[job.cell] += 1
-        if tries[job.cell] > most:
-            self._fail(job.cell, job.lock, problem, job)
-            return
-        job.lock.close()
-        self.queue.insert(0 if is_lost else len(self.queue), job.cell)
-        self._print(f"{job.cell.name}: {problem}; it will be tried again | {self._progress()}")
+    def _steps(self, cell: Cell, lock: BinaryIO) -> Iterator[Job]:
+        """Yield each step of a cell, started; the next one must be asked for when it has ended.
 
-    def _fail(self, cell: Cell, lock: BinaryIO, reason: str, job: Job | None = None) -> None:
-        """Give up a cell; the last ten lines of the job's log are printed at the end."""
-        lock.close()
-        lines = [f"the last lines of {job.log}:", *job.output().splitlines()[-10:]] if job else []
+        A step that fails is tried again, from its last checkpoint, before the cell is given up.
+        """
+        start, tries = time.monotonic(), Counter[bool]()
+        with lock:
+            while not is_done(cell):
+                try:
+                    job = Job(self._matrix, cell, lock, self._launcher)
+                except (OSError, subprocess.SubprocessError, UserError) as error:
+                    self._fail(cell, str(error), [])
+                    return
+                yield job
+                problem = job.problem()
+                job.keep_times()
+                if not problem:
+                    tries.clear()
+                    took = duration(time.monotonic() - job.start)
+                    self._num_done += is_done(cell)
+                    self._print(f"{cell.name}: {job} on {job.process.place} took {took} | {self._progress()}")
+                if self._stop.requested:
+                    self._queue += [] if is_done(cell) else [cell]
+                    return
+                if problem:
+                    is_lost = job.process.poll() == LOST
+                    tries[is_lost] += 1
+                    if tries[is_lost] > (MAX_LOST if is_lost else RETRIES):
+                        self._fail(cell, problem, [f"the last lines of {job.log}:", *job.output().splitlines()[-10:]])
+                        return
+                    self._print(f"{cell.name}: {problem}; it will be tried again | {self._progress()}")
+        self._durations.append(time.monotonic() - start)
+
+    def _fail(self, cell: Cell, reason: str, lines: list[str]) -> None:
+        """Give up a cell; the reason and further lines are printed at the end."""
         self._failures.append("\n    ".join([f"{cell.name}: {reason}", *lines]))
         self._print(f"{cell.name}: {reason} | {self._progress()}")
 
     def _count_time(self) -> None:
-        """Count the time since the last call for all steps, those of one device sharing it."""
+        """Count the time since the last call for all steps; those of one device share it."""
         now = time.monotonic()
         passed, self._counted = now - self._counted, now
-        busy = [worker for worker in self._launcher.workers() if worker.job is not None and worker.name]
-        sharing = Counter(worker.name for worker in busy)
-        for worker in busy:
-            assert worker.job is not None
-            worker.job.add_time(passed / sharing[worker.name])
-            if worker.job.times_are_due():
-                self._keep_times(worker.job)
-
-    def _keep_times(self, job: Job) -> None:
-        """Write the device time of a cell; that it cannot be written is told, and work goes on."""
-        try:
-            job.keep_times()
-        except (OSError, UserError) as error:
-            self._print(f"{job.cell.name}: its device time is not kept: {error}")
+        sharing = Counter(job.process.place for job in self._running.values())
+        for job in self._running.values():
+            if job.process.place:
+                job.add_time(passed / sharing[job.process.place])
 
     def _ask_to_stop(self) -> None:
         """Ask all processes to end. A training finishes its iteration and saves; a second request ends it at once."""
-        for job in self._jobs():
+        for job in self._running.values():
             job.process.terminate()
-        if self._jobs():
+        if self._running:
             self._print("Stopping: trainings finish their iteration and save; once more to stop at once.")
 
-    def _progress(self) -> str:
-        """Describe the progress of all cells and the time left; cells in training count in part."""
-        elapsed, left = duration(time.monotonic() - self._start), time_left_text(self._time_left())
-        return f"{self._num_done} of {self._num_cells} cells done, {elapsed}, {left}"
+    def _begun(self) -> float:
+        """Return the part of running cells that is done, in cells; an evaluation takes little."""
+        return sum(job.progress()[1] if job.kind == "training" else 1.0 for job in self._running.values())
 
-    def _time_left(self) -> float | None:
-        """Return the time for all cells that are left [s]; None if unknown."""
-        cells = self._num_cells - self._num_done - len(self._failures) - sum(job.fraction() for job in self._jobs())
-        return time_left(self._durations, cells, len(self._launcher.workers()))
+    def _progress(self) -> str:
+        """Describe the progress of all cells and the time left."""
+        cells = self._num_cells - self._num_done - len(self._failures) - self._begun()
+        left = time_left_text(time_left(self._durations, cells, self._launcher.room()))
+        return f"{self._num_done} of {self._num_cells} cells done, {duration(time.monotonic() - self._start)}, {left}"
 
     def _print(self, text: str) -> None:
         """Print a line with the time."""
         print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}", flush=True)
 
-    def _show(self, display: ExperimentDisplay) -> None:
-        """Update the display, if it is shown and the update is due."""
-        if display.is_due():
-            rows = [worker.job.row(worker.name) for worker in self._launcher.workers() if worker.job is not None]
-            share = (self._num_done + sum(job.fraction() for job in self._jobs())) / self._num_cells
-            display.show(f"{self._num_done} of {self._num_cells} cells done", share, self._time_left(), rows)
+    def _show(self, display: Progress) -> None:
+        """Show a bar for all cells and one for each running step."""
+        now = time.monotonic()
+        if display.disable or now - self._shown < REDRAW_EVERY:
+            return
+        self._shown = now
+        for bar in display.task_ids:
+            display.remove_task(bar)
+        done = round(100 * (self._num_done + self._begun()) / self._num_cells)
+        text, note = self._progress().split(", ", 1)
+        display.add_task(text, completed=done, note=note)
+        for job in self._running.values():
+            doing, share, note = job.progress()
+            text = f"{job.cell.name} on {job.process.place or 'no machine yet'}: {doing}"
+            display.add_task(text, completed=round(100 * share), note=note)
+        display.refresh()
+
+
+def bars() -> Progress:
+    """Return a display of bars with notes, which is shown on a terminal only."""
+    name = TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1))
+    columns = (name, BarColumn(20), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
+    console, is_shown = Console(highlight=False), is_terminal(sys.stdout)
+    return Progress(*columns, console=console, auto_refresh=False, transient=True, expand=True, disable=not is_shown)
 
 
 def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
     """Create the folder of the results, and copy the matrix's file into it; UserError if it has other settings."""
     check_same(matrix, out)  # before anything is created
-    out.mkdir(parents=True, exist_ok=True)
     with held(out / "lock"):  # another process may do the same right now
         check_same(matrix, out)
         copy, text = out / SETTINGS_FILE, file.read_bytes()
         if not copy.is_file() or copy.read_bytes() != text:
-            part = copy.with_suffix(".yaml.part")
-            part.write_bytes(text)
-            os.replace(part, copy)
+            write_whole(copy, text)
 
 
-def time_left(durations: list[float], cells: float, num_workers: int) -> float | None:
+def time_left(durations: list[float], cells: float, num_steps: int) -> float | None:
     """Return the time for the cells that are left [s], from the durations of finished ones [s]; None if unknown."""
     if cells <= 0:
         return 0.0
-    return fmean(durations) * max(cells / num_workers, min(cells, 1.0)) if durations else None
+    return fmean(durations) * max(cells / max(num_steps, 1), min(cells, 1.0)) if durations else None

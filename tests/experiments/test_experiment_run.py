@@ -9,6 +9,7 @@ import re
 import signal
 import threading
 import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -17,11 +18,9 @@ from support.scripts import assert_told_in_one_line, contents
 
 from legged_torque.experiments import matrix as experiment
 from legged_torque.experiments import run as experiment_run
-from legged_torque.experiments.job import GPU_JOBS
-from legged_torque.experiments.local_launcher import LocalLauncher, find_workers
-from legged_torque.experiments.matrix import read_matrix
+from legged_torque.experiments.local_launcher import GPU_JOBS, LocalLauncher
+from legged_torque.experiments.matrix import CellState, read_matrix
 from legged_torque.experiments.run import ExperimentRun, time_left
-from legged_torque.utils import display
 
 STAND_IN_TRAIN = """
 import os, signal, sys, time, zipfile
@@ -48,7 +47,7 @@ if behaviour.startswith("killed") and not (behaviour.endswith("once") and done):
 while done < 4 and not stopped and not (behaviour == "early" and done == 2):
     done += 1
     print(f"iteration {done} of 4, 0:00:01, 0:00:02 left; tracking 0.5{done}0 (best 0.600), 0.0 falls/min", flush=True)
-    while behaviour == "slow" and done == 3 and not stopped:
+    while Path(__file__).with_name("behaviour").read_text() == "slow" and done == 3 and not stopped:
         time.sleep(0.02)
 zipfile.ZipFile(run / f"model_{done}.pt", "w").close()
 if behaviour.startswith("measure"):
@@ -123,7 +122,7 @@ def test_a_damaged_checkpoint_does_not_block_its_cell(stage, tmp_path):
 
 
 def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
-    """It is tried once more, after the others; the exit status is 1, the last lines of its log are shown.
+    """It is tried once more; the exit status is 1, the last lines of its log are shown.
 
     The next call tries it again, and only it.
     """
@@ -137,8 +136,8 @@ def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
     (stage / "behaviour").write_text("")
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert (status, error) == (0, "") and "2 of 2 cells are done." in output
-    both = ["a1_position-low-s1", "a1_torque-low-s1"]
-    assert order(stage) == [*both, both[0], both[0]]
+    failed, other = "a1_position-low-s1", "a1_torque-low-s1"
+    assert order(stage) == [failed, failed, other, failed]
 
 
 @pytest.mark.parametrize("behaviour", ["killed once", "killed"])
@@ -289,7 +288,7 @@ def test_lost_and_broken_results_are_made_again(stage, tmp_path):
     assert json.loads(broken.read_text())["perturbation"] == "low"
     changed = {path.name for path, state in contents(out).items() if before.get(path) != state}
     cells = {lost.parent.name, broken.parent.name}
-    assert changed == {"result_high.json", "result_low.json", "evaluate.log", "lock", "times.json", *cells}
+    assert changed == {"result_high.json", "result_low.json", "evaluate.log", "times.json", *cells}
 
 
 def test_what_a_training_has_measured_is_not_evaluated_again(stage, tmp_path):
@@ -342,50 +341,66 @@ def test_results_of_another_training_are_not_kept(stage, tmp_path):
     assert json.loads((out / "a1_torque-low-s1" / "result_low.json").read_text())["perturbation"] == "low"
 
 
-def test_panel(stage, tmp_path):
-    """On a terminal a panel says how far the cell is that is trained, how well it tracks, and what is done."""
+def test_display(stage, tmp_path):
+    """On a terminal a bar shows how far the cell is, how well it tracks, and what is done; lines stay above it."""
     (stage / "behaviour").write_text("slow")
-    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
-    stream = io.StringIO()
+    file, out = write(tmp_path / "m.yaml", SMALL | {"tasks": ["a1_position"]}), tmp_path / "out"
+    stream, run = io.StringIO(), ExperimentRun(read_matrix(file), out, LocalLauncher("cpu", 1))
     stream.isatty = lambda: True
-    run = ExperimentRun(read_matrix(file), out, LocalLauncher("cpu", 1))
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(stream):
-        patch.setattr(display, "REDRAW_EVERY", 0.05)
         patch.setenv("TERM", "xterm")
         patch.setenv("COLUMNS", "100")
         thread = threading.Thread(target=run.run)
         thread.start()
-        wait_for(lambda: "75%" in stream.getvalue())
+        wait_for(lambda: "75%" in stream.getvalue(), 20)
         (stage / "behaviour").write_text("")
-        os.kill(int((out / "a1_position-low-s1" / "lock").read_text()), signal.SIGTERM)
         thread.join()
     lines = re.sub(r"\033\[[\d;?]*[A-Za-z]", "", stream.getvalue()).splitlines()
-    (head, row) = next((lines[i - 2], line) for i, line in enumerate(lines) if "75%" in line)
-    assert re.fullmatch(r"│ 0 of 2 cells done [╸━]+ +37% 0:00:\d\d, time left unknown │", head)
-    assert re.fullmatch(r"│ a1_position-low-s1 +cpu +training 75% +0.530 +0:00:02 +│", row)
-    assert {len(line) for line in lines if line.startswith("│")} == {98}
-    assert any(re.match(r"\d{4}-.*  a1_position-low-s1: training has ended after 3 of 4", line) for line in lines)
+    (head, row) = next((lines[i - 1], line) for i, line in enumerate(lines) if "75%" in line and "training" in line)
+    assert re.fullmatch(r"0 of 1 cells done +[╸━╺]+ +75% 0:00:\d\d, time left unknown *", head)
+    assert re.fullmatch(r"a1_position-low-s1 on cpu: training +[╸━╺]+ +75% tracking 0.530, 0:00:02 left *", row)
+    assert any(re.match(r"\d{4}-.*  a1_position-low-s1: evaluation in high on cpu took", line) for line in lines)
 
 
-def test_workers(monkeypatch):
-    """Every visible GPU gets workers that see only that GPU, the first ones on different GPUs; so does the CPU."""
+@pytest.fixture
+def places(stage, tmp_path, monkeypatch):
+    """Start evaluations of a launcher: their devices, and the variables by which they see one GPU and some cores."""
+    shown = "import os; print(*map(os.environ.get, ('CUDA_VISIBLE_DEVICES', 'OMP_NUM_THREADS')))"
+    (stage / "evaluate.py").write_text(shown + "\nwhile not os.path.exists('ended'): pass")
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 12)
-    assert [worker.device for worker in find_workers("auto", 3)] == ["cpu"] * 3
-    assert [worker.variables for worker in find_workers("cpu", None)] == [{}]
+    monkeypatch.chdir(tmp_path)
+    matrix = read_matrix(write(tmp_path / "m.yaml", SMALL))
+
+    def start(launcher, count):
+        """Start some, and let them end when all are there."""
+        (cell, *_), log = matrix.cells(tmp_path), tmp_path / "log"
+        Path("ended").unlink(missing_ok=True)
+        with log.open("wb") as output, (tmp_path / "lock").open("wb") as lock:
+            state = CellState(4, 4, ["low"])
+            processes = [launcher.start(matrix, cell, state, output, lock) for _ in range(count)]
+        Path("ended").touch()
+        assert [process.wait() for process in processes] == [0] * count
+        return [process.place for process in processes], log.read_text().split()
+
+    return start
+
+
+def test_devices(places, monkeypatch):
+    """A step goes where the fewest are, sees that GPU only, and shares the cores with the others."""
+    cpu = LocalLauncher("auto", 3)
+    assert (cpu.device, cpu.room(), places(cpu, 2)) == ("cpu", 3, (["cpu"] * 2, ["None", "4"] * 2))
+    assert LocalLauncher("cpu", None).room() == 1
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    for visible, names in {None: ["0", "1"], "3,5": ["3", "5"]}.items():
-        monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-        if visible:
-            monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-        workers = find_workers("auto", 2)
-        expected = [{"CUDA_VISIBLE_DEVICES": name, "OMP_NUM_THREADS": "3"} for name in names * 2]
-        assert [worker.variables for worker in workers] == expected
-        assert [(worker.name, worker.device) for worker in workers] == [("cuda:0", "cuda:0"), ("cuda:1", "cuda:0")] * 2
-        assert [worker.variables for worker in find_workers("cuda:1", 1)] == [{"CUDA_VISIBLE_DEVICES": names[1]}]
-    assert len(find_workers("auto", None)) == 2 * GPU_JOBS and len(find_workers("cpu", 2)) == 2
-    monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    assert all("OMP_NUM_THREADS" not in worker.variables for worker in find_workers("auto", 3))
+    for visible, names in {None: "01", "3,5": "35"}.items():
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible) if visible else None
+        launcher = LocalLauncher("auto", 2)
+        where, variables = places(launcher, 4)
+        assert (launcher.device, launcher.room()) == ("cuda:0", 4) and where == ["cuda:0", "cuda:1"] * 2
+        assert sorted(variables[::2]) == sorted(names * 2) and variables[1::2] == ["3"] * 4
+    assert places(LocalLauncher("cuda:1", 1), 1) == (["cuda:1"], ["5", "None"])
+    assert LocalLauncher("auto", None).room() == 2 * GPU_JOBS
 
 
 def test_device_time(stage, tmp_path):

@@ -5,14 +5,14 @@ import signal
 
 import pytest
 
-from legged_torque.experiments.mps import FOLDERS, PROGRAM, multi_process_service
+from legged_torque.experiments.local_launcher import MPS, multi_process_service
 from legged_torque.utils.errors import UserError
 
 
 @pytest.fixture
 def program(tmp_path, monkeypatch):
     """A program that notes arguments, input, folder and devices, and may refuse; returns where it notes them."""
-    notes, file = tmp_path / "notes", tmp_path / PROGRAM
+    notes, file = tmp_path / "notes", tmp_path / MPS
     noted = '$*|$([ "$1" ] || cat)|$CUDA_MPS_PIPE_DIRECTORY|$CUDA_VISIBLE_DEVICES'
     stays = f'[ "$1" ] && {{ sleep 60 & echo $! > {notes}.pid; }}'  # with its output open, as a service does
     file.write_text(f'#!/bin/sh\necho "{noted}" >> {notes}\n{stays}\necho "it is $1"\n[ ! -e {notes}.no ]\n')
@@ -24,29 +24,27 @@ def program(tmp_path, monkeypatch):
 
 def test_service(program, monkeypatch):
     """It runs with a folder of its own while the context is open, also when that ends by an error, and no longer."""
-    monkeypatch.setenv(FOLDERS[0], "/mine")
+    monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", "/mine")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,3")  # would be 0, 1 to programs that use the service
-    monkeypatch.delenv(FOLDERS[1], raising=False)
-    with pytest.raises(KeyError), multi_process_service():
-        folder = os.environ[FOLDERS[0]]
-        assert os.path.isdir(folder) and os.environ[FOLDERS[1]] == folder != "/mine"
-        assert program.read_text() == f"-d||{folder}|\n"
+    before = dict(os.environ)
+    with pytest.raises(KeyError), multi_process_service() as variables:
+        (folder,) = set(variables.values())
+        assert variables.keys() == {"CUDA_MPS_PIPE_DIRECTORY", "CUDA_MPS_LOG_DIRECTORY"}
+        assert os.path.isdir(folder) and program.read_text() == f"-d||{folder}|\n"
         raise KeyError
     assert program.read_text().splitlines()[1:] == [f"|quit|{folder}|"]
-    assert os.environ[FOLDERS[0]] == "/mine" and FOLDERS[1] not in os.environ and not os.path.exists(folder)
+    assert dict(os.environ) == before and not os.path.exists(folder)
 
 
-def test_service_that_refuses(program, monkeypatch):
-    """Nothing is started, and the variables are as they were."""
+def test_service_that_refuses(program):
+    """Its words are the error, and the work is not begun."""
     program.with_name("notes.no").touch()
-    before = dict(os.environ)
-    with pytest.raises(UserError, match=f"--mps: {PROGRAM} says: it is -d"), multi_process_service():
+    with pytest.raises(UserError, match=f"--mps: {MPS} says: it is -d"), multi_process_service():
         raise AssertionError("the service has not started")
-    assert dict(os.environ) == before
 
 
 def test_without_the_program(tmp_path, monkeypatch):
     """The program that is missing is named."""
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(UserError, match=f"--mps needs the program {PROGRAM}"), multi_process_service():
+    with pytest.raises(UserError, match=f"--mps needs the program {MPS}"), multi_process_service():
         raise AssertionError("there is no service")

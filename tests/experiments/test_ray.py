@@ -17,7 +17,7 @@ ray = pytest.importorskip("ray", reason="needs the extra: pip install -e .[ray]"
 
 import legged_torque
 from legged_torque.experiments import matrix, ray_launcher
-from legged_torque.experiments.ray_node import difference, versions_here, write_files
+from legged_torque.experiments.ray_node import check_versions, versions_here, write_files
 
 TRAIN = """
 import os, signal, sys, time, zipfile
@@ -201,5 +201,7 @@ def test_files_stay_in_their_folder(name, tmp_path):
 def test_versions():
     """The first difference is told; a file of code that changes is one."""
     here = versions_here()
-    assert not difference("m", here, dict(here)) and {"torch", "mujoco-warp", "code of legged_torque"} <= here.keys()
-    assert difference("m", here, here | {"torch": "1"}) == f"the machine m has torch 1, this one has {here['torch']}"
+    assert {"torch", "mujoco-warp", "code of legged_torque"} <= here.keys()
+    check_versions("m", here, dict(here))
+    told = error_of(check_versions, "m", here, here | {"torch": "1"})
+    assert told == f"the machine m has torch 1, this one has {here['torch']}"
