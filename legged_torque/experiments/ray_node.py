@@ -64,6 +64,7 @@ class NodeStep:
             sent, report = time.time(), Report(place, None)
             with open(Path(folder, LOG), "wb") as output, open(Path(folder, LOG), "rb") as log:
                 self._process = LocalProcess(place, command_of(words), output, {}, cwd=folder)
+                yield report
                 while report.status is None:
                     with contextlib.suppress(subprocess.TimeoutExpired):
                         report.status = self._process.wait(REPORT_EVERY)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from support.experiments import SMALL, experiment_here, wait_for, write
+from support.experiments import SMALL, experiment_here, order, wait_for, write, write_scripts
 from support.scripts import assert_told_in_one_line, contents
 
 from legged_torque.experiments import matrix as experiment
@@ -22,68 +22,18 @@ from legged_torque.experiments.local_launcher import GPU_JOBS, LocalLauncher
 from legged_torque.experiments.matrix import CellState, read_matrix
 from legged_torque.experiments.run import ExperimentRun, time_left
 
-STAND_IN_TRAIN = """
-import os, signal, sys, time, zipfile
-from pathlib import Path
-SETTINGS = '''{task: t, env: {env: {num_envs: 5}}, train: {runner: {num_steps_per_env: 2}}, max_iterations: 4,
-versions: {}}'''
-options = dict(word.lstrip("-").partition("=")[::2] for word in sys.argv[1:])
-cell = Path(options["log_root"]) / options["experiment_name"]
-behaviour = Path(__file__).with_name("behaviour").read_text()
-with open(Path(__file__).with_name("order"), "a") as order:
-    order.write(f"{cell.name}{' resumed' if 'resume' in options else ''}\\n")
-if behaviour == f"fail {cell.name}":
-    sys.exit("first\\nsomething broke")
-runs = sorted(cell.glob("run_*"))
-done = max((int(file.stem[6:]) for file in runs[-1].glob("model_*")), default=0) if runs else 0
-run = cell / f"run_{len(runs)}"
-run.mkdir()
-(run / "config.yaml").write_text(SETTINGS)
-stopped = []
-signal.signal(signal.SIGTERM, lambda *_: stopped.append(1))
-if behaviour.startswith("killed") and not (behaviour.endswith("once") and done):
-    zipfile.ZipFile(run / "model_2.pt", "w").close()
-    os.kill(os.getpid(), signal.SIGKILL)
-while done < 4 and not stopped and not (behaviour == "early" and done == 2):
-    done += 1
-    print(f"iteration {done} of 4, 0:00:01, 0:00:02 left; tracking 0.5{done}0 (best 0.600), 0.0 falls/min", flush=True)
-    while Path(__file__).with_name("behaviour").read_text() == "slow" and done == 3 and not stopped:
-        time.sleep(0.02)
-zipfile.ZipFile(run / f"model_{done}.pt", "w").close()
-if behaviour.startswith("measure"):
-    for name in behaviour.split()[1:]:
-        (run / name).write_text("steps\\n8\\n")
-"""
-
-STAND_IN_EVALUATE = """
-import json, sys
-from pathlib import Path
-options = dict(word.lstrip("-").partition("=")[::2] for word in sys.argv[1:])
-broken = Path(__file__).with_name("behaviour").read_text() == "broken"
-Path(options["json"]).write_text('{"half' if broken else json.dumps(options))
-"""
-
 
 @pytest.fixture
 def stage(tmp_path, monkeypatch):
-    """A folder with stand-ins for the scripts, whose file ``behaviour`` says how they behave."""
-    stage = tmp_path / "stage"
-    stage.mkdir()
-    for name, text in {
-        "train.py": STAND_IN_TRAIN,
-        "evaluate.py": STAND_IN_EVALUATE,
-        "behaviour": "",
-        "order": "",
-    }.items():
-        (stage / name).write_text(text)
-    monkeypatch.setattr(experiment, "SCRIPTS_DIR", stage)
+    """The folder of the stand-ins, which are started in place of the scripts."""
     monkeypatch.setattr(experiment_run, "POLL", 0.01)
-    return stage
+    monkeypatch.setattr(experiment, "SCRIPTS_DIR", write_scripts(tmp_path / "stage"))
+    return tmp_path / "stage"
 
 
-def order(stage):
-    """The cells that were trained, in their order."""
-    return (stage / "order").read_text().splitlines()
+def trained(stage):
+    """The cells that were trained, in their order, and the iterations that they had before."""
+    return [f"{cell} from {before}" if before != "0" else cell for cell, before, _ in order(stage)]
 
 
 def test_order_and_commands(stage, tmp_path):
@@ -93,7 +43,7 @@ def test_order_and_commands(stage, tmp_path):
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert (status, error) == (0, "")
     cells = [f"{task}-{name}-s{seed}" for seed in (3, 1) for name in ("low", "high") for task in SMALL["tasks"]]
-    assert order(stage) == cells and (out / "experiment.yaml").read_bytes() == file.read_bytes()
+    assert trained(stage) == cells and (out / "experiment.yaml").read_bytes() == file.read_bytes()
     log = (out / "a1_torque-high-s3" / "train.log").read_text()
     for word in (
         "--task=a1_torque",
@@ -118,7 +68,7 @@ def test_a_damaged_checkpoint_does_not_block_its_cell(stage, tmp_path):
     damaged.write_bytes(b"PK")
     (out / "a1_torque-low-s1" / "result_high.json").unlink()
     assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
-    assert order(stage).count("a1_torque-low-s1") == 2 and (out / "a1_torque-low-s1" / "result_high.json").is_file()
+    assert trained(stage).count("a1_torque-low-s1") == 2 and (out / "a1_torque-low-s1" / "result_high.json").is_file()
 
 
 def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
@@ -137,7 +87,7 @@ def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert (status, error) == (0, "") and "2 of 2 cells are done." in output
     failed, other = "a1_position-low-s1", "a1_torque-low-s1"
-    assert order(stage) == [failed, failed, other, failed]
+    assert trained(stage) == [failed, failed, other, failed]
 
 
 @pytest.mark.parametrize("behaviour", ["killed once", "killed"])
@@ -147,7 +97,7 @@ def test_a_training_that_is_killed_is_tried_again(stage, tmp_path, behaviour):
     (stage / "behaviour").write_text(behaviour)
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert "a1_torque-low-s1: training was ended by signal 9; it will be tried again | " in output
-    assert order(stage) == ["a1_torque-low-s1", "a1_torque-low-s1 resumed"]
+    assert trained(stage) == ["a1_torque-low-s1", "a1_torque-low-s1 from 2"]
     if behaviour == "killed":
         assert status == 1 and error.startswith("a1_torque-low-s1: training from iteration 2 on was ended by signal 9")
     else:
@@ -170,7 +120,7 @@ def test_steps_that_only_seem_to_succeed(stage, tmp_path, behaviour, message):
     (stage / "behaviour").write_text("")
     assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
     assert len(list(out.glob("*/result_*.json"))) == 4
-    assert any("resumed" in line for line in order(stage)) == (behaviour == "early")
+    assert any(" from 2" in line for line in trained(stage)) == (behaviour == "early")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -189,13 +139,13 @@ def test_stop(stage, tmp_path, number):
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     thread.join()
     assert (status, error) == (130, "interrupted\n") and "Stopping: " in output and "0 of 2 cells are done." in output
-    assert [path.name for path in out.glob("*/*/model_*")] == ["model_3.pt"]
+    assert max(path.name for path in out.glob("*/*/model_*")) == "model_3.pt"
     (stage / "behaviour").write_text("")
     words = [file, f"--out={out}", "--device=cpu"]
     listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1].splitlines()
     assert listed[0] == "a1_position-low-s1: resume after 3 of 4 iterations, evaluate in low, high"
     assert experiment_here(*words, tmp_path=tmp_path)[0] == 0
-    assert order(stage) == ["a1_position-low-s1", "a1_position-low-s1 resumed", "a1_torque-low-s1"]
+    assert trained(stage) == ["a1_position-low-s1", "a1_position-low-s1 from 3", "a1_torque-low-s1"]
 
 
 def test_a_cell_that_another_process_works_on(stage, tmp_path):
@@ -209,7 +159,7 @@ def test_a_cell_that_another_process_works_on(stage, tmp_path):
         """Let go when the other cell is done."""
         wait_for((out / "a1_torque-low-s1" / "result_high.json").is_file)
         time.sleep(0.1)
-        assert order(stage) == ["a1_torque-low-s1"]
+        assert trained(stage) == ["a1_torque-low-s1"]
         lock.close()
 
     thread = threading.Thread(target=release)
@@ -218,7 +168,7 @@ def test_a_cell_that_another_process_works_on(stage, tmp_path):
     thread.join()
     assert (status, error) == (0, "")
     assert output.count("a1_position-low-s1: another process works on it; left for later\n") == 1
-    assert order(stage) == ["a1_torque-low-s1", "a1_position-low-s1"]
+    assert trained(stage) == ["a1_torque-low-s1", "a1_position-low-s1"]
 
 
 def test_two_experiments_share_a_folder(stage, tmp_path):
@@ -232,7 +182,7 @@ def test_two_experiments_share_a_folder(stage, tmp_path):
     for thread in threads:
         thread.join()
     assert statuses == [0, 0]
-    assert sorted(order(stage)) == sorted(cell.name for cell in matrix.cells(out))
+    assert sorted(trained(stage)) == sorted(cell.name for cell in matrix.cells(out))
 
 
 @pytest.mark.parametrize(
@@ -266,7 +216,7 @@ def test_more_cells_are_added(stage, tmp_path):
     assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
     write(file, SMALL | {"environments": {"high": ["high"], "low": ["doubled", "low", "high"]}, "seeds": [2, 1]})
     assert experiment_here(file, f"--out={out}", "--device=cpu", "--jobs=3", tmp_path=tmp_path)[0] == 0
-    assert len(order(stage)) == len(set(order(stage))) == 8
+    assert len(trained(stage)) == len(set(trained(stage))) == 8
     assert (out / "a1_torque-low-s1" / "result_doubled.json").is_file()
     assert read_matrix(out / "experiment.yaml").seeds == [2, 1]
 
@@ -283,7 +233,7 @@ def test_lost_and_broken_results_are_made_again(stage, tmp_path):
     listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1].splitlines()
     assert listed == ["a1_position-low-s1: evaluate in high", "a1_torque-low-s1: evaluate in low"]
     status, output, error = experiment_here(*words, tmp_path=tmp_path)
-    assert (status, error) == (0, "") and output.count(" took ") == 2 and len(order(stage)) == 2
+    assert (status, error) == (0, "") and output.count(" took ") == 2 and len(trained(stage)) == 2
     assert json.loads(lost.read_text())["perturbation"] == "high"
     assert json.loads(broken.read_text())["perturbation"] == "low"
     changed = {path.name for path, state in contents(out).items() if before.get(path) != state}
@@ -326,7 +276,7 @@ def test_tiles_are_crossed_after_training(stage, tmp_path):
     listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1]
     assert listed == "a1_torque-low-s1: evaluate in rough ground\n"
     assert experiment_here(*words, tmp_path=tmp_path)[0] == 0
-    assert result.is_file() and len(order(stage)) == 1
+    assert result.is_file() and len(trained(stage)) == 1
     write(file, values | {"grounds": {"kinds": ["flat"], "levels": [0, 0.5]}})
     told = "grounds.kinds is ['flat'], was ['flat', 'pits']; give another --out"
     assert_told_in_one_line(experiment_here(*words, tmp_path=tmp_path), told)

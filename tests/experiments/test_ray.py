@@ -9,7 +9,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from support.experiments import SMALL, experiment_here, wait_for, write
+from support.experiments import SMALL, experiment_here, order, wait_for, write, write_scripts
 from support.scripts import ROOT, assert_told_in_one_line
 from support.settings import error_of
 
@@ -19,36 +19,6 @@ import legged_torque
 from legged_torque.experiments import matrix, ray_launcher
 from legged_torque.experiments.ray_node import check_versions, versions_here, write_files
 
-TRAIN = """
-import os, signal, sys, time, zipfile
-from pathlib import Path
-options = dict(word.lstrip("-").partition("=")[::2] for word in sys.argv[1:])
-cell, here = Path(options["log_root"]) / options["experiment_name"], Path(__file__).parent
-runs = sorted(cell.glob("run_*"))
-done = max(int(file.stem[6:]) for file in runs[-1].glob("model_*")) if "resume" in options else 0
-with open(here / "order", "a") as order:
-    order.write(f"{cell.name} {done} {os.getppid()}\\n")
-run = cell / f"run_{int(runs[-1].name[4:]) + 1 if runs else 0}"
-run.mkdir(parents=True)
-(run / "config.yaml").write_text("{task: t, env: {}, train: {}, max_iterations: 4, versions: {}}")
-stopped = []
-signal.signal(signal.SIGTERM, lambda *_: stopped.append(1))
-while done < 4 and not stopped:
-    done += 1
-    print(f"iteration {done} of 4, 0:00:01, 0:00:02 left; tracking 0.5{done}0 (best 0.600), 0.0 falls/min", flush=True)
-    if done == 3:
-        zipfile.ZipFile(run / "model_2.pt", "w").close()
-    while done == 3 and (here / "wait").exists() and not stopped:
-        time.sleep(0.02)
-zipfile.ZipFile(run / f"model_{done}.pt", "w").close()
-"""
-
-EVALUATE = """
-import json, sys
-from pathlib import Path
-options = dict(word.lstrip("-").partition("=")[::2] for word in sys.argv[1:])
-Path(options["json"]).write_text(json.dumps({"of": options["experiment_name"], "in": options["perturbation"]}))
-"""
 FAST = {
     "health_check_initial_delay_ms": 0,
     "health_check_period_ms": 200,
@@ -63,9 +33,7 @@ def stage(tmp_path_factory):
     """A copy of the package, which the machines use, and stand-ins for the scripts beside it."""
     stage = tmp_path_factory.mktemp("stage")
     shutil.copytree(ROOT / "legged_torque", stage / "legged_torque", ignore=shutil.ignore_patterns("__pycache__"))
-    (stage / "scripts").mkdir()
-    for name, text in {"train.py": TRAIN, "evaluate.py": EVALUATE, "order": ""}.items():
-        (stage / "scripts" / name).write_text(text)
+    write_scripts(stage / "scripts")
     return stage
 
 
@@ -100,11 +68,6 @@ def here(stage, cluster, monkeypatch, tmp_path):
     return lambda *more: experiment_here(*words, *more, tmp_path=tmp_path)
 
 
-def order(stage):
-    """The trainings that were started: cell, iterations before, process that started it."""
-    return [line.split() for line in (stage / "scripts" / "order").read_text().splitlines()]
-
-
 def node_of(cluster, process):
     """The node that a process, started by one of its own, belongs to."""
     nodes = {node.all_processes["raylet"][0].process.pid: node for node in cluster.worker_nodes}
@@ -113,10 +76,16 @@ def node_of(cluster, process):
     return nodes[process]
 
 
-def during(stage, act):
-    """Do something while both trainings wait in their third iteration, in a thread of its own."""
-    (stage / "scripts" / "wait").touch()
-    thread = threading.Thread(target=act)
+def during(stage, out, act):
+    """Do something when both trainings wait in their third iteration and have sent a checkpoint."""
+    (stage / "scripts" / "behaviour").write_text("slow")
+
+    def wait_and_act():
+        """Wait, in a thread of its own."""
+        wait_for(lambda: len(list(out.glob("*/run_0/model_2.pt"))) == 2, 60)
+        act()
+
+    thread = threading.Thread(target=wait_and_act)
     thread.start()
     return thread
 
@@ -124,22 +93,15 @@ def during(stage, act):
 def test_stop(here, stage, tmp_path):
     """Trainings save, their checkpoints come home, and the next call goes on from there."""
     out = tmp_path / "out"
-    logs = [out / f"{task}-low-s1" / "train.log" for task in SMALL["tasks"]]
-
-    def stop():
-        """Ask to stop when both are under way."""
-        wait_for(lambda: all(log.is_file() and "iteration 3 of 4" in log.read_text() for log in logs), 30)
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    thread = during(stage, stop)
+    thread = during(stage, out, lambda: os.kill(os.getpid(), signal.SIGTERM))
     status, output, error = here()
     thread.join()
     assert (status, error) == (130, "interrupted\n"), output
-    assert [max(path.name for path in log.parent.glob("run_0/model_*")) for log in logs] == ["model_3.pt"] * 2
-    (stage / "scripts" / "wait").unlink()
+    assert [(cell / "run_0" / "model_3.pt").is_file() for cell in out.glob("*-s1")] == [True] * 2
+    (stage / "scripts" / "behaviour").write_text("")
     status, output, error = here()
     assert (status, error) == (0, "") and output.endswith("2 of 2 cells are done.\n")
-    assert sorted(done for _, done, _ in order(stage)) == ["0", "0", "3", "3"]
+    assert sorted(done for _, done, _ in order(stage / "scripts")) == ["0", "0", "3", "3"]
 
 
 def test_a_machine_is_killed(here, stage, cluster, tmp_path):
@@ -147,24 +109,24 @@ def test_a_machine_is_killed(here, stage, cluster, tmp_path):
     out, lost = tmp_path / "out", SMALL["tasks"][0] + "-low-s1"
 
     def kill():
-        """Kill the machine of the first cell when a checkpoint of its training has come home; let the other go on."""
-        wait_for((out / lost / "run_0" / "model_2.pt").is_file, 30)
-        (process,) = (int(process) for cell, _, process in order(stage) if cell == lost)
+        """Kill the machine of the first cell; let the other go on."""
+        (process,) = (int(process) for cell, _, process in order(stage / "scripts") if cell == lost)
         cluster.remove_node(node_of(cluster, process), allow_graceful=False)
         with contextlib.suppress(ProcessLookupError):
             os.kill(process, signal.SIGKILL)  # all that runs on a machine goes with it
-        (stage / "scripts" / "wait").unlink()
+        (stage / "scripts" / "behaviour").write_text("")
 
-    thread = during(stage, kill)
+    thread = during(stage, out, kill)
     status, output, error = here()
     thread.join()
     assert (status, error) == (0, ""), output + error
     assert f"{lost}: the machine was lost during training; it will be tried again | " in output
-    trained = [(cell, done) for cell, done, _ in order(stage)]
+    trained = [(cell, done) for cell, done, _ in order(stage / "scripts")]
     other = SMALL["tasks"][1] + "-low-s1"
     assert sorted(trained) == [(lost, "0"), (lost, "2"), (other, "0")]
     for cell in (lost, other):
-        assert json.loads((out / cell / "result_low.json").read_text()) == {"of": cell, "in": "low"}
+        result = json.loads((out / cell / "result_low.json").read_text())
+        assert (result["experiment_name"], result["perturbation"]) == (cell, "low")
         assert (out / cell / ("run_1" if cell == lost else "run_0") / "model_4.pt").is_file()
         assert json.loads((out / cell / "times.json").read_text())["seconds"]["cpu training"] > 0.0
     names = {path.name for cell in (lost, other) for path in (out / cell).iterdir()}
