@@ -66,3 +66,7 @@ class Rewards:
         """Add the terms to the sums of the episode, as 0 in worlds that have diverged. Shape: (num_envs,), bool."""
         self.terms.masked_fill_(diverged, 0.0)
         self.episode_sums += self.terms
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the terms and their sums."""
+        return {"terms": self.terms, "episode_sums": self.episode_sums}
