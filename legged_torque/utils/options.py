@@ -92,7 +92,7 @@ def apply_options(
         for part, cfg in {"env": env_cfg, "train": train_cfg}.items():
             if not isinstance(run_config[part], dict):
                 raise UserError(f"config key '{part}' is a section with entries, not the value {run_config[part]!r}")
-            update_from_dict(cfg, run_config[part])
+            update_from_dict(cfg, cfg.upgraded(run_config[part]))
     if options.perturbation:
         apply_perturbation(env_cfg, options.perturbation)
     if options.ranges:

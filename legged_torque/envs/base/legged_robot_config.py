@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
+from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.motors.config import DelayCfg, IdealCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
 from legged_torque.utils.limits import (
@@ -279,6 +280,10 @@ class LeggedRobotCfg(BaseConfig):
             "default": {"domain_rand": default, "noise": {"noise_scales": errors}},
             "hard": {"domain_rand": default | harder, "noise": {"noise_scales": errors | hard["noise_scales"]}},
         }
+
+    def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Return the settings of a run of commit d8439d6 in today's layout."""
+        return converted(values) if is_older(values) else values
 
     def random_parameters(self) -> dict[str, dict[str, list[float]]]:
         """Return the ranges of all parameters of ``domain_rand``, by name."""
