@@ -34,7 +34,7 @@ class Sensor(Buffers):
         self.interval = round(steps)  # control steps from one measurement to the next
         if abs(steps - self.interval) > 1e-6 * steps:
             raise UserError(
-                f"the rate of a sensor must divide {1.0 / state.dt:g} Hz, of the control steps, not {cfg.rate:g}"
+                f"a sensor's rate must divide that of the control steps, {1 / state.dt:g} Hz, not {cfg.rate:g}"
             )
         self.delay = round(cfg.delay / state.dt)  # control steps
         self.has_noise = False  # whether errors are added; the task sets it

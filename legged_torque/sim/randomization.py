@@ -75,6 +75,7 @@ class Randomization:
     Nothing waits for the host and nothing changes its address, so that it may run inside a CUDA graph.
 
     Attributes:
+        parameters: What is drawn.
         fields: The tensors in which the parameters are kept, by the name of the model's field or of the parameter.
         sizes: How many numbers of their own the parameters have, by name; those that take others' draws are left out.
         values: These numbers as they are now, from -1, the lowest one possible, to 1. Shape: (num_envs, their sum).
@@ -95,7 +96,7 @@ class Randomization:
         own values do so in a share of draws, ``keep_probability``. A UserError if a parameter is not float32, has not
         two axes, or can fall below what it may be.
         """
-        self.fields: dict[str, Tensor] = {}
+        self.parameters, self.fields = list(parameters), dict[str, Tensor]()
         self.sizes: dict[str, int] = {}
         rows: list[kernels.Row] = []
         at_start: list[float] = []
@@ -104,6 +105,7 @@ class Randomization:
         for parameter in parameters:
             is_of_model = isinstance(parameter.field, str)
             field = model_field(parameter.field).flatten(1) if isinstance(parameter.field, str) else parameter.field
+            check_draw(f"random parameter '{parameter.name}'", parameter.draw, may_be_negative=True)
             check_field(parameter, field)
             self.fields[str(parameter.field) if is_of_model else parameter.name] = field
             count = 1 if parameter.shared else len(parameter.columns)
@@ -125,11 +127,22 @@ class Randomization:
                     row.place = len(at_start)
                     at_start.append((row.own_value - row.middle) * row.per_half_range)
                 rows.append(row)
+        self._refuse_views(parameters)
         self._without_rows = [name for name, field in self.fields.items() if len(field) != num_envs]
         self._device = device
         self.values = torch.tensor(at_start, device=device).repeat(num_envs, 1)
         self.seeds = torch.zeros(num_envs, dtype=torch.int32, device=device)
         self._rows: wp.array = wp.array(rows, dtype=kernels.Row, device=device)
+
+    def _refuse_views(self, parameters: Sequence[RandomParameter]) -> None:
+        """Raise a UserError for a tensor that is a field of the model: what follows from it would stay as it was."""
+        names = [str(parameter.field) for parameter in parameters if isinstance(parameter.field, str)]
+        storages = {self.fields[name].untyped_storage().data_ptr(): name for name in names}
+        for parameter in parameters:
+            is_tensor = isinstance(parameter.field, Tensor)
+            name = storages.get(parameter.field.untyped_storage().data_ptr()) if is_tensor else None
+            if name:
+                raise UserError(f"the random parameter '{parameter.name}' is the model's '{name}': give its name")
 
     def draw(self, mask: Tensor) -> None:
         """Draw all parameters anew in the worlds of ``mask`` (num_envs,), bool; a UserError if worlds share one."""
@@ -146,13 +159,18 @@ def check_field(parameter: RandomParameter, field: Tensor) -> None:
         raise UserError(f"random parameter '{parameter.name}' must be float32 with two axes, not {kind} {shape}")
 
 
-def check_draw(setting: str, draw: Draw) -> None:
-    """Raise a UserError that names the setting unless it has known operations with ranges, "set" being alone."""
+def check_draw(setting: str, draw: Draw, may_be_negative: bool = False) -> None:
+    """Raise a UserError that names the setting unless it has known operations with ranges, "set" being alone.
+
+    Numbers that are added may be negative, others only if ``may_be_negative``.
+    """
     for operation, limits in draw.items():
         if operation not in OPERATIONS:
             raise unknown_name(f"operation of {setting}", operation, OPERATIONS)
         if len(limits) != 2 or not -LARGEST <= limits[0] <= limits[1] <= LARGEST:
             raise UserError(f"{setting}.{operation} must be [minimum, maximum], not {limits}")
+        if limits[0] < 0.0 and operation != "add" and not may_be_negative:
+            raise UserError(f"{setting}.{operation} must be [minimum, maximum] of at least 0, not {limits}")
     if "set" in draw and len(draw) > 1:
         raise UserError(f"{setting} has 'set', which replaces the robot's own value: it cannot have {list(draw)}")
 

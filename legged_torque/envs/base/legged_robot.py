@@ -97,6 +97,7 @@ class LeggedRobot(RewardTerms, BaseTask):
     default_dof_pos: Tensor
     p_gains: Tensor
     d_gains: Tensor
+    motor_strength: Tensor
 
     def __init__(self, cfg: LeggedRobotCfg, device: str = "cpu") -> None:
         """Create the worlds on "cpu" or "cuda:N", each in a random initial state; ``cfg.env.num_actions`` is filled in.
@@ -382,6 +383,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         armature = self._tensor(asset.mj_model.dof_armature[6:])
         clock = (cfg.sim.dt, cfg.control.decimation)
         self.motors = MotorChain(cfg.motors, Joints(self.dof_names, self.torque_limits, armature, self.actions, *clock))
+        self.motor_strength = self.motors.strength
         self._torque_kernel = None
         if self.sim.is_fused and cfg.control.refresh_torques:
             self._torque_kernel = self.motors.kernel(self.control_law.kernel)
