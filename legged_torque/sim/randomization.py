@@ -134,13 +134,18 @@ class Randomization:
         self.seeds = torch.zeros(num_envs, dtype=torch.int32, device=device)
         self._rows: wp.array = wp.array(rows, dtype=kernels.Row, device=device)
 
+    def own_fields(self) -> dict[str, Tensor]:
+        """Return the tensors that are no fields of the model, by name of their parameter."""
+        names = [parameter.name for parameter in self.parameters if isinstance(parameter.field, Tensor)]
+        return {name: self.fields[name] for name in names}
+
     def _refuse_views(self, parameters: Sequence[RandomParameter]) -> None:
         """Raise a UserError for a tensor that is a field of the model: what follows from it would stay as it was."""
         names = [str(parameter.field) for parameter in parameters if isinstance(parameter.field, str)]
         storages = {self.fields[name].untyped_storage().data_ptr(): name for name in names}
         for parameter in parameters:
-            is_tensor = isinstance(parameter.field, Tensor)
-            name = storages.get(parameter.field.untyped_storage().data_ptr()) if is_tensor else None
+            field = parameter.field
+            name = None if isinstance(field, str) else storages.get(field.untyped_storage().data_ptr())
             if name:
                 raise UserError(f"the random parameter '{parameter.name}' is the model's '{name}': give its name")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -36,16 +35,14 @@ from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.motors.chain import MotorChain
 from legged_torque.motors.joints import Joints
-from legged_torque.sensors.config import SensorCfg
-from legged_torque.sensors.height_scan import HeightScan
-from legged_torque.sensors.sensor import Sensor
+from legged_torque.sensors.sensors import Sensors
 from legged_torque.sim.health import Health
 from legged_torque.sim.model import indices_matching
 from legged_torque.sim.randomization import RandomParameter, changes_legs
 from legged_torque.sim.simulator import Simulator
 from legged_torque.terrain import make_terrain
-from legged_torque.utils.config import section_keys, to_dict
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.config import section_keys
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import joint_limits
 
 MODEL_FIELDS = (
@@ -141,10 +138,8 @@ class LeggedRobot(RewardTerms, BaseTask):
 
     def observation_terms(self) -> list[ObservationTerm]:
         """Return the terms of all groups of observations."""
-        scan = self.sensors.get("height_scan")
-        parameters = (self.randomization.values, self.parameter_mirrors)
-        assert scan is None or isinstance(scan, HeightScan)
-        return standard_terms(self.cfg, self.state, self.control, *parameters, self.symmetry, scan)
+        drawn, scan = (self.randomization.values, self.parameter_mirrors), self.sensors.height_scan
+        return standard_terms(self.cfg, self.state, self.control, *drawn, self.symmetry, scan)
 
     def random_parameters(self) -> list[RandomParameter]:
         """Return what ``domain_rand`` draws in each world."""
@@ -216,9 +211,9 @@ class LeggedRobot(RewardTerms, BaseTask):
             self._keep_final_observations()
         end_episodes()
         self._reset_worlds()
-        if self._kernel_sensors:
+        if self.sensors.has_kernels:
             begin_episodes()
-            self._measure(self._kernel_sensors)
+            self.sensors.update_all(self.state.reset_buf, compilable=False)
             observe()
         else:
             finish_step()
@@ -274,7 +269,7 @@ class LeggedRobot(RewardTerms, BaseTask):
     def _finish_step(self) -> None:
         """Begin new episodes, and observe all worlds."""
         self._begin_episodes()
-        self._measure(self._kernel_sensors)
+        self.sensors.update_all(self.state.reset_buf, compilable=False)
         self._observe()
 
     def _begin_episodes(self) -> None:
@@ -288,29 +283,18 @@ class LeggedRobot(RewardTerms, BaseTask):
         state.update()
         self.command_generator.follow_headings()
 
-    def _measure(self, sensors: Sequence[Sensor]) -> None:
-        """Let sensors measure."""
-        for sensor in sensors:
-            sensor.update(self.state.reset_buf)
-
     def _observe(self) -> None:
-        """Let sensors measure, compute the observations, and keep what the next rewards compare with."""
-        self._measure(self._torch_sensors)
+        """Measure, compute the observations, and keep what the next rewards compare with."""
+        self.sensors.update_all(self.state.reset_buf, compilable=True)
         self.compute_observations()
         self.last_actions.copy_(self.actions)
         self.last_dof_vel.copy_(self.dof_vel)
 
     def _keep_final_observations(self) -> None:
         """Write the observations of all worlds before any reset; sensors go on as if nothing had been read."""
-        nobody = torch.zeros_like(self.state.reset_buf)
-        kept = [{name: tensor.clone() for name, tensor in s.state_dict().items()} for s in self.sensors.values()]
-        for sensor in self.sensors.values():
-            sensor.update(nobody)
-        for name, values in self.observations.look().items():
-            self._final.setdefault(name, torch.zeros_like(values)).copy_(values)
-        for sensor, tensors in zip(self.sensors.values(), kept, strict=True):
-            for name, tensor in sensor.state_dict().items():
-                tensor.copy_(tensors[name])
+        with self.sensors.looking_ahead():
+            for name, values in self.observations.look().items():
+                self._final.setdefault(name, torch.zeros_like(values)).copy_(values)
 
     def set_state(self, qpos: Tensor, qvel: Tensor) -> None:
         """Put all worlds into states as in ``sim.qpos`` and ``sim.qvel``, and observe them; episodes go on."""
@@ -318,14 +302,14 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.sim.qvel.copy_(qvel)
         self.state.update()
         self.command_generator.follow_headings()
-        self._measure(self._kernel_sensors)
+        self.sensors.update_all(self.state.reset_buf, compilable=False)
         self._observe()
 
     def world_state_dict(self) -> dict[str, Any]:
         """Return all that worlds keep from step to step, by owner."""
         owners: dict[str, Any] = {"sim": self.sim, "state": self.state, "rewards": self.rewards, "log": self.log}
         owners |= {"motors": self.motors, "events": self.events, "commands": self.command_generator}
-        owners |= {"terrain": self.terrain, "observations": self.observations, **self.sensors}
+        owners |= {"terrain": self.terrain, "observations": self.observations, "sensors": self.sensors}
         return {name: owner.state_dict() for name, owner in owners.items()} | {"task": self._world_state}
 
     # ---- construction, in this order ---------------------------------------------------------------------------------
@@ -389,29 +373,13 @@ class LeggedRobot(RewardTerms, BaseTask):
             self._torque_kernel = self.motors.kernel(self.control_law.kernel)
             if self._is_overridden() or not self._torque_kernel:
                 self.notes.append(f"{type(self).__name__}: {OUTSIDE_KERNEL}")
-        sections = {name: getattr(cfg.sensors, name) for name in section_keys(cfg.sensors)}
-        self.sensors: dict[str, Sensor] = {
-            name: section.build(self.state) for name, section in sections.items() if isinstance(section, SensorCfg)
-        }
-        if self.terrain.map is not None:
-            self.sensors["height_scan"] = HeightScan(cfg.terrain, self.state)
-        for sensor in self.sensors.values():
-            sensor.has_noise = cfg.noise.add_noise
-        self._torch_sensors = [sensor for sensor in self.sensors.values() if sensor.compilable]
-        self._kernel_sensors = [sensor for sensor in self.sensors.values() if not sensor.compilable]
+        self.sensors = Sensors(cfg.sensors, cfg.terrain, self.state, cfg.noise.add_noise)
 
     def _prepare_reward_functions(self) -> None:
         """Collect the functions of all terms with a scale that is not zero, and their weights."""
-        scales = {name: scale for name, scale in to_dict(self.cfg.rewards.scales).items() if scale != 0.0}
-        known = [name.removeprefix("_reward_") for name in dir(type(self)) if name.startswith("_reward_")]
-        curriculum = self.cfg.rewards.curriculum
-        curricula = {name: getattr(curriculum, name) for name in section_keys(curriculum)}
-        for name in [*scales, *curricula]:
-            if name not in known:
-                raise unknown_name("reward term", name, known)
-        functions = {name: getattr(self, f"_reward_{name}") for name in scales}
-        only_positive = self.cfg.rewards.only_positive_rewards
-        self.rewards = Rewards(functions, scales, curricula, only_positive, self.dt, self.num_envs, self.device)
+        names = [name for name in dir(type(self)) if name.startswith("_reward_")]
+        functions = {name.removeprefix("_reward_"): getattr(self, name) for name in names}
+        self.rewards = Rewards(functions, self.cfg.rewards, self.dt, self.num_envs, self.device)
         self.reward_names, self.episode_sums = self.rewards.names, self.rewards.episode_sums
         self.log = TaskLog(self.reward_names, self.num_envs, self.device)
 
@@ -447,11 +415,10 @@ class LeggedRobot(RewardTerms, BaseTask):
 
         A UserError if the robot is not symmetric, or the mirror image of a term or of a random parameter is not known.
         """
-        actions = [(term.name, self.symmetry.joints) for term in self.control_law.terms]
         unknown = [name for name, mirroring in self.parameter_mirrors.items() if mirroring is None]
         problem = f"the mirror image of the random parameter '{unknown[0]}' is not known" if unknown else ""
-        parts = {**self.observations.mirrors(), "actions": actions}
-        return Mirror(parts, self.symmetry.problem or problem, self.device)
+        actions = [(term.name, self.symmetry.joints) for term in self.control_law.terms]
+        return Mirror(self.observations.mirrors() | {"actions": actions}, self.symmetry.problem or problem, self.device)
 
     def _tensor(self, values: Any) -> Tensor:
         """Return values as a float tensor on the task's device."""

@@ -69,9 +69,5 @@ class RandomEvents:
             self._sim.update_constants(self._new_parameters)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the drawn parameters with the tensors that they are kept in, and all that draws follow from.
-
-        Fields of the model are left out, since the simulator keeps them.
-        """
-        kept = {"seeds": self._seeds, "new_parameters": self._new_parameters, "init_angles": self.init_angles}
-        return kept | {"values": self.parameters.values}
+        """Return the drawn parameters, and the tensors in which they are kept; those of the model the simulator has."""
+        return {"values": self.parameters.values, "fields": self.parameters.own_fields()}
