@@ -13,6 +13,7 @@ from torch import Tensor
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.motors.joints import by_joint
 from legged_torque.motors.kernel import control_law, launch_law, read
+from legged_torque.utils.errors import UserError
 
 
 class ControlParameters:
@@ -63,8 +64,8 @@ class ActionTerm:
     scale: Tensor  # factor on the action, one per world. Shape: (num_envs, 1)
     unit: str  # of scale times action
     meaning: str  # what scale times action is
-    law: Any  # Warp function ``(reads, action, world, joint, pos [rad], vel [rad/s]) -> torque [N m]``
-    reads: Any  # instance of the Warp struct that the law reads
+    law: Any = None  # Warp function ``(reads, action, world, joint, pos [rad], vel [rad/s]) -> torque [N m]``
+    reads: Any = None  # instance of the Warp struct that the law reads
     weight: Tensor | None = None  # of its torques, a scalar on the device; None is 1
     interval: int = 1  # control steps for which its actions are held, from the start of an episode on
 
@@ -83,19 +84,25 @@ class ControlLaw:
 
     Attributes:
         terms: The terms.
-        kernel: The Warp function of the sum, and what it reads, see :func:`~legged_torque.motors.kernel.control_law`.
+        kernel: The Warp function of the sum, and what it reads, see :func:`~legged_torque.motors.kernel.control_law`;
+            None if a term has no law, so that the task must compute torques itself.
     """
 
     def __init__(self, terms: Sequence[ActionTerm], num_dof: int) -> None:
         """Put terms together, each with one action per joint, in this order."""
         self.terms, self.num_actions = list(terms), len(terms) * num_dof
-        self.kernel = control_law([((term.law, term.reads), term.weight) for term in terms], num_dof)
+        laws = [((term.law, term.reads), term.weight) for term in terms]
+        self.kernel = control_law(laws, num_dof) if all(term.law for term in terms) else None
 
     def torques(self, actions: Tensor, pos: Tensor, vel: Tensor, out: Tensor) -> Tensor:
         """Write the torques that motors are asked for to ``out`` [N m], and return it.
 
-        Shapes: (num_envs, num_actions), others (num_envs, num_dof); pos in rad, vel in rad/s.
+        Shapes: (num_envs, num_actions), others (num_envs, num_dof); pos in rad, vel in rad/s. A UserError if a term has
+        no law.
         """
+        if not self.kernel:
+            lacking = [term.name for term in self.terms if not term.law]
+            raise UserError(f"the action term '{lacking[0]}' has no law, and no _compute_torques takes its place")
         launch_law(self.kernel, actions, pos, vel, out)
         return out
 

@@ -352,6 +352,7 @@ class LeggedRobot(RewardTerms, BaseTask):
     def _init_state(self) -> None:
         """Build control law, state, motors and sensors."""
         cfg, asset = self.cfg, self.asset
+        self._use_attributes_of(self.control)
         self.control_law = ControlLaw(self.action_terms(), self.num_dof)
         self.num_actions = self.control_law.num_actions
         if cfg.env.num_actions not in (None, self.num_actions):
@@ -359,10 +360,7 @@ class LeggedRobot(RewardTerms, BaseTask):
             raise UserError(f"env.num_actions must be {self.num_actions} for {name}, not {cfg.env.num_actions}")
         cfg.env.num_actions = self.num_actions
         self.state = RobotState(self.sim, self.terrain, asset.feet, asset.foot_of, self.num_actions, self.dt)
-        for owner in (self.state, self.control):
-            for name, value in vars(owner).items():
-                if isinstance(value, Tensor) and not name.startswith("_"):
-                    setattr(self, name, value)
+        self._use_attributes_of(self.state)
         self._given_actions, self._wanted_torques = torch.zeros_like(self.actions), torch.zeros_like(self.dof_vel)
         armature = self._tensor(asset.mj_model.dof_armature[6:])
         clock = (cfg.sim.dt, cfg.control.decimation)
@@ -370,7 +368,8 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.motor_strength = self.motors.strength
         self._torque_kernel = None
         if self.sim.is_fused and cfg.control.refresh_torques:
-            self._torque_kernel = self.motors.kernel(self.control_law.kernel)
+            law = self.control_law.kernel
+            self._torque_kernel = self.motors.kernel(law) if law else None
             if self._is_overridden() or not self._torque_kernel:
                 self.notes.append(f"{type(self).__name__}: {OUTSIDE_KERNEL}")
         self.sensors = Sensors(cfg.sensors, cfg.terrain, self.state, cfg.noise.add_noise)
@@ -419,6 +418,12 @@ class LeggedRobot(RewardTerms, BaseTask):
         problem = f"the mirror image of the random parameter '{unknown[0]}' is not known" if unknown else ""
         actions = [(term.name, self.symmetry.joints) for term in self.control_law.terms]
         return Mirror(self.observations.mirrors() | {"actions": actions}, self.symmetry.problem or problem, self.device)
+
+    def _use_attributes_of(self, owner: RobotState | ControlParameters) -> None:
+        """Have the tensors of an object as attributes, too."""
+        for name, value in vars(owner).items():
+            if isinstance(value, Tensor) and not name.startswith("_"):
+                setattr(self, name, value)
 
     def _tensor(self, values: Any) -> Tensor:
         """Return values as a float tensor on the task's device."""

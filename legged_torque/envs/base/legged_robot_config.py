@@ -97,7 +97,8 @@ class LeggedRobotCfg(BaseConfig):
         chain: list[str] = ["delay", "ideal"]  # links in order: those of actions, then those of torques
 
         class delay(DelayCfg):  # time from the policy to the motors
-            pass
+            range = [0, 0]  # in ``unit``, drawn at every reset
+            unit = "physics_steps"  # or "control_steps"
 
         class ideal(IdealCfg):  # any torque within the limits, at once
             pass
