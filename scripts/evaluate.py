@@ -1,4 +1,4 @@
-"""Measure a checkpoint.
+"""Measure a checkpoint, or all of a run.
 
 With ``--terrain`` and ``--level``, robots try to cross tiles of rough ground, once in each world: see docs/terrain.md.
 
@@ -7,6 +7,7 @@ Examples:
     python scripts/evaluate.py --task=a1_position --perturbation=high   # in another environment
     python scripts/evaluate.py --task=a1_position --command 0.5 0 0.2   # with one command
     python scripts/evaluate.py --task=a1_position --terrain all --level 0.5
+    python scripts/evaluate.py --task=a1_position --all_checkpoints     # a learning curve, for plot.py curves
 """
 
 from __future__ import annotations
@@ -34,11 +35,12 @@ from legged_torque.utils.cli import (
     run_script,
     write_json,
 )
+from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
-from legged_torque.utils.paths import portable_path
-from legged_torque.utils.runs import package_versions
+from legged_torque.utils.paths import portable_path, without_machine
+from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import LoadedRun, set_seed
 
 if TYPE_CHECKING:
@@ -48,14 +50,14 @@ if TYPE_CHECKING:
     from legged_torque.envs.base.metrics import CommandBreakdown
     from legged_torque.learning.crossing import Grounds
 
-STEPS = 2000  # control steps, where robots do not cross tiles
+WORLDS, STEPS = 16, 2000  # of one checkpoint, where robots do not cross tiles
+CURVE_WORLDS, CURVE_STEPS = 256, 1000  # of each of all checkpoints
+CURVE_SEED = 1000  # added to the training's seed: worlds other than in training, but the same for every checkpoint
 
 
 def main() -> None:
     """Roll out a checkpoint with mean actions, print the metrics, write them as JSON."""
     args = parse_args()
-    if args.json:
-        check_output(args.json)
     options = options_of(args)
     grounds = None
     with importing():
@@ -64,6 +66,12 @@ def main() -> None:
 
             grounds = Grounds.of(args.terrain, args.level, args.command)
         run = task_registry.load_run(options)
+        if args.all_checkpoints and not args.json:
+            args.json = run.folder / "curve.json"
+        if args.json:
+            check_output(args.json)
+        if args.seed is None:
+            args.seed = run.train_cfg.seed + CURVE_SEED if args.all_checkpoints else 1
         import torch
 
         from legged_torque.envs.base.commands import fix_command
@@ -77,19 +85,23 @@ def main() -> None:
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options, env_cfg)
     torch.manual_seed(args.seed)  # building and loading have drawn numbers too
-    if grounds:
+    if args.all_checkpoints:
+        measured = measure_all(args, run, env, runner)
+    elif grounds:
         measured = cross_tiles(run, env, runner, grounds)
     else:
         measured = walk(run, env, runner, args.steps, bool(args.command))
     if args.json:
-        write_json(args.json, circumstances(args, run, env, runner) | measured)
+        write_json(args.json, without_machine(circumstances(args, run, env, runner) | measured))
 
 
 def parse_args() -> argparse.Namespace:
     """Return the command line; a UserError if it makes no sense."""
     parser = Parser(__doc__)
     add_task_args(parser)
-    parser.set_defaults(num_envs=16, seed=1)
+    hint = f"""measure every checkpoint of the run; by default in {CURVE_WORLDS} worlds for {CURVE_STEPS} steps,
+        an episode, into curve.json in the run's folder"""
+    parser.add_argument("--all_checkpoints", action="store_true", help=hint)
     parser.add_argument("--steps", type=int, help=f"control steps; default: {STEPS}")
     add_command_arg(parser)
     hint = """kinds of rough ground to cross, or all; then --num_envs is for each kind and level, and --command a speed
@@ -99,11 +111,15 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--level", nargs="+", type=finite, help=hint)
     parser.add_argument("--json", type=Path, help="file to write")
     args = parser.parse_args()
+    if args.all_checkpoints and (args.terrain or args.checkpoint is not None):
+        raise UserError("--all_checkpoints takes neither --terrain nor --checkpoint")
     if args.terrain and args.steps is not None:
         raise UserError("--steps is not for --terrain: how long robots may try follows from the command")
     if args.level and not args.terrain:
         raise UserError("--level needs --terrain: the kinds of rough ground")
-    args.steps = STEPS if args.steps is None else args.steps
+    num_envs, steps = (CURVE_WORLDS, CURVE_STEPS) if args.all_checkpoints else (WORLDS, STEPS)
+    args.num_envs = num_envs if args.num_envs is None else args.num_envs
+    args.steps = steps if args.steps is None else args.steps
     args.level = args.level or GROUNDS["levels"]
     check_at_least(args, 1, "steps")
     return args
@@ -126,6 +142,24 @@ def walk(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, num_steps: in
         print_breakdown(breakdown)
     shown = {name: asdict(estimate) for name, estimate in metrics.items()}
     return {"num_steps": num_steps, "metrics": shown, "by_command": breakdown.table()}
+
+
+def measure_all(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner) -> dict[str, Any]:
+    """Measure all checkpoints in the order of training, print a line for each, and return their metrics."""
+    from legged_torque.envs.base.metrics import measure
+
+    points = []
+    for number in checkpoint_numbers(run.folder):
+        infos = runner.load(str(find_checkpoint(run.folder, number)), {"actor": True, "iteration": True})
+        set_seed(args.seed)
+        means = measure(env, runner.get_inference_policy(env.device), args.steps).means()
+        points.append({"steps": infos["total_timesteps"], "seconds": infos["seconds"], **means})
+        texts = [f"{name} {mean:.4f}" for name, mean in means.items()]
+        print(f"{infos['total_timesteps']:>12,} steps", *texts, sep="  ", flush=True)
+    settings = {"num_envs": env.num_envs, "num_steps": args.steps, "actions": "mean", "env": to_dict(env.cfg)}
+    settings["seed"] = args.seed
+    result = {"seed": run.config["train"]["seed"], "trained_with": run.config["train"], "evaluation": settings}
+    return result | {"trained_env": run.config["env"], "points": points}
 
 
 def print_breakdown(breakdown: CommandBreakdown) -> None:

@@ -12,7 +12,7 @@ from legged_torque.utils.plotting import save_figure
 def main() -> None:
     """Draw one panel per metric and one line per training."""
     parser = Parser(__doc__)
-    help_text = "JSON of learning_curve.py, evaluations.csv of a run, or evaluations.csv.gz of a report"
+    help_text = "JSON of evaluate.py --all_checkpoints, evaluations.csv of a run, or evaluations.csv.gz of a report"
     parser.add_argument("files", type=Path, nargs="+", help=help_text)
     parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
     args = parser.parse_args()

@@ -8,11 +8,27 @@ import numpy as np
 
 from legged_torque.terrain.colors import color_of
 from legged_torque.terrain.tiles import TILES, Grid
+from legged_torque.utils.cli import Parser, check_at_least, check_output
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.plotting import load_pyplot, save_figure
 
 _COLUMNS = 4
 _SINE, _COSINE = np.sin(np.radians(35.0)), np.cos(np.radians(35.0))  # of the angle at which one looks down
 _LIGHT = np.array([-0.66, -0.22, 0.72])  # where it comes from: walls that face the eye are of two shades
+
+
+def plot_terrain() -> None:
+    """Read the command line, and draw a tile of each kind."""
+    parser = Parser("Draw every kind of rough ground: ``python scripts/plot.py terrain --out tiles.png``.")
+    parser.add_argument("--difficulty", type=float, default=0.8, help="from 0 to 1; default: %(default)s")
+    parser.add_argument("--seed", type=int, default=1, help="of the random numbers; default: %(default)s")
+    parser.add_argument("--out", type=Path, required=True, help="picture to write (png, svg, pdf)")
+    args = parser.parse_args()
+    if not 0.0 <= args.difficulty <= 1.0:
+        raise UserError(f"--difficulty must be from 0 to 1, not {args.difficulty}")
+    check_at_least(args, 0, "seed")
+    check_output(args.out)
+    draw_tiles(args.out, args.difficulty, args.seed)
 
 
 def draw_tiles(file: Path, difficulty: float, seed: int) -> None:

@@ -183,16 +183,20 @@ def test_mistakes_when_training(root, words, message):
         ("play.py", "--grid=4 --viewer=web", "--grid is for videos, which --viewer web does not make"),
         ("play.py", "--stpes=5", "unknown option '--stpes=5'; did you mean '--steps'?"),
         ("play.py", "--set=control.stifness=1", "did you mean 'control.stiffness'?"),
-        ("learning_curve.py", "--steps=0", "--steps must be at least 1, not 0"),
-        ("learning_curve.py", "--load_run=2026", "unknown run '2026'"),
-        ("learning_curve.py", "--num_envs=2 --json=/dev/null/a", "cannot write '/dev/null/a': Not a directory"),
+        (
+            "evaluate.py",
+            "--all_checkpoints --terrain all",
+            "--all_checkpoints takes neither --terrain nor --checkpoint",
+        ),
+        ("evaluate.py", "--all_checkpoints --json=/dev/null/a", "cannot write '/dev/null/a': Not a directory"),
+        ("evaluate.py", "--steps=0", "--steps must be at least 1, not 0"),
+        ("evaluate.py", "--load_run=2026", "unknown run '2026'"),
         ("evaluate.py", "--json=/dev", "cannot write '/dev': it is a folder"),
         ("evaluate.py", "--json=/proc/x", "cannot write '/proc/x'"),
         ("evaluate.py", "--command nan 0 0", "argument --command: it must be finite, not nan"),
         ("export.py", "--num_envs=0", "num_envs must be from 1"),
         ("export.py", "--out=/dev/null", "cannot write '/dev/null/policy.yaml'"),
         ("play.py", "--video=/dev/null/a.mp4", "cannot write '/dev/null/a.mp4'"),
-        ("physics_accuracy.py", "--steps=0", "--steps must be at least 1, not 0"),
     ],
 )
 def test_mistakes_after_training(root, script, words, message):
@@ -215,7 +219,7 @@ def test_values_of_several_lines(tmp_path):
     assert_told_in_one_line(run_here("train.py", "--task=a\nb", root=tmp_path), "unknown task 'a")
 
 
-@pytest.mark.parametrize("script", ["train.py", "play.py", "learning_curve.py", "benchmark.py"])
+@pytest.mark.parametrize("script", ["train.py", "play.py", "benchmark.py"])
 def test_help(script, tmp_path):
     """``--help`` describes the options."""
     status, output, error = run_here(script, "--help", root=tmp_path)
@@ -283,11 +287,12 @@ def test_resume_in_a_folder_by_its_path(root, tmp_path):
 def test_learning_curve(root, tmp_path):
     """Every checkpoint is measured, at the number of steps after which it was saved."""
     file = tmp_path / "new" / "curve.json"
-    words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--steps=3", f"--json={file}"]
-    status, output, error = run_here("learning_curve.py", *words, root=root)
+    words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--steps=3", f"--json={file}", "--all_checkpoints"]
+    status, output, error = run_here("evaluate.py", *words, root=root)
     assert (status, error) == (0, "") and len(output.splitlines()) == 3
     curve = json.loads(file.read_text())
     assert [point["steps"] for point in curve["points"]] == [0, 8, 16]
+    assert (curve["task"], curve["seed"], curve["evaluation"]["seed"]) == ("a1_position", 1, 1001)
     assert all(math.isfinite(value) for point in curve["points"] for value in point.values())
 
 

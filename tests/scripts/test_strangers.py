@@ -31,8 +31,6 @@ LOADING = {
     "play.py": ["--steps=1"],
     "evaluate.py": ["--steps=1"],
     "export.py": [],
-    "learning_curve.py": ["--steps=1"],
-    "physics_accuracy.py": ["--steps=1"],
 }
 """Scripts that load a run, and words that make it short."""
 NAMES = (
