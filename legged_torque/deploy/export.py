@@ -31,8 +31,8 @@ from legged_torque.deploy.description import (
 )
 from legged_torque.deploy.policy import Policy, State
 from legged_torque.envs.base.commands import HEADING_GAIN
-from legged_torque.envs.base.height_scan import CLIP, OFFSET
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.sensors.height_scan import CLIP, OFFSET
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import package_versions
@@ -56,7 +56,7 @@ def nominal_cfg(cfg: Any) -> Any:
     """Turn off all randomization in a task's settings, in place, for :func:`export_policy`."""
     cfg.env.num_envs = 4
     cfg.domain_rand.randomize_parameters = cfg.domain_rand.push_robots = cfg.noise.add_noise = False
-    cfg.domain_rand.action_delay = [0, 0]
+    cfg.motors.delay.range = [0, 0]
     return cfg
 
 
@@ -103,7 +103,7 @@ def export_policy(task: LeggedRobot, model: MLPModel, folder: Path, name: str, t
 
 def check_terms(task: LeggedRobot) -> None:
     """Raise a UserError at the first term that :class:`~legged_torque.deploy.policy.Policy` cannot compute."""
-    for kind, terms in (("observation", task.observations.policy_terms()), ("action", task.action_terms())):
+    for kind, terms in (("observation", task.observations.policy_terms()), ("action", task.control_law.terms)):
         known = term_names(kind)
         for name in [term.name for term in terms]:
             if name not in known:
@@ -218,7 +218,7 @@ def _action_terms(task: LeggedRobot) -> list[dict[str, Any]]:
             "meaning": term.meaning,
             **({"interval": term.interval} if term.interval > 1 else {}),
         }
-        for term in task.action_terms()
+        for term in task.control_law.terms
     ]
 
 
@@ -248,7 +248,8 @@ def check_task(task: LeggedRobot, policy: Policy) -> None:
     task.actions.copy_(draw(task.actions, 3.0))
     task.reset_buf.fill_(True)  # the history starts with copies
     task.set_state(qpos, draw(task.sim.qvel, 3.0))
-    task.motors.apply(task._compute_torques(task.actions), task.dof_vel, out=task.torques)
+    wanted = task._compute_torques(task.actions)
+    task.torques.copy_(task.motors.apply(wanted, task.dof_pos, task.dof_vel, 0))
     for world in range(task.num_envs):
         for what, difference, tolerance in _differences(task, policy, world):
             if not difference <= tolerance:

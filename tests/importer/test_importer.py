@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from legged_torque.envs import robots, task_registry, tasks
-from legged_torque.envs.base.asset import by_joint, load_asset
+from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.held_pose import standing_note
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfgPPO
@@ -18,6 +18,7 @@ from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import import_robot
 from legged_torque.importer.settings import settings
 from legged_torque.importer.standing import fused_problem, measure, parse
+from legged_torque.motors.joints import by_joint
 from legged_torque.utils.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
