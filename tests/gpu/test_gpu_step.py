@@ -161,7 +161,7 @@ def test_parameters(device):
 
 
 def test_pushes(device):
-    """Their share, their sizes, and that half of them add to the velocity, compared with the same worlds without pushes."""
+    """Their share, their sizes, and that half of them add to the velocity: next to the same worlds without pushes."""
     pushes = ["--set=domain_rand.push_probability=0.3", "--set=domain_rand.push_velocity=[-2,2]"]
     pushes += ["--set=domain_rand.push_set_factor=1.5"]
     velocities = []
