@@ -8,7 +8,8 @@ import pytest
 import torch
 from support.control import CONVERGED, NOMINAL, TORQUE_LIMIT, pd_by_hand, random_state
 from support.episodes import HIGH_UP, time_out
-from support.resume import content, differences, start, train
+from support.reproducible import differences
+from support.resume import content, start, train
 from support.settings import error_of, get_cfgs, parse, torques_in_torch
 from support.symmetry import mirror_policy
 

@@ -16,6 +16,7 @@ import pytest
 import torch
 import yaml
 from support.random_stream import upcoming
+from support.reproducible import differences, values
 from support.rollouts import make_ppo, record_rollout, state_of
 from support.settings import parse
 
@@ -25,7 +26,6 @@ from legged_torque.utils import distributed
 from legged_torque.utils.errors import TrainingError
 from legged_torque.utils.runs import checkpoint_number, find_checkpoint
 from legged_torque.utils.task_registry import set_seed
-from tools.reproducible import equal, values
 
 ROOT = Path(__file__).resolve().parents[2]
 WORLDS, STEPS = 2, 4
@@ -339,7 +339,7 @@ def test_two_machines_without_shared_files(script, tmp_path):
     assert "Learning iteration" not in outputs[1] and not list((tmp_path / "1").iterdir())
     (resumed,) = (path for path in (tmp_path / "0" / "a1_position").iterdir() if path.name != kept.name)
     one, other = (dict(values(torch.load(file, weights_only=True))) for file in (checkpoint, resumed / checkpoint.name))
-    assert one.keys() == other.keys() and not [name for name in one if not equal(one[name], other[name])]
+    assert not differences(one, other)
 
 
 if __name__ == "__main__":

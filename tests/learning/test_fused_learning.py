@@ -6,7 +6,6 @@ The interpreter runs kernels on the CPU with the numbers' own precision: matrix 
 import copy
 import math
 import os
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,7 +28,6 @@ from support.rollouts import (
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.multi_head import MultiHeadModel
 from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, can_be_fused
-from tools.capture import KERNEL_TOLERANCE, compare_kernels
 
 pytest.importorskip("triton", reason="Triton is there for Linux only")
 if os.environ.get("TRITON_INTERPRET") != "1":
@@ -339,19 +337,3 @@ def test_what_has_no_kernels_is_left_to_torch(what):
 def test_mixed_precision_is_that_of_the_kernels():
     """An algorithm that works with torch's operations says that it does without."""
     assert make(use_mixed_precision=True).product_dtype == torch.float32
-
-
-def test_the_check_on_a_gpu_compares_with_autograd():
-    """Its errors are those of float32 here; a gradient that is off is seen."""
-    alg = make(fuse=True, multi_head=True, symmetric=True)
-    record_rollout(alg)
-    runner = SimpleNamespace(alg=alg)
-    before = [tensor.clone() for tensor in alg.fused.state()]
-    errors = compare_kernels(runner)
-    assert set(errors) == {"actor", "critic"}
-    assert max(errors.values()) < 1e-4
-    assert all(torch.equal(old, new) for old, new in zip(before, alg.fused.state(), strict=True))
-    alg.fused.gradients = lambda: [1.2 * gradient for gradient in FusedLearner.gradients(alg.fused)]
-    assert min(compare_kernels(runner).values()) > KERNEL_TOLERANCE
-    alg.fused = None
-    assert compare_kernels(runner) == {}

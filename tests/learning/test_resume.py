@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from support.resume import WORLDS, content, differences, start, train
+from support.reproducible import differences, values
+from support.resume import WORLDS, content, start, train
 from support.settings import error_of
 
 from legged_torque.envs import task_registry
@@ -18,7 +19,6 @@ from legged_torque.learning import checkpoint
 from legged_torque.learning.worlds import pack, unpack, world_tensors
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import Options
-from tools.reproducible import values
 
 
 def without_seconds(lines):

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import torch
+from support.reproducible import values
 from support.settings import parse
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.task_registry import set_seed
-from tools.reproducible import equal, values
 
 WORLDS = 6
 
@@ -59,8 +59,3 @@ def content(runner, iterations):
     """All that a run's checkpoint holds, by name, apart from times."""
     file = Path(runner.log_dir) / f"model_{iterations}.pt"
     return dict(values(torch.load(file, weights_only=True)))
-
-
-def differences(one, other):
-    """Names of what is not equal to the bit."""
-    return [name for name in one.keys() | other.keys() if not equal(one.get(name), other.get(name))]
