@@ -1,27 +1,52 @@
-"""How far a physics step is from MuJoCo's own, converged in float64, in states from walking to wild ones."""
+"""Compare a physics step with a converged mj_step: ``python tools/accuracy.py --task=a1_position``.
+
+States of ten kinds are made from those of a robot that walks under a trained policy. On rough ground, states of five
+kinds are compared in which only feet are near the ground, which is a plane near each: plain MuJoCo has such a plane for
+each foot.
+"""
 
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+
+from legged_torque.utils.rendering import without_renderer
+
+without_renderer()  # before anything imports mujoco
 
 import mujoco
 import numpy as np
 import torch
 
-from legged_torque.sim.simulator import Simulator
+from legged_torque import resource_path
+from legged_torque.envs import task_registry
+from legged_torque.envs.base.asset import load_asset
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.sim.height_map import HeightMap
+from legged_torque.sim.model import FLOOR, build_model
+from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.utils.args import Parser, add_task_args, options_of
+from legged_torque.utils.cli import check_at_least, run_script
+from legged_torque.utils.devices import device_name
+from legged_torque.utils.mjcf import read_spec
+from legged_torque.utils.options import Options
+from legged_torque.utils.task_registry import LoadedRun, set_seed
 
+WALKERS = 32  # worlds that walk
 TOLERANCE = 1e-3  # a world with a velocity that is further off [m/s, rad/s] counts as wrong
 LARGEST_TORQUE = 1000.0  # [N m]
 _FAR = 100.0  # [m] from the floor, at most
+_LEVEL = 1e-5  # [m] by which ground that is a plane may differ from it
+_AT_FIRST = {"pos": [0.1, 0.2, 0.3], "quat": [1.0, 0.1, 0.2, 0.3]}  # poses that MuJoCo takes for simple are final
 
 Arrays = dict[str, np.ndarray]
 PhysicsState = dict[str, torch.Tensor]
 """A batch of states: "qpos", "qvel", "qacc_warmstart", "ctrl", each (worlds, size)."""
 Pose = Callable[[mujoco.MjModel, mujoco.MjData], bool]
-"""Makes a model fit a state, and says whether it does, as :meth:`~tools.planes.PlanePerFoot.pose`."""
+"""Poses a model for a state, and returns whether it is comparable then, as :meth:`PlanePerFoot.pose`."""
 
 
 def copy_state(sim: Simulator) -> PhysicsState:
@@ -205,3 +230,131 @@ def measure_accuracy(sim: Simulator, state: PhysicsState, expected: np.ndarray, 
         left_out=float(1.0 - comparable.mean()),
         iterations=float(sim.data.solver_niter.numpy().mean()),
     )
+
+
+class PlanePerFoot:
+    """A robot whose spherical feet touch nothing but a plane each, posed like the ground under it.
+
+    MuJoCo's own contacts with an ``hfield`` are no truth: sides of its prisms act as edges that are not there.
+
+    Attributes:
+        model: The model; :meth:`pose` changes it.
+    """
+
+    def __init__(self, spec: mujoco.MjSpec, feet: list[str], height_map: HeightMap) -> None:
+        """Compile a robot that stands on a plane, from its specification, which changes."""
+        floor, self._map, self._feet = spec.geom(FLOOR), height_map, feet
+        names = ("friction", "solref", "solimp", "solmix", "priority", "condim")
+        feel = {name: getattr(floor, name) for name in names}
+        for k, foot in enumerate(feet):
+            spec.geom(foot).contype, spec.geom(foot).conaffinity = 0, 2 << k
+            kind = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [0.0, 0.0, 1.0], "contype": 2 << k, "conaffinity": 0}
+            spec.worldbody.add_geom(name=f"under_{foot}", **kind, **_AT_FIRST, **feel)
+        floor.contype, floor.conaffinity = 2 << len(feet), 0  # which nothing touches
+        self.model = build_model(spec, [])
+
+    def pose(self, model: mujoco.MjModel, data: mujoco.MjData) -> bool:
+        """Pose the planes of :attr:`model`, or a copy, for a state.
+
+        Returns whether nothing else matters: the ground is lower than all other parts, and near each foot it is a
+        plane or lower, too.
+        """
+        mujoco.mj_kinematics(model, data)
+        is_exact = True
+        for geom in range(model.ngeom):
+            if not model.geom_bodyid[geom] or not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+                continue
+            name = model.geom(geom).name
+            for point, radius in _ends(model, data, geom):
+                places, heights = self._near(point, radius)
+                is_near = heights.max() >= point[2] - radius
+                if name in self._feet:
+                    slopes, height = self._triangle(point)
+                    plane = model.geom(f"under_{name}").id
+                    model.geom_pos[plane], model.geom_quat[plane] = [*point[:2], height], _upwards(slopes)
+                    is_near &= np.abs(height + (places - point[:2]) @ slopes - heights).max() > _LEVEL
+                is_exact &= not is_near
+        return bool(is_exact)
+
+    def _near(self, point: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return x, y and heights of the corners of all cells that are so near along x or y."""
+        scale, corner, shape = self._map.horizontal_scale, self._map.corner, self._map.heights.shape
+        first, last = (np.floor((point[:2] + side * radius - corner) / scale).astype(int) for side in (-1, 1))
+        index = np.stack(np.meshgrid(*map(np.arange, first, last + 2), indexing="ij"), axis=-1).reshape(-1, 2)
+        return corner + scale * index, self._map.heights[tuple(index.clip(0, np.array(shape) - 1).T)].astype(float)
+
+    def _triangle(self, point: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return slopes along x and y, and height, of the triangle under a point; see :class:`HeightMap`."""
+        places, (low, left, ahead, far) = self._near(point, 0.0)  # by columns first
+        x, y = along = (point[:2] - places[0]) / self._map.horizontal_scale
+        rises = np.array([ahead - low, far - ahead] if x >= y else [far - left, left - low])
+        return rises / self._map.horizontal_scale, low + rises @ along
+
+
+def _ends(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> list[tuple[np.ndarray, float]]:
+    """Return the points of a geom that can touch the ground first, and how thick it is around them [m]."""
+    centre, turn, size = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+        return [(centre + turn @ (size * signs), 0.0) for signs in itertools.product((-1, 1), repeat=3)]
+    half = size[1] if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
+    return [(centre + side * half * turn[:, 2], size[0]) for side in (-1, 1)]
+
+
+def _upwards(slopes: np.ndarray) -> np.ndarray:
+    """Return the quaternion (w, x, y, z) that turns z to the normal of a plane with some slopes."""
+    normal = np.array([*-slopes, 1.0]) / np.sqrt(1.0 + slopes @ slopes)
+    quat = np.array([1.0 + normal[2], -normal[1], normal[0], 0.0])
+    return quat / np.linalg.norm(quat)
+
+
+def walk(run: LoadedRun, options: Options, steps: int) -> tuple[LeggedRobot, PhysicsState]:
+    """Let a trained policy walk for some control steps; return its task, and the states after each."""
+    env, runner = task_registry.make_loaded(run, options)
+    policy, obs = runner.get_inference_policy(env.device), env.get_observations()
+    kept: list[PhysicsState] = []
+    with torch.inference_mode():
+        for _ in range(steps):
+            obs = env.step(policy(obs))[0]
+            kept.append(copy_state(env.sim))
+    return env, {name: torch.cat([state[name] for state in kept]) for name in kept[0]}
+
+
+def main() -> None:
+    """Let a trained policy walk, keep its states, make the others of them, and step each with both engines."""
+    parser = Parser(__doc__)
+    add_task_args(parser)
+    parser.set_defaults(num_envs=WALKERS, seed=1)
+    parser.add_argument("--steps", type=int, default=100, help="control steps to walk; the states after each are kept")
+    parser.add_argument("--worlds", type=int, default=1500, help="states of each kind; default: %(default)s")
+    args = parser.parse_args()
+    check_at_least(args, 1, "steps", "worlds")
+    options = options_of(args)
+    run = task_registry.load_run(options)
+    set_seed(args.seed)
+    env, walking_states = walk(run, options, args.steps)
+    limits, ground, sims, pose = (env.cfg.sim.solver_iterations, env.cfg.sim.ls_iterations), env.terrain.map, {}, None
+    for engine in ENGINES:
+        height_map = ground if engine == "fused" else None
+        model = open_motors(load_asset(env.cfg, None if height_map else env.terrain).mj_model)
+        sims[engine] = Simulator(model, args.worlds, env.device, engine, *limits, height_map=height_map)
+    if ground:
+        spec = read_spec(resource_path(env.cfg.asset.file), env.dof_names)
+        planes = PlanePerFoot(spec, env.foot_names, ground)
+        model, pose = open_motors(planes.model), planes.pose
+        model.opt.timestep = env.cfg.sim.dt
+    print(f"{args.task} on {device_name(env.device)}: errors of the velocities after one step [m/s, rad/s]")
+    print(f"of {args.worlds} worlds each; {limits[0]} iterations of the solver, {limits[1]} of its line search")
+    titles = ("kind", "engine", "median", "99.9%", "max", f"> {TOLERANCE:g}", "left out", "iterations")
+    print("{:<21} | {:<11} | {:>7} | {:>7} | {:>7} | {:>7} | {:>8} | {:>10}".format(*titles))
+    for kind in ON_ANY_GROUND if ground else KINDS:
+        states = make_states(kind, model, walking_states, args.worlds, args.seed)
+        expected = reference_step(model, states, pose)
+        for engine, sim in sims.items():
+            row = measure_accuracy(sim, states, *expected)
+            errors = " | ".join(f"{value:7.1e}" for value in (row.median, row.p999, row.max))
+            shares = f"{row.wrong:7.2%} | {row.left_out:8.2%} | {row.iterations:10.1f}"
+            print(f"{kind:<21} | {engine:<11} | {errors} | {shares}", flush=True)
+
+
+if __name__ == "__main__":
+    run_script(main)

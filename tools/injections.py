@@ -1,12 +1,27 @@
-"""Bad numbers put into single worlds: do they stay there, and does a reset remove them?"""
+"""Put NaN, inf and 1e30 into single worlds of both engines: ``python tools/injections.py --count 400``.
+
+No other world may differ by a bit, and a reset must make the world as good as new. Exits with 1 otherwise.
+"""
 
 from __future__ import annotations
+
+import sys
+
+from legged_torque.utils.rendering import without_renderer
+
+without_renderer()  # before anything imports mujoco
 
 import mujoco
 import numpy as np
 import torch
 
-from legged_torque.sim.simulator import Simulator
+from legged_torque import RESOURCES_DIR
+from legged_torque.sim.model import build_model, collision_geoms
+from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.utils.args import Parser, add_options
+from legged_torque.utils.cli import check_at_least, run_script
+from legged_torque.utils.devices import resolve_device
+from legged_torque.utils.mjcf import read_spec
 
 FIELDS = ("qpos", "qvel", "qacc_warmstart", "ctrl")
 VALUES = (float("nan"), float("inf"), -float("inf"), 1e30)
@@ -71,3 +86,23 @@ def _same(sims: list[Simulator], worlds: torch.Tensor) -> bool:
     """Return whether some worlds are the same in both simulators, to the last bit, and finite."""
     pairs = [[getattr(sim, name)[worlds] for sim in sims] for name in _STATE]
     return all(torch.equal(a, b) and bool(torch.isfinite(a).all()) for a, b in pairs)
+
+
+def main() -> None:
+    """Print the counts of both engines."""
+    parser = Parser(__doc__)
+    parser.add_argument("--count", type=int, default=400, help="bad numbers per engine; default: %(default)s")
+    add_options(parser, "device")
+    args = parser.parse_args()
+    check_at_least(args, 1, "count")
+    device, spec = resolve_device(args.device), read_spec(RESOURCES_DIR / "robots/a1/a1.xml")
+    model, is_good = build_model(spec, collision_geoms(spec)), True
+    for engine in ENGINES:
+        counts = run(model, engine, args.count, device)
+        print(f"{engine}: " + ", ".join(f"{count} {name}" for name, count in counts.items()), flush=True)
+        is_good &= counts["leaked"] == counts["not recovered"] == 0
+    sys.exit(0 if is_good else 1)
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -8,8 +8,7 @@ from support.fused import draw_states, make_a1, step_mujoco
 from support.on_device import assert_matches, make_robot, make_sim, results, step
 
 from legged_torque.terrain.height_map import HeightMap
-from tools.accuracy import copy_state, reference_step
-from tools.planes import PlanePerFoot
+from tools.accuracy import PlanePerFoot, copy_state, reference_step
 
 WORDS = ["--task=a1_rough_torque_multihead_scan", "--num_envs=512", "--perturbation=low", "--set=evaluation.interval=0"]
 WORDS += ["--set=terrain.num_rows=3", "--set=terrain.max_init_terrain_level=2", "--set=runner.num_steps_per_env=8"]

@@ -1,4 +1,4 @@
-"""How accurate the default settings are, in states of every kind, against converged plain MuJoCo."""
+"""The accuracy of the default settings, in states of every kind, against converged plain MuJoCo."""
 
 import math
 
@@ -14,6 +14,7 @@ from legged_torque.sim.simulator import ENGINES, Simulator
 from legged_torque.terrain.height_map import HeightMap
 from tools.accuracy import (
     KINDS,
+    PlanePerFoot,
     copy_state,
     make_states,
     measure_accuracy,
@@ -21,7 +22,6 @@ from tools.accuracy import (
     put_on_floor,
     reference_step,
 )
-from tools.planes import PlanePerFoot
 
 WORLDS = 120
 SETTINGS = (LeggedRobotCfg.sim.solver_iterations, LeggedRobotCfg.sim.ls_iterations)
@@ -126,13 +126,13 @@ def test_a_plane_per_foot():
         assert planes.pose(planes.model, data) == is_exact
 
 
-def test_physics_accuracy(tmp_path):
+def test_script(tmp_path):
     """The script names the machine and has a row per kind of state and engine; mistakes are told in a line."""
     assert run_here("train.py", *SMALL, root=tmp_path)[0] == 0
     words = ("--task=a1_position", "--device=cpu", "--num_envs=2", "--steps=3", "--worlds=4")
-    status, output, _ = run_here("physics_accuracy.py", *words, root=tmp_path)
+    status, output, _ = run_here("../tools/accuracy.py", *words, root=tmp_path)
     lines = output.splitlines()
     rows = [line.split("|")[:2] for line in lines if " | " in line][1:]
     assert status == 0 and any(line.startswith("a1_position on CPU") for line in lines)
     assert [[cell.strip() for cell in row] for row in rows] == [[kind, engine] for kind in KINDS for engine in ENGINES]
-    assert run_here("physics_accuracy.py", *words, "--steps=0", root=tmp_path)[0] == 2
+    assert run_here("../tools/accuracy.py", *words, "--steps=0", root=tmp_path)[0] == 2
