@@ -46,16 +46,6 @@ COLUMNS = {
 }
 """Heading of each column, as wide as the column, and its number of decimals."""
 NOT_COMPARED = ("num_envs", "iteration_over_physics", "startup_s")
-SHARES = {
-    "num_envs": (" worlds", ",.0f"),
-    "update_gflop_per_s": ("update GFLOP/s", ",.0f"),
-    "update_flop_share": ("of peak", ".1%"),
-    "update_gbytes_per_s": ("update GB/s", ",.1f"),
-    "update_bytes_share": ("of peak", ".1%"),
-    "physics_gbytes_per_s": ("physics GB/s", ",.1f"),
-    "physics_bytes_share": ("of peak", ".1%"),
-}
-"""Heading of each column and its format."""
 LEGEND = """\
   physics: one control step of physics alone, with its torques; step: env.step; iteration: all of it, with logging
   x floor: iteration / (physics x control steps of a rollout); steps/s: over whole iterations
@@ -69,9 +59,6 @@ LEARNING = """\
 REACHED = """\
     tracking {share:.0%} after {steps:,} steps: {training_s:.1f} s from there, {command_s:.1f} s from the command"""
 NOT_REACHED = "    tracking {share:.0%} was not reached"
-PEAKS = """
-Counted FLOP and bytes per second (benchmark/roofline.py says which), and shares of what the device reaches here:
-  matrix products {peak_gflop_per_s:,.0f} GFLOP/s, copies {peak_gbytes_per_s:,.1f} GB/s"""
 
 
 def main() -> None:
@@ -85,45 +72,32 @@ def main() -> None:
             sizes.append(task_registry.get_cfgs(args.task, options))
             check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
         device = resolve_device(args.device)
-        from legged_torque.benchmark import roofline
         from legged_torque.benchmark.learning_time import time_training
         from legged_torque.benchmark.measure import MemoryMeter
     for file in filter(None, (args.json, args.profile)):
         check_output(file)
-    result = {
-        "task": args.task,
-        "device": device_name(device),
-        "versions": package_versions(),
-        "preset": args.preset or "parallel",
-        "perturbation": args.perturbation or "none",
-        "ranges": args.ranges or "default",
-        "set": without_machine(args.set),
-        "rounds": args.rounds,
-    }
+    result = {"task": args.task, "device": device_name(device), "versions": package_versions(), "rounds": args.rounds}
+    result |= {"preset": args.preset or "parallel", "perturbation": args.perturbation or "none"}
+    result |= {"ranges": args.ranges or "default", "set": without_machine(args.set)}
     numbers = [(env_cfg.env.num_envs, train_cfg.runner.num_steps_per_env) for env_cfg, train_cfg in sizes]
     baseline = Baseline(args.baseline, result, numbers) if args.baseline else None
     memory = MemoryMeter(device)
-    print_head(args, device, memory)
+    of_gpu = "GPU memory of torch and Warp together, without the CUDA context"
+    print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")
+    print(LEGEND.format(memory=of_gpu if memory.is_gpu else "peak resident memory of this process"))
+    print(" | ".join(title for title, _ in COLUMNS.values()), flush=True)
     rows: list[dict[str, Any]] = []
     for cfgs in sizes:
         row = measure_size(args, cfgs, memory)
         rows.append(row)
-        print_row(row, args.profile, memory)
+        print_row(row, args.profile)
         if args.learn and "error" not in row:
             row["learn"] = time_training(training_command(args, row["num_envs"]))
             print_learning(row["learn"])
         if args.json:
             write_json(args.json, result | {"rows": rows})
-    measured = [row for row in rows if "error" not in row]
-    if measured:
-        peaks = roofline.measure_peaks(device, measured[0]["update_dtype"])  # at the end: they take memory, too
-        for row in measured:
-            row |= roofline.shares(row, peaks)
-        print_shares(measured)
-    if args.json:
-        write_json(args.json, result | {"rows": rows})
     if baseline:
-        print_comparison(args.baseline, baseline, measured)
+        print_comparison(args.baseline, baseline, rows)
 
 
 def parse_args() -> argparse.Namespace:
@@ -178,28 +152,14 @@ def training_command(args: argparse.Namespace, num_envs: int) -> list[str]:
     return [sys.executable, str(SCRIPTS_DIR / "train.py"), *words]
 
 
-def print_head(args: argparse.Namespace, device: str, memory: MemoryMeter) -> None:
-    """Print what is measured, and the heading of the table."""
-    of_gpu = "GPU memory of torch and Warp together, without the CUDA context"
-    print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")
-    print(LEGEND.format(memory=of_gpu if memory.is_gpu else "peak resident memory of this process"))
-    print(" | ".join(title for title, _ in COLUMNS.values()), flush=True)
-
-
-def print_row(row: dict[str, Any], trace: Path, memory: MemoryMeter) -> None:
+def print_row(row: dict[str, Any], trace: Path) -> None:
     """Print the numbers of one size; ``trace`` is the file of its trace, if there is one."""
     cells = [f"{row[key]:>{len(title)},.{digits}f}" for key, (title, digits) in COLUMNS.items() if key in row]
-    if "error" in row:
-        cells.append(row["error"])
-    print(" | ".join(cells), flush=True)
+    print(" | ".join([*cells, *([row["error"]] if "error" in row else [])]), flush=True)
     if "endurance" in row:
         print(ENDURANCE.format(**row["endurance"]))
-    if "kernels" in row:
-        from legged_torque.benchmark.measure import TRACED
-
-        kind = "kernels" if memory.is_gpu else "torch operators (Warp's kernels show on a GPU only)"
-        print(f"  most expensive {kind} of {TRACED} iterations, see {trace}:")
-        print_kernels(row["kernels"])
+    if "profile" in row:
+        print(*row["profile"], f"The trace is in {trace}; Warp's kernels show on a GPU only.", sep="\n")
 
 
 def print_learning(times: dict[str, Any]) -> None:
@@ -209,33 +169,15 @@ def print_learning(times: dict[str, Any]) -> None:
         print((REACHED if point["steps"] else NOT_REACHED).format(**point), flush=True)
 
 
-def print_shares(rows: list[dict[str, Any]]) -> None:
-    """Print the shares of the device's peaks."""
-    print(PEAKS.format(**rows[0]))
-    print(" | ".join(title for title, _ in SHARES.values()))
-    for row in rows:
-        print(" | ".join(f"{row[name]:>{len(title)}{style}}" for name, (title, style) in SHARES.items()))
-
-
 def print_comparison(file: Path, baseline: Baseline, rows: list[dict[str, Any]]) -> None:
     """Print the numbers of all sizes against those of the baseline."""
     print(f"\nAgainst {file}", *baseline.notes, sep="\n  ")
     print(f" worlds | {'what':<12} | {'old':>11} | {'new':>11} | new / old")
-    names = [name for name in COLUMNS if name not in NOT_COMPARED]
     for row in rows:
-        for name, old, new, ratio in baseline.compare(row, names):
+        for name, old, new, ratio in baseline.compare(row, [name for name in COLUMNS if name not in NOT_COMPARED]):
             title, digits = COLUMNS[name]
             cells = [f"{row['num_envs']:>7,}", f"{title.strip():<12}"]
             print(" | ".join([*cells, *(f"{value:>11,.{digits}f}" for value in (old, new)), f"{ratio:>9.3f}"]))
-
-
-def print_kernels(kernels: list[dict[str, Any]]) -> None:
-    """Print the most expensive entries of a trace."""
-    print(f"  {'calls':>8}  {'total ms':>9}  name")
-    if not kernels:
-        print("  none: torch's profiler needs CUPTI and the permission to use it")
-    for kernel in kernels:
-        print(f"  {kernel['calls']:>8}  {kernel['total_ms']:>9.2f}  {kernel['name'][:110]}")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
@@ -19,7 +19,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from legged_torque.benchmark import roofline
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning.runner import OnPolicyRunner
@@ -28,11 +27,11 @@ from legged_torque.utils.progress import CompileProgress
 from legged_torque.utils.task_registry import set_seed
 
 WARM_UP = 2  # iterations before timing begins: the first one compiles, the second one captures the rollout
-TRACED = 2  # iterations in a trace
+TRACED = 2  # iterations in a trace, after one to warm up
 PHYSICS_STEPS = 5
 """Control steps of physics timed in a row: enough to hide the cost of the reset before them, and no robot falls yet."""
 ACTION_SCALE = 0.5  # standard deviation of the random actions while env.step is timed
-TOP_KERNELS = 10  # kernels listed from a trace
+GPU_CALLS = 20  # calls per timing on a GPU, where a single one is short; on the CPU one call is timed
 _MIB = 2**20
 _MS = 1e3
 
@@ -45,16 +44,15 @@ checkpoints that are due. "iteration": their sum, from the start of one iteratio
 class MemoryMeter:
     """Memory used by this process.
 
-    On a GPU: how much the free memory of the device has shrunk since the meter was created. This includes torch's
-    allocator and graphs, Warp's own pool, and loaded kernels, but not the CUDA context, which exists before. It also
-    includes other processes that allocate meanwhile, so measure on a GPU of your own. Allocators keep what they have
-    taken, so the largest value between iterations is what training needs.
+    On a GPU: how much the free memory of the device has shrunk since the meter was created, by torch, Warp and loaded
+    kernels. This includes other processes that allocate meanwhile, so measure on a GPU of your own. Allocators keep
+    what they have taken, so the largest value between iterations is what training needs.
 
     On the CPU: the peak resident set size of the process, which never shrinks.
     """
 
     def __init__(self, device: str) -> None:
-        """Note the free memory before any work on the device."""
+        """Note the free memory before any work on the device; the CUDA context exists then."""
         self.device, self.is_gpu = device, torch.device(device).type == "cuda"
         if self.is_gpu:
             prepare_device(device)
@@ -67,22 +65,12 @@ class MemoryMeter:
         unit = 1 if sys.platform == "darwin" else 1024
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / _MIB
 
-    def shares(self) -> dict[str, float]:
-        """Return the peak of torch's allocator and the present use of Warp's pool; nothing on the CPU [MiB]."""
-        if not self.is_gpu:
-            return {}
-        result = {"torch_memory_mib": torch.cuda.max_memory_reserved(self.device) / _MIB}
-        if wp.is_mempool_supported(self.device):
-            result["warp_memory_mib"] = wp.get_mempool_used_mem_current(self.device) / _MIB
-        return result
-
     def clear(self) -> None:
         """Give back the memory that is not in use any more."""
         gc.collect()
         if self.is_gpu:
             torch.cuda.synchronize(self.device)
             torch.cuda.empty_cache()
-            torch.cuda.reset_peak_memory_stats(self.device)
 
 
 def measure(
@@ -91,41 +79,39 @@ def measure(
     """Measure one task of one size; ``cfgs`` are the settings of the task and of its training.
 
     Timed are ``rounds`` iterations, and physics and step as often. ``endurance`` is the number of iterations in a row
-    to look for slow-down and growth, ``trace`` a file for :data:`TRACED` iterations; 0 and None leave them out.
+    to look for slow-down and growth, ``trace`` a file for some iterations; 0 and None leave them out.
 
     Returns:
-        The numbers, by names that end in their units. "build_s" is the time for task and runner, "log_s" that for
-        opening the log; the first iteration loads and compiles kernels, which only the first size of a process pays
-        for, and the second one captures. "startup_s": all together.
+        The numbers, by names that end in their units; see :func:`summarize`. "build_s" is the time for task and runner,
+        "startup_s" that for the first two iterations as well, which compile and capture.
     """
-    env_cfg, train_cfg = cfgs
-    marks, used = [time.perf_counter()], []
-
-    def mark(number: int = 0) -> None:
-        marks.append(time.perf_counter())
-        used.append(memory.used())
-
     with tempfile.TemporaryDirectory() as folder:
-        with CompileProgress() as compilation:
-            set_seed(train_cfg.seed)
-            task = task_registry.get_task_class(task_name)(env_cfg, memory.device)
-            runner, _ = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=folder)
-            runner.claim_log_dir({})
-            wp.synchronize_device(memory.device)
-            mark()
-            time_iterations(runner, WARM_UP, mark)
+        start, used = time.perf_counter(), []
+        with CompileProgress():
+            runner = build(task_name, cfgs, memory.device, folder)
+            built = time.perf_counter()
+            time_iterations(runner, WARM_UP, lambda number: used.append(memory.used()))
+        startup = time.perf_counter() - start
         times = time_iterations(runner, rounds)
-        peak = {"peak_memory_mib": max(*used, memory.used()), **memory.shares()}
-        physics, step = time_physics(task, rounds)
-        row = summarize(times, physics, step, task.num_envs, train_cfg.runner.num_steps_per_env) | peak
-        row |= zip(("build_s", "log_s", "first_iteration_s", "capture_s"), np.diff(marks).tolist(), strict=True)
-        row |= {"startup_s": marks[-1] - marks[0], "compiled_modules": compilation.modules}
-        row |= roofline.work(runner.alg, task.sim, env_cfg.control.decimation)
+        peak = max(*used, memory.used())
+        row = summarize(times, *time_physics(runner.env, rounds), runner.env.num_envs, runner.cfg["num_steps_per_env"])
+        row |= {"peak_memory_mib": peak, "build_s": built - start, "startup_s": startup}
         if endurance:
             row["endurance"] = measure_endurance(runner, endurance, memory)
         if trace:
-            row["kernels"] = trace_iterations(runner, trace)
+            row["profile"] = trace_iterations(runner, trace)
     return row
+
+
+def build(task_name: str, cfgs: tuple, device: str, folder: str) -> OnPolicyRunner:
+    """Return a runner that is ready to train; settings are those of task and training. It keeps runs in a folder."""
+    env_cfg, train_cfg = cfgs
+    set_seed(train_cfg.seed)
+    task = task_registry.get_task_class(task_name)(env_cfg, device)
+    runner, _ = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=folder)
+    runner.claim_log_dir({})
+    wp.synchronize_device(device)
+    return runner
 
 
 def time_iterations(runner: OnPolicyRunner, count: int, at_start: Callable[[int], object] | None = None) -> Times:
@@ -183,37 +169,43 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
         for _ in range(PHYSICS_STEPS):
             task.run_physics()
 
-    def milliseconds(function: Callable[[], object]) -> float:
-        return _MS * roofline.seconds_per_call(function, task.device)
-
     graph = CudaGraph(physics, task.device)
     for _ in range(WARM_UP):
         graph()
-    times = [(milliseconds(graph), milliseconds(lambda: task.step(actions))) for _ in range(rounds)]
+    calls = (graph, lambda: task.step(actions))
+    times = [[_MS * seconds_per_call(call, task.device) for call in calls] for _ in range(rounds)]
     of_physics, of_step = zip(*times, strict=True)
     return median(of_physics) / PHYSICS_STEPS, median(of_step)
+
+
+def seconds_per_call(function: Callable[[], object], device: str) -> float:
+    """Return the time of one call, with the work that it leaves to the device [s]."""
+    calls = GPU_CALLS if torch.device(device).type == "cuda" else 1
+    wp.synchronize_device(device)
+    start = time.perf_counter()
+    for _ in range(calls):
+        function()
+    wp.synchronize_device(device)
+    return (time.perf_counter() - start) / calls
 
 
 def summarize(times: Times, physics: float, step: float, num_envs: int, num_steps: int) -> dict[str, Any]:
     """Return medians [ms], steps per second, and ratios to physics alone; ``num_steps`` are those of a rollout."""
     medians = {"physics": physics, "step": step} | {name: median(values) for name, values in times.items()}
-    steps = {"physics": 1, "step": 1, "rollout": num_steps, "iteration": num_steps}
     return {
         "num_envs": num_envs,
         "num_steps_per_env": num_steps,
         **{f"{name}_ms": value for name, value in medians.items()},
         "iteration_min_ms": min(times["iteration"]),
         "iteration_max_ms": max(times["iteration"]),
-        "step_over_physics": step / physics,
         "iteration_over_physics": medians["iteration"] / (physics * num_steps),
-        **{f"{name}_steps_per_s": _MS * num_envs * count / medians[name] for name, count in steps.items()},
+        "iteration_steps_per_s": _MS * num_envs * num_steps / medians["iteration"],
     }
 
 
 def measure_endurance(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -> dict[str, float]:
     """Run many iterations in a row and compare the first tenth with the last, in mean time and in memory at its end."""
-    tenth = max(1, count // 10)
-    used: list[float] = []  # at the end of both tenths
+    tenth, used = max(1, count // 10), list[float]()
 
     def look(number: int) -> None:
         if number in (tenth, count):
@@ -221,19 +213,16 @@ def measure_endurance(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -
 
     times = time_iterations(runner, count, look)["iteration"]
     first, last = mean(times[:tenth]), mean(times[-tenth:])
-    return {
-        "iterations": count,
-        "first_ms": first,
-        "last_ms": last,
-        "slowdown": last / first - 1.0,
-        "first_memory_mib": used[0],
-        "last_memory_mib": used[-1],
-        "growth_mib": used[-1] - used[0],
-    }
+    result = {"iterations": count, "first_ms": first, "last_ms": last, "slowdown": last / first - 1.0}
+    return result | {"first_memory_mib": used[0], "last_memory_mib": used[-1], "growth_mib": used[-1] - used[0]}
 
 
-def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]:
-    """Write a trace of :data:`TRACED` iterations for Perfetto or Chrome (.json or .json.gz); list the dearest."""
+def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[str]:
+    """Write a trace of two iterations for Perfetto or Chrome (.json or .json.gz).
+
+    Returns:
+        Lines of a table of the most expensive kernels on a GPU, or operators of torch on a CPU.
+    """
     cuda, activity = torch.device(runner.device).type == "cuda", torch.profiler.ProfilerActivity
     activities = [activity.CPU, activity.CUDA] if cuda else [activity.CPU]
     schedule = torch.profiler.schedule(wait=0, warmup=1, active=TRACED, repeat=1)
@@ -241,16 +230,5 @@ def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[dict[str, Any]]
         time_iterations(runner, 1 + TRACED, lambda number: profiler.step() if number else None)
     file.parent.mkdir(parents=True, exist_ok=True)
     profiler.export_chrome_trace(str(file))
-    return most_expensive(profiler.key_averages(), cuda)
-
-
-def most_expensive(entries: Iterable[Any], cuda: bool) -> list[dict[str, Any]]:
-    """Return the most expensive kernels and copies of a GPU, or operators of torch on a CPU, from a profile."""
-    # Nested calls do not count ("self"); on the CPU, the profiler does not see Warp's kernels.
-    kind, total = ("CUDA", "self_device_time_total") if cuda else ("CPU", "self_cpu_time_total")
-    rows = [
-        {"name": entry.key, "calls": entry.count, "total_ms": 1e-3 * getattr(entry, total)}
-        for entry in entries
-        if entry.device_type.name == kind and not entry.is_user_annotation
-    ]
-    return sorted(rows, key=lambda row: row["total_ms"], reverse=True)[:TOP_KERNELS]
+    order = "self_device_time_total" if cuda else "self_cpu_time_total"
+    return profiler.key_averages().table(sort_by=order, row_limit=10).splitlines()

@@ -1,6 +1,6 @@
-"""How near update and physics come to what a device can do: operations and bytes that they need, and its peaks.
+"""Compare update and physics with the peaks of a device: ``python tools/roofline.py --num_envs 4096``.
 
-What is counted is what the mathematics asks for, not what an implementation does:
+The operations and bytes are counted that the mathematics asks for, not those of an implementation:
 
 - FLOP of an update: its matrix products, for each sample and mirror image: forward, gradients of weights, and
   gradients of inputs except for the first layer, which reads observations.
@@ -14,21 +14,29 @@ There is no count of the physics' operations: iterations of its solver and conta
 
 from __future__ import annotations
 
-import time
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
+from legged_torque.utils.rendering import without_renderer
+
+without_renderer()  # before anything imports mujoco
+
 import torch
-import warp as wp
 from torch import Tensor, nn
 
+from legged_torque.benchmark.measure import WARM_UP, build, seconds_per_call, time_iterations, time_physics
+from legged_torque.envs import task_registry
 from legged_torque.learning.ppo import OnDevicePPO
 from legged_torque.sim.fused.tables import FUSED_FIELDS, unread_columns
 from legged_torque.sim.simulator import Simulator
+from legged_torque.utils.args import Parser, add_build_args, options_of
+from legged_torque.utils.cli import check_at_least, run_script
+from legged_torque.utils.devices import device_name, resolve_device
 
-GPU_CALLS = 20  # calls per timing on a GPU, where a single one is short; on the CPU one call is timed
+RATES = (("update", "flop"), ("update", "bytes"), ("physics", "bytes"))
 _ROUNDS = 5  # timings of each peak
 _MATRIX = {"cuda": 8192, "cpu": 1024}  # rows and columns of the product
 _COPY = {"cuda": 2**29, "cpu": 2**26}  # bytes that are copied: several times the caches
@@ -56,17 +64,6 @@ def measure_peaks(device: str, dtype: str) -> Peaks:
     return Peaks(2 * size**3 / product, 2 * count / copy)
 
 
-def seconds_per_call(function: Callable[[], object], device: str) -> float:
-    """Return the time of one call, with the work that it leaves to the device [s]."""
-    calls = GPU_CALLS if torch.device(device).type == "cuda" else 1
-    wp.synchronize_device(device)
-    start = time.perf_counter()
-    for _ in range(calls):
-        function()
-    wp.synchronize_device(device)
-    return (time.perf_counter() - start) / calls
-
-
 def work(alg: OnDevicePPO, sim: Simulator, decimation: int) -> dict[str, Any]:
     """Return what an update and the physics of a control step need: "update_flop", "update_bytes", "physics_bytes".
 
@@ -83,7 +80,7 @@ def work(alg: OnDevicePPO, sim: Simulator, decimation: int) -> dict[str, Any]:
 def shares(row: dict[str, Any], peaks: Peaks) -> dict[str, float]:
     """Return rates of what :func:`work` has counted, in 1e9 per second, and their shares of the peaks."""
     rates = {"peak_gflop_per_s": 1e-9 * peaks.flop_per_s, "peak_gbytes_per_s": 1e-9 * peaks.bytes_per_s}
-    for part, unit in (("update", "flop"), ("update", "bytes"), ("physics", "bytes")):
+    for part, unit in RATES:
         rate = 1e-6 * row[f"{part}_{unit}"] / row[f"{part}_ms"]
         rates |= {f"{part}_g{unit}_per_s": rate, f"{part}_{unit}_share": rate / rates[f"peak_g{unit}_per_s"]}
     return rates
@@ -158,3 +155,32 @@ def _median_seconds(function: Callable[[], object], device: str) -> float:
     """Return the median time of a call that has run before [s]."""
     function()
     return median(seconds_per_call(function, device) for _ in range(_ROUNDS))
+
+
+def main() -> None:
+    """Time updates and physics of a task, and print their rates beside the peaks."""
+    parser = Parser(__doc__)
+    add_build_args(parser)
+    parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
+    args = parser.parse_args()
+    check_at_least(args, 1, "rounds")
+    device, options = resolve_device(args.device), options_of(args)
+    options.set = ["evaluation.interval=0", *options.set]  # without evaluations iterations are alike
+    env_cfg, train_cfg = task_registry.get_cfgs(args.task, options)
+    with tempfile.TemporaryDirectory() as folder:
+        runner = build(args.task, (env_cfg, train_cfg), device, folder)
+        time_iterations(runner, WARM_UP)
+        row = {"update_ms": median(time_iterations(runner, args.rounds)["update"])}
+        row["physics_ms"], _ = time_physics(runner.env, args.rounds)
+    row |= work(runner.alg, runner.env.sim, env_cfg.control.decimation)
+    row |= shares(row, measure_peaks(device, row["update_dtype"]))
+    print(f"{args.task}, {runner.env.num_envs} worlds on {device_name(device)}, medians of {args.rounds} rounds")
+    for part, unit in RATES:
+        rate, peak, share = (
+            row[name] for name in (f"{part}_g{unit}_per_s", f"peak_g{unit}_per_s", f"{part}_{unit}_share")
+        )
+        print(f"  {part:<7} {rate:>12,.1f} of {peak:>12,.1f} G{'FLOP' if unit == 'flop' else 'B'}/s: {share:.1%}")
+
+
+if __name__ == "__main__":
+    run_script(main)
