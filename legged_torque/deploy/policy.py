@@ -11,6 +11,7 @@ import numpy as np
 
 from legged_torque.deploy.description import interface, missing_extra, read
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.heading import heading
 
 
 @dataclass
@@ -150,9 +151,8 @@ class Policy:
 
         The trunk's position [m] and orientation (w, x, y, z) have shapes (2 or more,), (4,). Shape: (points, 2).
         """
-        w, _, _, z = quaternion
-        norm = max(w * w + z * z, 1e-12)  # 0 upside down, where there is no heading
-        cos, sin = (w * w - z * z) / norm, 2.0 * w * z / norm
+        ahead, left, length = heading(np.asarray(quaternion))
+        cos, sin = ahead / length, left / length
         return np.asarray(position)[:2] + self.scan_points @ np.array([[cos, sin], [-sin, cos]])
 
     def _height_scan(self, heights: np.ndarray | None) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.heading import heading
 from legged_torque.utils.metrics import NUM_SUMS, step_sums
 
 PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one
@@ -138,18 +139,14 @@ class Simulation:
     def _follow_heading(self) -> None:
         """Command the yaw rate that turns the trunk to its heading, if there is one, as in training."""
         if self._headings:
-            left = (self._heading - yaw(self.robot.quat) + math.pi) % (2.0 * math.pi) - math.pi
+            x_ahead, y_ahead, _ = heading(self.robot.quat)
+            left = (self._heading - math.atan2(y_ahead, x_ahead) + math.pi) % (2.0 * math.pi) - math.pi
             self.command[2] = np.clip(self._heading_gain * left, *self._command_range[:, 2])
 
     def _draw(self, name: str, size: int) -> np.ndarray:
         """Draw numbers from a range of the initial state. Shape: (size,)."""
         low, high = self._start[name]
         return self._rng.uniform(low, high, size)
-
-
-def yaw(quat: np.ndarray) -> float:
-    """Return the angle about the world's z axis by which a trunk with an orientation (w, x, y, z) is turned [rad]."""
-    return 2.0 * math.atan2(quat[3], quat[0])
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:

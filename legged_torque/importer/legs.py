@@ -10,6 +10,7 @@ import numpy as np
 from legged_torque.importer.shapes import Shape, box_around, fit_geom, fit_inertia
 from legged_torque.importer.source import Source
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.mjcf import body_chains
 
 TOLERANCE = 0.01  # [m] by which mirror images may miss each other
 FOOT_RADIUS = 0.02  # [m] of a foot that the file has a place for and no geom
@@ -71,7 +72,7 @@ def find_legs(source: Source, shapes: dict[int, list[Shape]]) -> list[Leg]:
     """
     model = source.model
     data = zero_pose(model, source.pose)
-    chains = [chain for chain in _chains(model) if len(chain) > 1]
+    chains = [chain for chain in body_chains(model) if len(chain) > 1]
     if not chains:
         raise UserError(f"cannot import '{source.file}': it has no legs of two joints or more")
     if not (np.abs(data.xaxis[1:, 1]) > 0.7).any():
@@ -85,21 +86,6 @@ def find_legs(source: Source, shapes: dict[int, list[Shape]]) -> list[Leg]:
         raise UserError(f"cannot import '{source.file}': no leg reaches below its trunk's origin; z must point upwards")
     names = _leg_names(source, legs, data)
     return [Leg(name, chain, _take_foot(source, shapes, chain, data)) for name, chain in zip(names, legs, strict=True)]
-
-
-def _chains(model: mujoco.MjModel) -> list[list[int]]:
-    """Return the paths from the trunk's children to every end of the tree."""
-    children = {
-        body: [c for c in range(2, model.nbody) if model.body_parentid[c] == body] for body in range(model.nbody)
-    }
-    ends = [body for body in range(2, model.nbody) if not children[body]]
-    chains = []
-    for body in ends:
-        chain = [body]
-        while model.body_parentid[chain[0]] != 1:
-            chain.insert(0, int(model.body_parentid[chain[0]]))
-        chains.append(chain)
-    return chains
 
 
 def _lowest(data: mujoco.MjData, body: int, shapes: list[Shape]) -> float:

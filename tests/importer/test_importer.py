@@ -17,7 +17,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfgPPO
 from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import import_robot
 from legged_torque.importer.settings import settings
-from legged_torque.importer.standing import fused_problem, measure, parse
+from legged_torque.importer.trial import fused_problem, parse, stand
 from legged_torque.utils.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -161,8 +161,8 @@ def check(model, cfg):
     assert len(asset.feet) == 4
     assert not fused_problem(model)
     gains = [by_joint("gains", values, asset.dof_names) for values in (cfg.control.stiffness, cfg.control.damping)]
-    result, _ = measure(model, *np.array(gains), seconds=3.0)
-    assert result.stands, str(result)
+    result, _ = stand(model, np.array(gains), seconds=3.0)
+    assert not result.fall, str(result)
     assert result.height == pytest.approx(cfg.rewards.base_height_target, rel=0.15)
 
 
