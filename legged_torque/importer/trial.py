@@ -35,7 +35,8 @@ def stand(model: mujoco.MjModel, gains: np.ndarray, seconds: float = 5.0) -> tup
     """
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
-    return hold_pose(data, *gains, model.actuator_ctrlrange.T, seconds), data
+    stiffness, damping = gains
+    return hold_pose(data, stiffness, damping, model.actuator_ctrlrange.T, seconds), data
 
 
 def draw(data: mujoco.MjData, file: Path, size: tuple[int, int] = (640, 480)) -> None:
