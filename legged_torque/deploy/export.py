@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import importlib.util
 import os
-import shutil
 import tempfile
 import warnings
 from collections.abc import Sequence
@@ -91,8 +90,8 @@ def export_policy(
     folder.parent.mkdir(parents=True, exist_ok=True)
     if folder.exists() and not folder.is_dir():
         raise UserError(f"'{folder}' is not a folder")
-    part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
+        part = Path(temporary)
         write_networks(model, part, interface(description))
         description["network"]["sha256"] = hashlib.sha256((part / NETWORK_FILE).read_bytes()).hexdigest()
         check(description)
@@ -100,9 +99,9 @@ def export_policy(
         _write(description, part)
         description["unsupported"] = terms_without_function(description) or differences(task, Policy(part))
         _write(description, part)
-        _move(part, folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+        folder.mkdir(exist_ok=True)
+        for file in (NETWORK_FILE, TORCHSCRIPT_FILE, DESCRIPTION_FILE):
+            os.replace(part / file, folder / file)
     return difference, description["unsupported"]
 
 
@@ -284,16 +283,6 @@ def _difference(ours: np.ndarray, theirs: np.ndarray) -> float:
 def _write(description: dict[str, Any], folder: Path) -> None:
     """Write ``policy.yaml``."""
     (folder / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
-
-
-def _move(part: Path, folder: Path) -> None:
-    """Move a finished folder to its place, or its files into an existing folder, the description last."""
-    part.chmod(0o755)
-    if not folder.exists():
-        os.replace(part, folder)
-        return
-    for name in (NETWORK_FILE, TORCHSCRIPT_FILE, DESCRIPTION_FILE):
-        os.replace(part / name, folder / name)
 
 
 def _by_joint(task: LeggedRobot, values: Tensor) -> dict[str, Any]:

@@ -24,17 +24,17 @@ class Standing:
     height: float  # of the trunk in the end [m]
     tilt: float  # of the trunk in the end [rad]
     drift: float  # of the trunk, horizontally [m]
-    error: float  # largest distance of a joint from its angle in the second half of the time [rad]
+    error: float  # largest distance of a joint from its angle in the second half of the time; 0 before [rad]
     joint: str  # the joint of that error
     saturated: float  # share of torques at their limits
 
     def __str__(self) -> str:
         """Return a line."""
-        verdict = f"IT FELL {self.fall}" if self.fall else "it stands"
+        errors = f"; largest joint error {self.error:.3f} rad ({self.joint})"
         return (
-            f"{verdict}: trunk at {self.height:.3f} m ({self.nominal:.3f} m nominal), tilted "
-            f"{np.degrees(self.tilt):.1f} degrees, moved {100 * self.drift:.1f} cm; largest joint error "
-            f"{self.error:.3f} rad ({self.joint}); {self.saturated:.1%} of torques at their limits"
+            f"{f'IT FELL {self.fall}' if self.fall else 'it stands'}: trunk at {self.height:.3f} m "
+            f"({self.nominal:.3f} m nominal), tilted {np.degrees(self.tilt):.1f} degrees, moved "
+            f"{100 * self.drift:.1f} cm{'' if self.fall else errors}; {self.saturated:.1%} of torques at their limits"
         )
 
 

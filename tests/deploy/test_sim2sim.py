@@ -124,7 +124,7 @@ def test_physics_is_the_task_s(make_task, policy):
     ],
 )
 def test_robots_that_do_not_fit(exported, tmp_path, change, message):
-    """A missing joint or motor is told before a step is taken."""
+    """A missing joint or motor is reported before a step is taken."""
 
     def edit(root):
         root.remove(root.find("keyframe"))
@@ -138,7 +138,7 @@ def test_robots_that_do_not_fit(exported, tmp_path, change, message):
     assert result[1] == ""
 
 
-def test_differences_are_told(policy, tmp_path):
+def test_differences(policy, tmp_path):
     """Time step and motor limits are compared with the policy's, a floor is added, an unnamed trunk is found."""
 
     def edit(root):
