@@ -27,10 +27,12 @@ from legged_torque.deploy.description import (
     missing_extra,
     to_yaml,
 )
-from legged_torque.deploy.policy import Policy, State, load_network, terms_without_function
+from legged_torque.deploy.policy import Policy, State, load_network, parts_without_function
 from legged_torque.envs.base.commands import HEADING_GAIN
-from legged_torque.envs.base.height_scan import CLIP, OFFSET
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.motors.ideal import IdealMotor
+from legged_torque.motors.motor import Motor
+from legged_torque.sensors.height_scan import CLIP, OFFSET
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import package_versions
@@ -54,7 +56,7 @@ def nominal_cfg(cfg: Any) -> Any:
     """Turn off all randomization in a task's settings, in place, for :func:`export_policy`."""
     cfg.env.num_envs = 4
     cfg.domain_rand.randomize_parameters = cfg.domain_rand.push_robots = cfg.noise.add_noise = False
-    cfg.domain_rand.action_delay = [0, 0]
+    cfg.motors.delay.range = [0, 0]
     return cfg
 
 
@@ -97,7 +99,8 @@ def export_policy(
         check(description)
         difference = check_networks(model, load_network(part / NETWORK_FILE, description), part)
         _write(description, part)
-        description["unsupported"] = terms_without_function(description) or differences(task, Policy(part))
+        unknown = parts_without_function(description) + motors_without_description(task)
+        description["unsupported"] = unknown or differences(task, Policy(part))
         _write(description, part)
         folder.mkdir(exist_ok=True)
         for file in (NETWORK_FILE, TORCHSCRIPT_FILE, DESCRIPTION_FILE):
@@ -157,6 +160,7 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
         "actions": {"clip": [-clip, clip], "terms": _action_terms(task)},
         "gains": {"stiffness": _by_joint(task, task.p_gains[0]), "damping": _by_joint(task, task.d_gains[0])},
         "torque_limits": _by_joint(task, task.torque_limits.T),
+        "motors": task.motors.describe(),
         "joints": _joints(task),
         "timing": {
             "control_frequency": 1.0 / task.dt,
@@ -215,8 +219,15 @@ def _action_terms(task: LeggedRobot) -> list[dict[str, Any]]:
             "meaning": term.meaning,
             **({"interval": term.interval} if term.interval > 1 else {}),
         }
-        for term in task.action_terms()
+        for term in task.control_law.terms
     ]
+
+
+def motors_without_description(task: LeggedRobot) -> list[str]:
+    """Return a line for each link of the motors that does not say what it does: it may do anything over time."""
+    links = task.motors.links.items()
+    silent = [name for name, link in links if type(link) is not IdealMotor and type(link).describe is Motor.describe]
+    return [f"the motor '{name}' has no describe()" for name in silent]
 
 
 def check_networks(model: MLPModel, session: Any, folder: Path) -> float:
@@ -245,7 +256,8 @@ def differences(task: LeggedRobot, policy: Policy) -> list[str]:
     task.actions.copy_(draw(task.actions, 3.0))
     task.reset_buf.fill_(True)  # the history starts with copies
     task.set_state(qpos, draw(task.sim.qvel, 3.0))
-    task.motors.apply(task._compute_torques(task.actions), task.dof_vel, out=task.torques)
+    wanted = task._compute_torques(task.actions)
+    task.torques.copy_(task.motors.apply(wanted, task.dof_pos, task.dof_vel, 0))
     obs, torques = map(np.array, zip(*(_computed(task, policy, world) for world in range(task.num_envs)), strict=True))
     expected = task.obs_buf["policy"].cpu().numpy()
     columns = task.observations.policy_columns("height_scan") if policy.scan else []

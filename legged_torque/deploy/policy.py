@@ -71,7 +71,7 @@ class Policy:
         """
         self.description, network = read(path)
         refuse(self.description.get("unsupported", []), f"'{path}' can only be run by its task")
-        refuse(terms_without_function(self.description), f"'{path}'")
+        refuse(parts_without_function(self.description), f"'{path}'")
         self.dtype = dtype
         self.joint_order: list[str] = self.description["joint_order"]
         self.nominal_pose = self._by_joint(self.description["nominal_pose"])
@@ -201,15 +201,16 @@ ACTIONS: dict[str, Callable[[Policy, np.ndarray, np.ndarray, np.ndarray], np.nda
 """Returns the torques [N m] of an action term for scale times action, q [rad] and qd [rad/s], by the term's name."""
 
 
-def terms_without_function(description: dict[str, Any]) -> list[str]:
-    """Return a line for each term of a description that has no function here."""
+def parts_without_function(description: dict[str, Any]) -> list[str]:
+    """Return a line for each term or motor of a description that has no function here; no motor has one."""
     functions: dict[str, Any] = {"observation": OBSERVATIONS, "action": ACTIONS}
-    return [
+    terms = [
         f"no numpy function for the {kind} term '{term['name']}'; there are {', '.join(known)}"
         for kind, known in functions.items()
         for term in description[f"{kind}s"]["terms"]
         if term["name"] not in known
     ]
+    return terms + [f"no numpy function for the motor '{name}'" for name in description.get("motors", {})]
 
 
 def load_network(file: Path, description: dict[str, Any]) -> Any:

@@ -17,6 +17,10 @@ from legged_torque.deploy.description import check
 from legged_torque.deploy.export import export_policy, nominal_cfg
 from legged_torque.deploy.policy import ACTIONS, OBSERVATIONS, Policy, State
 from legged_torque.envs import ObservationTerm, task_registry
+from legged_torque.envs.approaches.torque import TorqueRobot
+from legged_torque.envs.tasks import A1TorqueCfg
+from legged_torque.motors.config import MotorCfg
+from legged_torque.motors.motor import Motor
 
 CHANGED = {
     "env.history_length": 3,
@@ -227,6 +231,47 @@ def test_terms_of_a_user(make_task, tmp_path, monkeypatch, name):
     assert error_of(Policy, tmp_path / "out") == f"'{tmp_path / 'out'}': {problem}"
 
 
+def test_motors_of_a_user(tmp_path):
+    """A motor of a user's is named in policy.yaml, by its constants if it describes itself."""
+
+    class WeakMotor(Motor):
+        def apply(self, wanted, pos, vel, substep):
+            return 0.5 * wanted
+
+    class WeakMotorWithWords(WeakMotor):
+        def describe(self):
+            return {"share": 0.5}
+
+    class WeakCfg(MotorCfg):
+        def build(self, joints):
+            return WeakMotor(self, joints)
+
+    class WeakCfgWithWords(MotorCfg):
+        def build(self, joints):
+            return WeakMotorWithWords(self, joints)
+
+    class OwnMotorsCfg(A1TorqueCfg):
+        class motors:
+            chain = ["ideal", "weak", "half"]
+
+            class weak(WeakCfg):
+                pass
+
+            class half(WeakCfgWithWords):
+                pass
+
+    cfg = OwnMotorsCfg()
+    cfg.env.num_envs = 3
+    export_random(lambda *args, **kwargs: TorqueRobot(cfg), "a1_torque", tmp_path / "out", supported=False)
+    description = read_yaml(tmp_path / "out")
+    assert description["motors"] == {"half": {"share": 0.5}}
+    assert description["unsupported"] == [
+        "no numpy function for the motor 'half'",
+        "the motor 'weak' has no describe()",
+    ]
+    assert "no numpy function for the motor 'half'" in error_of(Policy, tmp_path / "out")
+
+
 def test_replaces_an_export(make_task, exported, tmp_path):
     """An export into a folder with an earlier one replaces it and leaves other files alone."""
     folder = shutil.copytree(exported, tmp_path / "out")
@@ -240,10 +285,10 @@ def test_nominal_settings():
     """A run with randomization is exported with the gains and scales of its settings."""
     cfg, _ = task_registry.get_cfgs("a1_position")
     cfg.domain_rand.randomize_parameters = cfg.domain_rand.push_robots = cfg.noise.add_noise = True
-    cfg.domain_rand.action_delay = [1, 2]
+    cfg.motors.delay.range = [1, 2]
     cfg = nominal_cfg(cfg)
     assert not (cfg.domain_rand.randomize_parameters or cfg.domain_rand.push_robots or cfg.noise.add_noise)
-    assert cfg.domain_rand.action_delay == [0, 0]
+    assert cfg.motors.delay.range == [0, 0]
 
 
 @pytest.mark.parametrize("package", ["onnx", "onnxruntime", "jsonschema"])

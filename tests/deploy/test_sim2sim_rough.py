@@ -114,7 +114,7 @@ def test_motion_is_the_task_s(exported, policy, robot):
         task.reset()
         task.base_pos[:, 0] += 1.4  # half on the first step
         task.reset_buf.fill_(True)  # scans start anew, too
-        task.compute_observations()
+        task.set_state(task.sim.qpos.clone(), task.sim.qvel.clone())
         q, v = task.sim.qpos[world].numpy(), task.sim.qvel[world].numpy()
         robot.reset(q[:3], q[3:7], q[7:], (v[:3], v[3:6], v[6:]))
         policy.reset()

@@ -9,7 +9,7 @@ import torch
 from support.published import as_menagerie, as_mjcf, urdf
 
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.asset import by_joint, load_asset
+from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.held_pose import standing_note
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfgPPO
@@ -17,6 +17,7 @@ from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import import_robot
 from legged_torque.importer.settings import settings
 from legged_torque.importer.trial import fused_problem, parse, stand
+from legged_torque.motors.joints import by_joint
 from legged_torque.utils.errors import UserError
 
 

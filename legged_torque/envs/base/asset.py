@@ -106,28 +106,6 @@ def _choose_self_collisions(
     return exclude_self_collisions(spec, model)
 
 
-def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:
-    """Return a number for each joint: one for all, or by parts of their names, the first match counting.
-
-    A UserError that names the setting if a joint has no number or a part of a name matches no joint.
-    """
-    if not isinstance(values, dict):
-        return [values] * len(dof_names)
-    for part in values:
-        if not any(part in name for name in dof_names):
-            raise unknown_name(f"joint (part of its name) in {setting}", part, dof_names)
-    taken = []
-    for name in dof_names:
-        matching = [part for part in values if part in name]
-        if not matching:
-            raise UserError(f"{setting} lacks the joint '{name}'; it has {', '.join(values) or 'no entries'}")
-        taken.append(matching[0])
-    for part in values:
-        if part not in taken:
-            raise UserError(f"'{part}' in {setting} has no effect: its joints take a name before it")
-    return [values[part] for part in taken]
-
-
 def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[float]:
     """Return the angles [rad] of ``init_state.default_joint_angles``, in the order of the model.
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import mujoco
 import numpy as np
+from torch import Tensor
 
 from legged_torque.sim.fused.tree import SLOWER, reasons_against
 from legged_torque.sim.model import FLOOR
-from legged_torque.sim.randomization import Parameter
+from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.mirroring import Mirroring
 from legged_torque.utils.mjcf import body_chains, joint_limits
 
@@ -71,25 +72,33 @@ def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, fo
     return ""
 
 
-def range_notes(drawn: Sequence[Parameter], torques: np.ndarray) -> Iterator[str]:
+def range_notes(drawn: Sequence[RandomParameter], fields: Mapping[str, Tensor], torques: np.ndarray) -> Iterator[str]:
     """Yield ranges that seem to be another robot's.
 
     Such a range leaves out the robot's own value, changes a mass by more than half, or draws dry friction of more than
-    a tenth of a joint's highest torque. Highest torques are ``torques`` [N m]. Shape: (num_dof,).
+    a tenth of a joint's highest torque.
+
+    Args:
+        drawn: The parameters.
+        fields: Those of the model that they are kept in, by name. Shapes: (num_envs, any).
+        torques: Highest torques [N m]. Shape: (num_dof,).
     """
-    for parameter in (each for each in drawn if each.model_field):
-        columns = list(parameter.columns)
-        own = parameter.field[0, columns].cpu().numpy()
-        weight, (low, high) = np.broadcast_to(parameter.weight, own.shape), parameter.offset
-        most = np.abs(weight) * max(-low, high)
-        problem = ""
-        if parameter.model_field == "body_mass" and (most > 0.5 * own).any():
-            problem = f"changes a mass of {own[0]:g} kg by {most[0]:g} kg"
-        elif parameter.model_field == "dof_frictionloss" and (most > 0.1 * torques[np.subtract(columns, 6)]).any():
-            problem = f"draws up to {most.max():g} N m, but a motor has {torques.min():g} N m"
-        elif parameter.base is not None:
-            scaled = np.divide(own - parameter.base, weight, out=np.zeros_like(own), where=weight != 0.0)
+    for parameter in drawn:
+        (kind, limits), *_ = [*parameter.draw.items(), ("", [0.0, 0.0])]
+        if not isinstance(parameter.field, str) or kind not in ("set", "add"):
+            continue
+        own = fields[parameter.field][0, list(parameter.columns)].cpu().numpy()
+        unit = np.broadcast_to(parameter.set_unit if kind == "set" else parameter.add_unit, own.shape)
+        low, high = limits
+        most = np.abs(unit) * max(-low, high)
+        note = ""
+        if parameter.field == "body_mass" and (most > 0.5 * own).any():
+            note = f"changes a mass of {own[0]:g} kg by {most[0]:g} kg"
+        elif parameter.field == "dof_frictionloss" and (most > 0.1 * torques[np.subtract(parameter.columns, 6)]).any():
+            note = f"draws up to {most.max():g} N m, but a motor has {torques.min():g} N m"
+        elif kind == "set":
+            scaled = np.divide(own, unit, out=np.zeros_like(own), where=unit != 0.0)
             outside = scaled[(scaled < low - 1e-6 * abs(low)) | (scaled > high + 1e-6 * abs(high))]
-            problem = f"draws {low:g} to {high:g}, but the robot's own value is {outside[0]:g}" if outside.size else ""
-        if problem:
-            yield f"domain_rand.{parameter.name} {problem}: is it the range of another robot?"
+            note = f"draws {low:g} to {high:g}, but the robot's own value is {outside[0]:g}" if outside.size else ""
+        if note:
+            yield f"domain_rand.{parameter.name} {note}: is it the range of another robot?"
