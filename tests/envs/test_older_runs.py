@@ -49,7 +49,7 @@ A1 = {
 
 
 def test_ranges():
-    """Each parameter has the ranges that were drawn: shares where there was no number, and none that were kept fixed."""
+    """Each parameter has the ranges that were drawn: shares where there was no number, none that were kept fixed."""
     values = {"domain_rand": A1, "motors": {"model": "ideal"}, "env": {"num_envs": 3}}
     assert is_older(values)
     new = converted(values)
