@@ -1,13 +1,14 @@
 """FLOP and bytes of update and physics: as PyTorch counts them, and as counted by hand."""
 
 import pytest
+from support.scripts import run_here
 from torch.utils.flop_counter import FlopCounterMode
 
-from legged_torque.benchmark import roofline
-from legged_torque.benchmark.roofline import Peaks
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.options import Options
+from tools import roofline
+from tools.roofline import Peaks
 
 SMALL = {
     "runner.num_steps_per_env": 3,
@@ -119,3 +120,14 @@ def test_peaks(monkeypatch):
 
     monkeypatch.setattr(roofline, "seconds_per_call", seconds)
     assert roofline.measure_peaks("cpu", "bfloat16") == Peaks(flop_per_s=2e6 / 3, bytes_per_s=2000 / 8)
+
+
+def test_script(tmp_path):
+    """It prints three rates with their peaks, each share being the one over the other."""
+    words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--rounds=1", "--set=runner.num_steps_per_env=3"]
+    status, output, error = run_here("../tools/roofline.py", *words, root=tmp_path)
+    rates = [line.replace(",", "").split() for line in output.splitlines()[1:]]
+    assert (status, error) == (0, "") and [words[0] for words in rates] == ["update", "update", "physics"]
+    assert {words[4] for words in rates} == {"GFLOP/s:", "GB/s:"} and not list(tmp_path.iterdir())
+    for words in rates:
+        assert float(words[5].strip("%")) == pytest.approx(100 * float(words[1]) / float(words[3]), abs=1.0)

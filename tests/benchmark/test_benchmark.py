@@ -5,14 +5,13 @@ import gzip
 import json
 import os
 import signal
-from types import SimpleNamespace
 
 import pytest
 import torch
 from support.scripts import assert_told_in_one_line, run_here
 
 from legged_torque.benchmark import measure as benchmark
-from legged_torque.benchmark.measure import MemoryMeter, most_expensive, summarize
+from legged_torque.benchmark.measure import MemoryMeter, summarize
 from legged_torque.envs import LeggedRobot, task_registry
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import is_out_of_memory
@@ -56,14 +55,11 @@ def test_numbers_belong_together(measured):
     for row in result["rows"]:
         assert all(row[f"{name}_ms"] > 0 for name in (*PARTS, "physics", "step", "iteration"))
         assert row["iteration_steps_per_s"] == pytest.approx(row["num_envs"] * 3 / (row["iteration_ms"] / 1000))
-        assert row["step_steps_per_s"] == pytest.approx(row["num_envs"] / (row["step_ms"] / 1000))
         assert row["iteration_over_physics"] == pytest.approx(row["iteration_ms"] / (3 * row["physics_ms"]))
         assert row["iteration_min_ms"] <= row["iteration_ms"] <= row["iteration_max_ms"]
         # with two rounds medians are means, which add up
         assert sum(row[f"{name}_ms"] for name in PARTS) == pytest.approx(row["iteration_ms"])
-        startup = [row[f"{name}_s"] for name in ("build", "log", "first_iteration", "capture")]
-        assert sum(startup) == pytest.approx(row["startup_s"]) and min(startup) > 0
-        assert row["compiled_modules"] >= 0
+        assert 0 < row["build_s"] < row["startup_s"]
         assert 50 < row["peak_memory_mib"] <= row["left_memory_mib"] < 50_000  # on the CPU memory only grows
 
 
@@ -74,7 +70,7 @@ def test_table(measured):
     assert max(map(len, lines)) <= 140
     (head,) = (i for i, line in enumerate(lines) if line.startswith(" worlds | physics ms"))
     titles = [cell.strip() for cell in lines[head].split("|")]
-    rows = [line for line in lines[head : lines.index("", head)] if "|" in line][1:]
+    rows = [line for line in lines[head + 1 :] if "|" in line]
     assert len(rows) == 2
     for line, row in zip(rows, result["rows"], strict=True):
         cells = dict(zip(titles, (cell.strip().replace(",", "") for cell in line.split("|")), strict=True))
@@ -82,19 +78,6 @@ def test_table(measured):
         assert cells["steps/s"] == f"{row['iteration_steps_per_s']:.0f}"
         assert cells["peak MiB"] == f"{row['peak_memory_mib']:.0f}"
         assert cells["start-up s"] == f"{row['startup_s']:.1f}"
-
-
-def test_shares_of_peaks(measured):
-    """The second table has a line for each size, with what follows from counts, times and peaks."""
-    output, result = measured
-    lines = output.splitlines()
-    (head,) = (i for i, line in enumerate(lines) if "update GFLOP/s" in line)
-    assert len(lines) == head + 3
-    for line, row in zip(lines[head + 1 :], result["rows"], strict=True):
-        share = row["update_flop"] / (row["update_ms"] / 1000) / (1e9 * row["peak_gflop_per_s"])
-        assert row["update_flop_share"] == pytest.approx(share)
-        cells = [cell.strip() for cell in line.split("|")]
-        assert cells[0] == str(row["num_envs"]) and cells[2] == f"{share:.1%}"
 
 
 def test_against_an_earlier_run(measured, tmp_path):
@@ -130,47 +113,13 @@ def test_endurance(measured):
 
 @pytest.mark.parametrize("name", ["trace.json", "trace.json.gz"])
 def test_trace(runner, tmp_path, name):
-    """The trace is JSON that has the traced iterations with their rollouts and updates, and the dear operators."""
-    rows = benchmark.trace_iterations(runner, tmp_path / name)
+    """The trace is JSON that has the traced iterations with their rollouts and updates; a table has the operators."""
+    lines = benchmark.trace_iterations(runner, tmp_path / name)
     content = (tmp_path / name).read_bytes()
     trace = json.loads(gzip.decompress(content) if name.endswith(".gz") else content)
     names = [event.get("name", "") for event in trace["traceEvents"]]
     assert names.count("rollout") == names.count("update") == benchmark.TRACED
-    assert sum(name.startswith("ProfilerStep") for name in names) == benchmark.TRACED
-    assert len(rows) == benchmark.TOP_KERNELS and "aten::mm" in names and "rollout" not in [row["name"] for row in rows]
-    assert [row["total_ms"] for row in rows] == sorted((row["total_ms"] for row in rows), reverse=True)
-    assert all(row["calls"] > 0 and row["total_ms"] > 0 for row in rows)
-
-
-def test_profile_option(tmp_path):
-    """``--profile`` writes the trace and prints what is expensive."""
-    file = tmp_path / "trace.json.gz"
-    status, output, error = run_here("benchmark.py", *SMALL, "--num_envs=2", f"--profile={file}", root=tmp_path)
-    assert (status, error) == (0, "")
-    assert len(gzip.decompress(file.read_bytes())) > 1000 and str(file) in output
-    lines = output.splitlines()
-    (head,) = (i for i, line in enumerate(lines) if line.split() == ["calls", "total", "ms", "name"])
-    kernels = lines[head + 1 : lines.index("", head)]
-    assert len(kernels) == benchmark.TOP_KERNELS and any(" aten::" in line for line in kernels)
-
-
-def test_most_expensive_on_a_gpu():
-    """On a GPU only what ran there counts, without the spans that have names of ours."""
-
-    def entry(name, device, milliseconds, annotation=False):
-        return SimpleNamespace(
-            key=name,
-            count=3,
-            device_type=torch.autograd.DeviceType.CUDA if device == "cuda" else torch.autograd.DeviceType.CPU,
-            self_device_time_total=1e3 * milliseconds,
-            self_cpu_time_total=1e6,
-            is_user_annotation=annotation,
-        )
-
-    entries = [entry(f"kernel {i}", "cuda", i) for i in range(15)]
-    entries += [entry("rollout", "cuda", 100, annotation=True), entry("aten::mm", "cpu", 50)]
-    rows = most_expensive(entries, cuda=True)
-    assert rows == [{"name": f"kernel {i}", "calls": 3, "total_ms": i} for i in range(14, 4, -1)]
+    assert "aten::mm" in names and any(" aten::mm " in line for line in lines)
 
 
 def test_whole_iterations(runner, tmp_path, capsys):
@@ -211,9 +160,8 @@ def test_summary_by_hand():
     times = {"rollout": [10, 12, 30], "update": [4, 5, 6], "log": [1, 1, 2], "iteration": [15, 18, 38]}
     row = summarize(times, physics=0.25, step=0.5, num_envs=100, num_steps=24)
     assert (row["rollout_ms"], row["update_ms"], row["log_ms"], row["iteration_ms"]) == (12, 5, 1, 18)
-    assert (row["iteration_over_physics"], row["step_over_physics"]) == (3.0, 2.0)
+    assert row["iteration_over_physics"] == 3.0
     assert row["iteration_steps_per_s"] == pytest.approx(2400 / 0.018)
-    assert (row["physics_steps_per_s"], row["step_steps_per_s"]) == (400_000, 200_000)
 
 
 def test_size_that_does_not_fit(tmp_path, monkeypatch):
