@@ -3,30 +3,131 @@
 Versions, processor, GPU and driver, where compiled kernels are kept, and which extras can be used.
 """
 
+from __future__ import annotations
+
 from legged_torque.utils.interrupt import end_on_interrupt
 from legged_torque.utils.rendering import choose_offscreen_renderer
 
 end_on_interrupt()
 NO_RENDERER = choose_offscreen_renderer()  # before anything imports mujoco
 
+import importlib.metadata
 import os
+import platform
+import subprocess
+from pathlib import Path
 
+from packaging.requirements import Requirement
+
+import legged_torque
 from legged_torque.utils.cli import Parser, importing, run_script
 from legged_torque.utils.errors import told_in
+from legged_torque.utils.runs import package_versions
+
+PURPOSES = {
+    "video": "videos of play.py and sim2sim.py",
+    "viewer": "play.py --viewer web",
+    "export": "export.py, sim2sim.py",
+    "plots": "figures and report.py",
+    "wandb": "--logger wandb",
+    "ray": "experiment.py --launcher ray",
+}
+"""The extras that users need."""
 
 
 def main() -> None:
     """Print a block of lines per topic."""
     Parser(__doc__).parse_args()
     with importing():
-        from legged_torque.benchmark.installation import topics
+        import torch
+
         from legged_torque.viewer.native import check_display
     no_window: list[str] = []
     with told_in(no_window):
         check_display("--viewer web")
-    shown = {"videos": NO_RENDERER or os.environ["MUJOCO_GL"], "MuJoCo's window": " ".join(no_window) or "ok"}
-    for title, lines in (topics() | {"rendering": [f"{what}: {text}" for what, text in shown.items()]}).items():
+    topics = {
+        f"legged_torque {legged_torque.__version__}": [f"in {Path(legged_torque.__file__).parent}"],
+        "versions": [f"{name:<14} {version}" for name, version in package_versions().items()],
+        "machine": [platform.platform(), f"{os.cpu_count()} cores, threads of torch: {torch.get_num_threads()}"],
+        "GPU": gpus(driver()),
+        "caches": caches(),
+        "extras": extras(installed_requirements()),
+        "rendering": [
+            f"videos: {NO_RENDERER or os.environ['MUJOCO_GL']}",
+            f"MuJoCo's window: {' '.join(no_window) or 'ok'}",
+        ],
+    }
+    for title, lines in topics.items():
         print(title, *lines, sep="\n  ")
+
+
+def driver() -> list[str]:
+    """Return a line per GPU of NVIDIA's driver; none without a driver."""
+    command = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return []
+    return [line.strip() for line in done.stdout.splitlines() if line.strip()]
+
+
+def gpus(of_driver: list[str]) -> list[str]:
+    """Return the GPUs and, if there are some that cannot be used, why."""
+    import torch
+
+    lines = [f"{line} (name, driver, memory)" for line in of_driver] or ["none with a driver of NVIDIA"]
+    if torch.version.cuda is None:
+        return [*lines, "torch is a build for the CPU" + (": install one for CUDA to use the GPU" if of_driver else "")]
+    usable = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
+    return [*lines, f"torch, for CUDA {torch.version.cuda}, can use: {', '.join(usable) or 'none'}"]
+
+
+def caches() -> list[str]:
+    """Return the folder of compiled kernels, with its number of modules and its size."""
+    import warp as wp
+
+    import legged_torque.sim  # noqa: F401 (lets Warp print no banner)
+
+    wp.init()
+    folder = Path(wp.config.kernel_cache_dir or "")
+    modules, size = sum(1 for path in folder.glob("wp_*")), size_of(folder) / 2**20
+    return [f"compiled kernels: {folder}, {modules} modules, {size:.0f} MiB; WARP_CACHE_PATH chooses it"]
+
+
+def size_of(folder: Path) -> int:
+    """Return the size of all files in a folder [bytes]; those that another process moves meanwhile may be left out."""
+    files = (Path(place, name) for place, _, names in os.walk(folder) for name in names)
+    return sum(file.lstat().st_size for file in files if os.path.lexists(file))
+
+
+def installed_requirements() -> list[Requirement] | None:
+    """Return the requirements of the installed package, with its extras; None if it is not installed."""
+    try:
+        return [Requirement(text) for text in importlib.metadata.requires("legged_torque") or []]
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def extras(requirements: list[Requirement] | None) -> list[str]:
+    """Return for each extra whether all that it needs is there, or what is missing and the command that installs it."""
+    if requirements is None:
+        return ["unknown, as the package is not installed: pip install -e ."]
+    lines = []
+    for extra, purpose in PURPOSES.items():
+        wanted = [need for need in requirements if need.marker and need.marker.evaluate({"extra": extra})]
+        missing = [problem for problem in map(lacking, wanted) if problem]
+        hint = f"missing {', '.join(missing)}: pip install 'legged_torque[{extra}]'"
+        lines.append(f"{extra:<7} {hint if missing else 'ok'} ({purpose})")
+    return lines
+
+
+def lacking(need: Requirement) -> str:
+    """Return the name of a required package that is missing, with the versions if another is there; "" if it is fine."""
+    try:
+        version = importlib.metadata.version(need.name)
+    except importlib.metadata.PackageNotFoundError:
+        return need.name
+    return "" if need.specifier.contains(version, prereleases=True) else f"{need.name}{need.specifier} (here {version})"
 
 
 if __name__ == "__main__":
