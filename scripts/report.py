@@ -3,12 +3,6 @@
 Takes the folder of an experiment, a folder with runs of train.py (logs/a1_torque, or all of logs), or a single run.
 """
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 from pathlib import Path
 
 from legged_torque.paper.report.blocks import to_html, to_markdown

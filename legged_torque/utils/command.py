@@ -27,7 +27,7 @@ def main() -> None:
     if words and not words[0].startswith("-"):
         run_script(lambda: start(*words))
     else:
-        run_script(tell)
+        run_script(show_overview)
 
 
 def start(name: str, *words: str) -> None:
@@ -41,7 +41,7 @@ def start(name: str, *words: str) -> None:
     spec.loader.exec_module(module)
 
 
-def tell() -> None:
+def show_overview() -> None:
     """Answer ``--help`` and ``--version``, and complete the name of a script."""
     parser = Parser(str(legged_torque.__doc__))
     parser.prog, parser.epilog = COMMAND, f"commands:\n{overview()}"

@@ -19,7 +19,7 @@ class UserError(Exception):
     """
 
     def __init__(self, message: object) -> None:
-        """Write what cannot be printed as its code: names in a stranger's file may hold line ends or worse."""
+        """Replace characters that cannot be printed by their codes: names in a stranger's file may hold line ends."""
         super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(message)))
 
 
@@ -42,8 +42,8 @@ def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
 
 
 @contextlib.contextmanager
-def told_in(problems: list[str]) -> Iterator[None]:
-    """Add the UserError raised inside to problems, which are told together later."""
+def collect_errors(problems: list[str]) -> Iterator[None]:
+    """Append the message of a UserError that is raised inside to a list, and go on."""
     try:
         yield
     except UserError as error:
@@ -53,8 +53,8 @@ def told_in(problems: list[str]) -> Iterator[None]:
 def is_out_of_memory(error: BaseException | None) -> bool:
     """Return whether an error, or one that led to it, says that memory has run out."""
     while error is not None:
-        is_told = isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY)
-        if is_told or isinstance(error, MemoryError):
+        is_said = isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY)
+        if is_said or isinstance(error, MemoryError):
             return True
         error = error.__cause__ or error.__context__
     return False

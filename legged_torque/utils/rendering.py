@@ -10,8 +10,8 @@ INSTALL_HINT = "on Debian: apt-get install libosmesa6, then MUJOCO_GL=osmesa"
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 
 
-def without_renderer() -> None:
-    """Tell MuJoCo to import without a renderer, which scripts that draw nothing must not depend on."""
+def disable_renderer() -> None:
+    """Let MuJoCo import without a renderer, on which scripts that draw nothing must not depend."""
     os.environ["MUJOCO_GL"] = "disable"
 
 
@@ -31,5 +31,5 @@ def choose_offscreen_renderer() -> str | None:
         if ctypes.util.find_library(_LIBRARIES[name]):
             os.environ["MUJOCO_GL"] = name
             return None
-    without_renderer()
+    disable_renderer()
     return f"the library of {' or '.join(candidates)} is not installed ({INSTALL_HINT})"

@@ -23,7 +23,8 @@ from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.learning import checkpoint
 from legged_torque.learning.pretrained import start_from
 from legged_torque.paper.report.curves import CURVE_METRICS
-from legged_torque.utils.config import parse_yaml, set_by_path
+from legged_torque.utils.config import set_by_path
+from legged_torque.utils.plain_yaml import parse_yaml
 from legged_torque.utils.task_registry import TaskRegistry, task_registry
 
 LOADING = {

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
+from legged_torque.learning.settings import Activation, TrainingCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
 from legged_torque.utils.limits import (
     Count,
@@ -299,7 +300,7 @@ class LeggedRobotCfg(BaseConfig):
         return {"domain_rand": {**dict.fromkeys((*per_joint, *shares)), "push_set_factor": 1.0}}
 
 
-class LeggedRobotCfgPPO(BaseConfig):
+class LeggedRobotCfgPPO(TrainingCfg):
     """Settings of the training: the ``parallel`` preset, made for thousands of worlds."""
 
     seed: Annotated[int, Limits(lowest=0)] = 1  # of all random numbers of a training
@@ -335,7 +336,7 @@ class LeggedRobotCfgPPO(BaseConfig):
     class actor:  # the policy's network, an rsl_rl model
         class_name: str = "MLPModel"  # an rsl_rl model
         hidden_dims: Sizes = [512, 256, 128]  # sizes of the hidden layers
-        activation: str = "elu"  # after every hidden layer
+        activation: Activation = "elu"  # after every hidden layer
 
         class distribution_cfg:  # the distribution of its actions
             class_name: str = "legged_torque.learning.distribution:GaussianDistribution"  # rsl_rl's, made for graphs
@@ -345,7 +346,7 @@ class LeggedRobotCfgPPO(BaseConfig):
     class critic:  # the value function's network
         class_name: str = "MLPModel"  # an rsl_rl model
         hidden_dims: Sizes = [512, 256, 128]  # sizes of the hidden layers
-        activation: str = "elu"  # after every hidden layer
+        activation: Activation = "elu"  # after every hidden layer
 
     class algorithm:  # PPO, with rsl_rl's names
         class_name: str = "legged_torque.learning.ppo:OnDevicePPO"  # rsl_rl's PPO without waiting for the host
