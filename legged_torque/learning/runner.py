@@ -22,6 +22,7 @@ from legged_torque.learning.evaluator import TrainingEvaluators, append_row
 from legged_torque.learning.guard import TrainingGuard
 from legged_torque.learning.log_writer import NoLogWriter
 from legged_torque.learning.ppo import OnDevicePPO
+from legged_torque.learning.random_state import random_state, restore_random_state
 from legged_torque.learning.training_display import TrainingDisplay
 from legged_torque.learning.worlds import (
     check_identity,
@@ -40,7 +41,6 @@ from legged_torque.utils.display import warn
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.files import write_errors
 from legged_torque.utils.interrupt import StopRequest
-from legged_torque.utils.random_state import random_state, restore_random_state
 from legged_torque.utils.runs import checkpoint_file, claim_run_dir, evaluations_file, tagged
 
 _STYLES = re.compile("\033\\[[0-9;]*m")  # what makes text bold or colored on a terminal

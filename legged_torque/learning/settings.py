@@ -1,8 +1,9 @@
-"""What all settings of trainings have in common: their checks, and the runner that they describe. Needs no torch."""
+"""Base of the settings of trainings: their checks, and the runner that they describe. Needs no torch."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import io
 import os
 from collections.abc import Iterable
@@ -51,9 +52,8 @@ class TrainingCfg(BaseConfig):
     def check_code_names(self, registered: Iterable[TrainingCfg]) -> None:
         """Refuse, by UserError, names of code that none of the ``registered`` settings or their presets have.
 
-        Settings may come from a file of a stranger, a run's ``config.yaml`` or the description of an experiment.
-        Importing or calling what they name would run any code that is installed; what a task of the user registers is
-        the user's own.
+        Settings may come from a stranger's file: a run's ``config.yaml`` or the description of an experiment. Importing
+        a name would run any code that is installed. The tasks that are registered are the user's own.
         """
         unknown, known = code_names(to_dict(self)), dict[str, list[Any]]()
         for cfg in registered:
@@ -75,6 +75,8 @@ class TrainingCfg(BaseConfig):
             task: Its name, for checkpoints.
             log_dir: Folder of the run; None keeps nothing.
         """
+        if log_dir and self.runner.logger == "wandb" and importlib.util.find_spec("wandb") is None:  # type: ignore[attr-defined]
+            raise UserError("--logger wandb needs the extra: pip install 'legged_torque[wandb]'")
         from rsl_rl.utils import resolve_callable
 
         for path, name in code_names(to_dict(self)).items():

@@ -22,7 +22,7 @@ def busy_cores() -> float | None:
 
 
 def busy_cores_note(threads: int) -> str | None:
-    """Return a note for a user who computes with so many threads; None if enough cores are free."""
+    """Return a note on computing with so many threads; None if enough cores are free."""
     cores = os.cpu_count() or 1
     others = busy_cores() if threads > 1 else None
     if others is None or others < MANY or threads <= cores - others:

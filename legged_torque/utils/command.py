@@ -14,7 +14,7 @@ from legged_torque.utils.cli import COMMAND, Parser, run_script
 from legged_torque.utils.errors import unknown_name
 
 USUAL = ("train", "play", "evaluate", "export", "sim2sim", "experiment", "report", "import_robot", "info")
-"""What most users need, in the order of ``--help``."""
+"""Scripts for most users, in the order of ``--help``."""
 
 
 def main() -> None:
@@ -57,11 +57,11 @@ def scripts() -> list[str]:
 
 
 def overview() -> str:
-    """Return a line per script, with what it does by the first line of its docstring."""
+    """Return a line per script, with the first line of its docstring."""
     return "\n".join(f"  {name:<20} {purpose(SCRIPTS_DIR / f'{name}.py')}" for name in scripts())
 
 
 def purpose(file: Path) -> str:
-    """Return what a script does."""
+    """Return the purpose of a script, by its docstring."""
     text = ast.get_docstring(ast.parse(file.read_text("utf-8"))) or ""
     return text.partition("\n")[0].partition(":")[0].rstrip(".")

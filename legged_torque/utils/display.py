@@ -37,13 +37,14 @@ class Display:
 
     On a terminal a thread of rich draws the :meth:`view`, below all that is printed meanwhile; elsewhere the
     :meth:`line` is printed now and then. Nothing waits for a device, and no error in drawing ends the work. Only one
-    view is shown at a time: a display inside another one prints lines. What a view reads must be replaced as a whole.
+    view is shown at a time: a display inside another one prints lines. The view
+    is drawn by another thread, so its lists and dictionaries must be replaced, not changed.
 
     Attributes:
-        total: How many there are to do.
-        done: How many of them are done; set this to count.
+        total: Number to count to.
+        done: Number that is reached; set this to count.
         bar: rich's bar, with a single task, which is updated when it is shown.
-        activity: What the work does now, if that is not the usual.
+        activity: An unusual activity, shown as long as it is set.
         notice: The last text of :meth:`notify`.
         warnings: The texts of :func:`warn` since the start.
     """
@@ -62,9 +63,9 @@ class Display:
         """Prepare; nothing is shown before the context is opened.
 
         Args:
-            what: What is counted, e.g. "iteration".
-            total: How many there are.
-            done: How many of them are done already.
+            what: Name of what is counted, e.g. "iteration".
+            total: Number to count to.
+            done: Number that is reached already.
             stream: Where to show it; None is standard output.
             stays: Whether the last view or line is left behind.
             clock: Returns the time [s].
@@ -88,7 +89,7 @@ class Display:
         return self.bar.tasks[0]
 
     def view(self) -> RenderableType:
-        """Return what a terminal shows now."""
+        """Return the view for a terminal."""
         self.update_bar()
         return Group(
             self.bar.get_renderable(), *(Text(text, "yellow") for text in (self.activity, self.notice) if text)
@@ -181,7 +182,7 @@ class Counter(Display):
     """
 
     def __init__(self, what: str, total: int, clock: Callable[[], float] = time.monotonic) -> None:
-        """Prepare to count ``total`` of what is named."""
+        """Prepare to count to ``total``; ``what`` names what is counted."""
         super().__init__(what, total, stream=sys.stderr, clock=clock)
 
     def add(self) -> None:

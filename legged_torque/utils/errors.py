@@ -13,7 +13,7 @@ NEAREST = 5  # how many those are
 
 
 class UserError(Exception):
-    """A mistake in what the user gave: one line that says what, what is allowed and the nearest match.
+    """A mistake of the user, in one line: the given value, the allowed ones and the nearest match.
 
     Scripts print the line and exit with status 2; no traceback is shown.
     """
@@ -28,9 +28,9 @@ class TrainingError(Exception):
 
 
 def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
-    """Return the error for a name that does not exist; ``kind`` is what it stands for, e.g. "task".
+    """Return the error for a name that does not exist; ``kind`` is the kind of things it names, e.g. "task".
 
-    It lists what is allowed, or of more than :data:`MANY` names the nearest ones.
+    It lists the allowed names, or the nearest ones of more than :data:`MANY`.
     """
     allowed = sorted(allowed)
     by_lower_case = {name.lower(): name for name in allowed}

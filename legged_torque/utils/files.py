@@ -16,7 +16,7 @@ from typing import Any
 
 from legged_torque.utils.errors import UserError
 
-_PART = re.compile(r"\.(\d+)\.part$")  # end of the name of what is being written: the process's id
+_PART = re.compile(r"\.(\d+)\.part$")  # end of the name of an unfinished file: the process's id
 
 
 @contextlib.contextmanager
@@ -29,7 +29,7 @@ def write_errors(path: Path) -> Iterator[None]:
 
 
 def part_of(path: Path) -> Path:
-    """Return where this process writes what will become a file or folder."""
+    """Return the path at which this process writes a file or folder until it is finished."""
     return path.with_name(f"{path.name}.{os.getpid()}.part")
 
 
@@ -75,7 +75,7 @@ def held(lock: Path) -> Iterator[None]:
 
 
 def remove_stale_parts(folder: Path) -> None:
-    """Remove what processes that have been killed were writing in a folder."""
+    """Remove the unfinished files of killed processes from a folder."""
     for path in folder.glob("*.part"):
         writer = _PART.search(path.name)
         if writer and not is_running(int(writer[1])):

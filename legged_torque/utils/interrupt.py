@@ -61,7 +61,7 @@ def write_error(text: str) -> None:
 
 
 def leave_terminal() -> None:
-    """Drop from now on what would be written to a terminal, where every attempt fails once it is closed."""
+    """Drop all further output to a terminal that is closed, where every write would fail."""
     for stream in (1, 2):
         with contextlib.suppress(OSError):
             if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty is false for one that is closed

@@ -102,7 +102,7 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
 
 
 def describe(hint: Any) -> str:
-    """Return what a type allows, in a few words."""
+    """Return the allowed values of a type in words."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
         limits = ", ".join(str(part) for part in parts[1:] if isinstance(part, Limits))

@@ -1,4 +1,4 @@
-"""Reading robots from MJCF files: what MuJoCo does not like is told in one line; joints and motors by transmission."""
+"""Reading robots from MJCF files, with MuJoCo's complaints as one line; joints and motors by transmission."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ def loading(file: str | Path) -> Iterator[None]:
     """Turn MuJoCo's errors and warnings inside into a UserError that names the MJCF file."""
     if not Path(file).is_file():
         raise UserError(f"cannot load the robot '{file}': there is no such file")
-    with kept_warnings() as told, warnings.catch_warnings():
+    with kept_warnings() as texts, warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
             yield
         except (ValueError, mujoco.FatalError, UserWarning) as error:
-            told.append(str(error))
-    if told:
-        raise UserError(f"cannot load the robot '{file}': {' '.join(told[0].split())}")
+            texts.append(str(error))
+    if texts:
+        raise UserError(f"cannot load the robot '{file}': {' '.join(texts[0].split())}")
 
 
 @contextlib.contextmanager
 def kept_warnings() -> Iterator[list[str]]:
     """Collect MuJoCo's warnings inside, which it would print, and write to a file in the current folder."""
-    told: list[str] = []
+    texts: list[str] = []
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(told.append)
+    mujoco.set_mju_user_warning(texts.append)
     try:
-        yield told
+        yield texts
     finally:
         mujoco.set_mju_user_warning(before)
 
@@ -125,7 +125,7 @@ def joint_axes(model: mujoco.MjModel) -> np.ndarray:
 
 
 def robot_notes(file: Path, trained: Path) -> Iterator[str]:
-    """Yield what of a robot in a MJCF is otherwise than of that with which a policy was trained: axes and mass."""
+    """Yield the differences of a robot from the one with which a policy was trained, in axes and mass."""
     if not trained.is_file():
         yield f"asset.file is not compared with that of the training, '{trained}', which is gone"
         return
@@ -149,7 +149,7 @@ def joint_limits(model: mujoco.MjModel) -> np.ndarray:
 
 
 def drawing_notes(spec: mujoco.MjSpec) -> Iterator[str]:
-    """Yield what to do if no view would draw the robot, since all its geoms are in other groups."""
+    """Yield a hint if no view would draw the robot, since all its geoms are in other groups."""
     robot = [geom for geom in spec.geoms if geom.parent.name != "world"]
     if robot and not any(geom.group in DRAWN_GROUPS for geom in robot):
         groups = ", ".join(sorted({str(geom.group) for geom in robot}))

@@ -78,7 +78,7 @@ class Options:
 
 
 def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: dict[str, Any] | None = None) -> None:
-    """Change settings as the options say; a UserError names what is not allowed.
+    """Change settings as the options say; a UserError names a value that is not allowed.
 
     The more explicit wins: a preset is overridden by the settings of a loaded run ("env" and "train" of
     ``run_config``), these by the perturbation and ranges, then by single options, then by ``set``.

@@ -56,7 +56,7 @@ class Loader(yaml.SafeLoader):
 
 
 class Dumper(yaml.SafeDumper):
-    """Writes what :class:`Loader` reads again: text that looks like one of its numbers is quoted."""
+    """Writes YAML for :class:`Loader`: text that looks like one of its numbers is quoted."""
 
 
 Loader.yaml_implicit_resolvers = {}  # none of YAML 1.1

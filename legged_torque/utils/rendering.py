@@ -18,8 +18,8 @@ def disable_renderer() -> None:
 def choose_offscreen_renderer() -> str | None:
     """Set ``MUJOCO_GL`` to a renderer that needs no screen; return why there is none, or None if there is one.
 
-    What the user has set is taken if its library is installed; otherwise EGL where there is a GPU, then Mesa's software
-    renderer. If there is none, MuJoCo is told to import without one, so that everything else works.
+    The user's choice is taken if its library is installed; otherwise EGL where there is a GPU, then Mesa's software
+    renderer. If there is none, MuJoCo imports without one, so that everything else works.
     """
     asked = os.environ.get("MUJOCO_GL", "").lower()
     if asked in _LIBRARIES:

@@ -120,7 +120,7 @@ def save_config(run_dir: str | Path, config: dict[str, Any]) -> None:
 
 
 def load_config(run_dir: Path) -> dict[str, Any]:
-    """Return what :func:`save_config` has written; a UserError if the file is missing, broken or not whole."""
+    """Return the content of a file of :func:`save_config`; a UserError if it is missing, broken or not whole."""
     file = run_dir / CONFIG_FILE
     if not file.is_file():
         raise UserError(f"the run '{run_dir}' has no {CONFIG_FILE}")

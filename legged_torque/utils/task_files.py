@@ -41,7 +41,7 @@ def import_task_files(tasks: dict[str, Any], files: Iterable[str | Path]) -> Non
 
 
 def import_installed_tasks(tasks: dict[str, Any]) -> None:
-    """Import what installed packages offer as :data:`ENTRY_POINTS`; ``tasks`` are those of the registry, by name.
+    """Import the :data:`ENTRY_POINTS` of installed packages; ``tasks`` are those of the registry, by name.
 
     A broken one does not affect the others: a line on standard error says what is wrong, and its tasks are missing.
     """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import importlib.util
 import math
 import pkgutil
 from collections.abc import Iterable
@@ -111,8 +110,8 @@ class TaskRegistry:
     def make_env(self, name: str, args: Options | None = None, env_cfg: Any | None = None) -> tuple[VecEnv, Any]:
         """Create a task on the device of ``args``; return it and its settings.
 
-        ``env_cfg`` are settings to use as they are; None takes the registered ones with ``args`` applied. What the task
-        notes of its robot is printed.
+        ``env_cfg`` are settings to use as they are; None takes the registered ones with ``args`` applied. Notes of the
+        task on its robot are printed.
         """
         task_class = self.get_task_class(name)
         if env_cfg is None:
@@ -144,8 +143,6 @@ class TaskRegistry:
             _, train_cfg = self.get_cfgs(name, args)
         default = experiment_dir(train_cfg, args.log_root if args else None)
         root = default if log_root == "default" else log_root and Path(log_root)
-        if root and train_cfg.runner.logger == "wandb" and importlib.util.find_spec("wandb") is None:
-            raise UserError("--logger wandb needs the extra: pip install 'legged_torque[wandb]'")
         log_dir = str(new_run_dir(root, train_cfg.runner.run_name)) if root else None
         runner = train_cfg.make_runner(env, name, log_dir)
         if args is not None and args.resume:
@@ -164,7 +161,7 @@ class TaskRegistry:
         if config["task"] != options.task:
             raise UserError(f"the run '{folder}' is of task '{config['task']}', not '{options.task}'")
         cfgs = self.get_cfgs(options.task, options, config)
-        robot, trained = cfgs[0].asset.file, config["env"]["asset"]["file"]
+        robot, trained = cfgs[0].asset.file, config["env"].get("asset", {}).get("file", cfgs[0].asset.file)
         if robot != trained:
             from legged_torque.utils.mjcf import robot_notes  # which imports mujoco
 
@@ -193,7 +190,7 @@ class TaskRegistry:
         return env_cfg, train_cfg
 
     def _get(self, name: str) -> tuple[type[VecEnv] | str, Any, Any]:
-        """Return what was registered under a name."""
+        """Return class and settings of a task; an unknown name is a UserError."""
         if name not in self._tasks:
             self._import_installed()
         if name not in self._tasks:
@@ -208,7 +205,7 @@ class TaskRegistry:
 
 
 def print_notes(notes: Iterable[str]) -> None:
-    """Print what a user should know of a task's robot, once for all processes."""
+    """Print notes for the user, once for all processes."""
     for note in notes if distributed.rank() == 0 else ():
         print(f"Note: {note}", flush=True)
 

@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.learning.random_state import own_random_numbers, seeded_state
 from legged_torque.paper.gravity.dynamics import RobotDynamics
 from legged_torque.paper.gravity.standing import (
     Act,
@@ -33,7 +34,6 @@ from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.random_state import own_random_numbers, seeded_state
 from legged_torque.utils.task_registry import task_registry
 
 STANDING_SECONDS = 5.0  # time after which the learned policy must stand

@@ -10,8 +10,8 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.sim.compiled import compiled
 from legged_torque.sim.graph import CudaGraph
-from legged_torque.utils.compiled import compiled
 
 
 class BaseTask(VecEnv):
