@@ -30,7 +30,7 @@ def load_pyplot() -> ModuleType:
 def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
     """Return the JSON object with at least these keys that ``script`` has written; a UserError if it is none."""
     if not file.is_file():  # a device might never end
-        raise UserError(f"there is no file '{file}'")
+        raise UserError(f"cannot read '{file}': there is no such file")
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:  # nested too deeply

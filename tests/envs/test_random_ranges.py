@@ -107,17 +107,6 @@ def test_ranges(words, ranges, errors):
     assert cfgs[-1].domain_rand.push_velocity == ([-1.0, 1.0] if words else [-0.3, 0.3])
 
 
-def test_older_runs_keep_their_ranges():
-    """A run from before factors per joint and on pushes has none of them."""
-    env = to_dict(get_cfgs("--perturbation=low")[0])
-    for name in (*NEW_SETTINGS, "push_set_factor"):
-        del env["domain_rand"][name]
-    env["domain_rand"]["ground_friction"] = [0.001, 2.0]
-    rand = get_cfgs(run_config={"env": env, "train": {}})[0].domain_rand
-    assert {getattr(rand, name) for name in NEW_SETTINGS} == {None} and rand.push_set_factor == 1.0
-    assert rand.ground_friction == [0.001, 2.0]
-
-
 def test_shares_of_the_robot(make_task):
     """Where a robot has no ranges of its own, they follow from its radii, armatures, gains and torque limits."""
     without = {f"domain_rand.{name}": None for name in ("foot_radius", *JOINT_RANGES)}
