@@ -57,6 +57,8 @@ def main() -> None:
     kinds, levels = named_kinds(args.terrain), rising_levels(args.level)
     options = options_of(args)
     with slow_imports():
+        import rsl_rl.runners  # noqa: F401  # before MuJoCo: Triton's LLVM cannot be loaded after that of Mesa's renderer
+
         run = task_registry.load_run(options) if args.agent == "policy" else None
         env_cfg, train_cfg = (run.env_cfg, run.train_cfg) if run else task_registry.get_cfgs(args.task, options)
         from legged_torque.envs.base.commands import fix_command

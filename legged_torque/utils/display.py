@@ -35,10 +35,9 @@ _PROGRESS = re.compile(rf"([\w, ]+?) (\d+) of (\d+), (?:\d+ days?, )?[\d:]+, (?:
 class Display:
     """Shows the progress of some work while this context is open.
 
-    On a terminal a thread of rich draws the :meth:`view`, below all that is printed meanwhile; elsewhere the
-    :meth:`line` is printed now and then. Nothing waits for a device, and no error in drawing ends the work. Only one
-    view is shown at a time: a display inside another one prints lines. The view
-    is drawn by another thread, so its lists and dictionaries must be replaced, not changed.
+    On a terminal a thread of rich draws the :meth:`view`, below all that is printed meanwhile, so the lists and
+    dictionaries in it must be replaced, not changed. Elsewhere the :meth:`line` is printed now and then. Nothing waits
+    for a device, and no error in drawing ends the work. A display inside another one has no view.
 
     Attributes:
         total: Number to count to.

@@ -73,10 +73,11 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
     """
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        value, limits = check_value(name, value, parts[0]), parts[1]
-        if not isinstance(limits, Limits) or limits.allow(value):
-            return value
-        raise UserError(f"{name} must be {limits}, not {value}")
+        value = check_value(name, value, parts[0])
+        for limits in parts[1:]:
+            if isinstance(limits, Limits) and not limits.allow(value):
+                raise UserError(f"{name} must be {limits}, not {value}")
+        return value
     if origin in (Union, types.UnionType):
         for part in parts:
             with contextlib.suppress(UserError):
@@ -88,17 +89,20 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
         return [check_value(f"{name}[{i}]", item, parts[0]) for i, item in enumerate(value)]
     if origin is dict and isinstance(value, dict):
         return {key: check_value(f"{name}.{key}", item, parts[1]) for key, item in value.items()}
-    base = origin or hint
-    if base in (int, float):
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
-            if not abs(value) <= (LARGEST if base is float else LARGEST_INT):
-                size = f"finite, at most {LARGEST:g} either way" if base is float else "an integer of 64 bits"
-                raise UserError(f"{name} must be {size}, not {value}")
-            if base(value) == value:
-                return base(value)
-    elif value in parts if origin is Literal else not isinstance(base, type) or isinstance(value, base):
+    if hint in (int, float) and isinstance(value, (int, float)) and not isinstance(value, bool):
+        if not abs(value) <= (LARGEST if hint is float else LARGEST_INT):
+            size = f"finite, at most {LARGEST:g} either way" if hint is float else "an integer of 64 bits"
+            raise UserError(f"{name} must be {size}, not {value}")
+        if hint(value) == value:
+            return hint(value)
+    elif value in parts if origin is Literal else hint not in (int, float) and _is_a(value, origin or hint):
         return value
     raise UserError(f"{name} must be {describe(hint) or hint}, not {value!r}")
+
+
+def _is_a(value: Any, kind: Any) -> bool:
+    """Return whether a value is of a kind; of one that is not a type, ``Any`` for instance, everything is."""
+    return isinstance(value, kind) if isinstance(kind, type) else True
 
 
 def describe(hint: Any) -> str:
