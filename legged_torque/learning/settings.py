@@ -67,8 +67,19 @@ class TrainingCfg(BaseConfig):
             error = unknown_name(path, str(name), {str(other) for other in known.get(path, []) if other})
             raise UserError(f"{error}; these are the names that registered tasks have, register a task to add one")
 
+    def import_code(self) -> None:
+        """Import the classes and functions that the settings name, with torch; a UserError if one does not exist."""
+        from rsl_rl.utils import resolve_callable
+
+        for path, name in code_names(to_dict(self)).items():
+            try:
+                if name:
+                    resolve_callable(name)
+            except (ValueError, ImportError, AttributeError) as error:
+                raise UserError(f"{path}: {error}") from None
+
     def make_runner(self, env: VecEnv, task: str | None, log_dir: str | None) -> OnPolicyRunner:
-        """Create the runner of these settings for a task; a UserError if a class that they name does not exist.
+        """Create the runner of these settings for a task.
 
         Args:
             env: The task.
@@ -79,12 +90,6 @@ class TrainingCfg(BaseConfig):
             raise UserError("--logger wandb needs the extra: pip install 'legged_torque[wandb]'")
         from rsl_rl.utils import resolve_callable
 
-        for path, name in code_names(to_dict(self)).items():
-            try:
-                if name:
-                    resolve_callable(name)
-            except (ValueError, ImportError, AttributeError) as error:
-                raise UserError(f"{path}: {error}") from None
         settings = self.to_rsl_rl()
         # A runner of rsl_rl's own, which a user may register, would run code that a checkpoint holds.
         os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"

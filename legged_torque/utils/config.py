@@ -11,7 +11,6 @@ from typing import Any
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import check_value, types_of
 from legged_torque.utils.plain_yaml import parse_value
-from legged_torque.utils.renamed import Renamed
 
 
 class Section:
@@ -96,8 +95,12 @@ class BaseConfig(Section):
         """Raise a UserError that names the first setting with a value that is not allowed, alone or with others."""
         check_section(self)
 
-    def renamed(self) -> Renamed:
-        """Return the new names of settings that runs of earlier versions have, see :mod:`utils.renamed`."""
+    def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Return the settings of an earlier run, as nested dictionaries, in today's layout."""
+        return values
+
+    def renamed(self) -> dict[str, str]:
+        """Return the new dotted paths of settings and sections by their old ones, which users may still give."""
         return {}
 
 

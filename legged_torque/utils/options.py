@@ -9,7 +9,6 @@ from typing import Any
 from legged_torque.utils.config import BaseConfig, section_keys, set_by_path, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import Count, Number, Worlds, check_value, types_of
-from legged_torque.utils.renamed import check_is_current, with_new_names
 
 DEFAULT_TASK = "a1_torque_multihead"
 DEFAULT_PRESET = "parallel"
@@ -92,7 +91,7 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
         for part, cfg in {"env": env_cfg, "train": train_cfg}.items():
             if not isinstance(run_config[part], dict):
                 raise UserError(f"config key '{part}' is a section with entries, not the value {run_config[part]!r}")
-            update_from_dict(cfg, with_new_names(run_config[part], cfg.renamed()))
+            update_from_dict(cfg, cfg.upgraded(run_config[part]))
     if options.perturbation:
         apply_perturbation(env_cfg, options.perturbation)
     if options.ranges:
@@ -122,8 +121,9 @@ def _named(kind: str, name: str, choices: dict[str, dict[str, Any]]) -> dict[str
 
 def _set_either(env_cfg: BaseConfig, train_cfg: BaseConfig, path: str, value: Any) -> None:
     """Set an entry of the task's or the training's settings, whose sections have different names."""
-    for cfg in (env_cfg, train_cfg):
-        check_is_current(path, value, cfg.renamed())
+    for old, new in (env_cfg.renamed() | train_cfg.renamed()).items():
+        if f"{path}.".startswith(f"{old}."):
+            raise UserError(f"'{path}' is now '{new}{path.removeprefix(old)}'")
     section = path.split(".")[0]
     sections = {key: cfg for cfg in (env_cfg, train_cfg) for key in section_keys(cfg)}
     if section not in sections:

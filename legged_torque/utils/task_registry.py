@@ -93,7 +93,8 @@ class TaskRegistry:
     ) -> tuple[Any, Any]:
         """Return copies of the settings of a task and its training, or of a loaded run's, as ``args`` change them.
 
-        With ``args``, a UserError names the first value that is not allowed, before torch is imported.
+        With ``args``, a UserError names the first value that is not allowed, before torch and the classes that the
+        settings name are imported.
         """
         env_cfg, train_cfg = self._copies(name)
         if args is None:
@@ -103,6 +104,7 @@ class TaskRegistry:
         train_cfg.check()
         train_cfg.check_code_names([registered for _, _, registered in self._tasks.values()])
         on_cpu = resolve_device(args.device) == "cpu"  # imports torch
+        train_cfg.import_code()
         if on_cpu and run_config is None and not args.gives_num_envs():
             env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
         return env_cfg, train_cfg

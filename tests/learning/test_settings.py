@@ -64,4 +64,4 @@ def test_names_of_a_users_own_task():
     )
     _, cfg = registry.get_cfgs("own", parse("--set=critic.class_name=RNNModel"))
     cfg.critic.class_name = "RNModel"
-    assert error_of(cfg.make_runner, None, "own", None).startswith("critic.class_name: ")
+    assert error_of(cfg.import_code).startswith("critic.class_name: ")
