@@ -5,15 +5,9 @@ Robots start from random states with the lowest foot just above the ground (``le
 
 import copy
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import importing, run_script, script_command
+from legged_torque.utils.cli import run_script, script_command, slow_imports
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.task_registry import set_seed
 
@@ -26,7 +20,7 @@ def main() -> None:
     parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in the current directory")
     args = parser.parse_args()
     options = options_of(args)
-    with importing():
+    with slow_imports():
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
         from legged_torque.learning.pretrained import check_spaces, pretrained_file, start_from
         from legged_torque.paper.gravity.dynamics import RobotDynamics

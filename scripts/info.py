@@ -5,12 +5,6 @@ Versions, processor, GPU and driver, where compiled kernels are kept, and which 
 
 from __future__ import annotations
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import choose_offscreen_renderer
-
-end_on_interrupt()
-NO_RENDERER = choose_offscreen_renderer()  # before anything imports mujoco
-
 import importlib.metadata
 import os
 import platform
@@ -20,8 +14,9 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 import legged_torque
-from legged_torque.utils.cli import Parser, importing, run_script
-from legged_torque.utils.errors import told_in
+from legged_torque.utils.cli import Parser, run_script, slow_imports
+from legged_torque.utils.errors import collect_errors
+from legged_torque.utils.rendering import choose_offscreen_renderer
 from legged_torque.utils.runs import package_versions
 
 PURPOSES = {
@@ -38,12 +33,13 @@ PURPOSES = {
 def main() -> None:
     """Print a block of lines per topic."""
     Parser(__doc__).parse_args()
-    with importing():
+    no_renderer = choose_offscreen_renderer()  # before anything imports mujoco
+    with slow_imports():
         import torch
 
         from legged_torque.viewer.native import check_display
     no_window: list[str] = []
-    with told_in(no_window):
+    with collect_errors(no_window):
         check_display("--viewer web")
     topics = {
         f"legged_torque {legged_torque.__version__}": [f"in {Path(legged_torque.__file__).parent}"],
@@ -53,7 +49,7 @@ def main() -> None:
         "caches": caches(),
         "extras": extras(installed_requirements()),
         "rendering": [
-            f"videos: {NO_RENDERER or os.environ['MUJOCO_GL']}",
+            f"videos: {no_renderer or os.environ['MUJOCO_GL']}",
             f"MuJoCo's window: {' '.join(no_window) or 'ok'}",
         ],
     }
@@ -122,7 +118,7 @@ def extras(requirements: list[Requirement] | None) -> list[str]:
 
 
 def lacking(need: Requirement) -> str:
-    """Return the name of a required package that is missing, with the versions if another is there; "" if it is fine."""
+    """Return the name of a required package that is missing, with the versions if another is there; else nothing."""
     try:
         version = importlib.metadata.version(need.name)
     except importlib.metadata.PackageNotFoundError:
@@ -131,4 +127,4 @@ def lacking(need: Requirement) -> str:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, draws=True)

@@ -6,16 +6,11 @@ The policy is kept where ``train.py`` looks for it, which also makes it itself i
 import shlex
 from pathlib import Path
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import Parser, add_build_args, options_of, task_file_words
-from legged_torque.utils.cli import check_output, importing, run_script, script_command, write_json
+from legged_torque.utils.cli import check_output, run_script, script_command, slow_imports
 from legged_torque.utils.devices import device_name, resolve_device
+from legged_torque.utils.files import write_json
 from legged_torque.utils.paths import without_machine
 
 
@@ -33,7 +28,7 @@ def main() -> None:
         if getattr(args, name) is not None:
             args.set.append(f"pretraining.{name}={getattr(args, name)}")
     options = options_of(args)
-    with importing():
+    with slow_imports():
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
         from legged_torque.learning.pretrained import make_pretrained, pretrained_file
         from legged_torque.utils.progress import CompileProgress

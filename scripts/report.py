@@ -3,12 +3,6 @@
 Takes the folder of an experiment, a folder with runs of train.py (logs/a1_torque, or all of logs), or a single run.
 """
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 from pathlib import Path
 
 from legged_torque.paper.report.blocks import to_html, to_markdown
@@ -17,6 +11,7 @@ from legged_torque.paper.report.report import find_videos, missing_lines, report
 from legged_torque.paper.report.results import read_experiment, summarize, write_tables
 from legged_torque.utils.args import Parser
 from legged_torque.utils.cli import check_at_least, check_output, run_script
+from legged_torque.utils.files import write_whole
 
 
 def main() -> None:
@@ -46,8 +41,8 @@ def main() -> None:
     figures = draw_all(experiment, table, out)
     blocks = report(experiment, table, from_step, figures, out, videos)
     title = f"Results of {experiment.folder.resolve().name}"
-    file.write_text(to_markdown(title, blocks), encoding="utf-8")
-    page.write_text(to_html(title, blocks), encoding="utf-8")
+    write_whole(file, to_markdown(title, blocks))
+    write_whole(page, to_html(title, blocks))
     write_tables(experiment, table, out)
     missing = len(missing_lines(experiment, from_step))
     print(f"{file}, {page.name}, {len(figures)} figures; missing or not finished: {missing} lines")

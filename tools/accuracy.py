@@ -13,9 +13,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from legged_torque.utils.rendering import without_renderer
+from legged_torque.utils.rendering import disable_renderer
 
-without_renderer()  # before anything imports mujoco
+disable_renderer()  # before anything imports mujoco
 
 import mujoco
 import numpy as np

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import sys
 
-from legged_torque.utils.rendering import without_renderer
+from legged_torque.utils.rendering import disable_renderer
 
-without_renderer()  # before anything imports mujoco
+disable_renderer()  # before anything imports mujoco
 
 import mujoco
 import numpy as np

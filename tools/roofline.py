@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from legged_torque.utils.rendering import without_renderer
+from legged_torque.utils.rendering import disable_renderer
 
-without_renderer()  # before anything imports mujoco
+disable_renderer()  # before anything imports mujoco
 
 import torch
 from torch import Tensor, nn

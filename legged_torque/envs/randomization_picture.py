@@ -12,7 +12,7 @@ import numpy as np
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import check_output, importing
+from legged_torque.utils.cli import check_output, slow_imports
 from legged_torque.utils.plotting import load_pyplot, save_figure
 from legged_torque.utils.task_registry import set_seed
 
@@ -56,7 +56,7 @@ def plot_randomization() -> None:
     args = parser.parse_args()
     check_output(args.out)
     options = options_of(args)
-    with importing():
+    with slow_imports():
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
         from legged_torque.envs.base.legged_robot import LeggedRobot
     set_seed(train_cfg.seed)

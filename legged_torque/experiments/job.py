@@ -13,7 +13,7 @@ from typing import BinaryIO, Protocol
 
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, cell_state, command_of, is_json, step_words
 from legged_torque.experiments.times import read_times, write_times
-from legged_torque.learning.training_display import WHAT, read_tracking
+from legged_torque.learning.training_display import UNIT, read_tracking
 from legged_torque.utils.display import read_progress
 from legged_torque.utils.errors import UserError
 
@@ -107,10 +107,10 @@ class Job:
     def progress(self) -> tuple[str, float, str]:
         """Return what the step does, the fraction of it that is done, and its tracking and time left, for the user."""
         text = self.output()[-LAST_LINES:]
-        doing, done, total, left = read_progress(text) or (WHAT, self.state.iterations, self.state.total or 1, "")
+        doing, done, total, left = read_progress(text) or (UNIT, self.state.iterations, self.state.total or 1, "")
         tracking = read_tracking(text)
         notes = [f"tracking {tracking}" if tracking else "", f"{left} left" if left else ""]
-        is_usual = doing == WHAT or self.kind == "evaluation"
+        is_usual = doing == UNIT or self.kind == "evaluation"
         return self.kind if is_usual else doing.partition(",")[0], done / max(total, 1), ", ".join(filter(None, notes))
 
     def problem(self) -> str:

@@ -8,17 +8,17 @@ import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
 from legged_torque.utils.args import task_file_words
-from legged_torque.utils.config import convert, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.limits import Count, check_value, types_of
+from legged_torque.utils.limits import Count, check_value
 from legged_torque.utils.options import Options
+from legged_torque.utils.plain_yaml import parse_yaml
 from legged_torque.utils.runs import (
     checkpoint_number,
     evaluations_file,
@@ -40,6 +40,10 @@ EVALUATION: dict[str, Any] = {"num_envs": 256, "num_steps": 2000}
 """Worlds and control steps of an evaluation, by default."""
 GROUNDS: dict[str, Any] = {"kinds": ["all"], "levels": [level / 10 for level in range(10)], "num_envs": 40}
 """Tiles that are crossed after training, and robots on each of them, by default."""
+KEYS = {"tasks": list[str], "environments": dict[str, list[str]], "seeds": list[int], "ranges": str}
+KEYS |= dict.fromkeys(("train", "evaluation", "grounds"), dict[str, object])
+"""Keys of a description, and the types of their values."""
+TYPES = {"num_envs": Count, "num_steps": Count, "kinds": list[str], "levels": list[float]}
 ROUGH_GROUND = "rough ground"
 """Name of the evaluation on :data:`GROUNDS`. Names of environments have no spaces."""
 
@@ -86,9 +90,9 @@ class Matrix:
     environments: dict[str, list[str]]  # for each perturbation during training, those of the evaluations
     seeds: list[int]
     ranges: str = ""  # of random parameters, as --ranges takes them; empty: the tasks' own
-    train: dict = field(default_factory=dict)  # changed settings, by dotted path
-    evaluation: dict[str, int] = field(default_factory=dict)  # as EVALUATION
-    grounds: dict = field(default_factory=dict)  # as GROUNDS; empty: none
+    train: dict[str, Any] = field(default_factory=dict)  # changed settings, by dotted path
+    evaluation: dict[str, Any] = field(default_factory=dict)  # as EVALUATION
+    grounds: dict[str, Any] = field(default_factory=dict)  # as GROUNDS; empty: none
     task_files: tuple[str, ...] = ()  # --task_file of the command line; a description cannot name any
 
     def cells(self, out: Path) -> list[Cell]:
@@ -170,33 +174,29 @@ def read_plan(file: Path) -> Matrix:
     if not file.is_file():
         raise UserError(f"there is no file '{file}'")
     values = parse_yaml(file.read_text(encoding="utf-8", errors="replace"), f"'{file}'")
-    hints = types_of(Matrix)
-    del hints["task_files"]
     if not isinstance(values, dict) or not {"tasks", "environments", "seeds"} <= values.keys():
-        raise UserError(f"'{file}' must hold the keys tasks, environments and seeds, and may hold {', '.join(hints)}")
+        raise UserError(f"'{file}' must hold the keys tasks, environments and seeds, and may hold {', '.join(KEYS)}")
     for key, value in values.items():
-        if key not in hints:
-            raise unknown_name("experiment key", str(key), hints)
-        if key in ("environments", "train", "evaluation", "grounds") and not isinstance(value, dict):
-            raise UserError(f"experiment key '{key}' must hold entries 'name: value', not {value!r}")
-        check_value(f"experiment key '{key}'", value, hints[key])
+        if key not in KEYS:
+            raise unknown_name("experiment key", str(key), KEYS)
+        if get_origin(KEYS[key]) is dict and not isinstance(value, dict):
+            raise UserError(f"{key} must hold entries 'name: value', not {value!r}")
+        values[key] = check_value(key, value, KEYS[key])
     for section, defaults in {"evaluation": EVALUATION, "grounds": GROUNDS}.items():
         for key, value in values.get(section, {}).items():
             if key not in defaults:
                 raise unknown_name(f"{section} key", str(key), defaults)
-            new = values[section][key] = convert(value, defaults[key], f"{section}.{key}")
-            if isinstance(new, int):
-                check_value(f"{section}.{key}", new, Count)
-            elif not new:
-                raise UserError(f"{section}.{key} must hold one entry or more, not {value!r}")
+            values[section][key] = check_value(f"{section}.{key}", value, TYPES[key])
+            if value == []:
+                raise UserError(f"{section}.{key} must hold one entry or more, not {value}")
     grounds = GROUNDS | values["grounds"] if values.get("grounds") else {}
     matrix = Matrix(**values | {"evaluation": EVALUATION | values.get("evaluation", {}), "grounds": grounds})
     for key, entries in matrix.lists().items():
         if not entries or len(set(entries)) < len(entries):
-            raise UserError(f"experiment key '{key}' must hold different entries, one or more, not {entries}")
+            raise UserError(f"{key} must hold different entries, one or more, not {entries}")
         for entry in entries:  # they name folders and figures
             if key != "seeds" and not re.fullmatch(r"\w[\w.-]*", str(entry)):
-                raise UserError(f"experiment key '{key}' must hold names, not {entry!r}")
+                raise UserError(f"{key} must hold names, not {entry!r}")
     return matrix
 
 

@@ -16,9 +16,9 @@ from legged_torque.envs.base.symmetry import with_mirror_images
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.fused.networks import read_network
 from legged_torque.learning.multi_head import MultiHeadModel
+from legged_torque.sim.compiled import has_triton
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
-from legged_torque.utils.compiled import has_triton
 from legged_torque.utils.errors import UserError, unknown_name
 
 if TYPE_CHECKING:

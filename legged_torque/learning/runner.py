@@ -22,6 +22,7 @@ from legged_torque.learning.evaluator import TrainingEvaluators, append_row
 from legged_torque.learning.guard import TrainingGuard
 from legged_torque.learning.log_writer import NoLogWriter
 from legged_torque.learning.ppo import OnDevicePPO
+from legged_torque.learning.random_state import random_state, restore_random_state
 from legged_torque.learning.training_display import TrainingDisplay
 from legged_torque.learning.worlds import (
     check_identity,
@@ -36,11 +37,10 @@ from legged_torque.learning.worlds import (
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils import distributed
 from legged_torque.utils.devices import device_name
-from legged_torque.utils.display import Pace, warn
+from legged_torque.utils.display import warn
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.files import told_by_name
+from legged_torque.utils.files import write_errors
 from legged_torque.utils.interrupt import StopRequest
-from legged_torque.utils.random_state import random_state, restore_random_state
 from legged_torque.utils.runs import checkpoint_file, claim_run_dir, evaluations_file, tagged
 
 _STYLES = re.compile("\033\\[[0-9;]*m")  # what makes text bold or colored on a terminal
@@ -104,7 +104,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         self.alg.train_mode()
         if self.is_distributed:
             self.alg.broadcast_parameters()
-        with told_by_name(Path(self.log_dir or "")), contextlib.redirect_stdout(io.StringIO()):  # it lists its files
+        with write_errors(Path(self.log_dir or "")), contextlib.redirect_stdout(io.StringIO()):  # it lists its files
             self.logger.init_logging_writer()
         start_it = self.current_learning_iteration
         total_it = start_it + num_learning_iterations
@@ -112,7 +112,7 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         warmup = self.cfg["pretraining"]["critic_warmup_iterations"]
         self.save_checkpoint()  # so that there is something to see at once
         self._display = self._new_display(total_it)
-        with self._display, StopRequest(self._display.tell) as stop:
+        with self._display, StopRequest(self._display.notify) as stop:
             for _ in range(num_learning_iterations):
                 if distributed.any_process(stop.requested or self._nobody_reads is not None, self.device):
                     break
@@ -282,10 +282,9 @@ class OnPolicyRunner(runners.OnPolicyRunner):
         num_worlds = self.gpu_world_size * self.env.num_envs
         place = device_name(self.env.device)
         title = f"{self.cfg.get('task') or 'training'}: {num_worlds} worlds on {place}"
-        pace = Pace(total_it, self.current_learning_iteration)
         is_quiet = self.verbose or self.logger.writer is None
         steps = num_worlds * self.cfg["num_steps_per_env"]
-        return TrainingDisplay(title, str(self.log_dir), pace, steps, is_quiet)
+        return TrainingDisplay(title, str(self.log_dir), total_it, self.current_learning_iteration, steps, is_quiet)
 
     def _prepare_log(self, start_it: int, total_it: int, times: dict, losses: dict, measured: dict) -> None:
         """Read the numbers of one iteration from the device, for :meth:`_write_log`."""

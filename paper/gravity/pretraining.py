@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.learning.random_state import own_random_numbers, seeded_state
 from legged_torque.paper.gravity.dynamics import RobotDynamics
 from legged_torque.paper.gravity.standing import (
     Act,
@@ -27,14 +28,13 @@ from legged_torque.paper.gravity.standing import (
     place_on_ground,
     use_standing_trials,
 )
+from legged_torque.paper.gravity.threads import single_threaded
 from legged_torque.paper.gravity.whole_body import WholeBodyController, WholeBodySettings, WholeBodyTorques
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.random_state import own_random_numbers, seeded_state
 from legged_torque.utils.task_registry import task_registry
-from legged_torque.utils.threads import single_threaded
 
 STANDING_SECONDS = 5.0  # time after which the learned policy must stand
 HIGHEST_FORCE = 1.6  # of a contact of the controller, as share of the robot's weight; no less than its settings have
@@ -241,7 +241,8 @@ def supervise(task: LeggedRobot, actor: MLPModel, collection: Collection, settin
             for name, values in (("training", losses), ("held_out", held_out)):
                 errors[name].append(task.cfg.control.torque_scale * float(torch.stack(values).mean().sqrt()))
             now = ", ".join(f"{name.replace('_', ' ')} {values[-1]:.2f} N m" for name, values in errors.items())
-            counter.add(f"root mean square error {now}")
+            counter.activity = f"root mean square error {now}"
+            counter.add()
     print(f"Learned in {settings.num_epochs} epochs: root mean square error {now}.", flush=True)
     return errors
 

@@ -5,19 +5,17 @@ import re
 import runpy
 import sys
 
-import numpy as np
 import pytest
 import torch
-from packaging.requirements import Requirement
 from support.command import command
 from support.scripts import ROOT, assert_told_in_one_line, run_here
 from support.settings import error_of, get_cfgs, parse
 
-from legged_torque.benchmark.installation import extras, gpus, size_of
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.commands import UniformCommands, fix_command
+from legged_torque.envs.base.commands import fix_command
 from legged_torque.utils.args import Parser, add_task_args, task_file_words
 from legged_torque.utils.cli import run_script, script_command
+from legged_torque.utils.options import Options
 
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("[!_]*.py"))
 
@@ -147,9 +145,10 @@ def test_fixed_command():
     env_cfg, _ = task_registry.get_cfgs("a1_position")
     env_cfg.env.num_envs = 3
     fix_command(env_cfg, (0.5, -0.25, 0.125))
-    generator = UniformCommands(env_cfg, "cpu")
-    generator.resample(generator.values[:, 0] == 0)
-    assert generator.values.tolist() == [[0.5, -0.25, 0.125]] * 3
+    task, _ = task_registry.make_env("a1_position", Options(device="cpu"), env_cfg)
+    task.commands.zero_()
+    task.command_generator.resample(torch.ones(3, dtype=torch.bool))
+    assert task.commands.tolist() == [[0.5, -0.25, 0.125]] * 3
 
 
 def test_words_for_task_files():
@@ -157,49 +156,8 @@ def test_words_for_task_files():
     assert task_file_words(["a.py", "b c.py"]) == ["--task_file=a.py", "--task_file=b c.py"]
 
 
-# ---- what is installed -----------------------------------------------------------------------------------------------
-
-
-def test_info(tmp_path):
-    """Versions, device, the folder of kernels, and renderers; nothing is written."""
-    status, output, _ = run_here("info.py", root=tmp_path)
-    assert status == 0 and f"  torch          {torch.__version__}\n" in output and "compiled kernels: " in output
-    for title in ("versions", "machine", "GPU", "caches", "extras", "rendering"):
-        assert f"\n{title}\n  " in output
-    assert not list(tmp_path.iterdir())
-
-
-def test_size_of_a_cache(tmp_path):
-    """All files in all folders count; a name behind which there is nothing, as of a file that has gone, is no error."""
-    (tmp_path / "wp_a" / "deep").mkdir(parents=True)
-    (tmp_path / "wp_a" / "kernel.o").write_bytes(bytes(1000))
-    (tmp_path / "wp_a" / "deep" / "kernel.o").write_bytes(bytes(234))
-    assert size_of(tmp_path) == 1234
-    (tmp_path / "gone").symlink_to("nowhere")
-    assert size_of(tmp_path) == 1234 + len("nowhere") and size_of(tmp_path / "missing") == 0
-
-
 def test_a_missing_package(capsys):
     """A package that should have come along is told in one line."""
     with pytest.raises(SystemExit, match="2"):
         run_script(lambda: importlib.import_module("nothing.of_this_name"))
     assert capsys.readouterr().err == "error: 'nothing' is not installed; pip install legged_torque brings it along\n"
-
-
-def test_missing_extras():
-    """What is missing, or too old, is named with the command that installs it."""
-    of_extras = {"video": "no-such-package>=2", "export": "numpy>=99", "viewer": "numpy"}
-    texts = ["numpy", *(f"{need}; extra == '{extra}'" for extra, need in of_extras.items())]
-    lines = {line.split()[0]: line for line in extras([Requirement(text) for text in texts])}
-    assert "missing no-such-package: pip install 'legged_torque[video]'" in lines["video"]
-    assert "missing numpy>=99" in lines["export"] and f"(here {np.__version__})" in lines["export"]
-    assert lines["viewer"].split()[1] == lines["plots"].split()[1] == "ok"
-    assert extras(None) == ["unknown, as the package is not installed: pip install -e ."]
-
-
-def test_gpus_that_cannot_be_used(monkeypatch):
-    """A driver beside a torch for the CPU is told."""
-    monkeypatch.setattr(torch.version, "cuda", None)
-    told = gpus(["NVIDIA H200, 580.1, 143771 MiB"])
-    assert told[0].startswith("NVIDIA H200, 580.1") and "install one for CUDA to use the GPU" in told[1]
-    assert gpus([]) == ["none with a driver of NVIDIA", "torch is a build for the CPU"]

@@ -12,9 +12,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.envs.base.state import RobotState
+from legged_torque.sim.compiled import compiled
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils.buffers import copy_state
-from legged_torque.utils.compiled import compiled
 
 
 class BaseTask(VecEnv):

@@ -5,9 +5,8 @@ from __future__ import annotations
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LinearChange
 from legged_torque.sim.randomization import check_draw
 from legged_torque.terrain.layout import Layout
-from legged_torque.utils.config import Section, section_keys
+from legged_torque.utils.config import Section, check_section, section_keys
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.limits import check_section
 
 
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:

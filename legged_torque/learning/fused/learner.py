@@ -14,8 +14,8 @@ from torch import Tensor
 from legged_torque.learning.fused import products, samples, steps
 from legged_torque.learning.fused.memory import NUMBERS, SAMPLES, TILE, LearningWorkspace, Parameters, Workspace
 from legged_torque.learning.fused.networks import ALIGNMENT, Network, read_network
+from legged_torque.sim.compiled import keep_kernels
 from legged_torque.utils import distributed
-from legged_torque.utils.compiled import keep_kernels
 from legged_torque.utils.progress import torch_compiles
 
 if TYPE_CHECKING:

@@ -1,0 +1,53 @@
+"""The script that shows what is installed."""
+
+import runpy
+
+import numpy as np
+import pytest
+import torch
+from packaging.requirements import Requirement
+from support.scripts import ROOT, run_here
+
+
+@pytest.fixture(scope="module")
+def info():
+    """The functions of the script."""
+    return runpy.run_path(str(ROOT / "scripts" / "info.py"))
+
+
+def test_info(tmp_path):
+    """Versions, device, the folder of kernels, and renderers; nothing is written."""
+    status, output, _ = run_here("info.py", root=tmp_path)
+    assert status == 0 and f"  torch          {torch.__version__}\n" in output and "compiled kernels: " in output
+    for title in ("versions", "machine", "GPU", "caches", "extras", "rendering"):
+        assert f"\n{title}\n  " in output
+    assert not list(tmp_path.iterdir())
+
+
+def test_size_of_a_cache(info, tmp_path):
+    """All files in all folders count; a name behind which there is nothing, as of a file that has gone, is no error."""
+    (tmp_path / "wp_a" / "deep").mkdir(parents=True)
+    (tmp_path / "wp_a" / "kernel.o").write_bytes(bytes(1000))
+    (tmp_path / "wp_a" / "deep" / "kernel.o").write_bytes(bytes(234))
+    assert info["size_of"](tmp_path) == 1234
+    (tmp_path / "gone").symlink_to("nowhere")
+    assert info["size_of"](tmp_path) == 1234 + len("nowhere") and info["size_of"](tmp_path / "missing") == 0
+
+
+def test_missing_extras(info):
+    """What is missing, or too old, is named with the command that installs it."""
+    of_extras = {"video": "no-such-package>=2", "export": "numpy>=99", "viewer": "numpy"}
+    texts = ["numpy", *(f"{need}; extra == '{extra}'" for extra, need in of_extras.items())]
+    lines = {line.split()[0]: line for line in info["extras"]([Requirement(text) for text in texts])}
+    assert "missing no-such-package: pip install 'legged_torque[video]'" in lines["video"]
+    assert "missing numpy>=99" in lines["export"] and f"(here {np.__version__})" in lines["export"]
+    assert lines["viewer"].split()[1] == lines["plots"].split()[1] == "ok"
+    assert info["extras"](None) == ["unknown, as the package is not installed: pip install -e ."]
+
+
+def test_gpus_that_cannot_be_used(info, monkeypatch):
+    """A driver beside a torch for the CPU is told."""
+    monkeypatch.setattr(torch.version, "cuda", None)
+    told = info["gpus"](["NVIDIA H200, 580.1, 143771 MiB"])
+    assert told[0].startswith("NVIDIA H200, 580.1") and "install one for CUDA to use the GPU" in told[1]
+    assert info["gpus"]([]) == ["none with a driver of NVIDIA", "torch is a build for the CPU"]
