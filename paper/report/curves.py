@@ -42,12 +42,12 @@ class LearningCurve:
 
 
 def read_curves(file: Path) -> list[LearningCurve]:
-    """Read ``learning_curve.py``'s JSON, a run's ``evaluations.csv`` or a report's (.gz); a UserError if it is none."""
+    """Read JSON of ``evaluate.py``, a run's ``evaluations.csv`` or a report's (.gz); a UserError if it is none."""
     training: dict[str, Any] = {}
     curves: dict[tuple, LearningCurve] = {}  # a report's file holds many trainings
     try:
         if file.suffix == ".json":
-            training = read_data(file, {"task", "seed", "points"}, "learning_curve.py")
+            training = read_data(file, {"task", "seed", "points"}, "evaluate.py")
             entries = training["points"]
         else:
             entries = read_csv(file)

@@ -18,7 +18,7 @@ METRICS = [metric.name for metric in CURVE_METRICS]
 
 @pytest.fixture
 def files(tmp_path):
-    """The same curve as a run's evaluations, as JSON of learning_curve.py, and twice as evaluations of a report."""
+    """The same curve as a run's evaluations, as JSON of evaluate.py, and twice as evaluations of a report."""
     lines = [line(1, 0.1), line(2, 0.2, height="")]
     (tmp_path / "config.yaml").write_text(
         yaml.safe_dump({"task": "a1_torque", "env": {}, "train": {"seed": 3}, "versions": {}})
@@ -54,7 +54,7 @@ def test_files_that_hold_no_curves(files, tmp_path):
     shutil.copy(files[0], tmp_path / "alone")
     for name, message in {
         "none.csv": "cannot read",
-        "other.json": "is not a file that learning_curve.py has written",
+        "other.json": "is not a file that evaluate.py has written",
         "half.json": "does not hold learning curves: KeyError('steps')",
         "text.csv.gz": "cannot read",
         "alone/evaluations.csv": "has no config.yaml",

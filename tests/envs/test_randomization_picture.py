@@ -1,17 +1,17 @@
-"""The picture of what is drawn at random, and the mistakes that its script tells."""
+"""The picture of random numbers, and mistakes in its command line."""
 
 import sys
 
 import pytest
 from support.scripts import assert_told_in_one_line, run_here
 
-SCRIPT = "plot_randomization.py"
-
 
 def plot(tmp_path, *words):
     """Run the script on the CPU with few worlds; return the result and the picture's path."""
     file = tmp_path / "new" / "picture.png"
-    return run_here(SCRIPT, "--device=cpu", "--num_envs=12", f"--out={file}", *words, root=tmp_path), file
+    return run_here(
+        "plot.py", "randomization", "--device=cpu", "--num_envs=12", f"--out={file}", *words, root=tmp_path
+    ), file
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,7 @@ def plot(tmp_path, *words):
     [
         ("--perturbation=none",),
         ("--task=a1_torque_multihead", "--perturbation=doubled", "--set=env.history_length=3"),
-        ("--set=motors.delay.range=[1, 4]", "--set=domain_rand.keep_fixed=[gravity, trunk_mass_offset]"),
+        ("--set=motors.delay.range=[1, 4]", "--set=domain_rand.keep_fixed=[gravity, trunk_mass]"),
     ],
 )
 def test_picture(tmp_path, words):
@@ -63,5 +63,5 @@ def test_unknown_format(tmp_path):
 
 def test_out_is_needed(tmp_path):
     """So is one without a name."""
-    result = run_here(SCRIPT, "--device=cpu", root=tmp_path)
+    result = run_here("plot.py", "randomization", "--device=cpu", root=tmp_path)
     assert_told_in_one_line(result, "--out")
