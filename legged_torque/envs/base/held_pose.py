@@ -9,10 +9,9 @@ from legged_torque.envs.base.asset import Asset, load_asset
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.sim.model import CONTACT_DATA, FLOOR
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.standing import LEAST_HEIGHT, stands
 
 STANDING_TIME = 3.0  # for which the nominal pose is held [s]
-LEAST_HEIGHT = 0.5  # of a standing robot's trunk, times that in the nominal pose
-MOST_TILT = 0.5  # of a standing robot's trunk [rad]
 _FAR = 10.0  # farther than any part is from the floor [m]
 
 
@@ -63,6 +62,8 @@ def _fall(asset: Asset, data: mujoco.MjData, height: float) -> str:
     if ending:
         return f"'{ending[0]}' touches the ground"
     tilt = np.arccos(np.clip(1.0 - 2.0 * (data.qpos[4] ** 2 + data.qpos[5] ** 2), -1.0, 1.0))
-    if data.qpos[2] < LEAST_HEIGHT * height:
+    if stands(data.qpos[2], height, tilt):
+        return ""
+    if data.qpos[2] <= LEAST_HEIGHT * height:
         return f"the trunk has sunk from {height:.2f} to {data.qpos[2]:.2f} m"
-    return f"the trunk is tilted by {tilt:.2f} rad" if tilt > MOST_TILT else ""
+    return f"the trunk is tilted by {tilt:.2f} rad"
