@@ -1,4 +1,4 @@
-"""Trainings that ``train.py`` has made without a plan: which are in a folder, and with what they were made."""
+"""Trainings made by ``train.py`` without a plan: those in a folder, and the names of their settings."""
 
 from __future__ import annotations
 
@@ -16,23 +16,24 @@ from legged_torque.utils.options import Options
 from legged_torque.utils.runs import CONFIG_FILE, load_config
 
 OWN = "own"
-"""Name of random events or ranges that have none of the published names."""
-
+"""Name of random events or ranges that match none of the published ones."""
 PUSHES = ("push_velocity", "push_probability")
-"""Settings of pushes, which without any may have any value."""
-
+"""Settings without effect where robots are not pushed."""
 FREE = ("seed", "evaluation.", "runner.save_interval", "runner.total_steps", "runner.logger")
-"""Settings that may differ between the runs of one training, and those that do not change what is learned."""
+"""Settings that do not change what is learned, or may differ between the runs of one training."""
 
 Trainings = dict[Cell, list[Path]]
-"""Folders of runs by training: the first one and those that have continued it, in the order of their names."""
+"""Folders of runs by training: the first run and those that continued it, in the order of their names."""
 
 
-def find_trainings(folder: Path, notes: list[str]) -> Trainings:
-    """Return the trainings in a folder; each run that cannot be read adds a note. UserError if there is none.
+def find_trainings(folder: Path, problems: list[str]) -> Trainings:
+    """Return the trainings in a folder; each run that cannot be read adds a message to ``problems``.
 
     Runs of the same task, run name, settings, random events and seed are one training that was interrupted and resumed;
     of two that both began at 0, the later one counts. Settings that differ between runs of a task follow its name.
+
+    Raises:
+        UserError: If there is no run.
     """
     keys: dict[Path, tuple[str, str, int]] = {}
     configs: dict[Path, dict[str, Any]] = {}
@@ -44,28 +45,28 @@ def find_trainings(folder: Path, notes: list[str]) -> Trainings:
             keys[run] = (task, environment_of(config), int(train["seed"]))
             configs[run] = flat({**config["env"], **train})
         except (UserError, LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            notes.append(f"the run '{run.relative_to(folder)}' cannot be read: {error}")
+            problems.append(f"the run '{run.relative_to(folder)}' cannot be read: {error}")
     if not keys:
         raise UserError(f"there is neither a file '{folder / SETTINGS_FILE}' nor a run with its {CONFIG_FILE}")
-    found: Trainings = {}
-    cells: dict[tuple[str, str, int], list[Path]] = {}
+    runs: dict[tuple[str, str, int], list[Path]] = {}
     for run, (task, environment, seed) in keys.items():
-        alike = [configs[other] for other, key in keys.items() if key[:2] == (task, environment)]
-        cells.setdefault((" ".join([task, *own_values(configs[run], alike)]), environment, seed), []).append(run)
-    for key in sorted(cells):
-        also = configs[cells[key][-1]].get("evaluation.also") or ()
-        found[Cell(cells[key][-1], *key, tuple(dict.fromkeys([key[1], *map(str, also)])))] = cells[key]
-    return found
+        others = [configs[other] for other, key in keys.items() if key[:2] == (task, environment)]
+        runs.setdefault((" ".join([task, *differing(configs[run], others)]), environment, seed), []).append(run)
+    trainings: Trainings = {}
+    for key, parts in sorted(runs.items()):
+        also = configs[parts[-1]].get("evaluation.also") or ()
+        trainings[Cell(parts[-1], *key, tuple(dict.fromkeys([key[1], *map(str, also)])))] = parts
+    return trainings
 
 
-def own_values(settings: Mapping[str, Any], others: list[dict[str, Any]]) -> list[str]:
-    """Return "path=value" of each setting, but those of :data:`FREE`, in which not all ``others`` agree with it."""
+def differing(settings: Mapping[str, Any], others: list[dict[str, Any]]) -> list[str]:
+    """Return "path=value" of each setting, except :data:`FREE` ones, that differs in one of the ``others``."""
     paths = [path for path in settings if not path.startswith(FREE)]
     return [f"{path}={settings[path]}" for path in paths if any(other.get(path) != settings[path] for other in others)]
 
 
 def plan_of(trainings: Trainings) -> Matrix:
-    """Return the tasks, environments and seeds of trainings, as if they had been planned."""
+    """Return the tasks, environments and seeds of trainings as a plan."""
     environments: dict[str, list[str]] = {}
     for cell in trainings:
         names = environments.setdefault(cell.environment, [])
@@ -75,29 +76,29 @@ def plan_of(trainings: Trainings) -> Matrix:
 
 
 def environment_of(config: Mapping[str, Any]) -> str:
-    """Return the name of the random events that a run was trained with, or :data:`OWN`."""
+    """Return the name of the random events of a run, or :data:`OWN`."""
     sets = settings_of(config).perturbations()
-    if not config["env"]["domain_rand"].get("push_robots"):  # then their size means nothing
+    if not config["env"]["domain_rand"].get("push_robots"):
         for changes, name in product(sets.values(), PUSHES):
             del changes["domain_rand"][name]
-    return _named(config, sets)
+    return _matching(config, sets)
 
 
 def ranges_of(config: Mapping[str, Any]) -> str:
-    """Return the name of the ranges of random parameters that a run was trained with, or :data:`OWN`."""
-    return _named(config, settings_of(config).parameter_ranges())
+    """Return the name of the ranges of random parameters of a run, or :data:`OWN`."""
+    return _matching(config, settings_of(config).parameter_ranges())
 
 
 def settings_of(config: Mapping[str, Any]) -> LeggedRobotCfg:
-    """Return today's settings of a run's task, or those of all robots if there is no such task any more."""
+    """Return the present settings of a run's task, or those of all robots if the task no longer exists."""
     try:
         return task_registry.get_cfgs(str(config["task"]), Options())[0]
     except UserError:
         return LeggedRobotCfg()
 
 
-def _named(config: Mapping[str, Any], sets: dict[str, dict]) -> str:
-    """Return the set with which a run agrees in all entries that both have, and at least one; else :data:`OWN`."""
+def _matching(config: Mapping[str, Any], sets: dict[str, dict]) -> str:
+    """Return the set that agrees with a run in all entries that both have, and at least one; else :data:`OWN`."""
     own = flat({"env": config["env"]})
     for name, changes in sets.items():
         shared = [(own[key], value) for key, value in flat({"env": changes}).items() if key in own]
