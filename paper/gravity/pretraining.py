@@ -70,10 +70,10 @@ def pretrain(name: str, env_cfg: Any, train_cfg: Any, device: str) -> tuple[MLPM
         collection, errors = learn_to_stand(task, controller, actor, settings)
         seconds = time.perf_counter() - start
         standing = {}
-        for who, act in {"controller": act_by_controller(controller), "policy": act_by_policy(actor)}.items():
+        for acting, act in {"controller": act_by_controller(controller), "policy": act_by_policy(actor)}.items():
             place_on_ground(task, controller.dynamics)
-            standing[who] = measure_standing(task, act, STANDING_SECONDS).share
-    print(f"Standing after 5 s: {' and '.join(f'the {who} {share:.1%}' for who, share in standing.items())}.")
+            standing[acting] = measure_standing(task, act, STANDING_SECONDS).share
+    print(f"Standing after 5 s: {' and '.join(f'the {acting} {share:.1%}' for acting, share in standing.items())}.")
     everything = collection.everything
     report = {
         "task": name,

@@ -118,7 +118,7 @@ def random_torques(seed):
 def test_dynamics_matches_mujoco(model):
     """All quantities agree with plain MuJoCo's to single precision, relative to the largest entry of each."""
     qpos, qvel = random_states(model, 8, seed=3)
-    robot = RobotDynamics(model, 8, "cpu")
+    robot = RobotDynamics(model, 8, "cpu", FEET)
     robot.update(torch.tensor(qpos), torch.tensor(qvel))
     for i in range(8):
         truth = reference(model, qpos[i], qvel[i])
@@ -150,7 +150,7 @@ def test_dynamics_refuses_a_fixed_robot():
         "<mujoco><worldbody><body><joint/><geom name='foot' size='0.1'/></body></worldbody></mujoco>"
     )
     with pytest.raises(UserError, match="free trunk"):
-        RobotDynamics(fixed, 1, "cpu")
+        RobotDynamics(fixed, 1, "cpu", ["foot"])
 
 
 # --------------------------------------------------------------------------------------------------- contacts

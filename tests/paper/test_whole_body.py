@@ -119,7 +119,7 @@ def test_without_contact_only_posture_remains(task, state):
 def test_refuses_another_pose(task):
     """The nominal pose must have as many joints as the robot."""
     with pytest.raises(UserError, match="3 joints, the robot 12"):
-        WholeBodyController(RobotDynamics(task.sim.mj_model, 1, "cpu"), [0.0, 0.8, -1.5])
+        WholeBodyController(RobotDynamics(task.sim.mj_model, 1, "cpu", FEET), [0.0, 0.8, -1.5])
 
 
 def test_refuses_a_robot_without_torque_limits(task):
@@ -127,7 +127,7 @@ def test_refuses_a_robot_without_torque_limits(task):
     model = copy.copy(task.sim.mj_model)
     model.actuator_forcelimited[:] = 0
     with pytest.raises(UserError, match="one motor with a force range per joint"):
-        WholeBodyController(RobotDynamics(model, 1, "cpu"), task.default_dof_pos.tolist())
+        WholeBodyController(RobotDynamics(model, 1, "cpu", FEET), task.default_dof_pos.tolist())
 
 
 # --------------------------------------------------------------------------------------------------- standing
@@ -136,7 +136,7 @@ def test_refuses_a_robot_without_torque_limits(task):
 def test_place_on_ground():
     """Nothing is below the ground, and some foot is at most 2 cm above it, according to MuJoCo's contacts."""
     task = make_trial(64)
-    place_on_ground(task, RobotDynamics(task.sim.mj_model, 64, "cpu"))
+    place_on_ground(task, RobotDynamics(task.sim.mj_model, 64, "cpu", FEET))
     model = task.sim.mj_model
     data = mujoco.MjData(model)
     clearance_used = []
