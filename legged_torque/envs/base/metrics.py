@@ -37,7 +37,7 @@ class WalkingMetrics:
         Only in the worlds that are ``counted``, if it is given. Shape: (num_envs,), bool.
         """
         task = self._task
-        velocity = task.planar_velocity()
+        velocity = task.state.planar_velocity()
         sums = metrics.step_sums(
             torch,
             commands,
@@ -45,7 +45,7 @@ class WalkingMetrics:
             speed=velocity[:, :2].norm(dim=1),
             force=task.sim.contact_force.norm(dim=2).sum(dim=1),
             power=(task.torques * task.dof_vel).abs().sum(dim=1),
-            height=task.base_height,
+            height=task.state.base_height,
             fell=task.reset_buf & ~task.time_out_buf,
             ended=task.reset_buf,
             tracked=num_tracked(task),
@@ -81,7 +81,7 @@ class CommandBreakdown:
     def add_step(self, commands: Tensor) -> None:
         """Add the step that the task has just made; arguments as for :meth:`WalkingMetrics.add_step`."""
         task = self._task
-        velocity = task.planar_velocity()
+        velocity = task.state.planar_velocity()
         error = (commands - velocity).abs()
         tracked = num_tracked(task)
         tracking = torch.stack(metrics.tracking_percentage(torch, error[:, :tracked], commands[:, :tracked]))
