@@ -19,6 +19,8 @@ OWN = "own"
 """Name of random events or ranges that match none of the published ones."""
 PUSHES = ("push_velocity", "push_probability")
 """Settings without effect where robots are not pushed."""
+NEUTRAL = {"add": [0.0, 0.0], "scale": [1.0, 1.0], "scale_per_joint": [1.0, 1.0]}
+"""Ranges of a random parameter that do not change it, by operation."""
 FREE = ("seed", "evaluation.", "runner.save_interval", "runner.total_steps", "runner.logger")
 """Settings that do not change what is learned, or may differ between the runs of one training."""
 
@@ -77,16 +79,21 @@ def plan_of(trainings: Trainings) -> Matrix:
 
 def environment_of(config: Mapping[str, Any]) -> str:
     """Return the name of the random events of a run, or :data:`OWN`."""
-    sets = settings_of(config).perturbations()
+    settings = settings_of(config)
+    sets = settings.perturbations()
     if not config["env"]["domain_rand"].get("push_robots"):
         for changes, name in product(sets.values(), PUSHES):
             del changes["domain_rand"][name]
-    return _matching(config, sets)
+    return _matching(settings.upgraded(config["env"]), sets)
 
 
 def ranges_of(config: Mapping[str, Any]) -> str:
     """Return the name of the ranges of random parameters of a run, or :data:`OWN`."""
-    return _matching(config, settings_of(config).parameter_ranges())
+    settings = settings_of(config)
+    try:
+        return _matching(settings.upgraded(config["env"]), settings.parameter_ranges())
+    except (LookupError, TypeError, ValueError, AttributeError):  # no settings of a task
+        return OWN
 
 
 def settings_of(config: Mapping[str, Any]) -> LeggedRobotCfg:
@@ -97,11 +104,15 @@ def settings_of(config: Mapping[str, Any]) -> LeggedRobotCfg:
         return LeggedRobotCfg()
 
 
-def _matching(config: Mapping[str, Any], sets: dict[str, dict]) -> str:
-    """Return the set that agrees with a run in all entries that both have, and at least one; else :data:`OWN`."""
-    own = flat({"env": config["env"]})
+def _matching(own: dict[str, dict[str, Any]], sets: dict[str, dict[str, dict[str, Any]]]) -> str:
+    """Return the set that agrees with settings in all entries that both have, and at least one; else :data:`OWN`."""
     for name, changes in sets.items():
-        shared = [(own[key], value) for key, value in flat({"env": changes}).items() if key in own]
-        if shared and all(now == value for now, value in shared):
+        keys = [(section, key) for section in changes for key in changes[section] if key in own.get(section, {})]
+        if keys and all(_effective(own[section][key]) == _effective(changes[section][key]) for section, key in keys):
             return name
     return OWN
+
+
+def _effective(value: Any) -> Any:
+    """Return a setting; of the ranges of a random parameter, those that change it."""
+    return {key: part for key, part in value.items() if part != NEUTRAL.get(key)} if isinstance(value, dict) else value

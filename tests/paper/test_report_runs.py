@@ -37,11 +37,12 @@ def test_names_of_settings():
     no_pushes = settings("no_such_task", 1, "none")
     no_pushes["env"]["domain_rand"]["push_velocity"] = [-0.3, 0.3]  # without effect
     assert environment_of(no_pushes) == "none"
-    older = settings("no_such_task", 1, "high")
-    del older["env"]["domain_rand"]["foot_radius_share"], older["env"]["noise"]  # entries that it does not have yet
-    assert (environment_of(older), ranges_of(older)) == ("high", "default")
-    older["env"]["domain_rand"]["gravity"] = [1.0, 2.0]
-    assert ranges_of(older) == "own"
+    other = settings("no_such_task", 1, "high")
+    del other["env"]["domain_rand"]["gravity"], other["env"]["noise"]  # entries that it does not have
+    other["env"]["domain_rand"]["stiffness"]["add"] = [0.0, 0.0]  # without effect
+    assert (environment_of(other), ranges_of(other)) == ("high", "default")
+    other["env"]["domain_rand"]["foot_pos"] = {"scale": [0.5, 2.0]}
+    assert ranges_of(other) == "own" and ranges_of({"task": "no_such_task", "env": "many"}) == "own"
 
 
 @pytest.fixture

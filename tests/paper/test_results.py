@@ -194,7 +194,7 @@ def test_means_and_standard_errors(folder):
     assert values["low -> high", "a1_position", "track_xy"] == pytest.approx([0.6, 0.7])  # of the last checkpoint
     single = table.loc["low", "a1_torque", "track_percentage"]
     assert single["values"] == pytest.approx([0.5]) and np.isnan(single["standard_error"]) and not single["is_final"]
-    assert (table.loc["low", "a1_multihead"]["seeds"] == 0).all()
+    assert (table["seeds"]["low"]["a1_multihead"] == 0).all()
 
 
 def test_evaluations_without_a_value(folder):
@@ -203,7 +203,7 @@ def test_evaluations_without_a_value(folder):
     none = {"height": ""}
     counted = [line(90, 0.5, height="nan"), line(100, 0.7, height="inf"), line(110, 0, track_percentage="", **none)]
     file.write_text("\n".join([HEADER, *whole_run(0.8)[:2], *counted]) + "\n")
-    cells = summarize(read_experiment(folder), 90e6).loc["low", "a1_position"]
+    cells = summarize(read_experiment(folder), 90e6).loc["low"].loc["a1_position"]
     assert cells["values"]["track_percentage"] == pytest.approx([0.7, 0.6])
     assert len(cells["values"]["height"]) == 1 and not cells["is_final"]["height"]
     assert cells["values"]["track_xy"] == pytest.approx([7.0, 4.0]) and cells["is_final"]["track_xy"]
