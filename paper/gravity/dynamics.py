@@ -59,7 +59,7 @@ class RobotDynamics:
             self._data = mjw.make_data(mj_model, nworld=num_states, nconmax=1, njmax=1)  # no contacts are sought
         geoms = [names.index(name) for name in contact_geoms]
         bodies = mj_model.geom_bodyid[geoms]
-        self.contact_joints = torch.tensor(_carrying_joints(mj_model, bodies), device=device)
+        self.contact_joints = wp.to_torch(self._model.body_isdofancestor)[bodies, TRUNK_DOFS : mj_model.nv].bool()
         self._geoms, self._bodies = (torch.tensor(ids, dtype=torch.long, device=device) for ids in (geoms, bodies))
         self._radii = torch.tensor(mj_model.geom_size[geoms, 0], dtype=torch.float32, device=device)
         self._weight_per_mass = torch.tensor(-mj_model.opt.gravity, dtype=torch.float32, device=device)
@@ -146,22 +146,9 @@ def _check_model(model: mujoco.MjModel, contact_geoms: Sequence[str], names: lis
             raise UserError(f"the contact geom '{name}' must be a sphere")
 
 
-def _carrying_joints(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
-    """Return the joints between the trunk and each body. Shape: (bodies, nv - 6), bool."""
-    carrying = np.zeros((len(bodies), model.nv), dtype=bool)
-    for row, body in zip(carrying, bodies, strict=True):
-        while body != TRUNK:
-            row[model.body_dofadr[body] : model.body_dofadr[body] + model.body_dofnum[body]] = True
-            body = model.body_parentid[body]
-    return carrying[:, TRUNK_DOFS:]
-
-
 def _dense_entries(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Return the places of the inertia matrix's entries in MuJoCo's array, and which are present. Shapes: (nv, nv)."""
-    place, present = (np.zeros((model.nv, model.nv), dtype=kind) for kind in (np.int64, bool))
-    for row in range(model.nv):
-        places = model.M_rowadr[row] + np.arange(model.M_rownnz[row])
-        columns = model.M_colind[places]
-        place[row, columns] = place[columns, row] = places
-        present[row, columns] = present[columns, row] = True
-    return place, present
+    lower, numbers = np.zeros((model.nv, model.nv)), np.arange(1.0, model.nC + 1.0)
+    mujoco.mju_sparse2dense(lower, numbers, model.M_rownnz, model.M_rowadr, model.M_colind)
+    numbers = (lower + np.tril(lower, -1).T).astype(np.int64)
+    return (numbers - 1).clip(min=0), numbers > 0
