@@ -221,14 +221,14 @@ def to_html(markdown: str, pictures: dict[str, Path]) -> tuple[Markup, dict[str,
     parser = MarkdownIt("zero").enable(["backticks", "emphasis", "fence", "heading", "image", "list", "table"])
     parser.validateLink = pictures.__contains__  # type: ignore[assignment, method-assign]
     tokens, headings = parser.parse(markdown), {}
-    for token, inner, cell in zip(tokens, tokens[1:], tokens[2:], strict=False):
+    for token, inner, text in zip(tokens, tokens[1:], tokens[2:], strict=False):
         if token.type == "heading_open" and token.tag == "h2":
             anchor = re.sub(r"\W+", "-", inner.content.lower()).strip("-")
             token.attrSet("id", anchor)
             headings[anchor] = inner.content
         elif token.type == "td_open" and inner.content[:1] in CLASSES:
             token.attrSet("class", CLASSES[inner.content[:1]])
-        elif token.type == "tr_open" and cell.content == "":  # of the group of the row above
+        elif token.type == "tr_open" and text.content == "":  # of the group of the row above
             token.attrSet("class", "more")
         for picture in (child for child in token.children or [] if child.type == "image"):
             picture.attrSet("src", data_uri(pictures[str(picture.attrs["src"])]))
