@@ -1,8 +1,10 @@
 """Draw figures.
 
-Each figure has options of its own: plot.py terrain --help.
+Each figure has options of its own: plot.py curves --help.
 
 Examples:
+    python scripts/plot.py curves logs/a1_torque/*/evaluations.csv --out curves.png
+    python scripts/plot.py pretraining report.json --out pretraining.png
     python scripts/plot.py randomization --out distributions.png
     python scripts/plot.py terrain --out tiles.png
 """
@@ -15,6 +17,8 @@ from legged_torque.utils.cli import Parser, run_script
 from legged_torque.utils.errors import unknown_name
 
 FIGURES = {
+    "curves": "legged_torque.paper.plot:plot_curves",
+    "pretraining": "legged_torque.paper.plot:plot_pretraining",
     "randomization": "legged_torque.envs.randomization_picture:plot_randomization",
     "terrain": "legged_torque.terrain.picture:plot_terrain",
 }

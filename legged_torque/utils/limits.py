@@ -53,6 +53,19 @@ class Limits:
         return all(self.lowest <= number <= self.highest and number > self.above for number in _numbers(value))
 
 
+class DrawLimits(Limits):
+    """Bounds of a random parameter's ranges by operation."""
+
+    def __str__(self) -> str:
+        """Return the bounds in words."""
+        return "ranges by operation: set, or add, scale and scale_per_joint; only those of add may be negative"
+
+    def allow(self, value: Any) -> bool:
+        """Return whether "set" is alone, and only added numbers are negative."""
+        is_alone = "set" not in value or len(value) == 1
+        return is_alone and all(limits[0] >= 0.0 for operation, limits in value.items() if operation != "add")
+
+
 Positive = Annotated[float, Limits(above=0)]
 NotNegative = Annotated[float, Limits(lowest=0)]
 Share = Annotated[float, Limits(lowest=0, highest=1)]
@@ -64,6 +77,8 @@ Sizes = Annotated[list[int], Limits(lowest=1, highest=1e6, nonempty=True)]
 Interval = Annotated[list[float], Limits(ordered=True)]
 PositiveInterval = Annotated[list[float], Limits(above=0, ordered=True)]
 NotNegativeInterval = Annotated[list[float], Limits(lowest=0, ordered=True)]
+Draw = dict[Literal["set", "add", "scale", "scale_per_joint"], Interval]
+Ranges = Annotated[Draw, DrawLimits()]
 
 
 def check_value(name: str, value: Any, hint: Any) -> Any:
@@ -88,7 +103,8 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
     if origin is list and isinstance(value, list):
         return [check_value(f"{name}[{i}]", item, parts[0]) for i, item in enumerate(value)]
     if origin is dict and isinstance(value, dict):
-        return {key: check_value(f"{name}.{key}", item, parts[1]) for key, item in value.items()}
+        keys = (check_value(f"{name}.{key}", key, parts[0]) for key in value)
+        return {key: check_value(f"{name}.{key}", value[key], parts[1]) for key in keys}
     if hint in (int, float) and isinstance(value, (int, float)) and not isinstance(value, bool):
         if not abs(value) <= (LARGEST if hint is float else LARGEST_INT):
             size = f"finite, at most {LARGEST:g} either way" if hint is float else "an integer of 64 bits"

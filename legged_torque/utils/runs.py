@@ -19,6 +19,8 @@ from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 
 CONFIG_FILE = "config.yaml"
 EVALUATIONS_FILE = "evaluations.csv"  # a row per evaluation during training
+MOVED = {"legged_torque.control.gravity_pretraining:pretrain": "legged_torque.paper.gravity.pretraining:pretrain"}
+"""Present names of functions that the settings of older runs name by their former modules."""
 _CHECKPOINT = "model_"
 _PACKAGES = ("legged_torque", "torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib", "numpy")
 
@@ -130,7 +132,14 @@ def load_config(run_dir: Path) -> dict[str, Any]:
         raise UserError(f"'{file}' lacks the entries task, env and train")
     if text.startswith("---") and not text.endswith("\n...\n"):
         raise UserError(f"'{file}' is not whole: its end is missing")
-    return config
+    return with_present_names(config)
+
+
+def with_present_names(settings: Any) -> Any:
+    """Return settings in which functions that have :data:`MOVED` have their present names."""
+    if isinstance(settings, dict):
+        return {key: with_present_names(value) for key, value in settings.items()}
+    return MOVED.get(settings, settings) if isinstance(settings, str) else settings
 
 
 def steps_per_iteration(config: dict[str, Any]) -> int | None:

@@ -16,7 +16,7 @@ from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Events, Simulation
-from legged_torque.paper.report.curves import CURVE_METRICS
+from legged_torque.paper.report.evaluations import CURVE_METRICS
 
 # ------------------------------------------------------------------------------------------------- results
 
@@ -55,7 +55,7 @@ def test_report(results, harm, number, tmp_path):
     result = run_here("report.py", str(results), "--out=report", root=tmp_path)
     assert result[0] == 0 and result[2] == ""
     assert (tmp_path / "report" / "report.md").read_text().count("cannot be read") == len(texts)
-    status, _, error = run_here("plot_curves.py", str(run / "evaluations.csv"), "--out=curve.png", root=tmp_path)
+    status, _, error = run_here("plot.py", "curves", str(run / "evaluations.csv"), "--out=curve.png", root=tmp_path)
     assert status in (0, 2) and "Traceback" not in error and error.count("\n") == (status == 2)
 
 
@@ -81,8 +81,9 @@ def test_experiment_names_other_folders(results, tmp_path):
 def test_figures(tmp_path, text):
     """Figures are not drawn of JSON that is not what its script writes."""
     (tmp_path / "theirs.json").write_text(text)
-    for script in ("plot_curves.py", "plot_pretraining.py"):
-        assert_told_in_one_line(run_here(script, "theirs.json", "--out=figure.png", root=tmp_path), "theirs.json'")
+    for figure in ("curves", "pretraining"):
+        words = (figure, "theirs.json", "--out=figure.png")
+        assert_told_in_one_line(run_here("plot.py", *words, root=tmp_path), "theirs.json'")
     assert not (tmp_path / "figure.png").exists()
 
 
@@ -92,7 +93,7 @@ def test_curves_that_are_no_text(tmp_path):
     (tmp_path / "large.csv.gz").write_bytes(gzip.compress(b"\n" * 60_000_000, 1))
     (tmp_path / "a.csv").write_text("task,steps\n" + "9" * 200_000 + ",1\n")
     for name in ("a.csv.gz", "large.csv.gz", "a.csv"):
-        result = run_here("plot_curves.py", name, "--out=figure.png", root=tmp_path)
+        result = run_here("plot.py", "curves", name, "--out=figure.png", root=tmp_path)
         assert_told_in_one_line(result, f"cannot read '{name}'")
 
 
@@ -101,7 +102,7 @@ def test_figure_named_like_a_folder(tmp_path):
     points = [{"steps": 1} | {metric.name: 0.5 for metric in CURVE_METRICS}]
     (tmp_path / "curve.json").write_text(json.dumps({"task": "a", "seed": 1, "points": points}))
     (tmp_path / "figures").mkdir()
-    result = run_here("plot_curves.py", "curve.json", "--out=figures", root=tmp_path)
+    result = run_here("plot.py", "curves", "curve.json", "--out=figures", root=tmp_path)
     assert_told_in_one_line(result, "cannot write 'figures'")
     assert sorted(os.listdir(tmp_path)) == ["curve.json", "figures"]
 

@@ -19,6 +19,7 @@ from legged_torque.utils.limits import (
     NotNegative,
     Number,
     Positive,
+    Ranges,
     Share,
     Sizes,
     Worlds,
@@ -27,7 +28,6 @@ from legged_torque.utils.limits import (
 Place = Annotated[list[float], Limits(-1e3, 1e3, length=3)]
 Scan = Annotated[list[float], Limits(-10, 10, nonempty=True)]
 Gains = Annotated[float | dict[str, float], Limits(lowest=0)]
-Ranges = dict[str, list[float]]  # of a parameter, by operation
 
 
 class LinearChange(Section):
