@@ -17,9 +17,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.envs.base.evaluation import evaluation_cfg
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import WalkingMetrics
-from legged_torque.learning.evaluator import evaluation_cfg
 from legged_torque.terrain.rough import RoughGround
 from legged_torque.terrain.selection import COLUMNS, named_kinds, rising_levels, select_tiles
 from legged_torque.utils.display import Counter

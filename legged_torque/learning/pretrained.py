@@ -86,7 +86,7 @@ def start_from(runner: OnPolicyRunner, file: Path) -> None:
     A UserError names the first parameter that the two do not have in the same shape, or that is not finite; then the
     actor is as it was.
     """
-    actor = runner.alg.actor
+    actor = runner.alg.policy()
     state, pretrained = actor.state_dict(), read_pretrained(file)["actor_state_dict"]
     for name in dict.fromkeys((*state, *map(str, pretrained))):
         if not name.startswith(STANDARD_DEVIATION):

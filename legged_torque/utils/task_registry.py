@@ -237,8 +237,11 @@ def to_rsl_rl(train_cfg: Any) -> dict[str, Any]:
     settings, runner = to_dict(train_cfg), train_cfg.runner
     loggers = {
         "tensorboard": {"class_name": "tensorboard"},
-        "wandb": {"class_name": "legged_torque.learning.log_writer:WandbWriter", "project_name": runner.wandb_project},
-        "none": {"class_name": "legged_torque.learning.log_writer:NoLogWriter"},
+        "wandb": {
+            "class_name": "legged_torque.learning.training_log:WandbWriter",
+            "project_name": runner.wandb_project,
+        },
+        "none": {"class_name": "legged_torque.learning.training_log:NoLogWriter"},
     }
     if runner.logger not in loggers:
         raise unknown_name("logger", runner.logger, loggers)

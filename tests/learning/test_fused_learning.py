@@ -28,13 +28,14 @@ from support.rollouts import (
 
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.multi_head import MultiHeadModel
-from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, can_be_fused
+from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO
+from legged_torque.learning.ppo.algorithm import can_be_fused, make_fused
 from tools.capture import KERNEL_TOLERANCE, compare_kernels
 
 pytest.importorskip("triton", reason="Triton is there for Linux only")
 if os.environ.get("TRITON_INTERPRET") != "1":
     pytest.skip("Triton's interpreter is for machines without a GPU: CUDA_VISIBLE_DEVICES=", allow_module_level=True)
-from legged_torque.learning.fused.learner import FusedLearner
+from legged_torque.learning.ppo.triton.learner import FusedPPO
 
 STEPS, WORLDS, NUM_ACTIONS = 3, 40, 6
 MIRROR = {  # an order that is its own inverse, and signs
@@ -69,7 +70,7 @@ def make(kind=OnDevicePPO, multi_head=False, symmetric=False, fuse=False, seed=0
     alg = kind(actor, critic, storage, **{**SETTINGS, **settings})
     if fuse:
         assert can_be_fused(alg)
-        alg.fused = FusedLearner(alg)
+        alg.fused = make_fused(alg)
     return alg
 
 
@@ -351,7 +352,7 @@ def test_the_check_on_a_gpu_compares_with_autograd():
     assert set(errors) == {"actor", "critic"}
     assert max(errors.values()) < 1e-4
     assert all(torch.equal(old, new) for old, new in zip(before, alg.fused.state(), strict=True))
-    alg.fused.gradients = lambda: [1.2 * gradient for gradient in FusedLearner.gradients(alg.fused)]
+    alg.fused.gradients = lambda: [1.2 * gradient for gradient in FusedPPO.gradients(alg.fused)]
     assert min(compare_kernels(runner).values()) > KERNEL_TOLERANCE
     alg.fused = None
     assert compare_kernels(runner) == {}

@@ -14,7 +14,7 @@ from support.settings import COMBINATIONS, TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.envs import task_registry
-from legged_torque.learning.log_writer import WandbWriter
+from legged_torque.learning.training_log import WandbWriter
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import UserError
 

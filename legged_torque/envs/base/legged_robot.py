@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import math
+from typing import Any
 
+import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,6 +18,7 @@ from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.commands import UniformCommands
 from legged_torque.envs.base.control_laws import pd_torque, pd_torques
 from legged_torque.envs.base.domain_rand import MODEL_FIELDS, check_fields, initial_state, mirrors, parameters
+from legged_torque.envs.base.evaluation import WalkingEvaluation
 from legged_torque.envs.base.health import watched
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
@@ -32,7 +37,7 @@ from legged_torque.sim.model import indices_matching
 from legged_torque.sim.randomization import Parameter, changes_legs
 from legged_torque.sim.simulator import Simulator
 from legged_torque.terrain import make_terrain
-from legged_torque.utils.config import section_keys, to_dict
+from legged_torque.utils.config import flat, section_keys, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.math import quat_rotate_inverse
 from legged_torque.utils.mjcf import joint_limits
@@ -252,6 +257,26 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.sim.qpos.copy_(qpos)
         self.sim.qvel.copy_(qvel)
         self._observe()
+
+    # ---- what a trainer needs ----------------------------------------------------------------------------------------
+
+    def make_evaluation(self, num_envs: int, perturbation: str) -> WalkingEvaluation:
+        """Return worlds of their own in which to measure a policy; an empty name is the environment of these worlds."""
+        return WalkingEvaluation(self, num_envs, perturbation)
+
+    def check_buffers(self) -> str | None:
+        """Return a warning if the simulator has dropped contacts; waits for the device."""
+        return self.sim.check_buffers()
+
+    def identity(self) -> dict[str, Any]:
+        """Return what must be the same for worlds to go on after a stop: settings, and hashes of robot and map."""
+        robot = np.zeros(mujoco.mj_sizeModel(self.sim.mj_model), np.uint8)
+        mujoco.mj_saveModel(self.sim.mj_model, None, robot)
+        parts = {"robot's model or the version of MuJoCo": robot}
+        if self.terrain.map:  # a user's own kinds of tiles are no settings
+            parts["map of the ground"] = self.terrain.map.heights
+        hashes = {name: hashlib.sha256(part.data).hexdigest() for name, part in parts.items()}
+        return {"settings": flat(to_dict(self.cfg)), **hashes}
 
     # ---- construction ------------------------------------------------------------------------------------------------
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.utils import metrics
 from legged_torque.utils.display import Counter
 
@@ -17,10 +17,38 @@ COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")
 NUM_BINS = 4  # into how many equal parts the range of each command is split
 
 
+class WalkingTask(Protocol):
+    """What is measured of a task; see :class:`~legged_torque.envs.base.legged_robot.LeggedRobot`."""
+
+    cfg: Any
+    sim: Any
+    num_envs: int
+    device: str
+    dt: float
+    commands: Tensor
+    torques: Tensor
+    dof_vel: Tensor
+    reset_buf: Tensor
+    time_out_buf: Tensor
+
+    @property
+    def base_height(self) -> Tensor:
+        """Height of the trunk's origin above the ground under it [m]. Shape: (num_envs,)."""
+
+    def planar_velocity(self) -> Tensor:
+        """Return v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3)."""
+
+    def reset(self) -> TensorDict:
+        """Start a new episode in every world, and return the observations."""
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+        """Make a control step, and return the observations first."""
+
+
 class WalkingMetrics:
     """Sums of :mod:`legged_torque.utils.metrics` over the steps of a task, per world and kept on the device."""
 
-    def __init__(self, task: LeggedRobot) -> None:
+    def __init__(self, task: WalkingTask) -> None:
         """Start with empty sums."""
         self._task = task
         model = task.sim.mj_model
@@ -71,7 +99,7 @@ class WalkingMetrics:
 class CommandBreakdown:
     """Tracking by commanded velocity: each command's range is split into :data:`NUM_BINS` equal parts."""
 
-    def __init__(self, task: LeggedRobot) -> None:
+    def __init__(self, task: WalkingTask) -> None:
         """Start with empty sums."""
         self._task = task
         ranges = task.cfg.commands.ranges
@@ -116,13 +144,13 @@ class CommandBreakdown:
         return result
 
 
-def num_tracked(task: LeggedRobot) -> int:
+def num_tracked(task: WalkingTask) -> int:
     """Return how many of a task's commands count for the tracking percentage, the yaw rate being the last."""
     return 2 if task.cfg.commands.heading_command else 3
 
 
 def measure(
-    task: LeggedRobot,
+    task: WalkingTask,
     policy: Callable[[TensorDict], Tensor],
     num_steps: int,
     on_step: Callable[[Tensor], None] = lambda commands: None,

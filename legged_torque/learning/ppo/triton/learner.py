@@ -1,34 +1,52 @@
-"""Acting and learning with the kernels of this package."""
+"""Acting and learning of PPO with the kernels of this package."""
 
 from __future__ import annotations
 
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque.learning.fused import products, samples, steps
-from legged_torque.learning.fused.memory import NUMBERS, SAMPLES, TILE, LearningWorkspace, Parameters, Workspace
-from legged_torque.learning.fused.networks import ALIGNMENT, Network, read_network
+from legged_torque.learning.ppo.triton import products, samples, steps
+from legged_torque.learning.ppo.triton.memory import NUMBERS, SAMPLES, TILE, LearningWorkspace, Parameters, Workspace
+from legged_torque.learning.ppo.triton.networks import ALIGNMENT, Network, read_network
 from legged_torque.utils import distributed
 from legged_torque.utils.compiled import keep_kernels
 from legged_torque.utils.progress import torch_compiles
 
-if TYPE_CHECKING:
-    from legged_torque.learning.ppo import OnDevicePPO
-
 GAE_WORLDS = 64  # worlds of a program
 
 
-def compiles_first(method: Callable) -> Callable:
-    """Let the progress line know when a method of the learner is called for the first time."""
+@dataclass(frozen=True)
+class Hyperparameters:
+    """Numbers of PPO with rsl_rl's names; tensors are scalars on the device that change during a training."""
+
+    gamma: float
+    lam: float
+    clip_param: float
+    value_loss_coef: float
+    use_clipped_value_loss: bool
+    max_grad_norm: float
+    is_adaptive: bool  # whether the learning rate follows the KL divergence
+    learning_rates: tuple[float, float]  # its bounds
+    learning_rate: Tensor
+    kl_target: Tensor  # that the adaptive learning rate aims at
+    entropy_weight: Tensor
+    actor_learns: Tensor  # 0: only the critic learns
+
+
+def shows_compilation(method: Callable) -> Callable:
+    """Show in the progress line that the first call of a method compiles its kernels."""
 
     @functools.wraps(method)
-    def call(self: FusedLearner, *args: Any) -> Any:
+    def call(self: FusedPPO, *args: Any) -> Any:
         if method.__name__ in self.compiled:
             return method(self, *args)
         self.compiled.add(method.__name__)
@@ -38,48 +56,72 @@ def compiles_first(method: Callable) -> Callable:
     return call
 
 
-class FusedLearner:
+class FusedPPO:
     """Does what :class:`~legged_torque.learning.ppo.OnDevicePPO` does with torch's operations, in few kernels.
 
     Products of matrices take bfloat16 numbers with mixed precision, else TF32; sums, parameters, losses and Adam are
     float32. Policies round alike when they act and when they learn.
     """
 
-    def __init__(self, alg: OnDevicePPO) -> None:
-        """Move an algorithm's parameters into one piece, and its optimizer's state."""
+    def __init__(
+        self,
+        actor: MLPModel,
+        critic: MLPModel,
+        storage: RolloutStorage,
+        optimizer: torch.optim.Optimizer,
+        hyperparameters: Hyperparameters,
+        indices: Tensor,
+        losses: Tensor,
+        mirror: dict[str, tuple[Tensor, Tensor]] | None,
+        dtype: torch.dtype,
+        is_distributed: bool,
+    ) -> None:
+        """Move the parameters of both models into one piece, and the optimizer's state.
+
+        Args:
+            actor: The policy, whose network :func:`read_network` knows.
+            critic: The value function, likewise.
+            storage: Where rollouts are kept.
+            optimizer: Adam or AdamW, whose settings and state are used.
+            hyperparameters: Numbers of the update.
+            indices: Samples of the next minibatch, kept at this address. Shape: (minibatch,), int64.
+            losses: Sums to which a minibatch adds its numbers. Shape: (LOSS_NAMES,).
+            mirror: Order and signs of the mirror images of observation groups and "actions"; None learns without.
+            dtype: Numbers that matrix products take: bfloat16, or float32 for TF32.
+            is_distributed: Whether gradients are averaged over several processes.
+        """
         keep_kernels()
-        self._alg = alg
         self.compiled: set[str] = set()  # methods whose kernels have been compiled
-        self._networks = networks = [network for m in (alg.actor, alg.critic) if (network := read_network(m.mlp))]
+        self._models, self._storage, self._optimizer = (actor, critic), storage, optimizer
+        self._hyper, self._indices, self._sums = hyperparameters, indices, losses
+        self._is_distributed = is_distributed
+        self._networks = networks = [network for m in self._models if (network := read_network(m.mlp))]
         layers = [layer for network in networks for layer in network.layers]
-        storage, device = alg.storage, alg.device
-        self._std = self._deviation_settings()
-        self._parameters = Parameters(alg.actor, alg.critic, layers, self._std[0], alg.product_dtype)
+        self._std = deviation_settings(actor)
+        self._parameters = Parameters(actor, critic, layers, self._std[0], dtype)
         self._acting = Workspace(networks, self._parameters, storage.num_envs)
-        images = 2 if alg.symmetry else 1
-        self._num_chosen = alg.batch_size
-        self._num_samples = images * alg.batch_size
+        self._num_chosen, self._num_samples = len(indices), len(indices) * (2 if mirror else 1)
         self._learning = LearningWorkspace(networks, self._parameters, self._num_samples)
         self._places = self._learning.output_places(networks)
         size, flat = storage.actions.shape[-1], self._parameters.flat
-        self._gradient = torch.zeros(len(flat) + NUMBERS, device=device)
+        self._gradient = flat.new_zeros(len(flat) + NUMBERS)
         self._numbers = self._gradient[len(flat) :]  # value loss, surrogate loss, entropy, KL divergence
-        self.moments, self.squares = torch.zeros(2, len(flat), device=device).unbind()
-        self.adam_steps = torch.zeros((), device=device)
-        self._norms = torch.zeros(2, steps.PARTS, device=device)
-        self._scalars = torch.zeros(5, device=device)  # see :func:`~legged_torque.learning.fused.steps.settle`
-        self._means, self._stds = torch.zeros_like(storage.actions), torch.zeros(size, device=device)
+        self.moments, self.squares = flat.new_zeros(2, len(flat)).unbind()
+        self.adam_steps = flat.new_zeros(())
+        self._norms = flat.new_zeros(2, steps.PARTS)
+        self._scalars = flat.new_zeros(5)  # see :func:`~legged_torque.learning.ppo.triton.steps.prepare_adam_step`
+        self._means, self._stds = torch.zeros_like(storage.actions), flat.new_zeros(size)
         storage.distribution_params = (self._means, self._stds.expand_as(self._means))  # the same for all samples
-        self._maps = [[self._mirror_map(group) for group in model.obs_groups] for model in (alg.actor, alg.critic)]
-        self._action_map = self._mirror_map("actions")
-        self.share_state(alg.optimizer)
+        self._maps = [[self._mirror_map(mirror, group) for group in model.obs_groups] for model in self._models]
+        self._action_map = self._mirror_map(mirror, "actions")
+        self.share_state(optimizer)
 
     # ---- acting --------------------------------------------------------------------------------------------------
 
-    @compiles_first
+    @shows_compilation
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions and keep the transition. Shape: (num_envs, num_actions)."""
-        storage, step = self._alg.storage, self._alg.storage.step
+        storage, step = self._storage, self._storage.step
         if step == 0:
             self.round_weights()  # something else than a gradient step may have changed them
         storage.observations[step].copy_(obs)
@@ -96,24 +138,24 @@ class FusedLearner:
 
     def add_step(self, rewards: Tensor, dones: Tensor, time_outs: Tensor | None) -> None:
         """Keep what followed the actions; a time-out is worth what the critic thought of the state before."""
-        storage, step = self._alg.storage, self._alg.storage.step
+        storage, step = self._storage, self._storage.step
         kept = storage.rewards[step].view(-1)
         if time_outs is None:
             kept.copy_(rewards)
         else:
-            torch.addcmul(rewards, storage.values[step].view(-1), time_outs.float(), value=self._alg.gamma, out=kept)
+            torch.addcmul(rewards, storage.values[step].view(-1), time_outs.float(), value=self._hyper.gamma, out=kept)
         storage.dones[step].copy_(dones.view(-1, 1))
         storage.step += 1
 
-    @compiles_first
+    @shows_compilation
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute returns and advantages (GAE), these of mean 0 and deviation 1 over the rollout."""
-        storage, alg = self._alg.storage, self._alg
+        storage, hyper = self._storage, self._hyper
         self._run_networks(obs)
         last_values = self._acting.outputs[: storage.num_envs, -1].contiguous()
         samples.generalized_advantages[(-(-storage.num_envs // GAE_WORLDS),)](
             storage.rewards, storage.dones, storage.values, last_values, storage.returns, storage.advantages,
-            storage.num_transitions_per_env, storage.num_envs, alg.gamma, alg.lam, WORLDS=GAE_WORLDS, num_warps=2,
+            storage.num_transitions_per_env, storage.num_envs, hyper.gamma, hyper.lam, WORLDS=GAE_WORLDS, num_warps=2,
         )  # fmt: skip
         advantages = storage.advantages
         advantages.copy_((advantages - advantages.mean()) / (advantages.std() + 1e-8))
@@ -124,12 +166,12 @@ class FusedLearner:
 
     # ---- learning ------------------------------------------------------------------------------------------------
 
-    @compiles_first
+    @shows_compilation
     def update_minibatch(self) -> None:
         """Take one gradient step on the chosen samples."""
-        alg, work = self._alg, self._learning
-        for network, model, maps in zip(self._networks, (alg.actor, alg.critic), self._maps, strict=True):
-            groups = [alg.storage.observations[group].flatten(0, 1) for group in model.obs_groups]
+        work = self._learning
+        for network, model, maps in zip(self._networks, self._models, self._maps, strict=True):
+            groups = [self._storage.observations[group].flatten(0, 1) for group in model.obs_groups]
             self._observe(work, network, groups, maps)
         self._forward(work)
         self._losses()
@@ -138,7 +180,7 @@ class FusedLearner:
             settings = {"SAMPLES": SAMPLES} | products.BACKWARD
             self._product(products.input_gradient, arguments, work.rows // SAMPLES, settings)
         self._weight_gradients()
-        if alg.is_multi_gpu:
+        if self._is_distributed:
             distributed.average([self._gradient])
         self._step()
 
@@ -169,7 +211,7 @@ class FusedLearner:
 
     def _run_networks(self, obs: TensorDict) -> None:
         """Compute the outputs of actor and critic in all worlds."""
-        for network, model in zip(self._networks, (self._alg.actor, self._alg.critic), strict=True):
+        for network, model in zip(self._networks, self._models, strict=True):
             self._observe(self._acting, network, [obs[group] for group in model.obs_groups], None)
         self._forward(self._acting)
 
@@ -183,7 +225,7 @@ class FusedLearner:
             columns = _power_of_two(group.shape[1])
             rows = max(1, min(samples.ROWS, samples.NUMBERS // columns))
             samples.observe[(work.rows // rows,)](
-                group, self._alg.indices, order, signs, work.values, *target, *counts,
+                group, self._indices, order, signs, work.values, *target, *counts,
                 CHOOSE=bool(maps), ROWS=rows, COLUMNS=columns,
             )  # fmt: skip
             column += group.shape[1]
@@ -202,7 +244,7 @@ class FusedLearner:
 
     def _losses(self) -> None:
         """Compute losses and their gradients by the outputs."""
-        alg, work, storage = self._alg, self._learning, self._alg.storage
+        hyper, work, storage = self._hyper, self._learning, self._storage
         size = storage.actions.shape[-1]
         batch = (
             storage.actions,
@@ -212,12 +254,14 @@ class FusedLearner:
             storage.advantages,
             storage.returns,
         )
-        numbers = (self._num_chosen, self._num_samples, size, alg.clip_param, alg.value_loss_coef, alg.entropy_weight)
+        counts = (self._num_chosen, self._num_samples, size)
+        weights = (hyper.clip_param, hyper.value_loss_coef, hyper.entropy_weight)
         places, strides, columns = self._places
         samples.losses[(len(work.sums),)](
-            work.outputs, *self._std[:3], self._stds, alg.indices, *self._action_map, *batch, alg.actor_learns,
-            work.gradients, places, strides, work.sums, work.sums.shape[1], columns, *numbers, IS_LOG=self._std[3],
-            CLIP_VALUES=alg.use_clipped_value_loss, ROWS=SAMPLES, COLUMNS=_power_of_two(size), num_warps=16,
+            work.outputs, *self._std[:3], self._stds, self._indices, *self._action_map, *batch, hyper.actor_learns,
+            work.gradients, places, strides, work.sums, work.sums.shape[1], columns, *counts, *weights,
+            IS_LOG=self._std[3], CLIP_VALUES=hyper.use_clipped_value_loss, ROWS=SAMPLES, COLUMNS=_power_of_two(size),
+            num_warps=16,
         )  # fmt: skip
 
     def _weight_gradients(self) -> None:
@@ -236,38 +280,39 @@ class FusedLearner:
 
     def _step(self) -> None:
         """Clip the gradients and let Adam take a step, unless they are not finite."""
-        alg, parameters = self._alg, self._parameters
-        size, group = len(parameters.flat), alg.optimizer.param_groups[0]
+        hyper, parameters = self._hyper, self._parameters
+        size, group = len(parameters.flat), self._optimizer.param_groups[0]
         steps.sum_squares[(steps.PARTS,)](
             self._gradient, parameters.actor_size, size, self._norms, PARTS=steps.PARTS, BLOCK=steps.BLOCK
         )
         beta1, beta2 = group["betas"]
-        steps.settle[(1,)](
-            self._numbers, self._norms, alg.learning_rate, alg.actor_learns, self.adam_steps, self._scalars, alg.losses,
-            alg.max_grad_norm, alg.kl_target, *alg.learning_rates, math.log(beta1), math.log(beta2),
-            ADAPTIVE=alg.schedule == "adaptive", PARTS=steps.PARTS,
+        steps.prepare_adam_step[(1,)](
+            self._numbers, self._norms, hyper.learning_rate, hyper.actor_learns, self.adam_steps, self._scalars,
+            self._sums, hyper.max_grad_norm, hyper.kl_target, *hyper.learning_rates, math.log(beta1), math.log(beta2),
+            ADAPTIVE=hyper.is_adaptive, PARTS=steps.PARTS,
         )  # fmt: skip
-        decay = group["weight_decay"] if isinstance(alg.optimizer, torch.optim.AdamW) else 0.0
+        decay = group["weight_decay"] if isinstance(self._optimizer, torch.optim.AdamW) else 0.0
         steps.adam[(-(-size // steps.BLOCK),)](
             parameters.flat, self._gradient, self.moments, self.squares, parameters.weights, parameters.source,
-            self._scalars, alg.learning_rate, parameters.actor_size, size,
+            self._scalars, hyper.learning_rate, parameters.actor_size, size,
             beta1, beta2, group["eps"], decay, BLOCK=steps.BLOCK,
         )  # fmt: skip
 
-    def _mirror_map(self, name: str) -> tuple[Tensor, Tensor]:
+    def _mirror_map(self, mirror: dict[str, tuple[Tensor, Tensor]] | None, name: str) -> tuple[Tensor, Tensor]:
         """Return order and signs of the mirror image of observations or actions; without images, of no change."""
-        alg = self._alg
-        if alg.symmetry:
-            return alg.symmetry.env.mirror.maps[name]
-        size = (alg.storage.actions if name == "actions" else alg.storage.observations[name]).shape[-1]
-        return torch.arange(size, device=alg.device), torch.ones(size, device=alg.device)
+        if mirror:
+            return mirror[name]
+        size = (self._storage.actions if name == "actions" else self._storage.observations[name]).shape[-1]
+        device = self._parameters.flat.device
+        return torch.arange(size, device=device), torch.ones(size, device=device)
 
-    def _deviation_settings(self) -> tuple[Any, float, float, bool]:
-        """Return the parameter of the standard deviations, its range, and whether it is a logarithm."""
-        distribution: Any = self._alg.actor.distribution
-        if distribution.std_type == "log":
-            return distribution.log_std_param, *distribution.log_std_range, True
-        return distribution.std_param, *distribution.std_range, False
+
+def deviation_settings(actor: MLPModel) -> tuple[Any, float, float, bool]:
+    """Return the parameter of the actions' standard deviations, its range, and whether it is a logarithm."""
+    distribution: Any = actor.distribution
+    if distribution.std_type == "log":
+        return distribution.log_std_param, *distribution.log_std_range, True
+    return distribution.std_param, *distribution.std_range, False
 
 
 def can_multiply(dtype: torch.dtype, device: str) -> bool:

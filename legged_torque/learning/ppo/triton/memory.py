@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from legged_torque.learning.fused.networks import Block, Columns, Layer, Network, aligned
+from legged_torque.learning.ppo.triton.networks import Block, Columns, Layer, Network, aligned
 
 SAMPLES = 128  # of a tile of a matrix product
 TILE = 128  # columns of it

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -14,20 +14,18 @@ from torch.utils._pytree import tree_map
 
 from legged_torque.envs.base.symmetry import with_mirror_images
 from legged_torque.learning.distribution import GaussianDistribution
-from legged_torque.learning.fused.networks import read_network
 from legged_torque.learning.multi_head import MultiHeadModel
+from legged_torque.learning.ppo.triton.networks import read_network
+from legged_torque.learning.protocols import Transition
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
 from legged_torque.utils.compiled import has_triton
 from legged_torque.utils.errors import UserError, unknown_name
 
-if TYPE_CHECKING:
-    from legged_torque.learning.fused.learner import FusedLearner
-
 MIN_LEARNING_RATE = 1e-5  # lower bound of the adaptive learning rate, that of rsl_rl
 
 LOSS_NAMES = ("value", "surrogate", "entropy", "kl", "gradient_norm", "critic_gradient_norm", "skipped_updates")
-"""What an update reports: means over the minibatches that were learned from, and how many were not."""
+"""Losses of an update: means over the minibatches that were learned from, and the number of the others."""
 
 
 class OnDevicePPO(PPO):
@@ -36,12 +34,20 @@ class OnDevicePPO(PPO):
     The losses are rsl_rl's. The adaptive learning rate is a tensor. A minibatch whose gradient norm is not finite
     leaves the networks and the optimizer untouched and is counted. If a weight or a moment is not finite after an
     iteration, all its minibatches are undone and counted. Processes that train together learn from minibatches
-    of their own, average gradients and KL divergence, and so take the same step, or skip it, all of them; as in rsl_rl,
-    each normalizes the advantages of its own rollout.
+    of their own and average gradients and KL divergence, so that all of them take the same step or skip it. As in
+    rsl_rl, each normalizes the advantages of its own rollout.
+
+    Attributes:
+        fused: Acts and learns with Triton's kernels in place of torch's operations, where that is possible, or None.
     """
 
+    capturable = True
+    needs_next_obs = False
     optimizer: torch.optim.Adam
     use_mixed_precision: bool
+    fused: Any = None
+    warm_up_iterations = 0
+    """Iterations at the start of a training in which only the critic learns."""
 
     def __init__(
         self,
@@ -54,7 +60,11 @@ class OnDevicePPO(PPO):
         annealing_start: float = 1.0,
         **kwargs,
     ) -> None:
-        """Create the algorithm; arguments are rsl_rl's, a bound of the adaptive learning rate, and :meth:`anneal`'s."""
+        """Create the algorithm.
+
+        Arguments are those of rsl_rl, and ``max_learning_rate``, the bound of the adaptive learning rate, and
+        ``annealing_start``, see :meth:`anneal`.
+        """
         if optimizer not in ("adam", "adamw"):  # of these torch can skip a step on the device
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
         if kwargs.get("rnd_cfg"):
@@ -81,21 +91,65 @@ class OnDevicePPO(PPO):
         self.optimizer = make_optimizer(self._parameters, lr=self.learning_rate, fused=True, capturable=True)
         self.actor_learns = torch.ones((), device=self.device)
         self._skip = torch.zeros((), device=self.device)
-        self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # where torch's own gradient scaler tells a fused optimizer to skip
+        self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # a fused optimizer skips its step where this is 1, as for torch's gradient scaler
         self.losses = torch.zeros(len(LOSS_NAMES), device=self.device)
         self.indices = torch.zeros(self.batch_size, dtype=torch.long, device=self.device)
         self.fused = self._fuse()
         self.use_mixed_precision = self.use_mixed_precision and self.fused is not None  # torch's operations do without
         self.update_graph = CudaGraph(self._update_minibatch, self.device)  # the update from one minibatch
 
+    @staticmethod
+    def construct_algorithm(obs: TensorDict, env: Any, cfg: dict[str, Any], device: str) -> PPO:
+        """Build the algorithm with its networks and storage from settings in rsl_rl's layout."""
+        alg = PPO.construct_algorithm(obs, env, cfg, device)
+        alg.update_graph.enabled = cfg["capture"]
+        alg.warm_up_iterations = cfg["pretraining"]["critic_warmup_iterations"]
+        return alg
+
+    # ---- the trainer's interface, see protocols.Learner ----------------------------------------------------------
+
+    def observe(self, transition: Transition) -> None:
+        """Keep what followed the actions, and compute the returns of the rollout after its last step."""
+        extras = transition.extras
+        self.process_env_step(transition.obs_after, transition.rewards, transition.dones, extras)
+        if self.storage.step == self.storage.num_transitions_per_env:
+            self.compute_returns(transition.obs_after)
+
+    def due(self) -> bool:
+        """Return that an update is due: the storage holds one rollout."""
+        return True
+
+    def set_progress(self, iteration: int, num_iterations: int) -> None:
+        """Prepare the update of an iteration: the warm-up of the critic, and annealing."""
+        self.learn_actor(iteration >= self.warm_up_iterations)
+        self.anneal(iteration / num_iterations)
+
+    def policy(self) -> MLPModel:
+        """Return the actor."""
+        return self.get_policy()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what :meth:`save` does."""
+        return self.save()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Load all parts of a :meth:`state_dict`."""
+        self.load(state, None, True)
+
+    def close(self) -> None:
+        """Free the graph of the update: NCCL waits for the end of graphs with its work in them."""
+        self.update_graph.reset()
+
+    # ---- rsl_rl's interface --------------------------------------------------------------------------------------
+
     def learn_actor(self, enabled: bool) -> None:
-        """Say whether the next updates train the policy too, or the value function alone."""
+        """Choose whether the next updates train the policy too, or the value function alone."""
         self.actor_learns.fill_(float(enabled))
 
     def anneal(self, progress: float) -> None:
         """Make the next update smaller, after this share of the training.
 
-        From the share ``annealing_start`` on, the weight of the entropy and the wanted KL divergence fall linearly to
+        From the share ``annealing_start`` on, the weight of the entropy and the desired KL divergence fall linearly to
         0. The adaptive learning rate follows the latter; a fixed learning rate falls itself.
         """
         left = min(1.0, (1.0 - progress) / max(1.0 - self.annealing_start, 1e-9))
@@ -126,7 +180,12 @@ class OnDevicePPO(PPO):
             self.storage.advantages = advantages.copy_(self.storage.advantages)
 
     def update(self) -> dict[str, float]:
-        """Learn from the rollout in random order, epoch by epoch; return :data:`LOSS_NAMES` over all processes."""
+        """Learn from the rollout in random order, epoch by epoch.
+
+        Returns:
+            :data:`LOSS_NAMES` over all processes, "learning_rate", "action_std" and "all_skipped", see
+            :class:`~legged_torque.learning.protocols.Learner`.
+        """
         self.losses.zero_()
         before = flattened(self._state())
         for _ in range(self.num_learning_epochs):
@@ -147,7 +206,9 @@ class OnDevicePPO(PPO):
             self._restore(before)
             losses = dict.fromkeys(LOSS_NAMES, 0.0) | {"skipped_updates": float(num_updates)}
         updates = num_updates - losses["skipped_updates"]
-        return {name: loss if name == "skipped_updates" else loss / max(updates, 1) for name, loss in losses.items()}
+        means = {name: loss if name == "skipped_updates" else loss / max(updates, 1) for name, loss in losses.items()}
+        policy = {"learning_rate": self.learning_rate.item(), "action_std": self.action_std().mean().item()}
+        return {**means, **policy, "all_skipped": updates <= 0}
 
     def save(self) -> dict:
         """Return what rsl_rl saves, each tensor in memory of its own."""
@@ -174,23 +235,23 @@ class OnDevicePPO(PPO):
         """Kind of numbers that matrix products take; those of float32 may be TF32."""
         return torch.bfloat16 if self.use_mixed_precision else torch.float32
 
-    def _fuse(self) -> FusedLearner | None:
-        """Return what acts and learns in few kernels; None where that needs something that is not there."""
+    def _fuse(self) -> Any:
+        """Return the kernels, or None without Triton or a GPU that can run them, or if parts of this have none."""
         if not has_triton(self.device) or not can_be_fused(self):
             return None
-        from legged_torque.learning.fused.learner import FusedLearner, can_multiply  # imports Triton
+        from legged_torque.learning.ppo.triton.learner import can_multiply  # imports Triton
 
-        return FusedLearner(self) if can_multiply(self.product_dtype, self.device) else None
+        return make_fused(self) if can_multiply(self.product_dtype, self.device) else None
 
     def _state(self) -> list[Tensor]:
-        """Return the weights, and the optimizer's moments and counters, which do not exist before the first step."""
+        """Return the weights, and the optimizer's moments and counters, which exist from the first step on."""
         if self.fused:
             return self.fused.state()
         kept = [value for entry in self.optimizer.state.values() for value in entry.values()]
         return [*(parameter.data for parameter in self._parameters), *kept]
 
     def _restore(self, before: Tensor) -> None:
-        """Undo an update; ``before`` are the numbers of :meth:`_state` in front of it."""
+        """Undo an update; ``before`` are the flattened numbers of :meth:`_state` before it."""
         state = self._state()
         before = torch.cat([before, before.new_zeros(sum(map(torch.numel, state)) - len(before))])  # as they start
         for tensor, numbers in zip(state, before.split([tensor.numel() for tensor in state]), strict=True):
@@ -213,7 +274,7 @@ class OnDevicePPO(PPO):
             self._update_by_autograd()
 
     def loss(self) -> tuple[Tensor, Tensor]:
-        """Return the loss of the samples of ``indices`` by torch's operations, and the first numbers of LOSS_NAMES."""
+        """Return the loss of the samples of ``indices`` with torch's operations, and the first four LOSS_NAMES."""
         batch = self._gather()
         if self.symmetry:
             self.symmetry.augment_batch(batch, self.batch_size)
@@ -281,7 +342,7 @@ class OnDevicePPO(PPO):
             lower = kl > 2.0 * self.kl_target
             higher = (kl < 0.5 * self.kl_target) & (kl > 0.0)
             factor = torch.where(lower, 1.0 / 1.5, torch.where(higher, 1.5, 1.0))
-            factor = torch.where(self.actor_learns.bool(), factor, 1.0)  # a policy that stays says nothing
+            factor = torch.where(self.actor_learns.bool(), factor, 1.0)  # a fixed policy has no divergence
             self.learning_rate.mul_(factor).clamp_(*self.learning_rates)
 
     def _surrogate_loss(self, batch: RolloutStorage.Batch, log_prob: Tensor) -> Tensor:
@@ -305,8 +366,33 @@ def flattened(tensors: list[Tensor]) -> Tensor:
     return torch.cat([tensor.flatten() for tensor in tensors])
 
 
+def make_fused(alg: OnDevicePPO) -> Any:
+    """Return kernels that act and learn in place of the algorithm's operations, and move its parameters to them."""
+    from legged_torque.learning.ppo.triton.learner import FusedPPO, Hyperparameters  # imports Triton
+
+    hyperparameters = Hyperparameters(
+        gamma=alg.gamma,
+        lam=alg.lam,
+        clip_param=alg.clip_param,
+        value_loss_coef=alg.value_loss_coef,
+        use_clipped_value_loss=alg.use_clipped_value_loss,
+        max_grad_norm=alg.max_grad_norm,
+        is_adaptive=alg.schedule == "adaptive",
+        learning_rates=alg.learning_rates,
+        learning_rate=alg.learning_rate,
+        kl_target=alg.kl_target,
+        entropy_weight=alg.entropy_weight,
+        actor_learns=alg.actor_learns,
+    )
+    mirror = alg.symmetry.env.mirror.maps if alg.symmetry else None
+    return FusedPPO(
+        alg.actor, alg.critic, alg.storage, alg.optimizer, hyperparameters, alg.indices, alg.losses, mirror,
+        alg.product_dtype, alg.is_multi_gpu,
+    )  # fmt: skip
+
+
 def can_be_fused(alg: OnDevicePPO) -> bool:
-    """Return whether there are kernels for all that an algorithm asks for; classes of a user's may do anything."""
+    """Return whether there are kernels for all parts of an algorithm; none are for classes of a user's."""
     models, symmetry = (alg.actor, alg.critic), alg.symmetry
     return (
         type(alg) is OnDevicePPO

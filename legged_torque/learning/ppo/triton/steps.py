@@ -47,7 +47,7 @@ def sum_squares(gradient, actor_size, size, squares, PARTS: tl.constexpr, BLOCK:
 
 
 @triton.jit
-def settle(
+def prepare_adam_step(
     numbers, squares, learning_rate, actor_learns, steps, scalars, sums, max_norm, kl_target, lowest_rate,
     highest_rate, log_beta1, log_beta2, ADAPTIVE: tl.constexpr, PARTS: tl.constexpr,
 ):  # fmt: skip
