@@ -65,15 +65,15 @@ def compare_kernels(runner: OnPolicyRunner) -> dict[str, float]:
         By network: the norm of the difference, relative to that of autograd's gradient; nothing without kernels.
     """
     alg = runner.alg
-    if not alg.fused:
+    if not hasattr(alg, "gradients"):
         return {}
     alg.indices.copy_(torch.arange(alg.batch_size))
-    before, rate = [tensor.clone() for tensor in alg.fused.state()], alg.learning_rate.clone()
-    alg.fused.update_minibatch()
-    fused = [gradient.clone() for gradient in alg.fused.gradients()]
-    for tensor, value in zip([*alg.fused.state(), alg.learning_rate], [*before, rate], strict=True):
+    before, rate = [tensor.clone() for tensor in alg.tensors()], alg.learning_rate.clone()
+    alg.update_minibatch()
+    fused = [gradient.clone() for gradient in alg.gradients()]
+    for tensor, value in zip([*alg.tensors(), alg.learning_rate], [*before, rate], strict=True):
         tensor.copy_(value)
-    alg.fused.round_weights()
+    alg.round_weights()
     alg.optimizer.zero_grad()
     with torch.enable_grad():
         alg.loss()[0].backward()

@@ -40,6 +40,7 @@ class Trainer:
         alg: The learner.
         logger: rsl_rl's logger, which counts steps and seconds and writes curves.
         current_learning_iteration: Number of complete iterations.
+        rollout_graph: A rollout; its graph is enabled where act and observe of the learner can be captured.
         on_checkpoint: Called with the file of each checkpoint of a training.
         stopped_by: Number of the signal that has ended the last training; 0 for none.
         verbose: Whether rsl_rl's block of every iteration is printed, in place of the display.
@@ -62,7 +63,8 @@ class Trainer:
             env.keep_final_observations = True  # type: ignore[attr-defined] # check_learner has seen it
         logger.device = "cpu"  # numbers are read from the device before they are logged
         capture = cfg["capture"] and alg.capturable
-        self._rollout = CudaGraph(self._collect, env.device, capture and cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS)
+        self.rollout_graph = CudaGraph(self._collect, env.device)
+        self.rollout_graph.enabled = capture and cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS
         self._evaluators = TrainingEvaluators(env, alg.policy(), cfg["evaluation"], cfg["seed"], capture)
         self.current_learning_iteration = 0
         self.on_checkpoint: Callable[[Path], None] | None = None
@@ -123,7 +125,7 @@ class Trainer:
         """Let the learner act and observe for one rollout, after curricula that hold for a rollout have moved on."""
         self.env.compile()
         self.env.update_curriculum()
-        self._rollout()
+        self.rollout_graph()
 
     def _collect(self) -> None:
         """Act for one rollout; runs as a CUDA graph."""

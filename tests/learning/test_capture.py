@@ -92,19 +92,27 @@ def test_graph_inside_another_one_runs(calls, monkeypatch):
     assert noted == ["run"] * 3
 
 
-@pytest.mark.parametrize("capture", [True, False])
-def test_capture_is_a_setting(make_runner, tmp_path, capture):
-    """It holds for steps, rollouts and updates, and after loading; training without is the same training."""
-    runner = make_runner(**{"runner.capture": capture})
-    path = tmp_path / "model_0.pt"
-    runner.save(str(path))
-    runner.load(str(path))
-    assert [each.enabled for each in (runner._rollout, runner.env.step_graph, runner.alg.update_graph)] == [capture] * 3
-    usual = make_runner()
-    for each in (runner, usual):
+@pytest.mark.parametrize(
+    ("capture", "steps", "enabled"), [(True, 4, [True] * 3), (False, 4, [False] * 3), (True, 65, [False, True, True])]
+)
+def test_capture_is_a_setting(make_runner, tmp_path, capture, steps, enabled):
+    """It holds for rollouts, steps and updates, and after loading; rollouts too long for a graph go step by step."""
+    runner = make_runner(**{"runner.capture": capture, "runner.num_steps_per_env": steps})
+    path = str(tmp_path / "model_0.pt")
+    runner.save(path)
+    runner.load(path)
+    assert [
+        graph.enabled for graph in (runner.rollout_graph, runner.env.step_graph, runner.alg.update_graph)
+    ] == enabled
+
+
+def test_training_without_capture_is_the_same(make_runner):
+    """The same bits come out."""
+    runners = [make_runner(**{"runner.capture": capture}) for capture in (True, False)]
+    for runner in runners:
         torch.manual_seed(0)
-        each.learn(1)
-    assert all(torch.equal(networks(runner)[key], value) for key, value in networks(usual).items())
+        runner.learn(1)
+    assert all(torch.equal(networks(runners[0])[key], value) for key, value in networks(runners[1]).items())
 
 
 def test_capture_on_the_command_line():
@@ -112,12 +120,6 @@ def test_capture_on_the_command_line():
     assert get_cfgs()[1].runner.capture is True
     assert get_cfgs("--set=runner.capture=False")[1].runner.capture is False
     assert "runner.capture" in error_of(get_cfgs, "--set=runner.capture=2")
-
-
-def test_long_rollouts_replay_step_by_step(make_runner):
-    """A rollout that is too long for one graph leaves steps and updates theirs."""
-    runner = make_runner(**{"runner.num_steps_per_env": 65})
-    assert not runner._rollout.enabled and runner.env.step_graph.enabled and runner.alg.update_graph.enabled
 
 
 @pytest.fixture

@@ -37,7 +37,7 @@ def noted(monkeypatch):
 
     Worlds of evaluations do not settle before the first one.
     """
-    monkeypatch.setattr(evaluator, "SETTLING_TIME", 0.0)
+    monkeypatch.setattr(evaluator, "WARM_UP_TIME", 0.0)
     steps, step = [], LeggedRobot.step
 
     def noted_step(task, actions):
@@ -151,7 +151,7 @@ def test_training_does_not_notice(make_runner):
 
 def test_worlds_settle_before_the_first_evaluation(make_runner, noted, monkeypatch):
     """For as long as it is said, in runs of whole evaluations; what happens then does not count."""
-    monkeypatch.setattr(evaluator, "SETTLING_TIME", 0.1)  # 5 steps, of an evaluation's 3
+    monkeypatch.setattr(evaluator, "WARM_UP_TIME", 0.1)  # 5 steps, of an evaluation's 3
     runner = make_runner(**{"evaluation.num_samples": 9, "evaluation.num_envs": 3, "evaluation.interval": 16})
     runner.learn(2)
     evaluations, rows = by_evaluation(noted, runner.env), rows_of(runner)

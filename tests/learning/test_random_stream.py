@@ -8,7 +8,7 @@ from support.random_stream import upcoming
 from support.settings import error_of, parse
 
 from legged_torque.envs import task_registry
-from legged_torque.learning import runner as runner_module
+from legged_torque.utils import distributed
 from legged_torque.utils.random_state import random_state, restore_random_state
 from legged_torque.utils.task_registry import set_seed
 
@@ -140,7 +140,7 @@ def test_checkpoints_hold_one_state_per_process(trained, iteration):
     assert torch.equal(torch.rand(5), trained.numbers[iteration])
 
 
-def test_every_process_takes_its_own(trained):
+def test_every_process_takes_its_own(trained, monkeypatch):
     """A process takes the state of its number; one that the run did not have keeps its own numbers."""
     runner = trained.runner
     states = []
@@ -154,16 +154,16 @@ def test_every_process_takes_its_own(trained):
         expected[rank] = torch.rand(5)
     for rank in (0, 1, 2):
         torch.manual_seed(22)
-        runner.gpu_global_rank = rank
+        monkeypatch.setenv("WORLD_SIZE", "3")
+        monkeypatch.setenv("RANK", str(rank))
         runner.continue_random_numbers({"random_states": states})
         assert torch.equal(torch.rand(5), expected[rank])
-    runner.gpu_global_rank = 0
 
 
 def test_states_of_all_processes_are_kept(trained, tmp_path, monkeypatch):
     """What is saved is the list that all processes have gathered, in their order."""
     others = [{"cpu": torch.full((3,), rank, dtype=torch.uint8)} for rank in range(3)]
-    monkeypatch.setattr(runner_module.distributed, "gather", lambda mine: [mine, *others])
+    monkeypatch.setattr(distributed, "gather", lambda mine: [mine, *others])
     trained.runner.save(str(tmp_path / "model_0.pt"))
     states = torch.load(tmp_path / "model_0.pt", weights_only=True)["infos"]["random_states"]
     assert len(states) == 4 and torch.equal(states[0]["cpu"], torch.get_rng_state())

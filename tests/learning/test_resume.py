@@ -15,7 +15,7 @@ from support.settings import error_of
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning import checkpoint
-from legged_torque.learning.worlds import pack, unpack, world_tensors
+from legged_torque.learning.worlds import load_world_state, world_state
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import Options
 from tools.reproducible import values
@@ -135,72 +135,12 @@ def test_tensors_of_a_users_task_are_found():
     task.clock.random_(100)
     task.helper.phases[0].normal_()
     task.by_foot["height"].normal_()
-    found = world_tensors(task)
+    found = world_state(task)
     assert {"clock", "helper.phases.0", "by_foot.height", "sim.qpos", "rewards.episode_sums"} <= found.keys()
     assert not {"_gravity", "feet_indices"} & found.keys()
-    unpack(pack(found, 12), world_tensors(other), 12)
-    for name, tensor in world_tensors(other).items():
+    load_world_state(other, found)
+    for name, tensor in world_state(other).items():
         assert torch.equal(tensor, found[name]), name
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64, torch.int32, torch.bool])
-@pytest.mark.parametrize("shape", [(5,), (5, 3), (2, 5, 3), (3, 5), (5, 1, 2)])
-def test_packing(dtype, shape):
-    """Every bit comes back, those of numbers that are not finite too, also into views of larger memory."""
-    noise = torch.randint(0, 256, (*shape, 8), dtype=torch.uint8)
-    tensor = noise.view(torch.float64).squeeze(-1) if dtype == torch.float64 else (noise[..., 0].float() - 7).to(dtype)
-    room = torch.zeros(*shape, 2, dtype=dtype)
-    unpack(pack({"x": tensor}, 5), {"x": room[..., 1]}, 5)
-    assert room[..., 1].numpy().tobytes() == tensor.contiguous().numpy().tobytes()
-    assert not room[..., 0].any()
-
-
-@pytest.mark.parametrize("num_worlds", [1, 3])
-def test_packing_of_odd_strides(num_worlds):
-    """Columns of a matrix whose other axis has one entry, and a single world, come back too."""
-    tensors = {"x": torch.rand(num_worlds, 5)[:, 2:3], "y": torch.rand(4, num_worlds).T[:, :1], "z": torch.rand(4, 1).T}
-    tensors = {name: tensor for name, tensor in tensors.items() if num_worlds in tensor.shape}
-    copies = {name: torch.zeros(tensor.shape) for name, tensor in tensors.items()}
-    unpack(pack(tensors, num_worlds), copies, num_worlds)
-    assert not differences(tensors, copies)
-
-
-def spoil(key, value):
-    """A function that replaces an entry."""
-    return lambda packed: packed.__setitem__(key, value)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (spoil("layout", []), "keeps other tensors than it did: x"),
-        (spoil("layout", [["x", "torch.float64", [5, 3]]]), "keeps other tensors"),
-        (spoil("places", torch.tensor([0, 1], dtype=torch.int32)), "not as large|larger"),
-        (spoil("planes", []), "not as large"),
-        (spoil("planes", [torch.zeros(9, dtype=torch.uint8)]), "cannot be decompressed"),
-        (lambda packed: packed["places"].fill_(-1), "not as large|larger"),
-        (lambda packed: packed["planes"].append(packed["planes"][0]), "not as large"),
-    ],
-)
-def test_worlds_that_do_not_fit_are_not_written(change, message):
-    """Not a number changes when what is read has other names, types or sizes."""
-    packed, target = pack({"x": torch.rand(5, 3)}, 5), torch.ones(5, 3)
-    change(packed)
-    with pytest.raises(UserError, match=message):
-        unpack(packed, {"x": target}, 5)
-    assert torch.equal(target, torch.ones(5, 3))
-
-
-def test_worlds_of_a_large_training_are_small(tmp_path):
-    """4096 worlds of training and as many of evaluation take 16 MB at most."""
-    options = Options(device="cpu", num_envs=4096, perturbation="low")
-    env_cfg, _ = task_registry.get_cfgs("a1_torque_multihead", options)
-    torch.manual_seed(0)
-    env, _ = task_registry.make_env("a1_torque_multihead", options, env_cfg)
-    for _ in range(3):
-        env.step(torch.randn(4096, env.num_actions))
-    checkpoint.write(tmp_path / "worlds.pt", pack(world_tensors(env), 4096))
-    assert 1e6 < (tmp_path / "worlds.pt").stat().st_size < 8e6
 
 
 def test_only_the_last_worlds_are_kept(half):
@@ -234,7 +174,7 @@ def test_an_end_between_worlds_and_checkpoint(half, tmp_path, monkeypatch, ends_
     monkeypatch.undo()
     resumed = start(tmp_path, "--resume", f"--load_run={runner.log_dir}")
     assert resumed.current_learning_iteration == 2
-    assert not differences(world_tensors(resumed.env), world_tensors(half.env))
+    assert not differences(world_state(resumed.env), world_state(half.env))
 
 
 def damage(file):

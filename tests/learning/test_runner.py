@@ -110,42 +110,27 @@ def test_two_iterations_of_every_task(make_runner, tmp_path, name, capsys):
     assert first.startswith("iteration 1 of 2, ") and last.startswith("iteration 2 of 2, ") and "; KL 0.0" in last
 
 
-def test_logs_are_written_while_the_next_rollout_is_collected(make_runner, tmp_path, monkeypatch):
-    """The numbers are those of the iteration before; a checkpoint has all that came before it."""
-    runner, order = make_runner(log_root=tmp_path, **{"runner.save_interval": 2, "runner.logger": "none"}), []
-    collect, save = runner.collect_rollout, runner.save
+def test_logs_and_checkpoints_are_of_their_iterations(make_runner, tmp_path):
+    """Curves have the numbers of each update at its iteration, though written later; checkpoints count all steps."""
+    runner = make_runner(log_root=tmp_path, **{"runner.save_interval": 2})
+    update, updates = runner.alg.update, []
 
-    def told_collect():
-        order.append("collect")
-        collect()
+    def noted_update():
+        updates.append(update())
+        return updates[-1]
 
-    def told_save(path, infos):
-        order.append(f"save {runner.logger.tot_timesteps}")
-        save(path, infos)
-
-    def told_log(it, learning_rate, action_std, **_):
-        order.append(f"log {it}")
-        assert learning_rate == rates[it] and torch.equal(action_std, stds[it])
-        runner.logger.tot_timesteps += BATCH
-
-    rates, stds, update = [], [], runner.alg.update
-
-    def told_update():
-        losses = update()
-        rates.append(float(runner.alg.learning_rate))
-        stds.append(runner.alg.actor.output_std.clone())
-        return losses
-
-    for owner, name, told in (
-        (runner, "collect_rollout", told_collect),
-        (runner, "save", told_save),
-        (runner.logger, "log", told_log),
-        (runner.alg, "update", told_update),
-    ):
-        monkeypatch.setattr(owner, name, told)
+    runner.alg.update = noted_update
     runner.learn(3)
-    middle = ["collect", "log 0", "log 1", f"save {2 * BATCH}", "collect", "log 2", f"save {3 * BATCH}"]
-    assert order == ["save 0", "collect", *middle]
+    runner.logger.writer.flush()
+    events = EventAccumulator(str(folder(runner))).Reload()
+    names = {"learning_rate": "Loss/learning_rate", "action_std": "Policy/mean_std", "kl": "Loss/kl"}
+    for name, tag in names.items():
+        curve = [(event.step, event.value) for event in events.Scalars(tag)]
+        assert curve == [(i, pytest.approx(numbers[name], rel=1e-6)) for i, numbers in enumerate(updates)]
+        assert len({value for _, value in curve}) == 3
+    for count in (0, 2, 3):
+        infos = torch.load(folder(runner) / f"model_{count}.pt", weights_only=True)["infos"]
+        assert infos["total_timesteps"] == count * BATCH
 
 
 def test_two_trainings_with_one_seed_are_equal(make_runner):

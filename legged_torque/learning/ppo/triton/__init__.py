@@ -1,5 +1,5 @@
-"""Acting and learning as few kernels on a GPU, written in Triton; elsewhere rsl_rl's and torch's own operations.
+"""PPO on a GPU in few kernels, written in Triton.
 
-networks (what layers read and write) < memory (where that is) < products, samples, steps (Triton kernels) < learner
-(which launches them).
+networks (what layers read and write) < memory (where that is) < products, samples, steps (Triton kernels) < triton_ppo
+(launches them).
 """

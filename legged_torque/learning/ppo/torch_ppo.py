@@ -12,14 +12,9 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.utils._pytree import tree_map
 
-from legged_torque.envs.base.symmetry import with_mirror_images
-from legged_torque.learning.distribution import GaussianDistribution
-from legged_torque.learning.multi_head import MultiHeadModel
-from legged_torque.learning.ppo.triton.networks import read_network
 from legged_torque.learning.protocols import Transition
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
-from legged_torque.utils.compiled import has_triton
 from legged_torque.utils.errors import UserError, unknown_name
 
 MIN_LEARNING_RATE = 1e-5  # lower bound of the adaptive learning rate, that of rsl_rl
@@ -28,7 +23,7 @@ LOSS_NAMES = ("value", "surrogate", "entropy", "kl", "gradient_norm", "critic_gr
 """Losses of an update: means over the minibatches that were learned from, and the number of the others."""
 
 
-class OnDevicePPO(PPO):
+class TorchPPO(PPO):
     """PPO whose minibatch update has fixed shapes and never waits for the host, so that it replays as a CUDA graph.
 
     The losses are rsl_rl's. The adaptive learning rate is a tensor. A minibatch whose gradient norm is not finite
@@ -38,16 +33,15 @@ class OnDevicePPO(PPO):
     rsl_rl, each normalizes the advantages of its own rollout.
 
     Attributes:
-        fused: Acts and learns with Triton's kernels in place of torch's operations, where that is possible, or None.
+        warm_up_iterations: Iterations at the start of a training in which only the critic learns.
+        update_graph: The update from the samples of ``indices``.
+        product_dtype: Numbers that matrix products take; those of float32 may be TF32.
     """
 
     capturable = True
     needs_next_obs = False
-    optimizer: torch.optim.Adam
-    use_mixed_precision: bool
-    fused: Any = None
     warm_up_iterations = 0
-    """Iterations at the start of a training in which only the critic learns."""
+    optimizer: torch.optim.Adam
 
     def __init__(
         self,
@@ -60,10 +54,9 @@ class OnDevicePPO(PPO):
         annealing_start: float = 1.0,
         **kwargs,
     ) -> None:
-        """Create the algorithm.
+        """Create the algorithm; arguments are rsl_rl's, the bound of the adaptive learning rate, and :meth:`anneal`'s.
 
-        Arguments are those of rsl_rl, and ``max_learning_rate``, the bound of the adaptive learning rate, and
-        ``annealing_start``, see :meth:`anneal`.
+        A UserError names a setting that is not supported.
         """
         if optimizer not in ("adam", "adamw"):  # of these torch can skip a step on the device
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
@@ -91,36 +84,41 @@ class OnDevicePPO(PPO):
         self.optimizer = make_optimizer(self._parameters, lr=self.learning_rate, fused=True, capturable=True)
         self.actor_learns = torch.ones((), device=self.device)
         self._skip = torch.zeros((), device=self.device)
-        self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # a fused optimizer skips its step where this is 1, as for torch's gradient scaler
+        self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # where it is 1, a fused optimizer skips
         self.losses = torch.zeros(len(LOSS_NAMES), device=self.device)
         self.indices = torch.zeros(self.batch_size, dtype=torch.long, device=self.device)
-        self.fused = self._fuse()
-        self.use_mixed_precision = self.use_mixed_precision and self.fused is not None  # torch's operations do without
-        self.update_graph = CudaGraph(self._update_minibatch, self.device)  # the update from one minibatch
+        self.product_dtype = torch.float32
+        self.update_graph = CudaGraph(self.update_minibatch, self.device)
 
-    @staticmethod
-    def construct_algorithm(obs: TensorDict, env: Any, cfg: dict[str, Any], device: str) -> PPO:
-        """Build the algorithm with its networks and storage from settings in rsl_rl's layout."""
-        alg = PPO.construct_algorithm(obs, env, cfg, device)
+    @classmethod
+    def construct_algorithm(cls, obs: TensorDict, env: Any, cfg: dict[str, Any], device: str) -> PPO:
+        """Build the algorithm with its networks and storage, from settings in rsl_rl's layout."""
+        algorithm = {**cfg["algorithm"], "class_name": cls.make}
+        alg = PPO.construct_algorithm(obs, env, {**cfg, "algorithm": algorithm}, device)
         alg.update_graph.enabled = cfg["capture"]
         alg.warm_up_iterations = cfg["pretraining"]["critic_warmup_iterations"]
         return alg
 
-    # ---- the trainer's interface, see protocols.Learner ----------------------------------------------------------
+    @classmethod
+    def make(cls, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> TorchPPO:
+        """Return the algorithm for networks, storage and settings; subclasses may choose between several."""
+        return cls(actor, critic, storage, **settings)
+
+    # ---- for the trainer, see protocols.Learner --------------------------------------------------------------------
 
     def observe(self, transition: Transition) -> None:
-        """Keep what followed the actions, and compute the returns of the rollout after its last step."""
-        extras = transition.extras
-        self.process_env_step(transition.obs_after, transition.rewards, transition.dones, extras)
+        """Keep what followed the actions, and compute returns after the last step of a rollout."""
+        after = transition.obs_after
+        self.process_env_step(after, transition.rewards, transition.dones, transition.extras)
         if self.storage.step == self.storage.num_transitions_per_env:
-            self.compute_returns(transition.obs_after)
+            self.compute_returns(after)
 
     def due(self) -> bool:
         """Return that an update is due: the storage holds one rollout."""
         return True
 
     def set_progress(self, iteration: int, num_iterations: int) -> None:
-        """Prepare the update of an iteration: the warm-up of the critic, and annealing."""
+        """Prepare the update of an iteration: warm-up of the critic, and annealing."""
         self.learn_actor(iteration >= self.warm_up_iterations)
         self.anneal(iteration / num_iterations)
 
@@ -140,7 +138,7 @@ class OnDevicePPO(PPO):
         """Free the graph of the update: NCCL waits for the end of graphs with its work in them."""
         self.update_graph.reset()
 
-    # ---- rsl_rl's interface --------------------------------------------------------------------------------------
+    # ---- rsl_rl's methods --------------------------------------------------------------------------------------------
 
     def learn_actor(self, enabled: bool) -> None:
         """Choose whether the next updates train the policy too, or the value function alone."""
@@ -161,23 +159,13 @@ class OnDevicePPO(PPO):
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions and keep the transition, with a copy of observations that a task may overwrite in its step."""
-        return self.fused.act(obs) if self.fused else super().act(obs.clone())
-
-    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
-        """Keep what followed the actions, as rsl_rl does."""
-        if self.fused:
-            self.fused.add_step(rewards, dones, extras.get("time_outs"))
-        else:
-            super().process_env_step(obs, rewards, dones, extras)
+        return super().act(obs.clone())
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute returns and advantages (GAE) in place, with rsl_rl's formulas."""
-        if self.fused:
-            self.fused.compute_returns(obs)
-        else:
-            advantages = self.storage.advantages
-            super().compute_returns(obs)
-            self.storage.advantages = advantages.copy_(self.storage.advantages)
+        advantages = self.storage.advantages
+        super().compute_returns(obs)
+        self.storage.advantages = advantages.copy_(self.storage.advantages)
 
     def update(self) -> dict[str, float]:
         """Learn from the rollout in random order, epoch by epoch.
@@ -187,7 +175,7 @@ class OnDevicePPO(PPO):
             :class:`~legged_torque.learning.protocols.Learner`.
         """
         self.losses.zero_()
-        before = flattened(self._state())
+        before = flattened(self.tensors())
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(self.batch_size * self.num_mini_batches, device=self.device)
             for indices in order.split(self.batch_size):
@@ -195,7 +183,7 @@ class OnDevicePPO(PPO):
                 self.update_graph()
         self._update_normalization()
         self.storage.clear()
-        is_finite = torch.isfinite(flattened(self._state())).all().float()
+        is_finite = torch.isfinite(flattened(self.tensors())).all().float()
         numbers = torch.cat([self.losses, is_finite.unsqueeze(0)])
         if self.is_multi_gpu:
             distributed.average([numbers])
@@ -221,38 +209,21 @@ class OnDevicePPO(PPO):
         self.learning_rate = learning_rate.copy_(torch.as_tensor(self.learning_rate))
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
-        if self.fused:
-            self.fused.share_state(self.optimizer)
         self.update_graph.reset()  # the optimizer's tensors are new
         return load_iteration
 
     def action_std(self) -> Tensor:
         """Return the standard deviations of the actions that were sampled last. Shape: (..., num_actions)."""
-        return self.fused.action_std() if self.fused else self.actor.output_std
+        return self.actor.output_std
 
-    @property
-    def product_dtype(self) -> torch.dtype:
-        """Kind of numbers that matrix products take; those of float32 may be TF32."""
-        return torch.bfloat16 if self.use_mixed_precision else torch.float32
-
-    def _fuse(self) -> Any:
-        """Return the kernels, or None without Triton or a GPU that can run them, or if parts of this have none."""
-        if not has_triton(self.device) or not can_be_fused(self):
-            return None
-        from legged_torque.learning.ppo.triton.learner import can_multiply  # imports Triton
-
-        return make_fused(self) if can_multiply(self.product_dtype, self.device) else None
-
-    def _state(self) -> list[Tensor]:
-        """Return the weights, and the optimizer's moments and counters, which exist from the first step on."""
-        if self.fused:
-            return self.fused.state()
+    def tensors(self) -> list[Tensor]:
+        """Return the weights, and moments and counters of the optimizer, which exist from its first step on."""
         kept = [value for entry in self.optimizer.state.values() for value in entry.values()]
         return [*(parameter.data for parameter in self._parameters), *kept]
 
     def _restore(self, before: Tensor) -> None:
-        """Undo an update; ``before`` are the flattened numbers of :meth:`_state` before it."""
-        state = self._state()
+        """Undo an update; ``before`` are the flattened numbers of :meth:`tensors` before it."""
+        state = self.tensors()
         before = torch.cat([before, before.new_zeros(sum(map(torch.numel, state)) - len(before))])  # as they start
         for tensor, numbers in zip(state, before.split([tensor.numel() for tensor in state]), strict=True):
             tensor.copy_(numbers.view_as(tensor))
@@ -265,13 +236,6 @@ class OnDevicePPO(PPO):
                 std = model.obs_normalizer._std
                 model.update_normalization(observations)  # from the rollouts of all processes
                 model.obs_normalizer._std = std.copy_(model.obs_normalizer._std)
-
-    def _update_minibatch(self) -> None:
-        """Take one gradient step on the samples of ``indices``."""
-        if self.fused:
-            self.fused.update_minibatch()
-        else:
-            self._update_by_autograd()
 
     def loss(self) -> tuple[Tensor, Tensor]:
         """Return the loss of the samples of ``indices`` with torch's operations, and the first four LOSS_NAMES."""
@@ -292,8 +256,8 @@ class OnDevicePPO(PPO):
         loss = self.actor_learns * actor_loss + self.value_loss_coef * value_loss
         return loss, torch.stack([value_loss, surrogate_loss, entropy, kl]).detach()
 
-    def _update_by_autograd(self) -> None:
-        """Take the step with torch's operations."""
+    def update_minibatch(self) -> None:
+        """Take one gradient step on the samples of ``indices``."""
         loss, numbers = self.loss()
         kl = numbers[3]
         self.optimizer.zero_grad()
@@ -364,43 +328,3 @@ class OnDevicePPO(PPO):
 def flattened(tensors: list[Tensor]) -> Tensor:
     """Return the numbers of several tensors behind each other."""
     return torch.cat([tensor.flatten() for tensor in tensors])
-
-
-def make_fused(alg: OnDevicePPO) -> Any:
-    """Return kernels that act and learn in place of the algorithm's operations, and move its parameters to them."""
-    from legged_torque.learning.ppo.triton.learner import FusedPPO, Hyperparameters  # imports Triton
-
-    hyperparameters = Hyperparameters(
-        gamma=alg.gamma,
-        lam=alg.lam,
-        clip_param=alg.clip_param,
-        value_loss_coef=alg.value_loss_coef,
-        use_clipped_value_loss=alg.use_clipped_value_loss,
-        max_grad_norm=alg.max_grad_norm,
-        is_adaptive=alg.schedule == "adaptive",
-        learning_rates=alg.learning_rates,
-        learning_rate=alg.learning_rate,
-        kl_target=alg.kl_target,
-        entropy_weight=alg.entropy_weight,
-        actor_learns=alg.actor_learns,
-    )
-    mirror = alg.symmetry.env.mirror.maps if alg.symmetry else None
-    return FusedPPO(
-        alg.actor, alg.critic, alg.storage, alg.optimizer, hyperparameters, alg.indices, alg.losses, mirror,
-        alg.product_dtype, alg.is_multi_gpu,
-    )  # fmt: skip
-
-
-def can_be_fused(alg: OnDevicePPO) -> bool:
-    """Return whether there are kernels for all parts of an algorithm; none are for classes of a user's."""
-    models, symmetry = (alg.actor, alg.critic), alg.symmetry
-    return (
-        type(alg) is OnDevicePPO
-        and all(type(model) in (MLPModel, MultiHeadModel) for model in models)
-        and type(alg.actor.distribution) is GaussianDistribution
-        and all(read_network(model.mlp) and not model.obs_normalization for model in models)
-        and all(parameter.requires_grad for model in models for parameter in model.parameters())
-        and not alg.normalize_advantage_per_mini_batch
-        and not (symmetry and symmetry.use_mirror_loss)
-        and not (symmetry and symmetry.data_augmentation_func is not with_mirror_images)
-    )
