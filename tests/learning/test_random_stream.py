@@ -81,42 +81,18 @@ def test_a_gpu_has_a_stream_of_its_own(monkeypatch):
     assert given == [("cuda:2", (kept + 1).tolist())]
 
 
-@pytest.mark.parametrize("iteration", [1, 2])
-def test_a_resumed_run_goes_on(trained, iteration):
-    """Resumed as by train.py, the next numbers are those that came after the checkpoint was saved."""
-    runner = start(trained.root, "--resume", f"--load_run={trained.folder.name}", f"--checkpoint={iteration}")
-    assert runner.current_learning_iteration == iteration
-    assert torch.equal(torch.rand(5), trained.numbers[iteration])
-
-
-def test_the_last_checkpoint_is_the_default(trained):
-    """What the process drew after training is what a resumed run draws first."""
-    start(trained.root, "--resume")
-    assert torch.equal(torch.rand(5), trained.next)
+def test_resumed_runs_go_on_and_never_repeat_the_start(trained):
+    """Numbers are those that came after the checkpoint was saved; the seed alone leads back to the run's start."""
+    start(trained.root)
+    assert torch.equal(upcoming(), trained.start)
+    for words, expected in (([], trained.next), (["--checkpoint=1"], trained.numbers[1])):
+        start(trained.root, "--resume", f"--load_run={trained.folder.name}", *words)
+        assert torch.equal(upcoming(), expected) and not torch.isclose(upcoming(), trained.start).any()
 
 
 def test_saving_draws_nothing(trained):
     """A run goes on alike whether it saves or not."""
     assert trained.saving_draws == [False] * 3
-
-
-def random_actions(runner):
-    """The actions of a rollout in which the policy says 0, so that they are the random numbers alone."""
-    for parameter in runner.alg.actor.parameters():
-        parameter.data.zero_()
-    runner.collect_rollout()
-    return runner.alg.storage.actions
-
-
-def test_a_resumed_run_does_not_repeat_the_start(trained):
-    """The seed alone leads back to the start of the run; resumed, numbers and actions are others."""
-    again = start(trained.root)
-    assert torch.equal(upcoming(), trained.start)
-    first = random_actions(again)
-    resumed = start(trained.root, "--resume")
-    assert not torch.isclose(upcoming(), trained.start).any()
-    assert not torch.isclose(random_actions(resumed), first).any()
-    assert torch.equal(random_actions(start(trained.root)), first)
 
 
 def test_loading_alone_leaves_the_stream(trained):
