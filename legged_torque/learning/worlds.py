@@ -145,14 +145,16 @@ def load_world_state(task: Any, state: dict[str, Any]) -> None:
 def tensors_of_worlds(task: Any) -> dict[str, Tensor]:
     """Return every tensor of a task that has a row per world, by the attributes that lead to it.
 
-    Those that repeat the same memory along an axis cannot change and are left out.
+    Those that repeat the same memory along an axis cannot change and are left out; so are second names.
     """
     found: dict[str, Tensor] = {}
-    seen = set()
+    seen: set[Any] = set()
 
     def visit(value: Any, name: str) -> None:
         if isinstance(value, Tensor):
-            if task.num_envs in value.shape and value.numel() and 0 not in value.stride():
+            memory = (value.data_ptr(), value.shape, value.stride())
+            if task.num_envs in value.shape and value.numel() and 0 not in value.stride() and memory not in seen:
+                seen.add(memory)
                 found[name] = value
             return
         parts = _parts(value)
