@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque.learning.protocols import EvaluableTask
+from legged_torque.learning.protocols import Evaluation
 from legged_torque.learning.worlds import load_world_state, world_state
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils.errors import UserError, unknown_name
@@ -36,13 +36,11 @@ class TrainingEvaluator:
     and without it. Robots stuck under an early policy stay stuck until time-out, so early metrics lag.
     """
 
-    def __init__(
-        self, task: EvaluableTask, policy: Policy, settings: dict[str, Any], seed: int, capture: bool = False
-    ) -> None:
+    def __init__(self, task: Any, policy: Policy, settings: dict[str, Any], seed: int, capture: bool = False) -> None:
         """Build the worlds; on a GPU with ``capture``, they replay as CUDA graphs.
 
         Args:
-            task: The task of the training, whose counters give the curricula.
+            task: The task of the training, with ``make_evaluation``; its counters give the curricula.
             policy: What is measured.
             settings: ``num_envs``, ``num_samples`` and ``perturbation`` of the training's ``evaluation``.
             seed: Of the random numbers.
@@ -52,7 +50,7 @@ class TrainingEvaluator:
         self._random_state = seeded_state(task.device, seed)
         with own_random_numbers(task.device, self._random_state):
             num_envs = min(settings["num_envs"], task.num_envs)
-            self._evaluation = task.make_evaluation(num_envs, settings["perturbation"])
+            self._evaluation: Evaluation = task.make_evaluation(num_envs, settings["perturbation"])
             self.worlds = worlds = self._evaluation.task
             worlds.episode_length_buf = torch.randint_like(worlds.episode_length_buf, int(worlds.max_episode_length))
         self._num_steps = math.ceil(settings["num_samples"] / num_envs)

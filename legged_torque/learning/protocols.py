@@ -95,7 +95,12 @@ class Health(Protocol):
 
 
 class Task(Protocol):
-    """A batch of worlds, as the trainer uses it.
+    """A batch of worlds.
+
+    Some methods are optional. ``make_evaluation(num_envs, perturbation)`` returns an :class:`Evaluation`; without it,
+    ``evaluation.interval`` must be 0. Worlds of a task with these three go on in a resumed training, others start anew:
+    ``identity()`` returns "settings" by dotted path and hashes by what they are of, which must not change, as plain
+    values; ``world_state_dict()`` and ``load_world_state_dict(state)`` are for tensors, in nested dictionaries.
 
     Attributes:
         device: "cpu" or "cuda:N".
@@ -113,15 +118,9 @@ class Task(Protocol):
     max_episode_length: int
     num_processes: int
     total_steps: Tensor
+    episode_length_buf: Tensor
     log: EpisodeLog
     health: Health
-
-    @property
-    def episode_length_buf(self) -> Tensor:
-        """See above."""
-
-    @episode_length_buf.setter
-    def episode_length_buf(self, value: Tensor) -> None: ...
 
     def get_observations(self) -> TensorDict:
         """Return the current observations."""
@@ -155,7 +154,7 @@ class Evaluation(Protocol):
         task: The worlds.
     """
 
-    task: Any
+    task: Task
 
     def step(self, actions: Tensor) -> TensorDict:
         """Make a step, count it, and return the observations; may be captured in a CUDA graph."""
@@ -168,25 +167,6 @@ class Evaluation(Protocol):
 
     def levels(self) -> dict[str, float]:
         """Return the present levels of the curricula of the training's ground."""
-
-
-class EvaluableTask(Task, Protocol):
-    """A task in which policies can be evaluated; without this, ``evaluation.interval`` must be 0."""
-
-    cfg: Any  # settings, whose ``perturbations()`` are the environments for evaluation
-
-    def make_evaluation(self, num_envs: int, perturbation: str) -> Evaluation:
-        """Return worlds for evaluation in an environment; an empty name is that of the training."""
-
-
-class ResumableTask(Task, Protocol):
-    """A task whose worlds are kept with checkpoints; without this, they start anew when a training is resumed."""
-
-    def identity(self) -> dict[str, Any]:
-        """Return what must be the same for worlds to go on: "settings" by dotted path, and hashes by what they are of.
-
-        All values are plain, as JSON has them.
-        """
 
 
 def check_learner(alg: Any, env: Any, num_processes: int) -> None:

@@ -39,8 +39,7 @@ class OnPolicyRunner(Trainer, runners.OnPolicyRunner):
 
     def get_inference_policy(self, device: str | None = None) -> nn.Module:
         """Return the policy for inference, on a device if one is given."""
-        policy = self.alg.policy().eval()
-        return policy.to(device) if device else policy
+        return self.alg.policy().eval().to(device)
 
     def _configure_multi_gpu(self) -> None:
         """Join the processes that torchrun has started; rsl_rl's own method knows only GPUs."""

@@ -27,6 +27,8 @@ from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import told_by_name
 
 _STYLES = re.compile("\033\\[[0-9;]*m")  # escape sequences of bold or colored text
+_SHOWN = {"skipped_updates": "skipped_updates", "kl": "kl", "learning_rate": "learning_rate", "action_std": "noise"}
+"""Numbers of a learner that the display shows, and their names there."""
 _NOT_LOSSES = ("learning_rate", "action_std", "all_skipped")  # numbers of a learner that are logged elsewhere, or not
 
 
@@ -85,9 +87,8 @@ class TrainingLog:
             return
         numbers = log.pop("numbers")
         losses = {name: number for name, number in numbers.items() if name not in _NOT_LOSSES}
-        shown = {"skipped_updates": 0.0, **self._logger.ep_extras[-1], **numbers}
-        if "action_std" in numbers:
-            shown["noise"] = numbers["action_std"]
+        shown = {"skipped_updates": 0.0, **self._logger.ep_extras[-1]}
+        shown |= {_SHOWN[name]: number for name, number in numbers.items() if name in _SHOWN}
         policy = {name: numbers.get(name, math.nan) for name in ("learning_rate", "action_std")}
         policy["action_std"] = torch.tensor(policy["action_std"])
         first, last = self._iterations

@@ -246,9 +246,18 @@ class TorchPPO(PPO):
         log_prob = self.actor.get_output_log_prob(batch.actions)
         values = self.critic(batch.observations)
         entropy = self.actor.output_entropy.mean()
-        kl = self._mean_kl(batch)
-        surrogate_loss = self._surrogate_loss(batch, log_prob)
-        value_loss = self._value_loss(batch, values)
+        with torch.no_grad():  # from the policy that acted, without mirror images
+            params = tuple(params[: self.batch_size] for params in self.actor.output_distribution_params)
+            kl = self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
+        ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze(1))
+        advantages = batch.advantages.squeeze(1)
+        clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
+        error = (values - batch.returns).square()
+        if self.use_clipped_value_loss:
+            change = (values - batch.values).clamp(-self.clip_param, self.clip_param)
+            error = torch.max(error, (batch.values + change - batch.returns).square())
+        value_loss = error.mean()
         actor_loss = surrogate_loss - self.entropy_weight * entropy
         if self.symmetry and self.symmetry.use_mirror_loss:
             mirror_loss = self.symmetry.compute_loss(self.actor, batch, self.batch_size)
@@ -294,35 +303,14 @@ class TorchPPO(PPO):
             old_distribution_params=tuple(pick(params) for params in storage.distribution_params),
         )
 
-    @torch.no_grad()
-    def _mean_kl(self, batch: RolloutStorage.Batch) -> Tensor:
-        """Return the mean KL divergence of the policy from the one that acted, without mirror images. Scalar."""
-        params = tuple(params[: self.batch_size] for params in self.actor.output_distribution_params)
-        return self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
-
     def _adapt_learning_rate(self, kl: Tensor) -> None:
-        """Steer the learning rate by the mean KL divergence."""
+        """Adapt the learning rate to the mean KL divergence, if it is adaptive."""
         if self.schedule == "adaptive":
             lower = kl > 2.0 * self.kl_target
             higher = (kl < 0.5 * self.kl_target) & (kl > 0.0)
             factor = torch.where(lower, 1.0 / 1.5, torch.where(higher, 1.5, 1.0))
             factor = torch.where(self.actor_learns.bool(), factor, 1.0)  # a fixed policy has no divergence
             self.learning_rate.mul_(factor).clamp_(*self.learning_rates)
-
-    def _surrogate_loss(self, batch: RolloutStorage.Batch, log_prob: Tensor) -> Tensor:
-        """Return PPO's clipped policy loss."""
-        ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze(1))
-        advantages = batch.advantages.squeeze(1)
-        clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        return torch.max(-advantages * ratio, -advantages * clipped).mean()
-
-    def _value_loss(self, batch: RolloutStorage.Batch, values: Tensor) -> Tensor:
-        """Return the squared error of the values, clipped as rsl_rl does if asked for."""
-        error = (values - batch.returns).square()
-        if self.use_clipped_value_loss:
-            change = (values - batch.values).clamp(-self.clip_param, self.clip_param)
-            error = torch.max(error, (batch.values + change - batch.returns).square())
-        return error.mean()
 
 
 def flattened(tensors: list[Tensor]) -> Tensor:
