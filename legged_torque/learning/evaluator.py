@@ -29,118 +29,112 @@ Policy = Callable[[TensorDict], Tensor]
 
 
 class TrainingEvaluator:
-    """Evaluates the policy of a training now and then.
+    """Evaluates the policy of a training now and then, in worlds that are built for the first evaluation.
 
     Its worlds have random numbers of their own, and go on where the last evaluation left them. An evaluation has as
     many steps of robots as the paper's 16 worlds x 2000 steps, but in many worlds at once. Training is the same with
     and without it. Robots stuck under an early policy stay stuck until time-out, so early metrics lag.
+
+    Attributes:
+        name: The environment, if it is one of ``evaluation.also``; empty for that of ``evaluation.perturbation``.
     """
 
-    def __init__(self, task: Any, policy: Policy, settings: dict[str, Any], seed: int, capture: bool = False) -> None:
-        """Build the worlds; on a GPU with ``capture``, they replay as CUDA graphs.
+    def __init__(
+        self, task: Any, policy: Policy, settings: dict[str, Any], seed: int, name: str = "", capture: bool = False
+    ) -> None:
+        """Prepare; nothing is built yet.
 
         Args:
             task: The task of the training, with ``make_evaluation``; its counters give the curricula.
             policy: What is measured.
-            settings: ``num_envs``, ``num_samples`` and ``perturbation`` of the training's ``evaluation``.
+            settings: ``evaluation`` of the training's settings.
             seed: Of the random numbers.
-            capture: See above.
+            name: See above.
+            capture: Whether evaluations replay as CUDA graphs on a GPU.
         """
-        self._task, self._policy = task, policy
-        self._random_state = seeded_state(task.device, seed)
-        with own_random_numbers(task.device, self._random_state):
-            num_envs = min(settings["num_envs"], task.num_envs)
-            self._evaluation: Evaluation = task.make_evaluation(num_envs, settings["perturbation"])
-            self.worlds = worlds = self._evaluation.task
-            worlds.episode_length_buf = torch.randint_like(worlds.episode_length_buf, int(worlds.max_episode_length))
-        self._num_steps = math.ceil(settings["num_samples"] / num_envs)
-        self._warm_up_runs = math.ceil(WARM_UP_TIME / worlds.dt / self._num_steps)
+        self.name = name
+        self._task, self._policy, self._settings, self._seed = task, policy, settings, seed
+        self._num_envs = min(settings["num_envs"], task.num_envs)
+        self._num_steps = math.ceil(settings["num_samples"] / self._num_envs)
         self._graph = CudaGraph(self._run, task.device, capture and self._num_steps <= MAX_CAPTURED_STEPS)
+        self.reset()
 
-    def evaluate(self) -> dict[str, float]:
-        """Return the metrics of the policy at this moment of training."""
-        self.worlds.total_steps.copy_(self._task.total_steps)
-        self.worlds.update_curriculum()
+    def reset(self) -> None:
+        """Let the next evaluation be the first one."""
+        self._evaluation: Evaluation | None = None
+        self._random_state = seeded_state(self._task.device, self._seed)
+        self._warm_up_runs = math.ceil(WARM_UP_TIME / self._task.dt / self._num_steps)
+        self._graph.reset()
+
+    def due(self, before: int, steps: int) -> bool:
+        """Return whether to evaluate after a rollout from ``before`` to ``steps`` of the training."""
+        interval = self._settings["interval"]
+        is_time = interval > 0 and steps // interval > before // interval
+        return is_time and (not self.name or steps >= self._settings["also_from"])
+
+    def evaluate(self) -> tuple[dict[str, float], dict[str, float]]:
+        """Return the metrics of the policy, and the levels of the training's ground, at this moment of training."""
+        evaluation = self._build()
+        evaluation.task.total_steps.copy_(self._task.total_steps)
+        evaluation.task.update_curriculum()
         with own_random_numbers(self._task.device, self._random_state):
             for _ in range(self._warm_up_runs):
                 self._graph()
             self._warm_up_runs = 0
-            self._evaluation.clear()
+            evaluation.clear()
             self._graph()
-        return self._evaluation.means()
-
-    def levels(self) -> dict[str, float]:
-        """Return the levels of the training's ground at this moment."""
-        return self._evaluation.levels()
+        return evaluation.means(), evaluation.levels()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the worlds and their random numbers."""
-        return {"worlds": world_state(self.worlds), "random_state": self._random_state}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a :meth:`state_dict`; a UserError, and nothing changed, if it does not fit."""
-        load_world_state(self.worlds, state["worlds"])
-        self._random_state.update(state["random_state"])
-        self._warm_up_runs = 0
-
-    def _run(self) -> None:
-        """Let the policy act; runs as a CUDA graph."""
-        with torch.no_grad():
-            obs = self.worlds.get_observations()
-            for _ in range(self._num_steps):
-                obs = self._evaluation.step(self._policy(obs))
-
-
-class TrainingEvaluators:
-    """The evaluators of a training, each built when it is first needed.
-
-    Their names are the environments of ``evaluation.also``; "" is that of ``evaluation.perturbation``.
-    """
-
-    def __init__(self, task: Any, policy: Policy, settings: dict[str, Any], seed: int, capture: bool) -> None:
-        """Take the arguments of :class:`TrainingEvaluator`, with the settings ``evaluation`` and the training's seed.
-
-        A UserError if an environment is unknown, or the task cannot be evaluated, but shall be.
-        """
-        self._task, self._policy, self._settings, self._seed, self._capture = task, policy, settings, seed, capture
-        self._names = list(dict.fromkeys(["", *settings["also"]]))
-        self._built: dict[str, TrainingEvaluator] = {}
-        if settings["interval"] and not hasattr(task, "make_evaluation"):
-            name = type(task).__name__
-            raise UserError(f"{name} has no make_evaluation() for evaluations; set evaluation.interval=0")
-        for key in ("perturbation", "also"):
-            for name in filter(None, [settings[key]] if key == "perturbation" else settings[key]):
-                if name not in task.cfg.perturbations():
-                    raise unknown_name(f"evaluation.{key}", name, task.cfg.perturbations())
-
-    def due(self, before: int, steps: int) -> list[str]:
-        """Return the names of the evaluators to run after a rollout from ``before`` to ``steps``."""
-        interval = self._settings["interval"]
-        if interval == 0 or steps // interval == before // interval:
-            return []
-        return [name for name in self._names if not name or steps >= self._settings["also_from"]]
-
-    def get(self, name: str) -> TrainingEvaluator:
-        """Return an evaluator."""
-        if name not in self._built:
-            settings = self._settings | ({"perturbation": name} if name else {})
-            seed = self._seed + SEED * (1 + self._names.index(name))
-            self._built[name] = TrainingEvaluator(self._task, self._policy, settings, seed, self._capture)
-        return self._built[name]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the states of all that are built, with keys "evaluation" and "evaluation_<name>"."""
-        return {tagged("evaluation", name): evaluator.state_dict() for name, evaluator in self._built.items()}
+        """Return the worlds and their random numbers, by the evaluator's name; nothing if they are not built."""
+        if self._evaluation is None:
+            return {}
+        state = {"worlds": world_state(self._evaluation.task), "random_state": self._random_state}
+        return {tagged("evaluation", self.name): state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a :meth:`state_dict`, which may have further entries; a UserError if it does not fit."""
-        for name in self._names:
-            if tagged("evaluation", name) in state:
-                self.get(name).load_state_dict(state[tagged("evaluation", name)])
+        mine = state.get(tagged("evaluation", self.name))
+        if mine:
+            load_world_state(self._build().task, mine["worlds"])
+            self._random_state.update(mine["random_state"])
+            self._warm_up_runs = 0
 
-    def clear(self) -> None:
-        """Let all start anew."""
-        self._built.clear()
+    def _build(self) -> Evaluation:
+        """Return the worlds, which are built at the first call."""
+        if self._evaluation is None:
+            with own_random_numbers(self._task.device, self._random_state):
+                perturbation = self.name or self._settings["perturbation"]
+                self._evaluation = self._task.make_evaluation(self._num_envs, perturbation)
+                worlds = self._evaluation.task
+                high = int(worlds.max_episode_length)
+                worlds.episode_length_buf = torch.randint_like(worlds.episode_length_buf, high)
+        return self._evaluation
+
+    def _run(self) -> None:
+        """Let the policy act; runs as a CUDA graph."""
+        evaluation = self._build()
+        with torch.no_grad():
+            obs = evaluation.task.get_observations()
+            for _ in range(self._num_steps):
+                obs = evaluation.step(self._policy(obs))
+
+
+def make_evaluators(
+    task: Any, policy: Policy, settings: dict[str, Any], seed: int, capture: bool
+) -> list[TrainingEvaluator]:
+    """Return the evaluators of a training, with its settings ``evaluation`` and its seed.
+
+    A UserError if an environment is unknown, or the task cannot be evaluated, but shall be.
+    """
+    if settings["interval"] and not hasattr(task, "make_evaluation"):
+        raise UserError(f"{type(task).__name__} has no make_evaluation() for evaluations; set evaluation.interval=0")
+    for key, names in {"perturbation": [settings["perturbation"]], "also": settings["also"]}.items():
+        for name in filter(None, names):
+            if name not in task.cfg.perturbations():
+                raise unknown_name(f"evaluation.{key}", name, task.cfg.perturbations())
+    names = enumerate(dict.fromkeys(["", *settings["also"]]), 1)
+    return [TrainingEvaluator(task, policy, settings, seed + SEED * i, name, capture) for i, name in names]
 
 
 def append_row(file: Path, row: dict[str, float]) -> None:

@@ -11,7 +11,7 @@ import torch
 from rsl_rl.utils.logger import Logger
 
 from legged_torque.learning import checkpoint
-from legged_torque.learning.evaluator import TrainingEvaluators, append_row
+from legged_torque.learning.evaluator import append_row, make_evaluators
 from legged_torque.learning.guard import TrainingGuard
 from legged_torque.learning.protocols import Learner, Task, Transition, check_learner
 from legged_torque.learning.training_log import TrainingLog
@@ -65,7 +65,7 @@ class Trainer:
         capture = cfg["capture"] and alg.capturable
         self.rollout_graph = CudaGraph(self._collect, env.device)
         self.rollout_graph.enabled = capture and cfg["num_steps_per_env"] <= MAX_CAPTURED_STEPS
-        self._evaluators = TrainingEvaluators(env, alg.policy(), cfg["evaluation"], cfg["seed"], capture)
+        self._evaluators = make_evaluators(env, alg.policy(), cfg["evaluation"], cfg["seed"], capture)
         self.current_learning_iteration = 0
         self.on_checkpoint: Callable[[Path], None] | None = None
         self.stopped_by = 0
@@ -74,7 +74,7 @@ class Trainer:
         self._saved_iteration = -1
         self._has_old_worlds = False  # whether the worlds are those of a checkpoint
         self._log = TrainingLog(env, logger, cfg)
-        self._worlds = Worlds(env, cfg["evaluation"], [self._evaluators, self._log])
+        self._worlds = Worlds(env, cfg["evaluation"], [*self._evaluators, self._log])
 
     @property
     def log_dir(self) -> str | None:
@@ -149,7 +149,7 @@ class Trainer:
     def _evaluate(self, numbers: dict[str, float], begin: float) -> dict[str, float]:
         """Evaluate the policy where it is time, add rows to the run's tables, and return what is to be logged."""
         steps = int(self.env.total_steps)
-        due = self._evaluators.due(steps - self._log.steps_per_iteration, steps)
+        due = [each for each in self._evaluators if each.due(steps - self._log.steps_per_iteration, steps)]
         if self.logger.writer is None or not due:
             return {}
         self._log.display.activity = "evaluating"
@@ -158,12 +158,12 @@ class Trainer:
         when = {"steps": steps, "iteration": self.current_learning_iteration + 1, "seconds": seconds}
         critic = {name: numbers[name] for name in ("critic_gradient_norm",) if name in numbers}
         logged: dict[str, float] = {}
-        for name in due:
-            evaluator = self._evaluators.get(name)
-            metrics, levels = evaluator.evaluate(), evaluator.levels()
-            logged |= {f"{tagged('Evaluation', name)}/{metric}": value for metric, value in metrics.items()}
+        for evaluator in due:
+            metrics, levels = evaluator.evaluate()
+            logged |= {f"{tagged('Evaluation', evaluator.name)}/{metric}": value for metric, value in metrics.items()}
+            file = evaluations_file(Path(str(self.log_dir)), evaluator.name)
             try:
-                append_row(evaluations_file(Path(str(self.log_dir)), name), {**when, **metrics, **critic, **levels})
+                append_row(file, {**when, **metrics, **critic, **levels})
             except UserError as error:  # what is learned is worth more than the row
                 warn(f"an evaluation is not kept: {error}")
         self._log.display.activity = ""
@@ -242,7 +242,8 @@ class Trainer:
             self._worlds.read(Path(path), infos.get("worlds"))
             self._has_old_worlds = True
         except UserError as error:
-            self._evaluators.clear()
+            for evaluator in self._evaluators:
+                evaluator.reset()
             if distributed.rank() == 0:
                 print(f"The worlds start anew: {error}.")
         self.continue_random_numbers(infos)

@@ -167,7 +167,7 @@ class PointMasses:
 def make_trainer(folder=None, learner=TDLearner, task=None, **settings):
     """A trainer of a learner in point masses, with nothing but what it needs."""
     task = task or PointMasses()
-    evaluation = {"interval": 0, "also": [], "perturbation": "", "num_envs": 1}
+    evaluation = {"interval": 0, "also": [], "perturbation": "", "num_envs": 1, "num_samples": 1}
     cfg = {"num_steps_per_env": 8, "save_interval": 100, "capture": True, "seed": 0, "evaluation": evaluation}
     cfg |= {"algorithm": {}, "logger": {"class_name": "legged_torque.learning.training_log:NoLogWriter"}, **settings}
     logger = Logger(str(folder) if folder else None, cfg, {}, task.num_envs, False, 1, 0, "cpu")

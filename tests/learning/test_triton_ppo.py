@@ -26,6 +26,7 @@ from support.rollouts import (
     record_rollout,
     steps_taken,
 )
+from support.runners import build_runner, networks
 
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.multi_head import MultiHeadModel
@@ -333,6 +334,29 @@ def test_what_has_no_kernels_is_left_to_torch(what):
     else:
         alg.actor.distribution.log_std_param.requires_grad_(False)
     assert not has_kernels(alg)
+
+
+def test_a_training_with_kernels(make_task, tmp_path, monkeypatch):
+    """Where there are kernels, the same settings train with them, and a checkpoint goes on without."""
+
+    def build(**settings):
+        small = {"actor.hidden_dims": [8, 8], "actor.head_hidden_dims": [8], "critic.hidden_dims": [8]}
+        small |= {"runner.logger": "none", "algorithm.use_mixed_precision": False, "algorithm.num_learning_epochs": 1}
+        return build_runner(make_task, "a1_torque_multihead", 2, log_root=tmp_path, **small, **settings)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("legged_torque.learning.ppo.has_triton", lambda device: True)
+        patch.setattr("legged_torque.learning.ppo.triton.triton_ppo.can_multiply", lambda dtype, device: True)
+        runner = build()
+    before = {name: value.clone() for name, value in networks(runner).items()}
+    runner.learn(2)
+    assert type(runner.alg) is TritonPPO and steps_taken(runner.alg) == 2 * 2
+    assert not any(torch.equal(value, before[name]) for name, value in networks(runner).items())
+    plain = build()
+    plain.load(f"{runner.log_dir}/model_2.pt")
+    assert type(plain.alg) is OnDevicePPO and plain.current_learning_iteration == 2
+    assert all(torch.equal(value, networks(runner)[name]) for name, value in networks(plain).items())
+    plain.learn(1)
 
 
 def test_mixed_precision_is_that_of_the_kernels():
