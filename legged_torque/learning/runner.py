@@ -32,7 +32,8 @@ class OnPolicyRunner(Trainer, runners.OnPolicyRunner):
             for group in groups or [""]:
                 if group not in groups_of_task:
                     raise unknown_name(f"observation group in obs_groups.{key}", group, groups_of_task)
-        env.step_graph.enabled = train_cfg["capture"]
+        if hasattr(env, "step_graph"):
+            env.step_graph.enabled = train_cfg["capture"]
         runners.OnPolicyRunner.__init__(self, env, train_cfg, log_dir, device)
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         Trainer.__init__(self, env, self.alg, train_cfg, self.logger)

@@ -94,7 +94,7 @@ class Trainer:
         if init_at_random_ep_len and not self._has_old_worlds:
             high = int(self.env.max_episode_length)
             self.env.episode_length_buf = torch.randint_like(self.env.episode_length_buf, high=high)
-        self.alg.policy().train()  # who took it for inference has set it to evaluation
+        self.alg.policy().train()  # get_inference_policy sets it to evaluation
         if distributed.world_size() > 1:
             self.alg.broadcast_parameters()  # type: ignore[attr-defined] # check_learner has seen it
         first, last = self.current_learning_iteration, self.current_learning_iteration + num_learning_iterations

@@ -25,7 +25,7 @@ _FOREIGN = ("mujoco", "mujoco_warp", "torch", "warp")  # packages whose objects 
 
 
 class Stateful(Protocol):
-    """What keeps a state besides the task."""
+    """An object with a state."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return tensors by name."""
@@ -35,10 +35,10 @@ class Stateful(Protocol):
 
 
 class Worlds:
-    """What the processes of a training keep from step to step, apart from what is in its checkpoints."""
+    """Keeps the state of all processes of a training that is not in its checkpoints."""
 
     def __init__(self, task: Any, evaluation: dict[str, Any], others: list[Stateful]) -> None:
-        """Take the task, the settings ``evaluation``, and what else has a state that belongs to the worlds."""
+        """Take the task, the settings ``evaluation``, and other objects whose state belongs to the worlds."""
         self._task, self._others = task, others
         self._evaluation = {key: evaluation[key] for key in ("num_envs", "perturbation")}
 
@@ -79,9 +79,12 @@ class Worlds:
         if len(processes) != distributed.world_size():
             raise UserError(f"{len(processes)} processes have trained, now there are {distributed.world_size()}")
         state = processes[distributed.rank()]
-        for other in self._others:
-            other.load_state_dict(state)
-        load_world_state(self._task, state["worlds"])
+        try:
+            for other in self._others:
+                other.load_state_dict(state)
+            load_world_state(self._task, state["worlds"])
+        except (RuntimeError, KeyError, TypeError, ValueError) as error:
+            raise UserError(f"'{file}' does not fit: {checkpoint.last_line(error)}") from None
 
     def _identity(self) -> dict[str, Any]:
         """Return what must be the same for worlds to go on: the task's identity, and settings of ``evaluation``."""

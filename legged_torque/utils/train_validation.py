@@ -13,7 +13,7 @@ def check_train_cfg(train_cfg: Any) -> None:
     """Raise a UserError that names the first setting of a training that makes no sense."""
     check_section(train_cfg)
     rate = train_cfg.algorithm
-    if rate.schedule == "adaptive" and rate.learning_rate > rate.max_learning_rate:
+    if getattr(rate, "schedule", None) == "adaptive" and rate.learning_rate > rate.max_learning_rate:
         raise UserError(
             f"algorithm.learning_rate must be at most algorithm.max_learning_rate, {rate.max_learning_rate}, not "
             f"{rate.learning_rate}"

@@ -110,8 +110,8 @@ def test_training_does_not_notice(make_runner):
     assert rows[0] is None and len(rows[1]) == 3 and rows[1] == rows[2]  # further evaluations change no other
 
 
-def test_worlds_settle_before_the_first_evaluation(make_runner, noted, monkeypatch):
-    """For as long as it is said, in runs of whole evaluations; what happens then does not count."""
+def test_warm_up_before_the_first_evaluation(make_runner, noted, monkeypatch):
+    """It takes whole evaluations of at least that time, which do not count."""
     monkeypatch.setattr(evaluator, "WARM_UP_TIME", 0.1)  # 5 steps, of an evaluation's 3
     runner = make_runner(**{"evaluation.num_samples": 9, "evaluation.num_envs": 3, "evaluation.interval": 16})
     runner.learn(2)
@@ -164,7 +164,7 @@ def test_environment_of_the_evaluation(make_runner, noted, chosen, expected):
 
 
 def test_further_environments(make_runner, noted):
-    """They are measured from their step on, in worlds of their own that settle on their own, and logged apart."""
+    """They are measured from their step on, in worlds of their own, and logged apart."""
     also = {"evaluation.also": ["high", "none"], "evaluation.also_from": 30, "evaluation.interval": 16}
     runner = make_runner(perturbation="low", **also, **{"runner.logger": "tensorboard"})
     runner.learn(3)
@@ -181,7 +181,7 @@ def test_further_environments(make_runner, noted):
 
 
 def test_unknown_environment(make_runner, tmp_path):
-    """It is told at once, with the nearest name, and nothing is written."""
+    """It is refused at once, with the nearest name, and nothing is written."""
     assert "unknown evaluation.also 'hihg'; did you mean 'high'?" in error_of(
         make_runner, **{"evaluation.also": ["low", "hihg"]}
     )

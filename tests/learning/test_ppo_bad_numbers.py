@@ -1,4 +1,4 @@
-"""Updates that must not happen: numbers that are not finite."""
+"""Updates from numbers that are not finite are skipped or undone."""
 
 import copy
 import math
@@ -110,12 +110,12 @@ def test_learning_rate_ignores_an_undefined_divergence():
 
 
 def spoil_learning_rate(value):
-    """What makes the learning rate a bad one."""
+    """A function that spoils the learning rate."""
     return lambda alg: alg.learning_rate.fill_(value)
 
 
 def spoil_moment(name, value):
-    """What makes one number of Adam's moments, or a counter of its steps, a bad one."""
+    """A function that spoils one of Adam's moments, or a counter of its steps."""
 
     def spoil(alg):
         entry = list(alg.optimizer.state.values())[2]  # of the actor's first bias

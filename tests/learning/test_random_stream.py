@@ -48,7 +48,7 @@ def trained(tmp_path_factory):
 
 
 def states_of(run, iteration):
-    """What a checkpoint says of the random numbers."""
+    """The random states in a checkpoint."""
     return torch.load(run.folder / f"model_{iteration}.pt", weights_only=True)["infos"]["random_states"]
 
 
@@ -96,7 +96,7 @@ def test_saving_draws_nothing(trained):
 
 
 def test_loading_alone_leaves_the_stream(trained):
-    """play.py and the like draw as their own seed says; a state of the checkpoint is only for who asks for it."""
+    """play.py and others keep the numbers of their own seed; only resuming takes those of the checkpoint."""
     runner = start(trained.root)
     torch.manual_seed(9)
     infos = runner.load(str(trained.folder / "model_2.pt"))
@@ -137,7 +137,7 @@ def test_every_process_takes_its_own(trained, monkeypatch):
 
 
 def test_states_of_all_processes_are_kept(trained, tmp_path, monkeypatch):
-    """What is saved is the list that all processes have gathered, in their order."""
+    """The states of all processes are saved, in their order."""
     others = [{"cpu": torch.full((3,), rank, dtype=torch.uint8)} for rank in range(3)]
     monkeypatch.setattr(distributed, "gather", lambda mine: [mine, *others])
     trained.runner.save(str(tmp_path / "model_0.pt"))

@@ -216,7 +216,7 @@ def test_worlds_start_anew(copied, tmp_path, capsys, case):
 
 
 def test_another_number_of_processes(copied, tmp_path, capsys):
-    """It is told like another setting."""
+    """A line says so, as for another setting."""
     file, model = copied / "worlds_2.pt", copied / "model_2.pt"
     content = torch.load(file, weights_only=True)
     digest = checkpoint.write(file, {**content, "processes": content["processes"] * 2})
@@ -345,7 +345,7 @@ def test_curves_that_cannot_be_written(tmp_path, capsys, fault):
 
 
 def test_worlds_that_cannot_be_written(tmp_path, capsys):
-    """The checkpoint is kept without them, and the last worlds stay beside their own."""
+    """The checkpoint is kept without them, and the last worlds stay with theirs."""
     runner = train(tmp_path, 1)
     (Path(runner.log_dir) / "worlds_2.pt").mkdir()
     runner.learn(1)

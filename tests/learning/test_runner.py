@@ -347,7 +347,7 @@ def test_signal_during_an_iteration(make_runner, tmp_path):
 
 
 def test_wandb(monkeypatch, tmp_path):
-    """It gets the settings as plain values; what it refuses is told in one line."""
+    """It gets the settings as plain values; its errors become one line."""
     uploaded = {}
     wandb = SimpleNamespace(
         Error=ArithmeticError, config=SimpleNamespace(update=uploaded.update), init=lambda **_: None

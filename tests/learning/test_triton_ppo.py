@@ -251,7 +251,7 @@ def test_the_critic_learns_alone():
 
 
 def test_checkpoints_go_both_ways():
-    """What the fused update has learned, torch's update goes on with, and the other way round; both then agree."""
+    """Torch continues from a checkpoint of the kernels, and the other way round; both then agree."""
     first = make()
     record_rollout(first)
     choose([first], 0)

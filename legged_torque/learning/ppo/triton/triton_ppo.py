@@ -57,7 +57,11 @@ class TritonPPO(TorchPPO):
         self.compiled: set[str] = set()  # methods whose kernels have been compiled
         self.product_dtype = torch.bfloat16 if self.use_mixed_precision else torch.float32
         self._models = (actor, critic)
-        self._networks = networks = [network for m in self._models if (network := read_network(m.mlp))]
+        actor_network = read_network(actor.mlp)
+        assert actor_network, "has_kernels has read it"
+        critic_network = read_network(critic.mlp, actor_network.num_outputs)
+        assert critic_network, "has_kernels has read it"
+        self._networks = networks = (actor_network, critic_network)
         layers = [layer for network in networks for layer in network.layers]
         self._std = self._deviation_settings()
         self._packed = Parameters(actor, critic, layers, self._std[0], self.product_dtype)
