@@ -20,7 +20,7 @@ from legged_torque.utils.cli import Parser, check_output, importing, run_script,
 
 
 def main() -> None:
-    """Load a checkpoint and write policy.onnx, policy.pt and policy.yaml."""
+    """Load a checkpoint and write policy.onnx, policy.pt and policy.yaml; print what the latter does not describe."""
     parser = Parser(__doc__)
     add_task_args(parser)
     parser.add_argument("--out", type=Path, help="folder to write; default: exported_<checkpoint> in the run's folder")
@@ -36,11 +36,15 @@ def main() -> None:
     out = args.out or run.folder / f"exported_{iterations}"
     training = {"run": run.folder.name, "checkpoint": run.checkpoint.name}
     training |= {"iterations": iterations, "total_steps": int(env.total_steps)}
-    difference = export_policy(env, runner.alg.policy(), out, args.task, training)
+    difference, unsupported = export_policy(env, runner.alg.policy(), out, args.task, training)
     print(f"{run.checkpoint}, after {training['total_steps']:,} steps of training:")
     print(f"  exported to {out}: policy.onnx, policy.pt, policy.yaml")
     print(f"  largest difference to the checkpoint's network: {difference:.2g}")
-    print(f"See it in plain MuJoCo: {script_command('sim2sim')} {out}")
+    if unsupported:
+        print("  policy.yaml does not describe the whole task, so sim2sim.py refuses it; the networks are complete:")
+        print("".join(f"  - {problem}\n" for problem in unsupported), end="")
+    else:
+        print(f"See it in plain MuJoCo: {script_command('sim2sim')} {out}")
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ def main() -> None:
         from legged_torque.importer.mjcf import mjcf
         from legged_torque.importer.robot import import_robot
         from legged_torque.importer.settings import settings
-        from legged_torque.importer.standing import draw, fused_problem, measure, parse
+        from legged_torque.importer.trial import draw, fused_problem, parse, stand
     robot = import_robot(args.file, args.name, args.torque_limit)
     folder = args.out or RESOURCES_DIR / "robots" / robot.name
     model_file = folder / f"{robot.name}.xml"
@@ -57,12 +57,12 @@ def main() -> None:
     print(f"wrote {model_file}\nwrote {code_file}")
     print(problem or "sim.engine 'fused' simulates it")
     if args.check:
-        result, data = measure(model, *robot.gains())
+        result, data = stand(model, robot.gains())
         print(f"5 s under PD: {result}")
         if no_picture:
             print(f"no picture: {no_picture}")
         else:
-            draw(model, data, folder / f"{robot.name}.png")
+            draw(data, folder / f"{robot.name}.png")
             print(f"wrote {folder / robot.name}.png")
     if args.out:
         print(f"To have its tasks, put {code_file.name} into {Path(package).parent / 'envs' / 'robots'}")

@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.nn.utils import parameters_to_vector
 
 from legged_torque.learning.runner import OnPolicyRunner
-from legged_torque.learning.worlds import load_world_state, world_state
 from legged_torque.utils.task_registry import set_seed
 
 WARM_UP_ITERATIONS = 2  # iterations before everything is replayed: the first runs as it is, the second captures
@@ -50,7 +49,7 @@ def compare_capture(plain: OnPolicyRunner, captured: OnPolicyRunner, seed: int) 
     Returns:
         By quantity: observations by group, actions, rewards, returns, the changes of actor and critic, and all losses.
     """
-    start = [tensor.clone() for tensor in _state(plain)], copy.deepcopy(world_state(plain.env))
+    start = [tensor.clone() for tensor in _state(plain)], copy.deepcopy(plain.env.world_state_dict())
     expected, rollout = _iterate(plain, start, seed)
     repeated, _ = _iterate(plain, start, seed, rollout)
     actual, _ = _iterate(captured, start, seed, rollout)
@@ -113,7 +112,7 @@ def _iterate(
     state, worlds = start
     for tensor, value in zip(_state(runner), state, strict=True):
         tensor.copy_(value)
-    load_world_state(env, worlds)
+    env.load_world_state_dict(worlds)
     set_seed(seed)
     env.reset()
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))

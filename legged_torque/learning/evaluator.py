@@ -13,7 +13,6 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.learning.protocols import Evaluation
-from legged_torque.learning.worlds import load_world_state, world_state
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.files import told_by_name
@@ -89,14 +88,14 @@ class TrainingEvaluator:
         """Return the worlds and their random numbers, by the evaluator's name; nothing if they are not built."""
         if self._evaluation is None:
             return {}
-        state = {"worlds": world_state(self._evaluation.task), "random_state": self._random_state}
+        state = {"worlds": self._evaluation.task.world_state_dict(), "random_state": self._random_state}
         return {tagged("evaluation", self.name): state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a :meth:`state_dict`, which may have further entries; a UserError if it does not fit."""
         mine = state.get(tagged("evaluation", self.name))
         if mine:
-            load_world_state(self._build().task, mine["worlds"])
+            self._build().task.load_world_state_dict(mine["worlds"])
             self._random_state.update(mine["random_state"])
             self._warm_up_runs = 0
 

@@ -151,10 +151,10 @@ class Evaluation(Protocol):
     """Worlds of their own in which a policy is measured while it trains.
 
     Attributes:
-        task: The worlds.
+        task: The worlds, a :class:`Task` that keeps its worlds.
     """
 
-    task: Task
+    task: Any
 
     def step(self, actions: Tensor) -> TensorDict:
         """Make a step, count it, and return the observations; may be captured in a CUDA graph."""

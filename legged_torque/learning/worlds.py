@@ -6,22 +6,16 @@ checkpoint, and those of earlier checkpoints are removed after it: a kill leaves
 
 from __future__ import annotations
 
-import inspect
 import json
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
-from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.learning import checkpoint
 from legged_torque.utils import distributed
-from legged_torque.utils.config import Section
 from legged_torque.utils.display import warn
 from legged_torque.utils.errors import UserError
-
-_FOREIGN = ("mujoco", "mujoco_warp", "torch", "warp")  # packages whose objects hold no state of a task
 
 
 class Stateful(Protocol):
@@ -49,7 +43,7 @@ class Worlds:
         """
         if not hasattr(self._task, "identity"):
             return ""
-        state = {"worlds": world_state(self._task)}
+        state = {"worlds": self._task.world_state_dict()}
         for other in self._others:
             state |= other.state_dict()
         processes = distributed.gather(on_cpu(state))
@@ -82,7 +76,7 @@ class Worlds:
         try:
             for other in self._others:
                 other.load_state_dict(state)
-            load_world_state(self._task, state["worlds"])
+            self._task.load_world_state_dict(state["worlds"])
         except (RuntimeError, KeyError, TypeError, ValueError) as error:
             raise UserError(f"'{file}' does not fit: {checkpoint.last_line(error)}") from None
 
@@ -121,64 +115,3 @@ def on_cpu(state: Any) -> Any:
     if isinstance(state, dict):
         return {key: on_cpu(value) for key, value in state.items()}
     return state.detach().cpu().clone() if isinstance(state, Tensor) else state
-
-
-def world_state(task: Any) -> dict[str, Any]:
-    """Return what a task keeps from step to step, apart from what its ``state_dict`` returns: tensors by name."""
-    return task.world_state_dict() if hasattr(task, "world_state_dict") else tensors_of_worlds(task)
-
-
-def load_world_state(task: Any, state: dict[str, Any]) -> None:
-    """Write a :func:`world_state` into a task; a UserError, and nothing written, if it does not fit."""
-    if hasattr(task, "load_world_state_dict"):
-        task.load_world_state_dict(state)
-        return
-    tensors = tensors_of_worlds(task)
-    kept, found = ({name: (t.shape, t.dtype) for name, t in each.items()} for each in (state, tensors))
-    other = sorted(name for name in kept.keys() | found.keys() if kept.get(name) != found.get(name))
-    if other:
-        raise UserError(f"the task keeps other tensors than it did: {', '.join(other[:5])}")
-    for name, tensor in tensors.items():
-        tensor.copy_(state[name])
-
-
-# ---- until LeggedRobot has world_state_dict() and load_world_state_dict(), its tensors are found by reflection -------
-
-
-def tensors_of_worlds(task: Any) -> dict[str, Tensor]:
-    """Return every tensor of a task that has a row per world, by the attributes that lead to it.
-
-    Those that repeat the same memory along an axis cannot change and are left out; so are second names.
-    """
-    found: dict[str, Tensor] = {}
-    seen: set[Any] = set()
-
-    def visit(value: Any, name: str) -> None:
-        if isinstance(value, Tensor):
-            memory = (value.data_ptr(), value.shape, value.stride())
-            if task.num_envs in value.shape and value.numel() and 0 not in value.stride() and memory not in seen:
-                seen.add(memory)
-                found[name] = value
-            return
-        parts = _parts(value)
-        if parts and id(value) not in seen:
-            seen.add(id(value))
-            for key, part in parts.items():
-                visit(part, f"{name}.{key}" if name else str(key))
-
-    visit(task, "")
-    return found
-
-
-def _parts(value: Any) -> dict[Any, Any]:
-    """Return what a container or an object holds, by key or attribute, unless it follows from the rest."""
-    if isinstance(value, (dict, TensorDict)):
-        return dict(value.items())
-    if isinstance(value, (list, tuple)):
-        return dict(enumerate(value))
-    is_code = inspect.isroutine(value) or inspect.isclass(value) or inspect.ismodule(value)
-    is_foreign = type(value).__module__.split(".")[0] in _FOREIGN
-    if is_code or is_foreign or isinstance(value, Section):
-        return {}
-    kept = getattr(value, "__dict__", {})
-    return {key: part for key, part in kept.items() if not isinstance(getattr(type(value), key, None), cached_property)}

@@ -52,9 +52,14 @@ class Section:
             setattr(self, key, value)
 
 
+def section_names(section: type) -> list[str]:
+    """Return the names of the settings and sections of a class; methods are neither."""
+    return [name for name in dir(section) if not name.startswith("_") and not inspect.isroutine(getattr(section, name))]
+
+
 def _check_names(cls: type[Section]) -> None:
     """Refuse names of a class that no base class has and that it does not declare new."""
-    known = [name for base in cls.__bases__ for name in dir(base) if not name.startswith("_")]
+    known = [name for base in cls.__bases__ for name in section_names(base)]
     annotated = inspect.get_annotations(cls)
     where = cls.__qualname__.rpartition("<locals>.")[2]
     for name, value in vars(cls).items():
@@ -91,6 +96,10 @@ def _merge(cls: type[Section], name: str) -> type[Section]:
 
 class BaseConfig(Section):
     """A whole configuration: settings in sections, and nothing but sections on top."""
+
+    def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Return the settings of an older run, as nested dictionaries, in today's layout."""
+        return values
 
 
 def section_keys(section: Any) -> list[str]:

@@ -90,10 +90,9 @@ def apply_options(
         env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
     if run_config:
         for part, cfg in {"env": env_cfg, "train": train_cfg}.items():
-            update_from_dict(cfg, cfg.of_older_runs())
             if not isinstance(run_config[part], dict):
                 raise UserError(f"config key '{part}' is a section with entries, not the value {run_config[part]!r}")
-            update_from_dict(cfg, run_config[part])
+            update_from_dict(cfg, cfg.upgraded(run_config[part]))
     if options.perturbation:
         apply_perturbation(env_cfg, options.perturbation)
     if options.ranges:

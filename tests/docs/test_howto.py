@@ -178,6 +178,29 @@ def test_approach_in_kernel(run_page):
     torch.testing.assert_close(tasks[1].torques, tasks[0].torques, rtol=1e-3, atol=1e-3)
 
 
+def test_motor(run_page):
+    """The rate limit acts inside the kernel: 1.5 N m per physics step."""
+    run_page("docs/howto/motor.md")
+    task = make("a1_slew", "init_state.pos=[0, 0, 50]")
+    assert not task.notes
+    task.step(torch.full((4, 12), 2.0))
+    torch.testing.assert_close(task.torques, torch.full((4, 12), 6.0))
+    train(task, "a1_slew")
+
+
+def test_sensor(run_page):
+    """Rays are as long as the trunk is high, two control steps late."""
+    run_page("docs/howto/observation.md")
+    task = make("a1_ray")
+    heights = []
+    for _ in range(6):
+        heights.append(task.base_pos[:, 2].clone())
+        obs = task.step(torch.zeros(4, 12))[0]
+    seen = obs["policy"][:, -2:]
+    assert (seen == seen[:, :1]).all() and not torch.equal(seen[:, 0], task.base_pos[:, 2])
+    assert any(torch.allclose(seen[:, 0], height) for height in heights)
+
+
 def test_robot(run_page):
     """The page's robot stands under PD control as in MuJoCo's own simulation, and can be trained."""
     (xml,) = blocks("docs/howto/robot.md", "xml")

@@ -236,7 +236,7 @@ def test_what_is_observed_of_two_rates(make_task):
 @pytest.mark.parametrize("delay", [3, 6])
 def test_two_rates_behind_a_delay(make_task, delay):
     """What is delayed is what acts: held positions and torques arrive together."""
-    task = make_task(TWO_RATES, 2, **HIGH_UP, **{"domain_rand.action_delay": [delay, delay]})
+    task = make_task(TWO_RATES, 2, **HIGH_UP, **{"motors.delay.range": [delay, delay]})
     torques_in_torch(task)
     states, step = [], task.sim.step
 

@@ -66,7 +66,7 @@ def test_no_number_may_be_anything(bad):
         *("actor.hidden_dims=[-1]", "actor.hidden_dims=[]", "algorithm.learning_rate=0", "actor.hidden_dims=[1.5]"),
         *("domain_rand.keep_fixed=[5]", "domain_rand.foot_radius=[]", "domain_rand.foot_radius=[0.02]"),
         *("domain_rand.gravity=[10, 9]", "domain_rand.ground_friction=[-1, 1]", "domain_rand.push_velocity=null"),
-        *("domain_rand.action_delay=[0.5, 1]", "domain_rand.action_delay=[-1, 1]", "noise.add_noise=1"),
+        *("motors.delay.range=[0.5, 1]", "motors.delay.range=[-1, 1]", "noise.add_noise=1"),
         *("commands.ranges.lin_vel_x=[1]", "commands.resampling_probability=1.5", "sim.engine=fusedd"),
         *("rewards.curriculum.tracking_lin_vel.t_start=20000000", "algorithm.max_learning_rate=1e-5"),
         *("evaluation.interval=-1", "runner.save_interval=0", "seed=-1", "algorithm.schedule=adaptiv"),
@@ -86,8 +86,8 @@ def test_a_variants_own_settings():
         rate: Positive = 1.0
         number: Count | None = None
         kind: Literal["a", "b"] = "a"
-        sizes: Annotated[dict[str, float], Limits(0, 2)] = {"x": 1.0}  # noqa: RUF012
-        limits: Interval = [0, 1]  # noqa: RUF012
+        sizes: Annotated[dict[str, float], Limits(0, 2)] = {"x": 1.0}
+        limits: Interval = [0, 1]
 
     class Other(Variant):
         rate = -1.0

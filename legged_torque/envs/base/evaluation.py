@@ -29,7 +29,7 @@ class WalkingEvaluation:
 
     def step(self, actions: Tensor) -> TensorDict:
         """Make a control step, measure it, and return the observations."""
-        commands = self.task.commands.clone()
+        commands = self.task.state.commands.clone()
         obs = self.task.step(actions)[0]
         self._metrics.add_step(commands)
         return obs

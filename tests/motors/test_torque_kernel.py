@@ -1,5 +1,6 @@
 """Torques inside the physics kernel: as in torch, as by hand, and never those of a method that was overridden."""
 
+import dataclasses
 import functools
 
 import mujoco
@@ -12,12 +13,9 @@ from support.episodes import HIGH_UP, time_out
 from support.fused import compiled, make_walker, random
 from support.settings import torques_in_torch
 
-from legged_torque.envs.base.control_laws import PdControl, pd_torque
+from legged_torque.envs.base.actions import PdControl, pd_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.robots.a1 import A1Cfg
-from legged_torque.motors import MOTORS
-from legged_torque.motors.drive import in_kernel
-from legged_torque.motors.ideal import IdealMotor, IdealMotors, ideal_torque
 from legged_torque.sim.simulator import ENGINES, Simulator
 
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "contact_found", "contact_force")
@@ -97,10 +95,10 @@ def test_only_the_fused_engine_drives():
     ("name", "settings"),
     [
         ("a1_position", {"domain_rand.randomize_parameters": True}),
-        ("a1_torque", {"domain_rand.action_delay": [0, 9], "control.decimation": 3}),
-        ("a1_multihead", {"domain_rand.action_delay": [1, 2], "domain_rand.action_delay_unit": "control_steps"}),
-        ("a1_torque_multihead", {"domain_rand.action_delay": [2, 6]}),
-        ("a1_multihead_two_rates", {"domain_rand.action_delay": [0, 5], "init_state.pos": [0.0, 0.0, 0.3]}),
+        ("a1_torque", {"motors.delay.range": [0, 9], "control.decimation": 3}),
+        ("a1_multihead", {"motors.delay.range": [1, 2], "motors.delay.unit": "control_steps"}),
+        ("a1_torque_multihead", {"motors.delay.range": [2, 6]}),
+        ("a1_multihead_two_rates", {"motors.delay.range": [0, 5], "init_state.pos": [0.0, 0.0, 0.3]}),
     ],
 )
 def test_as_in_torch(make_task, name, settings):
@@ -140,7 +138,7 @@ class Uneven(LeggedRobot):
 
     def _init_buffers(self):
         super()._init_buffers()
-        self.action_scale = torch.linspace(0.1, 0.4, self.num_dof).repeat(self.num_envs, 1)
+        self.control.action_scale = torch.linspace(0.1, 0.4, self.num_dof).repeat(self.num_envs, 1)
 
 
 def test_scales_that_differ_between_joints():
@@ -177,24 +175,23 @@ class Heir(Doubled):
 
 
 @wp.func
-def doubled(task: PdControl, actions: wp.array[float], world: int, joint: int, pos: float, vel: float) -> float:
+def doubled(pd: PdControl, action: float, world: int, joint: int, pos: float, vel: float) -> float:
     """Return twice the torque of position control."""
-    return 2.0 * pd_torque(task, actions, world, joint, pos, vel)
+    return 2.0 * pd_torque(pd, action, world, joint, pos, vel)
 
 
-class DoubledInKernel(Doubled):
-    """Names a function of its own again."""
+class DoubledInKernel(LeggedRobot):
+    """Has a law of its own."""
 
-    @in_kernel(doubled)
-    def _compute_torques(self, actions):
-        return super()._compute_torques(actions)
+    def action_terms(self):
+        return [dataclasses.replace(super().action_terms()[0], law=doubled)]
 
 
 @pytest.mark.parametrize(
     ("robot", "launch"), [(Doubled, "step"), (Wrapped, "step"), (Heir, "step"), (DoubledInKernel, "drive")]
 )
 def test_overrides_count(robot, launch):
-    """A class that overrides only the torch method gets its own torques, whatever its bases name for the kernel."""
+    """A class that overrides the method gets its own torques, and a note says that they leave the kernel."""
     cfg = A1Cfg()
     cfg.env.num_envs, cfg.control.decimation, cfg.init_state.pos = 2, 1, HIGH_UP["init_state.pos"]
     task = robot(cfg)
@@ -203,6 +200,7 @@ def test_overrides_count(robot, launch):
     assert notes == [launch]
     expected = np.clip(2.0 * pd_by_hand(0.3, q, qd), -TORQUE_LIMIT, TORQUE_LIMIT)
     np.testing.assert_allclose(task.torques, expected, atol=1e-4)
+    assert any("outside of the physics kernel" in note for note in task.notes) == (launch == "step")
 
 
 def test_override_of_one_task_counts(make_task):
@@ -218,32 +216,13 @@ def test_override_of_one_task_counts(make_task):
     assert notes == ["drive", "step", "drive"] and not (task.torques == 7.0).any()
 
 
-class Weak(IdealMotors):
-    """Motors that give half, said in torch only."""
-
-    def apply(self, wanted, dof_vel, out):
-        super().apply(0.5 * wanted, dof_vel, out)
-
-
-@wp.func
-def weak_torque(motors: IdealMotor, world: int, joint: int, wanted: float, vel: float) -> float:
-    """Return half."""
-    return ideal_torque(motors, world, joint, 0.5 * wanted, vel)
-
-
-class WeakInKernel(IdealMotors):
-    """The same inside the kernel."""
-
-    @in_kernel(weak_torque)
-    def apply(self, wanted, dof_vel, out):
-        raise AssertionError("the kernel does this")
-
-
-@pytest.mark.parametrize(("motors", "launch"), [(Weak, "step"), (WeakInKernel, "drive")])
-def test_motors(make_task, monkeypatch, motors, launch):
-    """Motors act as their own method or function says; one that lacks a function takes the task to torch."""
-    monkeypatch.setitem(MOTORS, "weak", motors)
-    task = make_task("a1_torque", 2, **HIGH_UP, **{"motors.model": "weak", "control.torque_scale": 4.0})
-    notes = launches(task)
-    task.step(torch.full((2, 12), 3.0))
-    assert set(notes) == {launch} and (task.torques == 6.0).all()
+def test_terms_by_themselves(make_task):
+    """Each action term gives its own torques, whatever its weight."""
+    task = make_task("a1_multihead", 3)
+    task.total_steps.fill_(40_000_000)
+    task.update_curriculum()
+    positions, torques = task.control_law.terms
+    actions = torch.randn(3, 12)
+    expected = pd_by_hand(actions.numpy(), task.dof_pos.numpy(), task.dof_vel.numpy())
+    np.testing.assert_allclose(positions.torques(actions, task.dof_pos, task.dof_vel), expected, rtol=1e-5, atol=1e-4)
+    torch.testing.assert_close(torques.torques(actions, task.dof_pos, task.dof_vel), 4.0 * actions)
