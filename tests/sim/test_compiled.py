@@ -9,7 +9,7 @@ from support.settings import error_of
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.tasks import A1TorqueCfg
-from legged_torque.sim.randomization import Parameter, Randomization
+from legged_torque.sim.randomization import Randomization, RandomParameter
 from legged_torque.utils import compiled as module
 from legged_torque.utils.compiled import compiled
 from legged_torque.utils.progress import TORCH_COMPILES
@@ -160,7 +160,7 @@ def test_draws_of_a_step_are_independent(make_task):
     settings |= {"domain_rand.push_robots": True, "domain_rand.push_probability": 1.0}
     task = make_task("a1_torque", 3000, **settings, **{"domain_rand.randomize_parameters": True})
     task.reset()
-    columns = [task.commands, task.init_angles[:, :1], task.sim.qvel[:, :3], task.motor_strength[:, :1]]
+    columns = [task.commands, task.events.init_angles[:, :1], task.sim.qvel[:, :3], task.motor_strength[:, :1]]
     columns += [task.p_gains[:, :1]]
     correlation = torch.corrcoef(torch.cat(columns, dim=1).T) - torch.eye(9)
     assert torch.isfinite(correlation).all() and correlation.abs().max() < 4.5 / math.sqrt(3000)
@@ -169,7 +169,7 @@ def test_draws_of_a_step_are_independent(make_task):
 def test_a_draw_follows_from_its_seeds():
     """The same seeds give the same numbers, world by world, and others give others."""
     field = torch.zeros(6, 2)
-    drawn = Randomization([Parameter("number", field, [0, 1], base=0.0, offset=(0.0, 1.0))], 6, "cpu")
+    drawn = Randomization([RandomParameter("number", field, [0, 1], {"set": [0.0, 1.0]})], {}.get, 6, "cpu")
     everywhere = torch.ones(6, dtype=torch.bool)
     drawn.seeds.copy_(torch.tensor([1, 2, 3, 1, 2, 4]))
     drawn.draw(everywhere)
