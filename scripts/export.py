@@ -5,18 +5,12 @@ Examples:
     python scripts/export.py --task=a1_torque_multihead --load_run=RUN --checkpoint=500 --out=exported
 """
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 from pathlib import Path
 
 from legged_torque.deploy.description import DESCRIPTION_FILE
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, check_output, importing, run_script, script_command
+from legged_torque.utils.cli import Parser, check_output, run_script, script_command, slow_imports
 
 
 def main() -> None:
@@ -28,7 +22,7 @@ def main() -> None:
     if args.out:
         check_output(args.out / DESCRIPTION_FILE)
     options = options_of(args)
-    with importing():
+    with slow_imports():
         run = task_registry.load_run(options)
         from legged_torque.deploy.export import export_policy, nominal_cfg
     env, runner = task_registry.make_loaded(run, options, nominal_cfg(run.env_cfg))

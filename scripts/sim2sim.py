@@ -8,14 +8,6 @@ Examples:
 
 from __future__ import annotations
 
-import sys
-
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import choose_offscreen_renderer
-
-end_on_interrupt()
-NO_RENDERER = None if "--viewer" in sys.argv else choose_offscreen_renderer()  # before anything imports mujoco
-
 import argparse
 import contextlib
 import importlib.metadata
@@ -29,11 +21,12 @@ from legged_torque.utils.cli import (
     check_at_least,
     check_output,
     finite,
-    importing,
     run_script,
-    write_json,
+    slow_imports,
 )
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import write_json
+from legged_torque.utils.rendering import choose_offscreen_renderer
 
 if TYPE_CHECKING:
     from legged_torque.deploy.policy import Policy
@@ -82,7 +75,8 @@ def parse_args() -> argparse.Namespace:
 def main() -> None:
     """Load a policy and a robot, simulate, print the metrics, and write JSON and video if asked to."""
     args = parse_args()
-    with importing():
+    no_renderer = None if args.viewer else choose_offscreen_renderer()
+    with slow_imports():
         import numpy as np
 
         from legged_torque.deploy.ground import select_ground
@@ -122,7 +116,7 @@ def main() -> None:
     if args.json:
         write_results(args, policy, notes, metrics)
     if recorder:
-        recorder.save(args.video, NO_RENDERER)
+        recorder.save(args.video, no_renderer)
 
 
 def write_results(args: argparse.Namespace, policy: Policy, notes: list[str], metrics: dict[str, Estimate]) -> None:
@@ -136,4 +130,4 @@ def write_results(args: argparse.Namespace, policy: Policy, notes: list[str], me
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, draws=True)

@@ -10,9 +10,9 @@ from typing import Any
 
 import yaml
 
-from legged_torque.utils.config import Dumper, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import LARGEST
+from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 
 DESCRIPTION_FILE = "policy.yaml"
 NETWORK_FILE = "policy.onnx"

@@ -13,10 +13,10 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.learning.protocols import Evaluation
+from legged_torque.learning.random_state import own_random_numbers, seeded_state
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.files import told_by_name
-from legged_torque.utils.random_state import own_random_numbers, seeded_state
+from legged_torque.utils.files import write_errors
 from legged_torque.utils.runs import tagged
 
 SEED = 10_000  # added to the seed of a training, once for its first evaluator, twice for the second, and so on
@@ -139,7 +139,7 @@ def make_evaluators(
 def append_row(file: Path, row: dict[str, float]) -> None:
     """Append a row to a CSV file, after a header if the file is new; a UserError if it cannot be written."""
     is_new = not file.exists()
-    with told_by_name(file), file.open("a", newline="", encoding="utf-8") as stream:
+    with write_errors(file), file.open("a", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, row, lineterminator="\n")
         if is_new:
             writer.writeheader()

@@ -14,6 +14,7 @@ from legged_torque.learning import checkpoint
 from legged_torque.learning.evaluator import append_row, make_evaluators
 from legged_torque.learning.guard import TrainingGuard
 from legged_torque.learning.protocols import Learner, Task, Transition, check_learner
+from legged_torque.learning.random_state import random_state, restore_random_state
 from legged_torque.learning.training_log import TrainingLog
 from legged_torque.learning.worlds import Worlds, remove_other_worlds
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
@@ -21,7 +22,6 @@ from legged_torque.utils import distributed
 from legged_torque.utils.display import warn
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
-from legged_torque.utils.random_state import random_state, restore_random_state
 from legged_torque.utils.runs import checkpoint_file, claim_run_dir, evaluations_file, tagged
 
 
@@ -101,7 +101,7 @@ class Trainer:
         guard = TrainingGuard(self.env.health)
         self._log.start(first, last, self.verbose)
         self.save_checkpoint()  # the viewer shows it while the first iterations run
-        with self._log.display, StopRequest(self._log.display.tell) as stop:
+        with self._log.display, StopRequest(self._log.display.notify) as stop:
             while self.current_learning_iteration < last and not guard.problem:
                 if distributed.any_process(stop.requested or self._log.broken_pipe is not None, self.device):
                     break

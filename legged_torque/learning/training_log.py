@@ -22,9 +22,9 @@ from legged_torque.learning.training_display import TrainingDisplay
 from legged_torque.utils import distributed
 from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.devices import device_name
-from legged_torque.utils.display import Pace, warn
+from legged_torque.utils.display import warn
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.files import told_by_name
+from legged_torque.utils.files import write_errors
 
 _STYLES = re.compile("\033\\[[0-9;]*m")  # escape sequences of bold or colored text
 _SHOWN = {"skipped_updates": "skipped_updates", "kl": "kl", "learning_rate": "learning_rate", "action_std": "noise"}
@@ -52,14 +52,14 @@ class TrainingLog:
 
     def start(self, first: int, last: int, verbose: bool) -> None:
         """Open the log of iterations ``first`` to ``last``, and create the display, which ``verbose`` silences."""
-        with told_by_name(Path(self._logger.log_dir or "")), contextlib.redirect_stdout(io.StringIO()):
+        with write_errors(Path(self._logger.log_dir or "")), contextlib.redirect_stdout(io.StringIO()):
             self._logger.init_logging_writer()  # which prints a list of its files
         self._iterations, self._verbose = (first, last), verbose
         num_worlds = distributed.world_size() * self._env.num_envs
         title = f"{self._cfg.get('task') or 'training'}: {num_worlds} worlds on {device_name(self._env.device)}"
         is_quiet = verbose or self._logger.writer is None
-        folder, pace = str(self._logger.log_dir), Pace(last, first)
-        self.display = TrainingDisplay(title, folder, pace, self.steps_per_iteration, is_quiet)
+        folder, steps = str(self._logger.log_dir), self.steps_per_iteration
+        self.display = TrainingDisplay(title, folder, last, first, steps, is_quiet)
 
     def prepare(
         self, iteration: int, times: dict[str, float], numbers: dict[str, float], measured: dict[str, float]

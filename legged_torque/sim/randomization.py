@@ -14,14 +14,9 @@ import warp as wp
 from torch import Tensor
 
 from legged_torque.sim import kernels
-from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.limits import LARGEST
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.limits import Draw, check_value
 from legged_torque.utils.mirroring import Mirroring
-
-Draw = dict[str, list[float]]
-"""Lowest and highest values by operation, see :class:`RandomParameter`."""
-OPERATIONS = ("set", "add", "scale", "scale_per_joint")
-"""The operations of a :data:`Draw`."""
 
 
 @dataclass
@@ -37,7 +32,7 @@ class RandomParameter:
     name: str  # also of the observed number
     field: str | Tensor  # of the model, by its name, or a tensor. Shape: (num_envs, any)
     columns: Sequence[int]  # which numbers of a world, all entries of a field behind each other
-    draw: Draw  # the ranges
+    draw: dict[str, list[float]]  # the ranges
     unit: str = ""  # of the values
     own: Sequence[float] | float | None = None  # the robot's own values, per column; None: those at the start
     set_unit: Sequence[float] | float = 1.0  # of "set" numbers, per column or for all
@@ -105,7 +100,7 @@ class Randomization:
         for parameter in parameters:
             is_of_model = isinstance(parameter.field, str)
             field = model_field(parameter.field).flatten(1) if isinstance(parameter.field, str) else parameter.field
-            check_draw(f"random parameter '{parameter.name}'", parameter.draw, may_be_negative=True)
+            check_value(f"random parameter '{parameter.name}'", parameter.draw, Draw)
             check_field(parameter, field)
             self.fields[str(parameter.field) if is_of_model else parameter.name] = field
             count = 1 if parameter.shared else len(parameter.columns)
@@ -162,22 +157,6 @@ def check_field(parameter: RandomParameter, field: Tensor) -> None:
     kind, shape = field.dtype, tuple(field.shape)
     if kind != torch.float32 or len(shape) != 2:
         raise UserError(f"random parameter '{parameter.name}' must be float32 with two axes, not {kind} {shape}")
-
-
-def check_draw(setting: str, draw: Draw, may_be_negative: bool = False) -> None:
-    """Raise a UserError that names the setting unless it has known operations with ranges, "set" being alone.
-
-    Numbers that are added may be negative, others only if ``may_be_negative``.
-    """
-    for operation, limits in draw.items():
-        if operation not in OPERATIONS:
-            raise unknown_name(f"operation of {setting}", operation, OPERATIONS)
-        if len(limits) != 2 or not -LARGEST <= limits[0] <= limits[1] <= LARGEST:
-            raise UserError(f"{setting}.{operation} must be [minimum, maximum], not {limits}")
-        if limits[0] < 0.0 and operation != "add" and not may_be_negative:
-            raise UserError(f"{setting}.{operation} must be [minimum, maximum] of at least 0, not {limits}")
-    if "set" in draw and len(draw) > 1:
-        raise UserError(f"{setting} has 'set', which replaces the robot's own value: it cannot have {list(draw)}")
 
 
 def fixed(parameter: RandomParameter) -> RandomParameter:

@@ -1,9 +1,10 @@
-"""Holding a robot's pose under PD control in plain MuJoCo, to see whether it stands."""
+"""The criterion of a standing robot, and holding a robot's pose under PD control in plain MuJoCo."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -11,8 +12,21 @@ import numpy as np
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import kept_warnings
 
-LEAST_HEIGHT = 0.5  # of a standing robot's trunk, as a share of that in the beginning
+LEAST_HEIGHT = 0.5  # of a standing robot's trunk, as a share of its height in the nominal pose
 MOST_TILT = 0.5  # of a standing robot's trunk [rad]
+
+Values: TypeAlias = Any  # a number, a numpy array or a tensor
+
+
+def stands(height: Values, nominal_height: float, tilt: Values) -> Values:
+    """Return whether a trunk is neither too low nor too tilted for a standing robot; NaN is not standing.
+
+    Args:
+        height: Height of the trunk above the ground [m].
+        nominal_height: The same in the nominal pose [m].
+        tilt: Angle between the trunk's vertical axis and that of the world [rad], of the shape of ``height``.
+    """
+    return (height > LEAST_HEIGHT * nominal_height) & (tilt < MOST_TILT)
 
 
 @dataclass
@@ -97,10 +111,12 @@ def _fall(data: mujoco.MjData, nominal: float, may_not_touch: Sequence[int]) -> 
     touching = np.intersect1d(data.contact.geom, may_not_touch)
     if touching.size:
         return f"'{data.model.geom(int(touching[0])).name}' touches the ground"
-    if data.qpos[2] < LEAST_HEIGHT * nominal:
-        return f"the trunk has sunk from {nominal:.2f} to {data.qpos[2]:.2f} m"
-    tilt = _tilt(data)
-    return f"the trunk is tilted by {tilt:.2f} rad" if tilt > MOST_TILT else ""
+    height, tilt = float(data.qpos[2]), _tilt(data)
+    if stands(height, nominal, tilt):
+        return ""
+    if tilt < MOST_TILT:
+        return f"the trunk has sunk from {nominal:.2f} to {height:.2f} m"
+    return f"the trunk is tilted by {tilt:.2f} rad"
 
 
 def _tilt(data: mujoco.MjData) -> float:

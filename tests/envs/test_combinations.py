@@ -104,7 +104,7 @@ def test_a_torque_head_is_pretrained(monkeypatch):
             seen.append(torch.stack([task._compute_torques(actions), 4.0 * actions[:, 12:]]))
             return actions
 
-        wanted = 4.0 * follow(task, controller, noting, 16, 8).actions[..., 12:]
+        wanted = 4.0 * follow(task, controller, noting, 16, 8)["actions"][..., 12:]
         wrong.append((torch.stack(seen, dim=1) - wanted).square().mean(dim=(1, 2, 3)).sqrt())
     assert wrong[1][0] < wrong[0][0] and wrong[1][1] < 0.7 * wrong[0][1]
 

@@ -8,8 +8,8 @@ from support.random_stream import upcoming
 from support.settings import error_of, parse
 
 from legged_torque.envs import task_registry
+from legged_torque.learning.random_state import random_state, restore_random_state
 from legged_torque.utils import distributed
-from legged_torque.utils.random_state import random_state, restore_random_state
 from legged_torque.utils.task_registry import set_seed
 
 WORDS = ["--task=a1_torque", "--num_envs=2", "--seed=3", "--set=runner.num_steps_per_env=3", "--logger=none"]

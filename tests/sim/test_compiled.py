@@ -9,9 +9,9 @@ from support.settings import error_of
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.tasks import A1TorqueCfg
+from legged_torque.sim import compiled as module
+from legged_torque.sim.compiled import compiled
 from legged_torque.sim.randomization import Randomization, RandomParameter
-from legged_torque.utils import compiled as module
-from legged_torque.utils.compiled import compiled
 from legged_torque.utils.progress import TORCH_COMPILES
 
 SETTINGS = {"domain_rand.randomize_parameters": True, "domain_rand.push_robots": True, "noise.add_noise": True}

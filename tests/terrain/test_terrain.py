@@ -368,4 +368,4 @@ def test_robots_stand_on_their_tiles(make_rough_task):
 )
 def test_mistakes_are_told(settings, line):
     """One line says what cannot be, before anything is built."""
-    assert line in error_of(check_env_cfg, ground_cfg(**settings))
+    assert line in error_of(lambda: check_env_cfg(ground_cfg(**settings)))

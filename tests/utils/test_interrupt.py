@@ -125,9 +125,9 @@ def test_mujoco_leaves_no_file(tmp_path):
     """Its warnings go to standard error."""
     code = """
 import numpy
-from legged_torque.utils.cli import importing, run_script
+from legged_torque.utils.cli import slow_imports, run_script
 def main():
-    with importing():
+    with slow_imports():
         import mujoco
     ball = "<body><freejoint/><geom size='1'/></body>"
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{ball}</worldbody></mujoco>")

@@ -14,7 +14,7 @@ from legged_torque.envs.base.robot_checks import engine_notes, floor_problems, f
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching
 from legged_torque.sim.robot_file import model_problems, spec_problems, use_plain_motors
 from legged_torque.terrain.terrain import Terrain
-from legged_torque.utils.errors import UserError, told_in, unknown_name
+from legged_torque.utils.errors import UserError, collect_errors, unknown_name
 from legged_torque.utils.mjcf import (
     drawing_notes,
     exclude_self_collisions,
@@ -66,14 +66,14 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     problems, notes, geoms = list(spec_problems(spec)), list(drawing_notes(spec)), collision_geoms(spec)
     chosen: list[list[int]] = []
     for parts in ([settings.foot_name], settings.penalize_contacts_on, settings.terminate_after_contacts_on):
-        with told_in(problems):
+        with collect_errors(problems):
             chosen.append(indices_matching(geoms, parts))
     with loading(file):
         if terrain and not problems:
             terrain.add_to(spec, FLOOR)
         model = spec.compile() if problems else build_model(spec, geoms)
     dof_names = [model.joint(i).name for i in range(1, model.njnt)]
-    with told_in(problems):
+    with collect_errors(problems):
         problems += model_problems(model)
         problems += pose_problems(nominal_pose(cfg.init_state.default_joint_angles, dof_names), model)
     if not problems:

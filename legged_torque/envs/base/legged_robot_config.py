@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from legged_torque.envs.base.older_runs import converted, is_older
+from legged_torque.envs.base.older_runs import RENAMED, converted, is_older
+from legged_torque.learning.settings import Activation, TrainingCfg
 from legged_torque.motors.config import DelayCfg, IdealCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
 from legged_torque.utils.limits import (
@@ -18,6 +19,7 @@ from legged_torque.utils.limits import (
     NotNegative,
     Number,
     Positive,
+    Ranges,
     Share,
     Sizes,
     Worlds,
@@ -26,7 +28,6 @@ from legged_torque.utils.limits import (
 Place = Annotated[list[float], Limits(-1e3, 1e3, length=3)]
 Scan = Annotated[list[float], Limits(-10, 10, nonempty=True)]
 Gains = Annotated[float | dict[str, float], Limits(lowest=0)]
-Ranges = dict[str, list[float]]  # of a parameter, by operation
 
 
 class LinearChange(Section):
@@ -286,6 +287,10 @@ class LeggedRobotCfg(BaseConfig):
         """Return the settings of a run of commit d8439d6 in today's layout."""
         return converted(values) if is_older(values) else values
 
+    def renamed(self) -> dict[str, str]:
+        """Return the new names of settings of commit d8439d6."""
+        return RENAMED
+
     def random_parameters(self) -> dict[str, dict[str, list[float]]]:
         """Return the ranges of all parameters of ``domain_rand``, by name."""
         return {name: value for name, value in to_dict(self.domain_rand).items() if isinstance(value, dict)}
@@ -298,7 +303,7 @@ def _replaced(own: Any, hard: Any) -> Any:
     return own if "set" in own and "set" not in hard else own | hard
 
 
-class LeggedRobotCfgPPO(BaseConfig):
+class LeggedRobotCfgPPO(TrainingCfg):
     """Settings of the training: the ``parallel`` preset, made for thousands of worlds."""
 
     seed: Annotated[int, Limits(lowest=0)] = 1  # of all random numbers of a training
@@ -334,7 +339,7 @@ class LeggedRobotCfgPPO(BaseConfig):
     class actor:  # the policy's network, an rsl_rl model
         class_name: str = "MLPModel"  # an rsl_rl model
         hidden_dims: Sizes = [512, 256, 128]  # sizes of the hidden layers
-        activation: str = "elu"  # after every hidden layer
+        activation: Activation = "elu"  # after every hidden layer
 
         class distribution_cfg:  # the distribution of its actions
             class_name: str = "legged_torque.learning.distribution:GaussianDistribution"  # rsl_rl's, made for graphs
@@ -344,7 +349,7 @@ class LeggedRobotCfgPPO(BaseConfig):
     class critic:  # the value function's network
         class_name: str = "MLPModel"  # an rsl_rl model
         hidden_dims: Sizes = [512, 256, 128]  # sizes of the hidden layers
-        activation: str = "elu"  # after every hidden layer
+        activation: Activation = "elu"  # after every hidden layer
 
     class algorithm:  # PPO, with rsl_rl's names
         class_name: str = "legged_torque.learning.ppo:OnDevicePPO"  # rsl_rl's PPO without waiting for the host

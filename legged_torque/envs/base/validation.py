@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LinearChange
-from legged_torque.sim.randomization import check_draw
 from legged_torque.terrain.layout import Layout
-from legged_torque.utils.config import Section, section_keys
+from legged_torque.utils.config import Section, check_section, section_keys
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.limits import check_section
 
 
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:
@@ -27,8 +25,6 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     for name in cfg.domain_rand.keep_fixed:
         if name not in parameters:
             raise unknown_name("parameter in domain_rand.keep_fixed", name, parameters)
-    for name, draw in parameters.items():
-        check_draw(f"domain_rand.{name}", draw)
     delay = cfg.motors.delay
     if delay.range[1] and delay.unit == "physics_steps" and not cfg.control.refresh_torques:
         raise UserError(

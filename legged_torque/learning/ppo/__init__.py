@@ -14,7 +14,7 @@ from legged_torque.learning.multi_head import MultiHeadModel
 from legged_torque.learning.ppo.torch_ppo import LOSS_NAMES as LOSS_NAMES
 from legged_torque.learning.ppo.torch_ppo import TorchPPO
 from legged_torque.learning.ppo.triton.networks import read_network
-from legged_torque.utils.compiled import has_triton
+from legged_torque.sim.compiled import has_triton
 
 
 class OnDevicePPO(TorchPPO):

@@ -17,8 +17,8 @@ from legged_torque.learning.ppo.torch_ppo import TorchPPO
 from legged_torque.learning.ppo.triton import products, samples, steps
 from legged_torque.learning.ppo.triton.memory import NUMBERS, SAMPLES, TILE, LearningWorkspace, Parameters, Workspace
 from legged_torque.learning.ppo.triton.networks import ALIGNMENT, Network, read_network
+from legged_torque.sim.compiled import keep_kernels
 from legged_torque.utils import distributed
-from legged_torque.utils.compiled import keep_kernels
 from legged_torque.utils.progress import torch_compiles
 
 GAE_WORLDS = 64  # worlds of a program

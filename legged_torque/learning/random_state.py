@@ -1,4 +1,4 @@
-"""Where the streams of random numbers stand, so that a resumed run goes on with them."""
+"""States of the streams of random numbers, with which a resumed run goes on."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def restore_random_state(device: str, state: dict[str, Tensor]) -> None:
 
 @contextlib.contextmanager
 def own_random_numbers(device: str, state: dict[str, Tensor]) -> Iterator[None]:
-    """Let what happens inside draw from a stream of its own, whose state moves on, and leave torch's as they were."""
+    """Context that draws from a stream of its own, whose state moves on, and leaves torch's streams as they were."""
     outside = random_state(device)
     restore_random_state(device, state)
     try:

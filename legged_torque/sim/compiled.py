@@ -19,7 +19,7 @@ SETTINGS: dict[str, Any] = {
     "fullgraph": True,  # all or nothing: a part that cannot be compiled fails before anything has run
     "dynamic": False,
     "options": {
-        "aggressive_fusion": True,  # one kernel for what has nothing in common but the number of worlds
+        "aggressive_fusion": True,  # one kernel for operations that share only the number of worlds
         "combo_kernels": True,  # one launch for several kernels that do not wait for each other
         "combo_kernels_autotune": 0,  # nothing is chosen by timing: that takes time, and additions keep their order
         "compile_threads": 1,  # the kernels are few: starting helpers takes longer
@@ -48,7 +48,7 @@ def can_compile(device: str) -> bool:
 def compiled(function: Callable[[], None], device: str) -> Callable[[], None]:
     """Return a function that does the same with few kernels; the function itself where it cannot be compiled.
 
-    It must only run operations of torch, on tensors that keep their addresses; what it writes, it writes in place.
+    It must only run operations of torch, on tensors that keep their addresses, and write in place.
     It is compiled at the first call, once per machine: the kernels are kept in a folder of Warp's cache. Where that
     is not possible, a line on standard error says so and names the place, and the function runs as it is.
     """
@@ -64,7 +64,7 @@ class Compiled:
         self._run: Callable[[], None] | None = None
 
     def __call__(self) -> None:
-        """Do what the function does; always in the same mode of autograd, since each would be compiled by itself."""
+        """Run the function, always in the same mode of autograd, since each mode would be compiled separately."""
         import torch._dynamo as dynamo  # takes a second, and only a GPU needs it
 
         with torch.inference_mode(False), torch.no_grad():
@@ -80,7 +80,7 @@ class Compiled:
                 self._run()
 
     def _compile(self) -> Callable[[], None]:
-        """Return what compiles the function when it is called."""
+        """Return a function that is compiled when it is called."""
         import torch._dynamo as dynamo
 
         keep_kernels()
@@ -89,7 +89,7 @@ class Compiled:
 
 
 def keep_kernels() -> None:
-    """Let torch and Triton keep what they compile in Warp's cache, unless the environment names other folders."""
+    """Let torch and Triton keep their kernels in Warp's cache, unless the environment names other folders."""
     if wp.config.kernel_cache_dir:
         folder = os.path.join(wp.config.kernel_cache_dir, TORCH_FOLDER)
         os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", folder)
@@ -97,7 +97,7 @@ def keep_kernels() -> None:
 
 
 def reason(error: Exception) -> str:
-    """Return in one line why a function cannot be compiled, and the user's line at which it failed."""
+    """Return in one line the reason why a function cannot be compiled, with the line of the code."""
     stack = getattr(error, "real_stack", None)
     place = f"{stack[-1].name} ({stack[-1].filename}:{stack[-1].lineno})" if stack else "no line is known"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
