@@ -69,7 +69,7 @@ def main() -> None:
         import torch
 
         from legged_torque.envs.base.commands import fix_command
-        from legged_torque.learning.evaluator import evaluation_cfg
+        from legged_torque.envs.base.evaluation import evaluation_cfg
     if grounds:
         env_cfg = grounds.cfg(run.env_cfg, run.env_cfg.env.num_envs)
     else:

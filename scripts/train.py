@@ -57,9 +57,9 @@ def main() -> None:
             raise UserError("--preset cannot be given with --resume, which keeps the settings of the run")
         with slow_imports():
             if distributed.world_size() > 1:
-                from legged_torque.learning.run_of_first import take_run_of_first
+                from legged_torque.learning.first_run import use_first_run
 
-                take_run_of_first(options)
+                use_first_run(options)
             run = task_registry.load_run(options)
         env_cfg, train_cfg = run.env_cfg, run.train_cfg
         options.load_run, options.preset = str(run.folder), run.config.get("preset")

@@ -35,6 +35,7 @@ from legged_torque.sim.simulator import Simulator
 from legged_torque.utils.args import Parser, add_build_args, options_of
 from legged_torque.utils.cli import check_at_least, run_script
 from legged_torque.utils.devices import device_name, resolve_device
+from legged_torque.utils.errors import UserError
 
 RATES = (("update", "flop"), ("update", "bytes"), ("physics", "bytes"))
 _ROUNDS = 5  # timings of each peak
@@ -168,13 +169,16 @@ def main() -> None:
     options.set = ["evaluation.interval=0", *options.set]  # without evaluations iterations are alike
     env_cfg, train_cfg = task_registry.get_cfgs(args.task, options)
     with tempfile.TemporaryDirectory() as folder:
-        runner = build(args.task, (env_cfg, train_cfg), device, folder)
+        task, runner = build(args.task, (env_cfg, train_cfg), device, folder)
+        alg = runner.alg
+        if not isinstance(alg, OnDevicePPO):
+            raise UserError(f"updates of PPO are counted, not those of {type(alg).__name__}")
         time_iterations(runner, WARM_UP)
-        row = {"update_ms": median(time_iterations(runner, args.rounds)["update"])}
-        row["physics_ms"], _ = time_physics(runner.env, args.rounds)
-    row |= work(runner.alg, runner.env.sim, env_cfg.control.decimation)
-    row |= shares(row, measure_peaks(device, row["update_dtype"]))
-    print(f"{args.task}, {runner.env.num_envs} worlds on {device_name(device)}, medians of {args.rounds} rounds")
+        row: dict[str, Any] = {"update_ms": median(time_iterations(runner, args.rounds)["update"])}
+        row["physics_ms"], _ = time_physics(task, args.rounds)
+    row |= work(alg, task.sim, env_cfg.control.decimation)
+    row |= shares(row, measure_peaks(device, str(row["update_dtype"])))
+    print(f"{args.task}, {task.num_envs} worlds on {device_name(device)}, medians of {args.rounds} rounds")
     for part, unit in RATES:
         rate, peak, share = (
             row[name] for name in (f"{part}_g{unit}_per_s", f"peak_g{unit}_per_s", f"{part}_{unit}_share")

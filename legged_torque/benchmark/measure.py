@@ -88,13 +88,13 @@ def measure(
     with tempfile.TemporaryDirectory() as folder:
         start, used = time.perf_counter(), []
         with CompileProgress():
-            runner = build(task_name, cfgs, memory.device, folder)
+            task, runner = build(task_name, cfgs, memory.device, folder)
             built = time.perf_counter()
             time_iterations(runner, WARM_UP, lambda number: used.append(memory.used()))
         startup = time.perf_counter() - start
         times = time_iterations(runner, rounds)
         peak = max(*used, memory.used())
-        row = summarize(times, *time_physics(runner.env, rounds), runner.env.num_envs, runner.cfg["num_steps_per_env"])
+        row = summarize(times, *time_physics(task, rounds), task.num_envs, cfgs[1].runner.num_steps_per_env)
         row |= {"peak_memory_mib": peak, "build_s": built - start, "startup_s": startup}
         if endurance:
             row["endurance"] = measure_endurance(runner, endurance, memory)
@@ -103,15 +103,15 @@ def measure(
     return row
 
 
-def build(task_name: str, cfgs: tuple, device: str, folder: str) -> OnPolicyRunner:
-    """Return a runner that is ready to train; settings are those of task and training. It keeps runs in a folder."""
+def build(task_name: str, cfgs: tuple, device: str, folder: str) -> tuple[LeggedRobot, OnPolicyRunner]:
+    """Return a task of some settings, and its runner, which is ready to train and keeps its run in a folder."""
     env_cfg, train_cfg = cfgs
     set_seed(train_cfg.seed)
     task = task_registry.get_task_class(task_name)(env_cfg, device)
     runner, _ = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=folder)
     runner.claim_log_dir({})
     wp.synchronize_device(device)
-    return runner
+    return task, runner
 
 
 def time_iterations(runner: OnPolicyRunner, count: int, at_start: Callable[[int], object] | None = None) -> Times:

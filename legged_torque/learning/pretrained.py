@@ -90,7 +90,7 @@ def start_from(runner: OnPolicyRunner, file: Path) -> None:
     Raises:
         UserError: If a parameter is missing, of another shape or not finite; the actor is unchanged then.
     """
-    actor = runner.alg.actor
+    actor = runner.alg.policy()
     state, pretrained = actor.state_dict(), read_pretrained(file)["actor_state_dict"]
     for name in dict.fromkeys((*state, *map(str, pretrained))):
         if not name.startswith(STANDARD_DEVIATION):

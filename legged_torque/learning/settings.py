@@ -33,7 +33,7 @@ class TrainingCfg(BaseConfig):
         super().check()
         cfg: Any = self
         rate = cfg.algorithm
-        if rate.schedule == "adaptive" and rate.learning_rate > rate.max_learning_rate:
+        if getattr(rate, "schedule", None) == "adaptive" and rate.learning_rate > rate.max_learning_rate:
             most = f"at most algorithm.max_learning_rate, {rate.max_learning_rate}"
             raise UserError(f"algorithm.learning_rate must be {most}, not {rate.learning_rate}")
         if cfg.pretraining.file and not cfg.pretraining.function:
@@ -104,10 +104,10 @@ class TrainingCfg(BaseConfig):
         loggers = {
             "tensorboard": {"class_name": "tensorboard"},
             "wandb": {
-                "class_name": "legged_torque.learning.log_writer:WandbWriter",
+                "class_name": "legged_torque.learning.training_log:WandbWriter",
                 "project_name": runner["wandb_project"],
             },
-            "none": {"class_name": "legged_torque.learning.log_writer:NoLogWriter"},
+            "none": {"class_name": "legged_torque.learning.training_log:NoLogWriter"},
         }
         return {**runner, **settings, "logger": loggers[runner["logger"]]}
 

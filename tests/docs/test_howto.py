@@ -1,5 +1,6 @@
 """The code in the how-to pages and in the README, run as it stands there."""
 
+import math
 import re
 import runpy
 import shlex
@@ -121,6 +122,21 @@ def test_parameter(run_page):
     critic = task.get_observations()["critic"]
     torch.testing.assert_close(critic[:, -1], (ratio[:, 0] - 1.0) / 0.2, atol=1e-4, rtol=0)
     train(make("a1_thigh_mass", "domain_rand.randomize_parameters=true"), "a1_thigh_mass")
+
+
+def test_learner(tmp_path, monkeypatch):
+    """The page's learner trains, resumes and is evaluated by the scripts."""
+    file = tmp_path / "random_search.py"
+    file.write_text("\n".join(blocks("docs/howto/learner.md", "python")))
+    monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
+    words = ["--task=a1_search", f"--task_file={file}", "--device=cpu"]
+    settings = [*TINY, "--logger=none", "--set=actor.hidden_dims=[8]", "--set=evaluation.interval=8"]
+    for more in ([*settings, "--set=evaluation.num_samples=4"], ["--resume", "--max_iterations=3"]):
+        status, output, error = run_here("train.py", *words, *more, root=tmp_path)
+        assert (status, error) == (0, "") and "anew" not in output
+    (file,) = tmp_path.glob("logs/a1_search/*/model_3.pt")
+    assert torch.load(file, weights_only=True)["best_reward"] > -math.inf
+    assert run_here("evaluate.py", *words, "--num_envs=2", "--steps=2", root=tmp_path)[0] == 0
 
 
 def test_combination(run_page):

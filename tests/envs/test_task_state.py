@@ -7,7 +7,7 @@ import torch
 from support.rewards import TABLE_III
 from support.settings import error_of
 
-from legged_torque.learning.worlds import check_identity, identity
+from legged_torque.learning.worlds import check_identity
 from legged_torque.terrain.tiles import TILES
 
 
@@ -120,7 +120,7 @@ def test_worlds_know_their_map(make_task, monkeypatch):
     changes = {f"terrain.{name}": value for name, value in ground.items()}
 
     def now():
-        return identity(make_task("a1_rough_position", 2, **changes), {"num_envs": 1, "perturbation": ""})
+        return make_task("a1_rough_position", 2, **changes).identity()
 
     was = now()
     check_identity(was, now())

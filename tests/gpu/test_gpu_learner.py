@@ -54,12 +54,10 @@ def make(device, multi_head=False, symmetric=False, precision="TF32", **settings
         settings["symmetry_cfg"] = {"data_augmentation_func": function, "use_data_augmentation": True}
         settings["symmetry_cfg"] |= {"use_mirror_loss": False, "env": Mirrored(device)}
     settings = SETTINGS | {"device": device, "use_mixed_precision": precision == "bfloat16"} | settings
-    alg = OnDevicePPO(actor, critic, storage, **settings)
-    if device == "cpu":  # in Triton's interpreter
-        from legged_torque.learning.fused.learner import FusedLearner
+    from legged_torque.learning.ppo.triton.triton_ppo import TritonPPO
 
-        alg.fused = FusedLearner(alg)
-    assert alg.fused and (alg.product_dtype == torch.bfloat16) == (precision == "bfloat16")
+    alg = (TritonPPO if device == "cpu" else OnDevicePPO.make)(actor, critic, storage, **settings)
+    assert type(alg) is TritonPPO and (alg.product_dtype == torch.bfloat16) == (precision == "bfloat16")
     return alg
 
 
@@ -144,7 +142,7 @@ def test_steps_are_those_of_torch(device):
     for number in range(3):
         choose(alg, number)
         alg.update_graph()
-        for parameter, gradient in zip(theirs, alg.fused.gradients(), strict=True):
+        for parameter, gradient in zip(theirs, alg.gradients(), strict=True):
             parameter.grad = gradient.double()
         for model in models:
             torch.nn.utils.clip_grad_norm_(model.parameters(), 0.05)
@@ -160,13 +158,13 @@ def test_a_bad_sample_changes_nothing(device):
         record(alg)
     spoiled.storage.returns[0, 2] = torch.nan
     spoiled.indices.copy_(torch.arange(spoiled.batch_size))
-    before = [tensor.clone() for tensor in spoiled.fused.state()]
+    before = [tensor.clone() for tensor in spoiled.tensors()]
     spoiled.update_graph()
-    assert all(map(torch.equal, spoiled.fused.state(), before)) and float(spoiled.losses[-1]) == 1.0
+    assert all(map(torch.equal, spoiled.tensors(), before)) and float(spoiled.losses[-1]) == 1.0
     for alg in (spoiled, healthy):
         alg.indices.copy_(torch.arange(60, 60 + alg.batch_size))
         alg.update_graph()
-    assert all(map(torch.equal, spoiled.fused.state(), healthy.fused.state()))
+    assert all(map(torch.equal, spoiled.tensors(), healthy.tensors()))
 
 
 def test_the_same_bits_twice(device):
@@ -176,6 +174,6 @@ def test_the_same_bits_twice(device):
         alg = make(device, multi_head=True, symmetric=True, precision="TF32" if device == "cpu" else "bfloat16")
         record(alg)
         alg.update()
-        changed = (*alg.fused.state(), *alg.storage.observations.values(), alg.storage.actions, alg.losses)
+        changed = (*alg.tensors(), *alg.storage.observations.values(), alg.storage.actions, alg.losses)
         states.append([tensor.clone() for tensor in changed])
     assert all(map(torch.equal, *states))

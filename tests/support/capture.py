@@ -42,14 +42,14 @@ def gradient_errors(alg):
 
     Nothing has changed afterwards.
     """
-    state, rate, losses = alg.fused.state(), alg.learning_rate, alg.losses
+    state, rate, losses = alg.tensors(), alg.learning_rate, alg.losses
     tensors = [*state, rate, losses]
     before = [tensor.clone() for tensor in tensors]
-    alg.fused.update_minibatch()
-    found = [gradient.clone() for gradient in alg.fused.gradients()]
+    alg.update_minibatch()
+    found = [gradient.clone() for gradient in alg.gradients()]
     for tensor, value in zip(tensors, before, strict=True):
         tensor.copy_(value)
-    alg.fused.round_weights()
+    alg.round_weights()
     alg.optimizer.zero_grad()
     with torch.enable_grad():
         alg.loss()[0].backward()

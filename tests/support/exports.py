@@ -27,7 +27,7 @@ def export_random(make_task, name, folder, normalization=False, supported=True, 
     train_cfg.actor.obs_normalization = normalization
     torch.manual_seed(3)
     runner, _ = task_registry.make_alg_runner(task, name, train_cfg=train_cfg, log_root=None)
-    model = runner.alg.get_policy()
+    model = runner.alg.policy()
     if normalization:
         model.obs_normalizer._mean.normal_()
         model.obs_normalizer._std.uniform_(0.5, 2.0)

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import mujoco
+import numpy as np
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.envs.base.evaluation import WalkingEvaluation
 from legged_torque.envs.base.state import RobotState
 from legged_torque.sim.compiled import compiled
 from legged_torque.sim.graph import CudaGraph
+from legged_torque.sim.simulator import Simulator
+from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.buffers import copy_state
+from legged_torque.utils.config import flat, to_dict
 
 
 class BaseTask(VecEnv):
@@ -34,6 +41,8 @@ class BaseTask(VecEnv):
         keep_final_observations: Whether "final_observations" of the extras are computed, see :meth:`step`.
     """
 
+    sim: Simulator
+    terrain: Terrain
     state: RobotState
     obs_buf: TensorDict
     num_processes = 1
@@ -143,6 +152,24 @@ class BaseTask(VecEnv):
     def load_world_state_dict(self, state: Any) -> None:
         """Go on with the worlds of a :meth:`world_state_dict`; a UserError, and nothing changed, if it does not fit."""
         copy_state(self.world_state_dict(), state)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what must be the same for worlds to go on after a stop: settings, and hashes of robot and map."""
+        robot = np.zeros(mujoco.mj_sizeModel(self.sim.mj_model), np.uint8)
+        mujoco.mj_saveModel(self.sim.mj_model, None, robot)
+        parts = {"robot's model or the version of MuJoCo": robot}
+        if self.terrain.map:  # a user's own kinds of tiles are no settings
+            parts["map of the ground"] = self.terrain.map.heights
+        hashes = {name: hashlib.sha256(part.data).hexdigest() for name, part in parts.items()}
+        return {"settings": flat(to_dict(self.cfg)), **hashes}
+
+    def check_buffers(self) -> str | None:
+        """Return a warning if the simulator has dropped contacts; waits for the device."""
+        return self.sim.check_buffers()
+
+    def make_evaluation(self, num_envs: int, perturbation: str) -> WalkingEvaluation:
+        """Return worlds of their own in which to measure a policy; an empty name is the environment of these worlds."""
+        return WalkingEvaluation(self, num_envs, perturbation)
 
     # ---- what a task does --------------------------------------------------------------------------------------------
 

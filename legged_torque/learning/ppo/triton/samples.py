@@ -1,4 +1,4 @@
-"""What happens to single samples before and after the networks, as Triton kernels: observations, actions, losses.
+"""Triton kernels of single samples, before and after the networks: observations, actions, losses.
 
 Blocks of samples are rows; the columns of actions are padded to a power of two.
 """

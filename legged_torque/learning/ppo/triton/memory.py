@@ -1,4 +1,4 @@
-"""The memory of fused networks: parameters in one piece, weights as products read them, and tables of tiles."""
+"""The memory of all networks: parameters in one piece, weights as products read them, and tables of tiles."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from legged_torque.learning.fused.networks import Block, Columns, Layer, Network, aligned
+from legged_torque.learning.ppo.triton.networks import Block, Columns, Layer, Network, aligned
 
 SAMPLES = 128  # of a tile of a matrix product
 TILE = 128  # columns of it
-NUMBERS = 4  # that the losses leave beside gradients: value loss, surrogate loss, entropy, KL divergence
+NUMBERS = 4  # that follow the gradients: value loss, surrogate loss, entropy, KL divergence
 SAMPLES_PER_PART = 1024  # of which gradients of weights are summed up by one program, if there are not too many
 MAX_PARTS = 16  # a power of two
 
@@ -87,7 +87,7 @@ class Parameters:
 
 
 class Workspace:
-    """What the networks compute for a number of samples, and tables that say which tile of which product is where.
+    """Memory for the outputs of all layers for a number of samples, and tables of the tiles of their products.
 
     Attributes:
         rows: Samples, up to whole tiles.
@@ -110,14 +110,10 @@ class Workspace:
             room += block.width * self.rows
         self.values = weights.new_zeros(room + TILE)  # a tile may read beyond
         self.outputs = torch.zeros(self.rows, sum(network.num_outputs for network in networks), device=device)
-        firsts = (0, networks[0].num_outputs)
-        owners = zip(networks, firsts, strict=True)
-        first_output = {layer: first for network, first in owners for layer in network.layers}
-        chains = [network.layers for network in networks]
         self.forward = []
-        for stage in stages(chains):
+        for stage in stages([network.layers for network in networks]):
             has_outputs = any(layer.first_output is not None for layer in stage)
-            self.forward.append((self._table(self._forward_tiles(stage, first_output)), has_outputs))
+            self.forward.append((self._table(self._forward_tiles(stage)), has_outputs))
 
     def place(self, columns: Columns) -> int:
         """Return where columns begin in ``values`` and ``gradients``."""
@@ -127,7 +123,7 @@ class Workspace:
         """Return tiles as a table on the device."""
         return torch.tensor(tiles, dtype=torch.int64, device=self.values.device)
 
-    def _forward_tiles(self, layers: Sequence[Layer], first_output: dict[Layer, int]) -> list[list[int]]:
+    def _forward_tiles(self, layers: Sequence[Layer]) -> list[list[int]]:
         """Return the tiles of layers for the kernel ``forward``."""
         tiles = []
         for layer in layers:
@@ -135,7 +131,7 @@ class Workspace:
             weights = self._parameters.place[layer]
             bias = self._parameters.start(layer.linear.bias)
             for first in range(0, aligned(target.size), TILE):
-                output = -1 if layer.first_output is None else first_output[layer] + layer.first_output + first
+                output = -1 if layer.first_output is None else layer.first_output + first
                 read = [self.place(source), source.block.width, layer.input_width]
                 read += [weights + first * layer.input_width, layer.input_width]
                 written = [self.place(target) + first, target.block.width]

@@ -1,7 +1,7 @@
-"""Where the layers of a network find their inputs, outputs and weights in memory that all of them share.
+"""Layout of networks: the columns of shared memory that each layer reads and writes.
 
-A network is a list of :class:`Layer`. A layer reads columns and writes columns; where it reads what several layers
-have written, these lie next to each other. All widths are multiples of :data:`ALIGNMENT`, with zeros in between.
+A network is a list of :class:`Layer`. Where a layer reads the outputs of several others, their columns are next to each
+other. All widths are multiples of :data:`ALIGNMENT`, with zeros in between.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """What one layer writes, or the input of a network."""
+    """Columns that one layer writes, or the inputs of a network."""
 
     block: Block
     start: int
@@ -53,7 +53,7 @@ class Layer:
     linear: nn.Linear
     sources: Sequence[Columns]
     target: Columns
-    first_output: int | None = None  # column among the outputs of the network; None: a hidden layer
+    first_output: int | None = None  # its first column among the outputs of all networks; None: a hidden layer
 
     def input_columns(self) -> Tensor:
         """Return which column of the block, from the first source on, each input is. Shape: (inputs,)."""
@@ -97,8 +97,11 @@ class Network:
         return sources[0]
 
 
-def read_network(module: nn.Module) -> Network | None:
-    """Return the layers of an rsl_rl ``MLP`` or of our ``MultiHeadMLP`` with ELUs; None of any other network."""
+def read_network(module: nn.Module, first_output: int = 0) -> Network | None:
+    """Return the layers of an rsl_rl ``MLP`` or of our ``MultiHeadMLP`` with ELUs; None of any other network.
+
+    ``first_output`` is the column of its first output among those of all networks.
+    """
     parts = [part for part in module.modules() if not list(part.children())]
     if not all(isinstance(part, nn.Linear) or (isinstance(part, nn.ELU) and part.alpha == 1.0) for part in parts):
         return None
@@ -107,14 +110,14 @@ def read_network(module: nn.Module) -> Network | None:
         if not (isinstance(first, nn.Linear) and isinstance(last, nn.Linear)):
             return None
         network = Network(Block().columns(first.in_features), last.out_features)
-        network.add(module, [network.inputs], 0)
+        network.add(module, [network.inputs], first_output)
         return network
     if isinstance(module, MultiHeadMLP):
         first, positions, torques = module.trunk[0], module.position_head[-1], module.torque_head[-1]
         network = Network(Block().columns(first.in_features), positions.out_features + torques.out_features)
         seen = Block()  # by the torque head
         features = network.add(module.trunk, [network.inputs], None, seen)
-        angles = network.add(module.position_head, [features], 0, seen)
-        network.add(module.torque_head, [features, angles], positions.out_features)
+        angles = network.add(module.position_head, [features], first_output, seen)
+        network.add(module.torque_head, [features, angles], first_output + positions.out_features)
         return network
     return None

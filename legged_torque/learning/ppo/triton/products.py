@@ -1,8 +1,8 @@
 """Matrix products of several layers at once, with biases, ELUs and their gradients, as Triton kernels.
 
-A program computes one tile of one layer for ``SAMPLES`` samples. What belongs to a tile stands in a row of a table of
-integers, whose columns are named in the kernels' docstrings; places are counted in numbers from the start of an array.
-All widths are multiples of 64, which a tile may exceed: what it reads beyond is not used.
+A program computes one tile of one layer for ``SAMPLES`` samples. A row of a table of integers describes the tile; the
+kernels' docstrings name its columns. Places are offsets from the start of an array, in numbers. All widths are
+multiples of 64, which a tile may exceed: what it reads beyond is not used.
 """
 
 import triton

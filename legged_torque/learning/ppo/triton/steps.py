@@ -1,4 +1,4 @@
-"""What follows the gradients, as Triton kernels: sums over parts, the learning rate, clipping, Adam."""
+"""Triton kernels from gradients to weights: sums over parts, the learning rate, clipping, Adam."""
 
 import triton
 import triton.language as tl
@@ -9,7 +9,7 @@ PARTS = 64  # programs that sum up squares
 
 @triton.jit
 def sum_rows(sums, num_rows, num_columns, destination, gradient, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
-    """Sum up the rows of what programs have summed up for their samples; -1 as destination: not used."""
+    """Sum up the rows, each of them the sums of one program's samples; columns with destination -1 are not used."""
     columns, rows = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS), tl.arange(0, ROWS)
     place = tl.load(destination + columns, mask=columns < num_columns, other=-1)
     used = place >= 0
@@ -22,7 +22,7 @@ def sum_rows(sums, num_rows, num_columns, destination, gradient, ROWS: tl.conste
 
 @triton.jit
 def sum_parts(partial, num_parts, partial_size, source, gradient, size, BLOCK: tl.constexpr):
-    """Sum up the gradients of weights from all parts of the samples; others, whose source is -1, have theirs."""
+    """Sum up the gradients of weights over all parts of the samples; other parameters have the source -1."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     index = tl.load(source + place, mask=place < size, other=-1)
     total = tl.zeros((BLOCK,), tl.float32)
@@ -47,7 +47,7 @@ def sum_squares(gradient, actor_size, size, squares, PARTS: tl.constexpr, BLOCK:
 
 
 @triton.jit
-def settle(
+def prepare_adam_step(
     numbers, squares, learning_rate, actor_learns, steps, scalars, sums, max_norm, kl_target, lowest_rate,
     highest_rate, log_beta1, log_beta2, ADAPTIVE: tl.constexpr, PARTS: tl.constexpr,
 ):  # fmt: skip
@@ -61,7 +61,7 @@ def settle(
     if ADAPTIVE:
         wanted = tl.load(kl_target)
         factor = tl.where(kl > 2.0 * wanted, 1.0 / 1.5, tl.where((kl < 0.5 * wanted) & (kl > 0.0), 1.5, 1.0))
-        factor = tl.where(tl.load(actor_learns) > 0.0, factor, 1.0)  # a policy that stays says nothing
+        factor = tl.where(tl.load(actor_learns) > 0.0, factor, 1.0)  # a fixed policy has no divergence
         rate = tl.minimum(tl.maximum(rate * factor, lowest_rate), highest_rate)
         tl.store(learning_rate, rate)
     parts = tl.arange(0, PARTS)

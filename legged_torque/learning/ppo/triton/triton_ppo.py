@@ -1,34 +1,34 @@
-"""Acting and learning with the kernels of this package."""
+"""PPO that acts and learns with the kernels of this package."""
 
 from __future__ import annotations
 
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque.learning.fused import products, samples, steps
-from legged_torque.learning.fused.memory import NUMBERS, SAMPLES, TILE, LearningWorkspace, Parameters, Workspace
-from legged_torque.learning.fused.networks import ALIGNMENT, Network, read_network
+from legged_torque.learning.ppo.torch_ppo import TorchPPO
+from legged_torque.learning.ppo.triton import products, samples, steps
+from legged_torque.learning.ppo.triton.memory import NUMBERS, SAMPLES, TILE, LearningWorkspace, Parameters, Workspace
+from legged_torque.learning.ppo.triton.networks import ALIGNMENT, Network, read_network
 from legged_torque.sim.compiled import keep_kernels
 from legged_torque.utils import distributed
 from legged_torque.utils.progress import torch_compiles
 
-if TYPE_CHECKING:
-    from legged_torque.learning.ppo import OnDevicePPO
-
 GAE_WORLDS = 64  # worlds of a program
 
 
-def compiles_first(method: Callable) -> Callable:
-    """Let the progress line know when a method of the learner is called for the first time."""
+def shows_compilation(method: Callable) -> Callable:
+    """Show in the progress line that the first call of a method compiles its kernels."""
 
     @functools.wraps(method)
-    def call(self: FusedLearner, *args: Any) -> Any:
+    def call(self: TritonPPO, *args: Any) -> Any:
         if method.__name__ in self.compiled:
             return method(self, *args)
         self.compiled.add(method.__name__)
@@ -38,48 +38,56 @@ def compiles_first(method: Callable) -> Callable:
     return call
 
 
-class FusedLearner:
-    """Does what :class:`~legged_torque.learning.ppo.OnDevicePPO` does with torch's operations, in few kernels.
+class TritonPPO(TorchPPO):
+    """Does what :class:`TorchPPO` does, in few kernels.
 
     Products of matrices take bfloat16 numbers with mixed precision, else TF32; sums, parameters, losses and Adam are
     float32. Policies round alike when they act and when they learn.
     """
 
-    def __init__(self, alg: OnDevicePPO) -> None:
-        """Move an algorithm's parameters into one piece, and its optimizer's state."""
+    use_mixed_precision: bool
+
+    def __init__(self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
+        """Create the algorithm, and move the parameters of both models into one piece, and the optimizer's state.
+
+        Arguments are those of :class:`TorchPPO`, for which there must be kernels.
+        """
+        super().__init__(actor, critic, storage, **settings)
         keep_kernels()
-        self._alg = alg
         self.compiled: set[str] = set()  # methods whose kernels have been compiled
-        self._networks = networks = [network for m in (alg.actor, alg.critic) if (network := read_network(m.mlp))]
+        self.product_dtype = torch.bfloat16 if self.use_mixed_precision else torch.float32
+        self._models = (actor, critic)
+        actor_network = read_network(actor.mlp)
+        assert actor_network, "has_kernels has read it"
+        critic_network = read_network(critic.mlp, actor_network.num_outputs)
+        assert critic_network, "has_kernels has read it"
+        self._networks = networks = (actor_network, critic_network)
         layers = [layer for network in networks for layer in network.layers]
-        storage, device = alg.storage, alg.device
         self._std = self._deviation_settings()
-        self._parameters = Parameters(alg.actor, alg.critic, layers, self._std[0], alg.product_dtype)
-        self._acting = Workspace(networks, self._parameters, storage.num_envs)
-        images = 2 if alg.symmetry else 1
-        self._num_chosen = alg.batch_size
-        self._num_samples = images * alg.batch_size
-        self._learning = LearningWorkspace(networks, self._parameters, self._num_samples)
+        self._packed = Parameters(actor, critic, layers, self._std[0], self.product_dtype)
+        self._acting = Workspace(networks, self._packed, storage.num_envs)
+        self._num_samples = self.batch_size * (2 if self.symmetry else 1)
+        self._learning = LearningWorkspace(networks, self._packed, self._num_samples)
         self._places = self._learning.output_places(networks)
-        size, flat = storage.actions.shape[-1], self._parameters.flat
-        self._gradient = torch.zeros(len(flat) + NUMBERS, device=device)
+        size, flat = storage.actions.shape[-1], self._packed.flat
+        self._gradient = flat.new_zeros(len(flat) + NUMBERS)
         self._numbers = self._gradient[len(flat) :]  # value loss, surrogate loss, entropy, KL divergence
-        self.moments, self.squares = torch.zeros(2, len(flat), device=device).unbind()
-        self.adam_steps = torch.zeros((), device=device)
-        self._norms = torch.zeros(2, steps.PARTS, device=device)
-        self._scalars = torch.zeros(5, device=device)  # see :func:`~legged_torque.learning.fused.steps.settle`
-        self._means, self._stds = torch.zeros_like(storage.actions), torch.zeros(size, device=device)
+        self._moments, self._squares = flat.new_zeros(2, len(flat)).unbind()
+        self._adam_steps = flat.new_zeros(())
+        self._norms = flat.new_zeros(2, steps.PARTS)
+        self._scalars = flat.new_zeros(5)  # see :func:`~legged_torque.learning.ppo.triton.steps.prepare_adam_step`
+        self._means, self._stds = torch.zeros_like(storage.actions), flat.new_zeros(size)
         storage.distribution_params = (self._means, self._stds.expand_as(self._means))  # the same for all samples
-        self._maps = [[self._mirror_map(group) for group in model.obs_groups] for model in (alg.actor, alg.critic)]
+        self._maps = [[self._mirror_map(group) for group in model.obs_groups] for model in self._models]
         self._action_map = self._mirror_map("actions")
-        self.share_state(alg.optimizer)
+        self._share_optimizer_state()
 
     # ---- acting --------------------------------------------------------------------------------------------------
 
-    @compiles_first
+    @shows_compilation
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions and keep the transition. Shape: (num_envs, num_actions)."""
-        storage, step = self._alg.storage, self._alg.storage.step
+        storage, step = self.storage, self.storage.step
         if step == 0:
             self.round_weights()  # something else than a gradient step may have changed them
         storage.observations[step].copy_(obs)
@@ -94,26 +102,27 @@ class FusedLearner:
         )  # fmt: skip
         return actions
 
-    def add_step(self, rewards: Tensor, dones: Tensor, time_outs: Tensor | None) -> None:
+    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
         """Keep what followed the actions; a time-out is worth what the critic thought of the state before."""
-        storage, step = self._alg.storage, self._alg.storage.step
+        storage, step = self.storage, self.storage.step
         kept = storage.rewards[step].view(-1)
-        if time_outs is None:
-            kept.copy_(rewards)
+        if "time_outs" in extras:
+            time_outs = extras["time_outs"].float()
+            torch.addcmul(rewards, storage.values[step].view(-1), time_outs, value=self.gamma, out=kept)
         else:
-            torch.addcmul(rewards, storage.values[step].view(-1), time_outs.float(), value=self._alg.gamma, out=kept)
+            kept.copy_(rewards)
         storage.dones[step].copy_(dones.view(-1, 1))
         storage.step += 1
 
-    @compiles_first
+    @shows_compilation
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute returns and advantages (GAE), these of mean 0 and deviation 1 over the rollout."""
-        storage, alg = self._alg.storage, self._alg
+        storage = self.storage
         self._run_networks(obs)
         last_values = self._acting.outputs[: storage.num_envs, -1].contiguous()
         samples.generalized_advantages[(-(-storage.num_envs // GAE_WORLDS),)](
             storage.rewards, storage.dones, storage.values, last_values, storage.returns, storage.advantages,
-            storage.num_transitions_per_env, storage.num_envs, alg.gamma, alg.lam, WORLDS=GAE_WORLDS, num_warps=2,
+            storage.num_transitions_per_env, storage.num_envs, self.gamma, self.lam, WORLDS=GAE_WORLDS, num_warps=2,
         )  # fmt: skip
         advantages = storage.advantages
         advantages.copy_((advantages - advantages.mean()) / (advantages.std() + 1e-8))
@@ -124,52 +133,57 @@ class FusedLearner:
 
     # ---- learning ------------------------------------------------------------------------------------------------
 
-    @compiles_first
+    @shows_compilation
     def update_minibatch(self) -> None:
-        """Take one gradient step on the chosen samples."""
-        alg, work = self._alg, self._learning
-        for network, model, maps in zip(self._networks, (alg.actor, alg.critic), self._maps, strict=True):
-            groups = [alg.storage.observations[group].flatten(0, 1) for group in model.obs_groups]
+        """Take one gradient step on the samples of ``indices``."""
+        work = self._learning
+        for network, model, maps in zip(self._networks, self._models, self._maps, strict=True):
+            groups = [self.storage.observations[group].flatten(0, 1) for group in model.obs_groups]
             self._observe(work, network, groups, maps)
         self._forward(work)
-        self._losses()
+        self._write_losses()
         for table in work.backward:
-            arguments = (work.values, work.gradients, self._parameters.weights, work.sums, work.sums.shape[1], table)
+            arguments = (work.values, work.gradients, self._packed.weights, work.sums, work.sums.shape[1], table)
             settings = {"SAMPLES": SAMPLES} | products.BACKWARD
             self._product(products.input_gradient, arguments, work.rows // SAMPLES, settings)
         self._weight_gradients()
-        if alg.is_multi_gpu:
+        if self.is_multi_gpu:
             distributed.average([self._gradient])
         self._step()
 
     def round_weights(self) -> None:
         """Prepare the weights for the products, after something else than a gradient step has changed them."""
-        parameters = self._parameters
+        parameters = self._packed
         arrays = (parameters.flat, parameters.weights, parameters.source, len(parameters.flat))
         steps.round_weights[(-(-len(parameters.flat) // steps.BLOCK),)](*arrays, BLOCK=steps.BLOCK)
 
-    def state(self) -> list[Tensor]:
-        """Return the parameters, both moments and the number of steps; writing them changes the state."""
-        return [self._parameters.flat, self.moments, self.squares, self.adam_steps.view(1)]
-
     def gradients(self) -> list[Tensor]:
-        """Return the gradients of the last minibatch before they were clipped, as the algorithm's parameters."""
-        return self._parameters.views(self._gradient)
+        """Return the gradients of the last minibatch before they were clipped, in the order of the parameters."""
+        return self._packed.views(self._gradient)
 
-    def share_state(self, optimizer: torch.optim.Optimizer) -> None:
-        """Take over the state of an Adam optimizer, and let it be views of what is used here."""
-        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-        moments, squares = self._parameters.views(self.moments), self._parameters.views(self.squares)
-        for parameter, moment, square in zip(parameters, moments, squares, strict=True):
-            state = optimizer.state[parameter] or {"exp_avg": 0.0, "exp_avg_sq": 0.0, "step": 0.0}
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Load as :class:`TorchPPO` does, into the memory of the kernels."""
+        load_iteration = super().load(loaded_dict, load_cfg, strict)
+        self._share_optimizer_state()
+        return load_iteration
+
+    def tensors(self) -> list[Tensor]:
+        """Return the parameters, both moments and the number of steps."""
+        return [self._packed.flat, self._moments, self._squares, self._adam_steps.view(1)]
+
+    def _share_optimizer_state(self) -> None:
+        """Take over the state of the optimizer, and let it be views of what the kernels use."""
+        moments, squares = self._packed.views(self._moments), self._packed.views(self._squares)
+        for parameter, moment, square in zip(self._parameters, moments, squares, strict=True):
+            state = self.optimizer.state[parameter] or {"exp_avg": 0.0, "exp_avg_sq": 0.0, "step": 0.0}
             moment.copy_(torch.as_tensor(state["exp_avg"]))
             square.copy_(torch.as_tensor(state["exp_avg_sq"]))
-            self.adam_steps.copy_(torch.as_tensor(state["step"]))
-            optimizer.state[parameter] = {"step": self.adam_steps, "exp_avg": moment, "exp_avg_sq": square}
+            self._adam_steps.copy_(torch.as_tensor(state["step"]))
+            self.optimizer.state[parameter] = {"step": self._adam_steps, "exp_avg": moment, "exp_avg_sq": square}
 
     def _run_networks(self, obs: TensorDict) -> None:
         """Compute the outputs of actor and critic in all worlds."""
-        for network, model in zip(self._networks, (self._alg.actor, self._alg.critic), strict=True):
+        for network, model in zip(self._networks, self._models, strict=True):
             self._observe(self._acting, network, [obs[group] for group in model.obs_groups], None)
         self._forward(self._acting)
 
@@ -179,11 +193,11 @@ class FusedLearner:
         for i, group in enumerate(groups):
             order, signs = maps[i] if maps else (group, group)
             target = (work.place(network.inputs), network.inputs.block.width, column)
-            counts = (self._num_chosen, self._num_samples if maps else len(group), group.shape[1])
+            counts = (self.batch_size, self._num_samples if maps else len(group), group.shape[1])
             columns = _power_of_two(group.shape[1])
             rows = max(1, min(samples.ROWS, samples.NUMBERS // columns))
             samples.observe[(work.rows // rows,)](
-                group, self._alg.indices, order, signs, work.values, *target, *counts,
+                group, self.indices, order, signs, work.values, *target, *counts,
                 CHOOSE=bool(maps), ROWS=rows, COLUMNS=columns,
             )  # fmt: skip
             column += group.shape[1]
@@ -191,7 +205,7 @@ class FusedLearner:
     def _forward(self, work: Workspace) -> None:
         """Compute the outputs of actor and critic from their inputs."""
         for table, has_outputs in work.forward:
-            arrays = (work.values, self._parameters.weights, self._parameters.flat, work.outputs, table)
+            arrays = (work.values, self._packed.weights, self._packed.flat, work.outputs, table)
             sizes = {"HAS_OUTPUTS": has_outputs, "SAMPLES": SAMPLES}
             self._product(products.forward, arrays, work.rows // SAMPLES, sizes | products.FORWARD)
 
@@ -200,29 +214,25 @@ class FusedLearner:
         num_tiles, columns = arguments[-1].shape
         kernel[num_tiles, parts](*arguments, COLUMNS=columns, TILE=TILE, STEP=ALIGNMENT, PRECISION="tf32", **settings)
 
-    def _losses(self) -> None:
+    def _write_losses(self) -> None:
         """Compute losses and their gradients by the outputs."""
-        alg, work, storage = self._alg, self._learning, self._alg.storage
+        work, storage = self._learning, self.storage
         size = storage.actions.shape[-1]
-        batch = (
-            storage.actions,
-            self._means,
-            storage.actions_log_prob,
-            storage.values,
-            storage.advantages,
-            storage.returns,
-        )
-        numbers = (self._num_chosen, self._num_samples, size, alg.clip_param, alg.value_loss_coef, alg.entropy_weight)
+        policy = (storage.actions, self._means, storage.actions_log_prob)
+        values = (storage.values, storage.advantages, storage.returns)
+        counts = (self.batch_size, self._num_samples, size)
+        weights = (self.clip_param, self.value_loss_coef, self.entropy_weight)
         places, strides, columns = self._places
         samples.losses[(len(work.sums),)](
-            work.outputs, *self._std[:3], self._stds, alg.indices, *self._action_map, *batch, alg.actor_learns,
-            work.gradients, places, strides, work.sums, work.sums.shape[1], columns, *numbers, IS_LOG=self._std[3],
-            CLIP_VALUES=alg.use_clipped_value_loss, ROWS=SAMPLES, COLUMNS=_power_of_two(size), num_warps=16,
+            work.outputs, *self._std[:3], self._stds, self.indices, *self._action_map, *policy, *values,
+            self.actor_learns, work.gradients, places, strides, work.sums, work.sums.shape[1], columns,
+            *counts, *weights, IS_LOG=self._std[3], CLIP_VALUES=self.use_clipped_value_loss, ROWS=SAMPLES,
+            COLUMNS=_power_of_two(size), num_warps=16,
         )  # fmt: skip
 
     def _weight_gradients(self) -> None:
         """Compute the gradient of all parameters from those of what the layers compute."""
-        work, parameters = self._learning, self._parameters
+        work, parameters = self._learning, self._packed
         parts, room = work.partial.shape
         arguments = (work.values, work.gradients, work.partial, work.rows // parts, room, work.weight_tiles)
         self._product(products.weight_gradient, arguments, parts, products.BACKWARD)
@@ -236,35 +246,34 @@ class FusedLearner:
 
     def _step(self) -> None:
         """Clip the gradients and let Adam take a step, unless they are not finite."""
-        alg, parameters = self._alg, self._parameters
-        size, group = len(parameters.flat), alg.optimizer.param_groups[0]
+        parameters = self._packed
+        size, group = len(parameters.flat), self.optimizer.param_groups[0]
         steps.sum_squares[(steps.PARTS,)](
             self._gradient, parameters.actor_size, size, self._norms, PARTS=steps.PARTS, BLOCK=steps.BLOCK
         )
         beta1, beta2 = group["betas"]
-        steps.settle[(1,)](
-            self._numbers, self._norms, alg.learning_rate, alg.actor_learns, self.adam_steps, self._scalars, alg.losses,
-            alg.max_grad_norm, alg.kl_target, *alg.learning_rates, math.log(beta1), math.log(beta2),
-            ADAPTIVE=alg.schedule == "adaptive", PARTS=steps.PARTS,
+        steps.prepare_adam_step[(1,)](
+            self._numbers, self._norms, self.learning_rate, self.actor_learns, self._adam_steps, self._scalars,
+            self.losses, self.max_grad_norm, self.kl_target, *self.learning_rates, math.log(beta1), math.log(beta2),
+            ADAPTIVE=self.schedule == "adaptive", PARTS=steps.PARTS,
         )  # fmt: skip
-        decay = group["weight_decay"] if isinstance(alg.optimizer, torch.optim.AdamW) else 0.0
+        decay = group["weight_decay"] if isinstance(self.optimizer, torch.optim.AdamW) else 0.0
         steps.adam[(-(-size // steps.BLOCK),)](
-            parameters.flat, self._gradient, self.moments, self.squares, parameters.weights, parameters.source,
-            self._scalars, alg.learning_rate, parameters.actor_size, size,
+            parameters.flat, self._gradient, self._moments, self._squares, parameters.weights, parameters.source,
+            self._scalars, self.learning_rate, parameters.actor_size, size,
             beta1, beta2, group["eps"], decay, BLOCK=steps.BLOCK,
         )  # fmt: skip
 
     def _mirror_map(self, name: str) -> tuple[Tensor, Tensor]:
         """Return order and signs of the mirror image of observations or actions; without images, of no change."""
-        alg = self._alg
-        if alg.symmetry:
-            return alg.symmetry.env.mirror.maps[name]
-        size = (alg.storage.actions if name == "actions" else alg.storage.observations[name]).shape[-1]
-        return torch.arange(size, device=alg.device), torch.ones(size, device=alg.device)
+        if self.symmetry:
+            return self.symmetry.env.mirror.maps[name]
+        size = (self.storage.actions if name == "actions" else self.storage.observations[name]).shape[-1]
+        return torch.arange(size, device=self.device), torch.ones(size, device=self.device)
 
     def _deviation_settings(self) -> tuple[Any, float, float, bool]:
         """Return the parameter of the standard deviations, its range, and whether it is a logarithm."""
-        distribution: Any = self._alg.actor.distribution
+        distribution: Any = self.actor.distribution
         if distribution.std_type == "log":
             return distribution.log_std_param, *distribution.log_std_range, True
         return distribution.std_param, *distribution.std_range, False

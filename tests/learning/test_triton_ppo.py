@@ -23,16 +23,18 @@ from support.rollouts import (
     poison,
     random_obs,
     record_rollout,
+    steps_taken,
 )
+from support.runners import build_runner, networks
 
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.multi_head import MultiHeadModel
-from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, can_be_fused
+from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, has_kernels
 
 pytest.importorskip("triton", reason="Triton is there for Linux only")
 if os.environ.get("TRITON_INTERPRET") != "1":
     pytest.skip("Triton's interpreter is for machines without a GPU: CUDA_VISIBLE_DEVICES=", allow_module_level=True)
-from legged_torque.learning.fused.learner import FusedLearner
+from legged_torque.learning.ppo.triton.triton_ppo import TritonPPO
 
 STEPS, WORLDS, NUM_ACTIONS = 3, 40, 6
 MIRROR = {  # an order that is its own inverse, and signs
@@ -51,7 +53,7 @@ class Mirrored:
         self.mirror.maps = self.maps
 
 
-def make(kind=OnDevicePPO, multi_head=False, symmetric=False, fuse=False, seed=0, std_type="log", **settings):
+def make(kind=TritonPPO, multi_head=False, symmetric=False, seed=0, std_type="log", **settings):
     """An algorithm whose layers are wider than a tile, no multiple of one, and no power of two."""
     torch.manual_seed(seed)
     distribution = {"class_name": GaussianDistribution, "init_std": 0.7, "std_type": std_type}
@@ -64,16 +66,13 @@ def make(kind=OnDevicePPO, multi_head=False, symmetric=False, fuse=False, seed=0
         function = "legged_torque.envs.base.symmetry:with_mirror_images"
         settings["symmetry_cfg"] = {"data_augmentation_func": function, "use_data_augmentation": True}
         settings["symmetry_cfg"] |= {"use_mirror_loss": False, "env": Mirrored()}
-    alg = kind(actor, critic, storage, **{**SETTINGS, **settings})
-    if fuse:
-        assert can_be_fused(alg)
-        alg.fused = FusedLearner(alg)
-    return alg
+    assert kind is PPO or has_kernels(OnDevicePPO(actor, critic, storage, **{**SETTINGS, **settings}))
+    return kind(actor, critic, storage, **{**SETTINGS, **settings})
 
 
 def pair(seed=3, **settings):
-    """The same algorithm with torch's operations and fused, after the same rollout, and samples of a minibatch."""
-    plain, fused = make(**settings), make(**settings, fuse=True)
+    """The same algorithm with torch's operations and with kernels, after the same rollout."""
+    plain, fused = make(OnDevicePPO, **settings), make(**settings)
     record_rollout(plain, seed)
     record_rollout(fused, seed)
     return plain, fused
@@ -110,9 +109,9 @@ def test_gradients_are_those_of_autograd(kind):
         choose(algorithms, round_number)
         plain.losses.zero_()
         fused.losses.zero_()
-        plain._update_minibatch()
-        fused._update_minibatch()
-        gradients = dict(zip(parameters(fused), fused.fused.gradients(), strict=True))
+        plain.update_minibatch()
+        fused.update_minibatch()
+        gradients = dict(zip(parameters(fused), fused.gradients(), strict=True))
         expected = {f"actor.{name}": p.grad for name, p in plain.actor.named_parameters()}
         expected |= {f"critic.{name}": p.grad for name, p in plain.critic.named_parameters()}
         for name, gradient in gradients.items():
@@ -124,17 +123,18 @@ def test_gradients_are_those_of_autograd(kind):
         with torch.no_grad():  # errors do not add up
             for own, other in zip(parameters(fused).values(), parameters(plain).values(), strict=True):
                 own.copy_(other)
-        fused.fused.round_weights()
+        fused.round_weights()
 
 
 def test_share_of_clipped_samples_is_neither_none_nor_all():
     """In the test above, rollouts do clip: the ratio leaves its range for some samples."""
     plain, _ = pair(clip_param=0.02, learning_rate=1e-3)
     choose([plain], 0)
-    plain._update_minibatch()
-    batch = plain._gather()
-    plain.actor(batch.observations, stochastic_output=True)
-    ratio = torch.exp(plain.actor.get_output_log_prob(batch.actions) - batch.old_actions_log_prob.squeeze(1))
+    plain.update_minibatch()
+    storage, chosen = plain.storage, plain.indices
+    plain.actor(storage.observations.flatten(0, 1)[chosen], stochastic_output=True)
+    log_probs = plain.actor.get_output_log_prob(storage.actions.flatten(0, 1)[chosen])
+    ratio = torch.exp(log_probs - storage.actions_log_prob.flatten()[chosen])
     share = ((ratio - 1.0).abs() > 0.02).float().mean()
     assert 0.1 < share < 0.9
 
@@ -142,15 +142,15 @@ def test_share_of_clipped_samples_is_neither_none_nor_all():
 @pytest.mark.parametrize("optimizer", ["adam", "adamw"])
 def test_steps_are_those_of_torch(optimizer):
     """Adam and AdamW of torch, in float64 and given the same gradients, which are clipped as torch clips them."""
-    alg = make(fuse=True, optimizer=optimizer, max_grad_norm=0.05)
+    alg = make(optimizer=optimizer, max_grad_norm=0.05)
     models = (copy.deepcopy(alg.actor).double(), copy.deepcopy(alg.critic).double())
     theirs = [*models[0].parameters(), *models[1].parameters()]
     reference = type(alg.optimizer)(theirs, lr=1e-3)
     record_rollout(alg)
     for round_number in range(3):
         choose([alg], round_number)
-        alg._update_minibatch()
-        for parameter, gradient in zip(theirs, alg.fused.gradients(), strict=True):
+        alg.update_minibatch()
+        for parameter, gradient in zip(theirs, alg.gradients(), strict=True):
             parameter.grad = gradient.double()
         for model in models:
             torch.nn.utils.clip_grad_norm_(model.parameters(), 0.05)
@@ -179,21 +179,21 @@ def test_learning_rate_follows_the_divergence():
         choose(algorithms, round_number)
         for alg in algorithms:
             alg.anneal(0.3 + 0.3 * round_number)
-        algorithms[0]._update_minibatch()
-        algorithms[1]._update_minibatch()
+        algorithms[0].update_minibatch()
+        algorithms[1].update_minibatch()
         assert float(algorithms[1].learning_rate) == pytest.approx(float(algorithms[0].learning_rate), rel=1e-6)
     assert float(algorithms[1].learning_rate) < 1e-2
 
 
 def test_a_gradient_that_is_not_finite_changes_nothing():
     """It is counted; parameters, moments and the count of steps stay as they were to the bit."""
-    alg = make(fuse=True)
+    alg = make()
     record_rollout(alg, poison=(2, 3))
-    before = [tensor.clone() for tensor in alg.fused.state()]
+    before = [tensor.clone() for tensor in alg.tensors()]
     choose([alg], 0)
     alg.indices[0] = 2 * WORLDS + 3  # the poisoned sample
-    alg._update_minibatch()
-    assert all(torch.equal(old, new) for old, new in zip(before, alg.fused.state(), strict=True))
+    alg.update_minibatch()
+    assert all(torch.equal(old, new) for old, new in zip(before, alg.tensors(), strict=True))
     losses = dict(zip(LOSS_NAMES, alg.losses.tolist(), strict=True))
     assert losses.pop("skipped_updates") == 1.0
     assert set(losses.values()) == {0.0}
@@ -203,14 +203,14 @@ def learn(alg, firsts):
     """Learn from minibatches that begin at these samples of a rollout."""
     for first in firsts:
         alg.indices.copy_(torch.arange(first, first + alg.batch_size))
-        alg._update_minibatch()
+        alg.update_minibatch()
     return alg
 
 
 @pytest.fixture(scope="module")
 def twin():
     """An algorithm that has never seen the spoiled minibatch."""
-    alg = make(fuse=True, **KINDS[1])
+    alg = make(**KINDS[1])
     record_rollout(alg)
     return learn(alg, [60])
 
@@ -218,53 +218,53 @@ def twin():
 @pytest.mark.parametrize(("field", "value"), POISONS[1::2])
 def test_a_minibatch_that_is_skipped_leaves_nothing_behind(twin, field, value):
     """The next one is learned from as if the one before had never been, to the bit."""
-    spoiled = make(fuse=True, **KINDS[1])
+    spoiled = make(**KINDS[1])
     record_rollout(spoiled)
     poison(spoiled.storage, field, value, step=0, world=2)
     learn(spoiled, [0, 60])
     assert [float(alg.losses[-1]) for alg in (spoiled, twin)] == [1.0, 0.0]
-    assert all(map(torch.equal, spoiled.fused.state(), twin.fused.state()))
+    assert all(map(torch.equal, spoiled.tensors(), twin.tensors()))
 
 
 def test_gradients_are_finite_whatever_the_learning_rate():
     """It is no part of them, nor of the samples that fill up the last tile."""
-    alg = make(fuse=True)
+    alg = make()
     record_rollout(alg)
     alg.learning_rate.fill_(math.inf)
     choose([alg], 0)
-    alg._update_minibatch()
-    assert all(torch.isfinite(gradient).all() for gradient in alg.fused.gradients())
+    alg.update_minibatch()
+    assert all(torch.isfinite(gradient).all() for gradient in alg.gradients())
 
 
 def test_the_critic_learns_alone():
     """While a pre-trained policy stays, only the critic's parameters move."""
-    alg = make(fuse=True)
+    alg = make()
     record_rollout(alg)
     alg.learn_actor(False)
     before = {name: value.clone() for name, value in parameters(alg).items()}
     choose([alg], 0)
-    alg._update_minibatch()
+    alg.update_minibatch()
     for name, value in parameters(alg).items():
         assert torch.equal(value, before[name]) == name.startswith("actor")
 
 
 def test_checkpoints_go_both_ways():
-    """What the fused update has learned, torch's update goes on with, and the other way round; both then agree."""
-    first = make(fuse=True)
+    """Torch continues from a checkpoint of the kernels, and the other way round; both then agree."""
+    first = make()
     record_rollout(first)
     choose([first], 0)
-    first._update_minibatch()
-    plain, fused = make(seed=8), make(seed=9, fuse=True)
+    first.update_minibatch()
+    plain, fused = make(OnDevicePPO, seed=8), make(seed=9)
     for alg in (plain, fused):
         alg.load(copy.deepcopy(first.save()), None, True)
         record_rollout(alg, 4)
-    assert math.isclose(float(fused.fused.adam_steps), 1.0)
+    assert steps_taken(plain) == steps_taken(fused) == 1
     choose([plain, fused], 1)
-    plain._update_minibatch()
-    fused._update_minibatch()
+    plain.update_minibatch()
+    fused.update_minibatch()
     for own, other in zip(parameters(fused).values(), parameters(plain).values(), strict=True):
         torch.testing.assert_close(own, other, rtol=1e-3, atol=2e-5)
-    back = make(fuse=True)
+    back = make()
     back.load(copy.deepcopy(plain.save()), None, True)
     for own, other in zip(parameters(back).values(), parameters(plain).values(), strict=True):
         assert torch.equal(own, other)
@@ -274,24 +274,24 @@ def test_the_same_bits_twice():
     """Rollouts and updates repeat to the bit."""
     states = []
     for _ in range(2):
-        alg = make(fuse=True, multi_head=True)
+        alg = make(multi_head=True)
         record_rollout(alg)
         choose([alg], 0)
-        alg._update_minibatch()
-        states.append([tensor.numpy().tobytes() for tensor in alg.fused.state()])
+        alg.update_minibatch()
+        states.append([tensor.numpy().tobytes() for tensor in alg.tensors()])
     assert states[0] == states[1]
 
 
 def test_padding_does_not_matter():
     """A minibatch that fills no tile gives the mean over its samples alone, here by hand."""
-    alg = make(fuse=True, num_mini_batches=3)
+    alg = make(num_mini_batches=3)
     assert alg.batch_size == 40
     record_rollout(alg)
     choose([alg], 0)
-    alg._update_minibatch()
+    alg.update_minibatch()
     observations = alg.storage.observations["critic"].flatten(0, 1)[alg.indices]
     with torch.no_grad():
-        fresh = make(num_mini_batches=3)
+        fresh = make(OnDevicePPO, num_mini_batches=3)
         values = fresh.critic.mlp(observations).squeeze(1).double().numpy()
     returns = alg.storage.returns.flatten()[alg.indices].double().numpy()
     old = alg.storage.values.flatten()[alg.indices].double().numpy()
@@ -316,7 +316,7 @@ PARTS = [
 def test_what_has_no_kernels_is_left_to_torch(what):
     """Algorithms with other parts are known beforehand."""
     alg = make_ppo()
-    assert can_be_fused(alg)
+    assert has_kernels(alg)
     if what == "normalization":
         alg = make_ppo(obs_normalization=True)
     elif what == "activation":
@@ -324,16 +324,39 @@ def test_what_has_no_kernels_is_left_to_torch(what):
     elif what == "advantages":
         alg = make_ppo(normalize_advantage_per_mini_batch=True)
     elif what == "mirror loss":
-        alg = make(symmetric=True)
+        alg = make(OnDevicePPO, symmetric=True)
         alg.symmetry.use_mirror_loss = True
     elif what in ("losses", "model", "distribution"):
         part = {"losses": alg, "model": alg.critic, "distribution": alg.actor.distribution}[what]
         part.__class__ = type("Own", (type(part),), {})  # of a user, with methods that kernels do not know
     else:
         alg.actor.distribution.log_std_param.requires_grad_(False)
-    assert not can_be_fused(alg)
+    assert not has_kernels(alg)
+
+
+def test_a_training_with_kernels(make_task, tmp_path, monkeypatch):
+    """Where there are kernels, the same settings train with them, and a checkpoint goes on without."""
+
+    def build(**settings):
+        small = {"actor.hidden_dims": [8, 8], "actor.head_hidden_dims": [8], "critic.hidden_dims": [8]}
+        small |= {"runner.logger": "none", "algorithm.use_mixed_precision": False, "algorithm.num_learning_epochs": 1}
+        return build_runner(make_task, "a1_torque_multihead", 2, log_root=tmp_path, **small, **settings)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("legged_torque.learning.ppo.has_triton", lambda device: True)
+        patch.setattr("legged_torque.learning.ppo.triton.triton_ppo.can_multiply", lambda dtype, device: True)
+        runner = build()
+    before = {name: value.clone() for name, value in networks(runner).items()}
+    runner.learn(2)
+    assert type(runner.alg) is TritonPPO and steps_taken(runner.alg) == 2 * 2
+    assert not any(torch.equal(value, before[name]) for name, value in networks(runner).items())
+    plain = build()
+    plain.load(f"{runner.log_dir}/model_2.pt")
+    assert type(plain.alg) is OnDevicePPO and plain.current_learning_iteration == 2
+    assert all(torch.equal(value, networks(runner)[name]) for name, value in networks(plain).items())
+    plain.learn(1)
 
 
 def test_mixed_precision_is_that_of_the_kernels():
     """An algorithm that works with torch's operations says that it does without."""
-    assert make(use_mixed_precision=True).product_dtype == torch.float32
+    assert make(OnDevicePPO, use_mixed_precision=True).product_dtype == torch.float32

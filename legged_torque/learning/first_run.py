@@ -1,4 +1,4 @@
-"""Resuming on several machines: the first process has the run, the others get what they lack."""
+"""Resume on several machines: the first process has the run, the others get copies of its files."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from legged_torque.utils.runs import CONFIG_FILE
 from legged_torque.utils.task_registry import task_registry
 
 
-def take_run_of_first(options: Options) -> None:
-    """Let ``options`` name the run and the checkpoint that the first of all processes finds.
+def use_first_run(options: Options) -> None:
+    """Write the run and the checkpoint that the first process finds into ``options`` of all processes.
 
     A process that does not see the same files, on a machine with a file system of its own, gets copies in a temporary
-    folder. A UserError in all processes if the first one finds none.
+    folder. A UserError in all processes if the first one finds no run.
     """
     device = resolve_device(options.device)
     distributed.join(device)
@@ -30,24 +30,20 @@ def take_run_of_first(options: Options) -> None:
     if distributed.rank() == 0:
         try:
             run = task_registry.load_run(options)
-            options.load_run, options.checkpoint = str(run.folder.resolve()), run.iterations
-            files = (
-                run.folder.resolve() / CONFIG_FILE,
-                run.checkpoint.resolve(),
-                worlds_file(run.checkpoint.resolve()),
-            )
+            options.checkpoint, checkpoint_file = run.iterations, run.checkpoint.resolve()
+            files = (run.folder.resolve() / CONFIG_FILE, checkpoint_file, worlds_file(checkpoint_file))
             digests = {str(file): checkpoint.digest(file) for file in files if file.is_file()}
         except UserError as error:
             problem = str(error)
-    digests, number, problem = distributed.from_first((digests, options.checkpoint, problem), device)
+    digests, options.checkpoint, problem = distributed.from_first((digests, options.checkpoint, problem), device)
     if problem:
         raise UserError(problem)
-    lacks = any(checkpoint.digest(Path(name)) != digest for name, digest in digests.items())
-    folder, options.checkpoint = Path(next(iter(digests))).parent, number
-    if distributed.any_process(lacks, device):
+    folder = Path(next(iter(digests))).parent
+    is_missing = any(checkpoint.digest(Path(name)) != digest for name, digest in digests.items())
+    if distributed.any_process(is_missing, device):
         mine = {Path(name).name: Path(name).read_bytes() for name in digests} if distributed.rank() == 0 else None
         contents = distributed.from_first(mine, device)
-        if lacks:
+        if is_missing:
             temporary = tempfile.mkdtemp(prefix="legged_torque_")
             atexit.register(shutil.rmtree, temporary, ignore_errors=True)
             folder = Path(temporary) / folder.name

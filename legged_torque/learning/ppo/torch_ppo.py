@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -12,36 +12,36 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.utils._pytree import tree_map
 
-from legged_torque.envs.base.symmetry import with_mirror_images
-from legged_torque.learning.distribution import GaussianDistribution
-from legged_torque.learning.fused.networks import read_network
-from legged_torque.learning.multi_head import MultiHeadModel
-from legged_torque.sim.compiled import has_triton
+from legged_torque.learning.protocols import Transition
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
 
-if TYPE_CHECKING:
-    from legged_torque.learning.fused.learner import FusedLearner
-
 MIN_LEARNING_RATE = 1e-5  # lower bound of the adaptive learning rate, that of rsl_rl
 
 LOSS_NAMES = ("value", "surrogate", "entropy", "kl", "gradient_norm", "critic_gradient_norm", "skipped_updates")
-"""What an update reports: means over the minibatches that were learned from, and how many were not."""
+"""Losses of an update: means over the minibatches that were learned from, and the number of the others."""
 
 
-class OnDevicePPO(PPO):
+class TorchPPO(PPO):
     """PPO whose minibatch update has fixed shapes and never waits for the host, so that it replays as a CUDA graph.
 
     The losses are rsl_rl's. The adaptive learning rate is a tensor. A minibatch whose gradient norm is not finite
     leaves the networks and the optimizer untouched and is counted. If a weight or a moment is not finite after an
     iteration, all its minibatches are undone and counted. Processes that train together learn from minibatches
-    of their own, average gradients and KL divergence, and so take the same step, or skip it, all of them; as in rsl_rl,
-    each normalizes the advantages of its own rollout.
+    of their own and average gradients and KL divergence, so that all of them take the same step or skip it. As in
+    rsl_rl, each normalizes the advantages of its own rollout.
+
+    Attributes:
+        warm_up_iterations: Iterations at the start of a training in which only the critic learns.
+        update_graph: The update from the samples of ``indices``.
+        product_dtype: Numbers that matrix products take; those of float32 may be TF32.
     """
 
+    capturable = True
+    needs_next_obs = False
+    warm_up_iterations = 0
     optimizer: torch.optim.Adam
-    use_mixed_precision: bool
 
     def __init__(
         self,
@@ -54,7 +54,10 @@ class OnDevicePPO(PPO):
         annealing_start: float = 1.0,
         **kwargs,
     ) -> None:
-        """Create the algorithm; arguments are rsl_rl's, a bound of the adaptive learning rate, and :meth:`anneal`'s."""
+        """Create the algorithm; arguments are rsl_rl's, the bound of the adaptive learning rate, and :meth:`anneal`'s.
+
+        A UserError names a setting that is not supported.
+        """
         if optimizer not in ("adam", "adamw"):  # of these torch can skip a step on the device
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
         if kwargs.get("rnd_cfg"):
@@ -81,21 +84,70 @@ class OnDevicePPO(PPO):
         self.optimizer = make_optimizer(self._parameters, lr=self.learning_rate, fused=True, capturable=True)
         self.actor_learns = torch.ones((), device=self.device)
         self._skip = torch.zeros((), device=self.device)
-        self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # where torch's own gradient scaler tells a fused optimizer to skip
+        self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # where it is 1, a fused optimizer skips
         self.losses = torch.zeros(len(LOSS_NAMES), device=self.device)
         self.indices = torch.zeros(self.batch_size, dtype=torch.long, device=self.device)
-        self.fused = self._fuse()
-        self.use_mixed_precision = self.use_mixed_precision and self.fused is not None  # torch's operations do without
-        self.update_graph = CudaGraph(self._update_minibatch, self.device)  # the update from one minibatch
+        self.product_dtype = torch.float32
+        self.update_graph = CudaGraph(self.update_minibatch, self.device)
+
+    @classmethod
+    def construct_algorithm(cls, obs: TensorDict, env: Any, cfg: dict[str, Any], device: str) -> PPO:
+        """Build the algorithm with its networks and storage, from settings in rsl_rl's layout."""
+        algorithm = {**cfg["algorithm"], "class_name": cls.make}
+        alg = PPO.construct_algorithm(obs, env, {**cfg, "algorithm": algorithm}, device)
+        alg.update_graph.enabled = cfg["capture"]
+        alg.warm_up_iterations = cfg["pretraining"]["critic_warmup_iterations"]
+        return alg
+
+    @classmethod
+    def make(cls, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> TorchPPO:
+        """Return the algorithm for networks, storage and settings; subclasses may choose between several."""
+        return cls(actor, critic, storage, **settings)
+
+    # ---- for the trainer, see protocols.Learner --------------------------------------------------------------------
+
+    def observe(self, transition: Transition) -> None:
+        """Keep what followed the actions, and compute returns after the last step of a rollout."""
+        after = transition.obs_after
+        self.process_env_step(after, transition.rewards, transition.dones, transition.extras)
+        if self.storage.step == self.storage.num_transitions_per_env:
+            self.compute_returns(after)
+
+    def due(self) -> bool:
+        """Return that an update is due: the storage holds one rollout."""
+        return True
+
+    def set_progress(self, iteration: int, num_iterations: int) -> None:
+        """Prepare the update of an iteration: warm-up of the critic, and annealing."""
+        self.learn_actor(iteration >= self.warm_up_iterations)
+        self.anneal(iteration / num_iterations)
+
+    def policy(self) -> MLPModel:
+        """Return the actor."""
+        return self.get_policy()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what :meth:`save` does."""
+        return self.save()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Load all parts of a :meth:`state_dict`."""
+        self.load(state, None, True)
+
+    def close(self) -> None:
+        """Free the graph of the update: NCCL waits for the end of graphs with its work in them."""
+        self.update_graph.reset()
+
+    # ---- rsl_rl's methods --------------------------------------------------------------------------------------------
 
     def learn_actor(self, enabled: bool) -> None:
-        """Say whether the next updates train the policy too, or the value function alone."""
+        """Choose whether the next updates train the policy too, or the value function alone."""
         self.actor_learns.fill_(float(enabled))
 
     def anneal(self, progress: float) -> None:
         """Make the next update smaller, after this share of the training.
 
-        From the share ``annealing_start`` on, the weight of the entropy and the wanted KL divergence fall linearly to
+        From the share ``annealing_start`` on, the weight of the entropy and the desired KL divergence fall linearly to
         0. The adaptive learning rate follows the latter; a fixed learning rate falls itself.
         """
         left = min(1.0, (1.0 - progress) / max(1.0 - self.annealing_start, 1e-9))
@@ -107,28 +159,23 @@ class OnDevicePPO(PPO):
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions and keep the transition, with a copy of observations that a task may overwrite in its step."""
-        return self.fused.act(obs) if self.fused else super().act(obs.clone())
-
-    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
-        """Keep what followed the actions, as rsl_rl does."""
-        if self.fused:
-            self.fused.add_step(rewards, dones, extras.get("time_outs"))
-        else:
-            super().process_env_step(obs, rewards, dones, extras)
+        return super().act(obs.clone())
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute returns and advantages (GAE) in place, with rsl_rl's formulas."""
-        if self.fused:
-            self.fused.compute_returns(obs)
-        else:
-            advantages = self.storage.advantages
-            super().compute_returns(obs)
-            self.storage.advantages = advantages.copy_(self.storage.advantages)
+        advantages = self.storage.advantages
+        super().compute_returns(obs)
+        self.storage.advantages = advantages.copy_(self.storage.advantages)
 
     def update(self) -> dict[str, float]:
-        """Learn from the rollout in random order, epoch by epoch; return :data:`LOSS_NAMES` over all processes."""
+        """Learn from the rollout in random order, epoch by epoch.
+
+        Returns:
+            :data:`LOSS_NAMES` over all processes, "learning_rate", "action_std" and "all_skipped", see
+            :class:`~legged_torque.learning.protocols.Learner`.
+        """
         self.losses.zero_()
-        before = flattened(self._state())
+        before = flattened(self.tensors())
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(self.batch_size * self.num_mini_batches, device=self.device)
             for indices in order.split(self.batch_size):
@@ -136,7 +183,7 @@ class OnDevicePPO(PPO):
                 self.update_graph()
         self._update_normalization()
         self.storage.clear()
-        is_finite = torch.isfinite(flattened(self._state())).all().float()
+        is_finite = torch.isfinite(flattened(self.tensors())).all().float()
         numbers = torch.cat([self.losses, is_finite.unsqueeze(0)])
         if self.is_multi_gpu:
             distributed.average([numbers])
@@ -147,7 +194,9 @@ class OnDevicePPO(PPO):
             self._restore(before)
             losses = dict.fromkeys(LOSS_NAMES, 0.0) | {"skipped_updates": float(num_updates)}
         updates = num_updates - losses["skipped_updates"]
-        return {name: loss if name == "skipped_updates" else loss / max(updates, 1) for name, loss in losses.items()}
+        means = {name: loss if name == "skipped_updates" else loss / max(updates, 1) for name, loss in losses.items()}
+        policy = {"learning_rate": self.learning_rate.item(), "action_std": self.action_std().mean().item()}
+        return {**means, **policy, "all_skipped": updates <= 0}
 
     def save(self) -> dict:
         """Return what rsl_rl saves, each tensor in memory of its own."""
@@ -160,38 +209,21 @@ class OnDevicePPO(PPO):
         self.learning_rate = learning_rate.copy_(torch.as_tensor(self.learning_rate))
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
-        if self.fused:
-            self.fused.share_state(self.optimizer)
         self.update_graph.reset()  # the optimizer's tensors are new
         return load_iteration
 
     def action_std(self) -> Tensor:
         """Return the standard deviations of the actions that were sampled last. Shape: (..., num_actions)."""
-        return self.fused.action_std() if self.fused else self.actor.output_std
+        return self.actor.output_std
 
-    @property
-    def product_dtype(self) -> torch.dtype:
-        """Kind of numbers that matrix products take; those of float32 may be TF32."""
-        return torch.bfloat16 if self.use_mixed_precision else torch.float32
-
-    def _fuse(self) -> FusedLearner | None:
-        """Return what acts and learns in few kernels; None where that needs something that is not there."""
-        if not has_triton(self.device) or not can_be_fused(self):
-            return None
-        from legged_torque.learning.fused.learner import FusedLearner, can_multiply  # imports Triton
-
-        return FusedLearner(self) if can_multiply(self.product_dtype, self.device) else None
-
-    def _state(self) -> list[Tensor]:
-        """Return the weights, and the optimizer's moments and counters, which do not exist before the first step."""
-        if self.fused:
-            return self.fused.state()
+    def tensors(self) -> list[Tensor]:
+        """Return the weights, and moments and counters of the optimizer, which exist from its first step on."""
         kept = [value for entry in self.optimizer.state.values() for value in entry.values()]
         return [*(parameter.data for parameter in self._parameters), *kept]
 
     def _restore(self, before: Tensor) -> None:
-        """Undo an update; ``before`` are the numbers of :meth:`_state` in front of it."""
-        state = self._state()
+        """Undo an update; ``before`` are the flattened numbers of :meth:`tensors` before it."""
+        state = self.tensors()
         before = torch.cat([before, before.new_zeros(sum(map(torch.numel, state)) - len(before))])  # as they start
         for tensor, numbers in zip(state, before.split([tensor.numel() for tensor in state]), strict=True):
             tensor.copy_(numbers.view_as(tensor))
@@ -205,15 +237,8 @@ class OnDevicePPO(PPO):
                 model.update_normalization(observations)  # from the rollouts of all processes
                 model.obs_normalizer._std = std.copy_(model.obs_normalizer._std)
 
-    def _update_minibatch(self) -> None:
-        """Take one gradient step on the samples of ``indices``."""
-        if self.fused:
-            self.fused.update_minibatch()
-        else:
-            self._update_by_autograd()
-
     def loss(self) -> tuple[Tensor, Tensor]:
-        """Return the loss of the samples of ``indices`` by torch's operations, and the first numbers of LOSS_NAMES."""
+        """Return the loss of the samples of ``indices`` with torch's operations, and the first four LOSS_NAMES."""
         batch = self._gather()
         if self.symmetry:
             self.symmetry.augment_batch(batch, self.batch_size)
@@ -221,9 +246,18 @@ class OnDevicePPO(PPO):
         log_prob = self.actor.get_output_log_prob(batch.actions)
         values = self.critic(batch.observations)
         entropy = self.actor.output_entropy.mean()
-        kl = self._mean_kl(batch)
-        surrogate_loss = self._surrogate_loss(batch, log_prob)
-        value_loss = self._value_loss(batch, values)
+        with torch.no_grad():  # from the policy that acted, without mirror images
+            params = tuple(params[: self.batch_size] for params in self.actor.output_distribution_params)
+            kl = self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
+        ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze(1))
+        advantages = batch.advantages.squeeze(1)
+        clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
+        error = (values - batch.returns).square()
+        if self.use_clipped_value_loss:
+            change = (values - batch.values).clamp(-self.clip_param, self.clip_param)
+            error = torch.max(error, (batch.values + change - batch.returns).square())
+        value_loss = error.mean()
         actor_loss = surrogate_loss - self.entropy_weight * entropy
         if self.symmetry and self.symmetry.use_mirror_loss:
             mirror_loss = self.symmetry.compute_loss(self.actor, batch, self.batch_size)
@@ -231,8 +265,8 @@ class OnDevicePPO(PPO):
         loss = self.actor_learns * actor_loss + self.value_loss_coef * value_loss
         return loss, torch.stack([value_loss, surrogate_loss, entropy, kl]).detach()
 
-    def _update_by_autograd(self) -> None:
-        """Take the step with torch's operations."""
+    def update_minibatch(self) -> None:
+        """Take one gradient step on the samples of ``indices``."""
         loss, numbers = self.loss()
         kl = numbers[3]
         self.optimizer.zero_grad()
@@ -269,52 +303,16 @@ class OnDevicePPO(PPO):
             old_distribution_params=tuple(pick(params) for params in storage.distribution_params),
         )
 
-    @torch.no_grad()
-    def _mean_kl(self, batch: RolloutStorage.Batch) -> Tensor:
-        """Return the mean KL divergence of the policy from the one that acted, without mirror images. Scalar."""
-        params = tuple(params[: self.batch_size] for params in self.actor.output_distribution_params)
-        return self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
-
     def _adapt_learning_rate(self, kl: Tensor) -> None:
-        """Steer the learning rate by the mean KL divergence."""
+        """Adapt the learning rate to the mean KL divergence, if it is adaptive."""
         if self.schedule == "adaptive":
             lower = kl > 2.0 * self.kl_target
             higher = (kl < 0.5 * self.kl_target) & (kl > 0.0)
             factor = torch.where(lower, 1.0 / 1.5, torch.where(higher, 1.5, 1.0))
-            factor = torch.where(self.actor_learns.bool(), factor, 1.0)  # a policy that stays says nothing
+            factor = torch.where(self.actor_learns.bool(), factor, 1.0)  # a fixed policy has no divergence
             self.learning_rate.mul_(factor).clamp_(*self.learning_rates)
-
-    def _surrogate_loss(self, batch: RolloutStorage.Batch, log_prob: Tensor) -> Tensor:
-        """Return PPO's clipped policy loss."""
-        ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze(1))
-        advantages = batch.advantages.squeeze(1)
-        clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        return torch.max(-advantages * ratio, -advantages * clipped).mean()
-
-    def _value_loss(self, batch: RolloutStorage.Batch, values: Tensor) -> Tensor:
-        """Return the squared error of the values, clipped as rsl_rl does if asked for."""
-        error = (values - batch.returns).square()
-        if self.use_clipped_value_loss:
-            change = (values - batch.values).clamp(-self.clip_param, self.clip_param)
-            error = torch.max(error, (batch.values + change - batch.returns).square())
-        return error.mean()
 
 
 def flattened(tensors: list[Tensor]) -> Tensor:
     """Return the numbers of several tensors behind each other."""
     return torch.cat([tensor.flatten() for tensor in tensors])
-
-
-def can_be_fused(alg: OnDevicePPO) -> bool:
-    """Return whether there are kernels for all that an algorithm asks for; classes of a user's may do anything."""
-    models, symmetry = (alg.actor, alg.critic), alg.symmetry
-    return (
-        type(alg) is OnDevicePPO
-        and all(type(model) in (MLPModel, MultiHeadModel) for model in models)
-        and type(alg.actor.distribution) is GaussianDistribution
-        and all(read_network(model.mlp) and not model.obs_normalization for model in models)
-        and all(parameter.requires_grad for model in models for parameter in model.parameters())
-        and not alg.normalize_advantage_per_mini_batch
-        and not (symmetry and symmetry.use_mirror_loss)
-        and not (symmetry and symmetry.data_augmentation_func is not with_mirror_images)
-    )
