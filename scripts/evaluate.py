@@ -120,7 +120,7 @@ def parse_args() -> argparse.Namespace:
 
 
 def walk(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, num_steps: int, is_fixed: bool) -> dict[str, Any]:
-    """Roll a policy out, print its metrics, and return them; a fixed command has no ranges to be told apart."""
+    """Roll a policy out, print its metrics, and return them; a fixed command has no parts of its range to compare."""
     from legged_torque.envs.base.metrics import CommandBreakdown, measure
 
     breakdown = CommandBreakdown(env)
@@ -171,8 +171,8 @@ def cross_tiles(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, ground
 
     results = cross(env, runner.get_inference_policy(env.device), grounds)
     time_limit, trained = grounds.time_limit(env.cfg.terrain.tile_size), runner.logger.tot_timesteps
-    told = "told to walk {:g} {:g} m/s for {:.1f} s at most".format(*grounds.command, time_limit)
-    print(f"{run.checkpoint}, after {trained:,} steps of training, {env.num_envs} worlds, {told}:")
+    trial = "commanded to walk {:g} {:g} m/s for {:.1f} s at most".format(*grounds.command, time_limit)
+    print(f"{run.checkpoint}, after {trained:,} steps of training, {env.num_envs} worlds, {trial}:")
     print(f"  {'kind':<18} {'level':>6} {'worlds':>6} {'crossed':>16} {'fell':>16} {'tracking':>9} {'cost':>6}")
     for result in results:
         shares = [f"{share.mean:.3f} +- {share.standard_error:.3f}" for share in (result.crossed, result.fell)]

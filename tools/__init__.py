@@ -1,1 +1,1 @@
-"""What maintainers run in a checkout; not a part of the package."""
+"""Programs for maintainers, run from a checkout: ``python tools/accuracy.py``. They are not in the package."""

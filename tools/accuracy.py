@@ -156,7 +156,7 @@ KINDS: dict[str, Callable[[mujoco.MjModel, Arrays, np.random.Generator], None]] 
     "torques to 1000 N m": large_torques,
     "flight, at the limits": flight,
 }
-"""What is changed in walking states, by name."""
+"""Changes of walking states, by name."""
 ON_ANY_GROUND = [
     name for name, change in KINDS.items() if change in (walking, sliding, fast_joints, impact, large_torques)
 ]
@@ -245,11 +245,11 @@ class PlanePerFoot:
         """Compile a robot that stands on a plane, from its specification, which changes."""
         floor, self._map, self._feet = spec.geom(FLOOR), height_map, feet
         names = ("friction", "solref", "solimp", "solmix", "priority", "condim")
-        feel = {name: getattr(floor, name) for name in names}
+        contact = {name: getattr(floor, name) for name in names}
         for k, foot in enumerate(feet):
             spec.geom(foot).contype, spec.geom(foot).conaffinity = 0, 2 << k
             kind = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [0.0, 0.0, 1.0], "contype": 2 << k, "conaffinity": 0}
-            spec.worldbody.add_geom(name=f"under_{foot}", **kind, **_AT_FIRST, **feel)
+            spec.worldbody.add_geom(name=f"under_{foot}", **kind, **_AT_FIRST, **contact)
         floor.contype, floor.conaffinity = 2 << len(feet), 0  # which nothing touches
         self.model = build_model(spec, [])
 

@@ -159,7 +159,7 @@ def _median_seconds(function: Callable[[], object], device: str) -> float:
 
 
 def main() -> None:
-    """Time updates and physics of a task, and print their rates beside the peaks."""
+    """Time updates and physics of a task, and print their rates as shares of the peaks."""
     parser = Parser(__doc__)
     add_build_args(parser)
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from legged_torque.sim.randomization import Randomization
 
 COLORS = {"reset": "#56B4E9", "model": "#E69F00", "control": "#CC79A7", "push": "#F0E442", "sensor": "#999999"}
-"""By group of numbers; colour-blind people can tell them apart."""
+"""By group of numbers; colour-blind people can distinguish them."""
 OWN = "#D55E00"
 COLUMNS, BINS = 6, 20
 SAMPLES = 200_000  # of an expected distribution

@@ -28,14 +28,8 @@ from legged_torque.utils.runs import (
 )
 
 SETTINGS_FILE = "experiment.yaml"  # copy of the description, in the folder of the results
-CELL_SETTINGS = {
-    "seed": "seeds",
-    "runner.experiment_name": "tasks, environments and seeds",
-    "env.num_actions": "the tasks",
-    "evaluation.perturbation": "environments",
-    "evaluation.also": "environments",
-}
-"""Settings that ``train`` must not change, and the keys that they come from."""
+CELL_SETTINGS = ("seed", "runner.experiment_name", "env.num_actions", "evaluation.perturbation", "evaluation.also")
+"""Settings that ``train`` must not change, since they follow from tasks, environments and seeds."""
 EVALUATION: dict[str, Any] = {"num_envs": 256, "num_steps": 2000}
 """Worlds and control steps of an evaluation, by default."""
 GROUNDS: dict[str, Any] = {"kinds": ["all"], "levels": [level / 10 for level in range(10)], "num_envs": 40}
@@ -149,9 +143,9 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
 
     task_registry.import_files(task_files)
     matrix = replace(read_plan(file), task_files=tuple(str(Path(name).resolve()) for name in task_files))
-    for key, source in CELL_SETTINGS.items():
+    for key in CELL_SETTINGS:
         if key in matrix.train:
-            raise UserError(f"train.{key} cannot be set: it comes from {source}")
+            raise UserError(f"train.{key} cannot be set: it comes from tasks, environments and seeds")
     named_kinds(matrix.grounds.get("kinds", []))
     rising_levels(matrix.grounds.get("levels", []))
     of_tasks = {}

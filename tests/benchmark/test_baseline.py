@@ -43,7 +43,7 @@ def test_ratios_by_hand(tmp_path):
 
 
 def test_other_settings_and_machine(tmp_path):
-    """Another task, other settings, another device and other software are told, not refused."""
+    """Another task, other settings, another device and other software are reported, not refused."""
     changes = {"task": "a1_torque", "set": [], "perturbation": "low"}
     file = write(tmp_path, device="NVIDIA H100", versions={"torch": "2.10", "warp-lang": "1.19"}, **changes)
     assert Baseline(file, RESULT, [(4096, 24)]).notes == [

@@ -81,7 +81,7 @@ def test_table(measured):
 
 
 def test_against_an_earlier_run(measured, tmp_path):
-    """Its numbers and the new ones stand beside each other with their ratios; a whole training is timed on demand."""
+    """Old and new numbers are printed with their ratios; a whole training is timed on demand."""
     old = measured[1]
     more = ["runner.total_steps=12", "evaluation.interval=6", "evaluation.num_samples=4"]
     (tmp_path / "old.json").write_text(json.dumps(old | {"set": CHANGES + more, "device": "a mill"}))
@@ -231,7 +231,7 @@ def test_memory_of_a_gpu(monkeypatch):
     ],
 )
 def test_mistakes(tmp_path, words, message):
-    """Mistakes are told in one line, before anything is measured."""
+    """Mistakes are refused in one line, before anything is measured."""
     result = run_here("benchmark.py", *SMALL, *words.split(), root=tmp_path)
     assert_told_in_one_line(result, message)
     assert result[1] == "" and not list(tmp_path.iterdir())

@@ -41,7 +41,7 @@ def test_picture(tmp_path, words):
     ],
 )
 def test_mistakes(tmp_path, words, message):
-    """They are told in one line, with exit status 2, and nothing is written."""
+    """They are refused in one line, with exit status 2, and nothing is written."""
     result, _ = plot(tmp_path, words)
     assert_told_in_one_line(result, message)
     assert not list(tmp_path.iterdir())

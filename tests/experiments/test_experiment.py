@@ -158,10 +158,10 @@ def test_dry_run(name, tmp_path):
         ({"train": {"runner.total_steps": "many"}}, "runner.total_steps must be an integer, not 'many'"),
         ({"train": {"env.num_envs": 0}}, "num_envs must be from 1 to 10000000, not 0"),
         ({"train": {"sim.engine": "nope"}}, "unknown sim.engine 'nope'"),
-        ({"train": {"env.num_actions": 5}}, "train.env.num_actions cannot be set: it comes from the tasks"),
+        ({"train": {"env.num_actions": 5}}, "train.env.num_actions cannot be set: it comes from tasks"),
         ({"train": {"asset.file": "missing.xml"}}, "cannot load the robot 'missing.xml': there is no such file"),
-        ({"train": {"seed": 3}}, "train.seed cannot be set: it comes from seeds"),
-        ({"train": {"evaluation.also": ["low"]}}, "train.evaluation.also cannot be set: it comes from environments"),
+        ({"train": {"seed": 3}}, "train.seed cannot be set: it comes from tasks"),
+        ({"train": {"evaluation.also": ["low"]}}, "train.evaluation.also cannot be set: it comes from tasks"),
         ({"evaluation": {"num_env": 3}}, "unknown evaluation key 'num_env'; did you mean 'num_envs'?"),
         ({"grounds": {"level": [0.5]}}, "unknown grounds key 'level'; did you mean 'levels'?"),
         ({"grounds": {"levels": [0, 1.5]}}, "a level must be from 0 to 1, not 1.5"),
@@ -174,7 +174,7 @@ def test_dry_run(name, tmp_path):
     ],
 )
 def test_mistakes_in_the_file(change, message, tmp_path):
-    """A key, name or value that makes no sense is told in one line with exit status 2, and nothing is written."""
+    """A key, name or value that makes no sense is refused in one line with exit status 2, and nothing is written."""
     file = write(tmp_path / "matrix.yaml", SMALL | change)
     result = experiment_here(file, f"--out={tmp_path / 'out'}", "--device=cpu", tmp_path=tmp_path)
     assert_told_in_one_line(result, message)
@@ -199,7 +199,7 @@ def test_mistakes_in_the_file(change, message, tmp_path):
     ],
 )
 def test_mistakes_in_the_command_line(words, message, tmp_path):
-    """They are told in one line too."""
+    """They are refused in one line, too."""
     texts = {"file": yaml.safe_dump(SMALL), "broken": "tasks: [", "text": "run all", "half": "tasks: [a1_torque]"}
     for name, text in texts.items():
         (tmp_path / name).write_text(text)

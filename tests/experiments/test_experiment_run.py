@@ -1,4 +1,4 @@
-"""How an experiment goes through its cells, with stand-ins for the scripts."""
+"""Order, failures, locks and signals of an experiment, with stand-ins for the scripts."""
 
 import contextlib
 import fcntl
@@ -149,7 +149,7 @@ def test_stop(stage, tmp_path, number):
 
 
 def test_a_cell_that_another_process_works_on(stage, tmp_path):
-    """It is left for later, told once, and begun when the other process lets it go."""
+    """It is left for later, reported once, and begun when the other process lets it go."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (out / "a1_position-low-s1").mkdir(parents=True)
     lock = (out / "a1_position-low-s1" / "lock").open("a")
@@ -278,8 +278,8 @@ def test_tiles_are_crossed_after_training(stage, tmp_path):
     assert experiment_here(*words, tmp_path=tmp_path)[0] == 0
     assert result.is_file() and len(trained(stage)) == 1
     write(file, values | {"grounds": {"kinds": ["flat"], "levels": [0, 0.5]}})
-    told = "grounds.kinds is ['flat'], was ['flat', 'pits']; give another --out"
-    assert_told_in_one_line(experiment_here(*words, tmp_path=tmp_path), told)
+    message = "grounds.kinds is ['flat'], was ['flat', 'pits']; give another --out"
+    assert_told_in_one_line(experiment_here(*words, tmp_path=tmp_path), message)
 
 
 def test_results_of_another_training_are_not_kept(stage, tmp_path):

@@ -25,12 +25,12 @@ FAST = {
     "health_check_timeout_ms": 1000,
     "health_check_failure_threshold": 2,
 }
-"""How soon Ray notices that a machine is gone."""
+"""Settings by which Ray soon notices that a machine is gone."""
 
 
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory):
-    """A copy of the package, which the machines use, and stand-ins for the scripts beside it."""
+    """A copy of the package, which the machines use, with stand-ins for the scripts."""
     stage = tmp_path_factory.mktemp("stage")
     shutil.copytree(ROOT / "legged_torque", stage / "legged_torque", ignore=shutil.ignore_patterns("__pycache__"))
     write_scripts(stage / "scripts")
@@ -134,14 +134,14 @@ def test_a_machine_is_killed(here, stage, cluster, tmp_path):
 
 
 def test_other_code_is_refused(here, monkeypatch, tmp_path):
-    """A machine with other code than this one's is told by name, and nothing is trained."""
+    """A machine with other code than this one's is named, and nothing is trained."""
     monkeypatch.setattr(legged_torque, "SCRIPTS_DIR", ROOT / "scripts")
     assert_told_in_one_line(here(), "code of legged_torque")
     assert not list(tmp_path.glob("out/*/run_*"))
 
 
 def test_mistakes(here, tmp_path):
-    """They are told in one line."""
+    """They are refused in one line."""
     assert_told_in_one_line(here("--jobs=2"), "--jobs is for GPUs on a cluster")
     assert_told_in_one_line(here("--device=cuda:0"), "--device must be auto, cuda or cpu, not 'cuda:0'")
     assert_told_in_one_line(here("--device=cuda"), "has no GPU")
@@ -161,9 +161,9 @@ def test_files_stay_in_their_folder(name, tmp_path):
 
 
 def test_versions():
-    """The first difference is told; a file of code that changes is one."""
+    """The first difference is named."""
     here = versions_here()
     assert {"torch", "mujoco-warp", "code of legged_torque"} <= here.keys()
     check_versions("m", here, dict(here))
-    told = error_of(check_versions, "m", here, here | {"torch": "1"})
-    assert told == f"the machine m has torch 1, this one has {here['torch']}"
+    message = error_of(check_versions, "m", here, here | {"torch": "1"})
+    assert message == f"the machine m has torch 1, this one has {here['torch']}"

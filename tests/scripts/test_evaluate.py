@@ -106,7 +106,7 @@ def test_crossing_tiles_after_training_on_a_plane(root, tmp_path):
         cost = row["metrics"]["cost_of_transport"]["mean"]
         place = rf"{row['kind']} +{row['level']:g} +2 +0.000 \+- 0.000 +{row['fell']['mean']:.3f} "
         assert re.search(rf"(?m)^  {place}.* {cost:.2f}$", output), row
-    assert "8 worlds, told to walk 2 0 m/s for 4.0 s at most:" in output
+    assert "8 worlds, commanded to walk 2 0 m/s for 4.0 s at most:" in output
 
 
 MISTAKES = {

@@ -46,8 +46,8 @@ def test_missing_extras(info):
 
 
 def test_gpus_that_cannot_be_used(info, monkeypatch):
-    """A driver beside a torch for the CPU is told."""
+    """A driver with a torch for the CPU is reported."""
     monkeypatch.setattr(torch.version, "cuda", None)
-    told = info["gpus"](["NVIDIA H200, 580.1, 143771 MiB"])
-    assert told[0].startswith("NVIDIA H200, 580.1") and "install one for CUDA to use the GPU" in told[1]
+    lines = info["gpus"](["NVIDIA H200, 580.1, 143771 MiB"])
+    assert lines[0].startswith("NVIDIA H200, 580.1") and "install one for CUDA to use the GPU" in lines[1]
     assert info["gpus"]([]) == ["none with a driver of NVIDIA", "torch is a build for the CPU"]

@@ -98,7 +98,7 @@ def test_slopes_do_not_creep(friction, impratio, impedance):
 
 
 def test_a_plane_per_foot():
-    """On a slope it is the robot on MuJoCo's tilted plane; states near edges, or with more than feet near, are told."""
+    """On a slope it is the robot on MuJoCo's tilted plane; states near edges, or with other parts near, are left out."""
     axis = 0.05 * np.arange(-40, 41)
     ramp = HeightMap(0.3 * axis[:, None] + 0.0 * axis, 0.05, (-2.0, -2.0), "cpu")
     step = HeightMap(np.where(axis > 0.1, 0.02, 0.0)[:, None] + 0.0 * axis, 0.05, (-2.0, -2.0), "cpu")
@@ -127,7 +127,7 @@ def test_a_plane_per_foot():
 
 
 def test_script(tmp_path):
-    """The script names the machine and has a row per kind of state and engine; mistakes are told in a line."""
+    """The script names the machine and has a row per kind of state and engine; mistakes are refused in a line."""
     assert run_here("train.py", *SMALL, root=tmp_path)[0] == 0
     words = ("--task=a1_position", "--device=cpu", "--num_envs=2", "--steps=3", "--worlds=4")
     status, output, _ = run_here("../tools/accuracy.py", *words, root=tmp_path)
