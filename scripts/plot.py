@@ -19,7 +19,7 @@ from legged_torque.utils.errors import unknown_name
 FIGURES = {
     "curves": "legged_torque.paper.plot:plot_curves",
     "pretraining": "legged_torque.paper.plot:plot_pretraining",
-    "randomization": "legged_torque.envs.randomization_picture:plot_randomization",
+    "randomization": "legged_torque.paper.randomization_picture:plot_randomization",
     "terrain": "legged_torque.terrain.picture:plot_terrain",
 }
 """Functions ("module:name") by figure: each parses its own command line, ``sys.argv``, and draws."""
