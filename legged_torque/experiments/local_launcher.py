@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
-import signal
 import subprocess
-import sys
 from typing import BinaryIO
 
 from legged_torque.experiments.job import CPU_JOBS, GPU_JOBS, MAX_JOBS, Worker
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, command_of, step_words
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
-
-_LIBC = ctypes.CDLL(None)
-_PR_SET_PDEATHSIG = 1  # Linux
+from legged_torque.utils.processes import ending_with_parent
 
 
 class LocalLauncher:
@@ -42,7 +37,7 @@ def start_process(
 ) -> subprocess.Popen[bytes]:
     """Start a process that writes to ``log``, and gets SIGTERM when this process ends for any reason."""
     return subprocess.Popen(
-        command,
+        ending_with_parent(command),
         stdin=subprocess.DEVNULL,
         stdout=log,
         stderr=subprocess.STDOUT,
@@ -50,13 +45,7 @@ def start_process(
         pass_fds=pass_fds,
         cwd=cwd,
         start_new_session=True,  # Ctrl-C reaches only this process, which passes it on
-        preexec_fn=end_with_parent if sys.platform == "linux" else None,
     )
-
-
-def end_with_parent() -> None:
-    """Ask the system to send SIGTERM to this process when its parent ends for any reason."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def check_jobs(jobs: int | None) -> None:
