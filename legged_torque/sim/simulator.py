@@ -21,9 +21,10 @@ from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.height_map import HeightMap
 from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts, use_known_options
 from legged_torque.sim.per_world import check_fields, expand, owner
-from legged_torque.sim.robot_file import actuator_problems, refuse
+from legged_torque.sim.robot_file import actuator_problems
 from legged_torque.sim.warp_step import WarpStep
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.problems import refuse
 
 ENGINES = ("fused", "mujoco_warp")
 """What may step the worlds: one kernel per step for legged robots, or MuJoCo Warp for any robot."""
@@ -121,6 +122,7 @@ class Simulator:
         self.derived = [self.field(name) for name in derived]  # what update_constants has written, to be saved
         forces = tuple(map(wp.to_torch, (self.data.xfrc_applied, self.data.qfrc_applied))) if applied_forces else ()
         self.xfrc_applied, self.qfrc_applied = forces or (None, None)
+        self._fields = (*per_world, *derived)
         self._carried = [tensor.view(num_envs, -1) for tensor in (*forces, *self._step.carried)]
 
     def field(self, name: str) -> Tensor:
@@ -207,6 +209,12 @@ class Simulator:
         data = self.data
         state = [data.qpos, data.qvel, data.qacc_warmstart, data.overflow, self._diverged, self._overflow]
         wp.launch(kernels.flag_diverged, data.qpos.shape, state, device=self._wp_device)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return everything on which the next steps of the worlds depend, as references to the simulator's memory."""
+        names = ("qpos", "qvel", "qacc_warmstart", "ctrl", "contact_found", "contact_force", "diverged")
+        state = {name: getattr(self, name) for name in names} | {name: self.field(name) for name in self._fields}
+        return state | {f"carried_{i}": tensor for i, tensor in enumerate(self._carried)}
 
     def check_buffers(self) -> str | None:
         """Return a warning if contacts or constraints were dropped since the start because a buffer was full.

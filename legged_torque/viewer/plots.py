@@ -40,7 +40,7 @@ class Plots:
         seconds = HISTORY_STEPS * task.dt
         names = [name.replace("_", " ") for name in session.mixing]
         self._parts = [(name, PARTS[i % len(PARTS)]) for i, name in enumerate(names)]
-        self._has_targets = any(term.name == "position_residual" for term in task.action_terms())
+        self._has_targets = any(term.name == "position_residual" for term in task.control_law.terms)
         panel = gui.add_panel()
         with panel.add_tab("Walking", viser.Icon.ACTIVITY):
             lines = [("commanded", COMMAND), ("actual", ACTUAL), ("companion", COMPANION)]

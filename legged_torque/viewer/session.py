@@ -269,7 +269,7 @@ class Session:
     @request
     def load_checkpoint(self, number: int) -> None:
         """Load another checkpoint of the run while the robots walk on; if it is broken, the old policy continues."""
-        actor = self._runner.alg.actor
+        actor = self._runner.alg.policy()
         weights, counters = copy.deepcopy(actor.state_dict()), self.task.state_dict()
         try:
             self._load(number)

@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque.envs.base.height_scan import HeightScan
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.sensors.height_scan import HeightScan
 from legged_torque.terrain.rough import RoughGround
 
 
@@ -41,29 +41,23 @@ class WatchedRobot(LeggedRobot):
 
     Attributes:
         torque_parts: Torques of each weighted action term, with its weight and the motors' strength, but before the
-            limits [N m]. Shape: (terms, num_envs, num_dof).
+            limits [N m]; NaN for terms without a law. Shape: (terms, num_envs, num_dof).
     """
 
-    def _init_actions(self) -> None:
+    def _init_state(self) -> None:
         """Allocate the parts, and prepare the height scan."""
-        super()._init_actions()
-        self._watched_scan = HeightScan(self)
-        self.torque_parts = torch.zeros(len(weighted_terms(self)), self.num_envs, self.num_dof, device=self.device)
+        super()._init_state()
+        self._watched_scan = HeightScan(self.cfg.terrain, self.state)
+        self.torque_parts = torch.zeros(len(weighted_terms(self)), *self.dof_pos.shape, device=self.device)
 
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """Return the task's torques and record their parts."""
-        torques = super()._compute_torques(actions)
-        for part, weight in zip(self.torque_parts, weighted_terms(self).values(), strict=True):
-            part.copy_(self._torques_of(weight, actions, torques) * self.motors.strength)
-        return torques
-
-    def _torques_of(self, weight: Tensor, actions: Tensor, torques: Tensor) -> Tensor:
-        """Return the part of the torques that a weight of 0 would take away. Shape: (num_envs, num_dof)."""
-        kept = weight.clone()
-        weight.zero_()
-        part = torques - super()._compute_torques(actions)
-        weight.copy_(kept)
-        return part
+        parts = iter(self.torque_parts)
+        for term, own in zip(self.control_law.terms, actions.split(self.num_dof, dim=1), strict=True):
+            if term.weight is not None:
+                torques = term.torques(own.contiguous(), self.dof_pos, self.dof_vel) if term.law else own * torch.nan
+                next(parts).copy_(term.weight * torques * self.motors.strength)
+        return super()._compute_torques(actions)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Keep what a control step overwrites, and make one."""
@@ -82,7 +76,7 @@ class WatchedRobot(LeggedRobot):
         tensors = {
             "qpos": self.sim.qpos,
             "commands": commands,
-            "velocities": self.planar_velocity(),
+            "velocities": self.state.planar_velocity(),
             "torques": self.torques[world],
             "torque_parts": self.torque_parts[:, world],
             "targets": self._position_targets()[world],
@@ -97,10 +91,10 @@ class WatchedRobot(LeggedRobot):
 
     def _position_targets(self) -> Tensor:
         """Return the joint positions wanted by PD control, see :class:`Snapshot`. Shape: (num_envs, num_dof or 0)."""
-        for place, term in enumerate(self.action_terms()):
+        for place, term in enumerate(self.control_law.terms):
             if term.name == "position_residual":
                 actions = self.actions[:, place * self.num_dof :][:, : self.num_dof]
-                return self.default_dof_pos + self.joint_offset + term.scale * actions
+                return self.control.default_dof_pos + self.control.joint_offset + term.scale * actions
         return self.actions[:, :0]
 
 
@@ -111,4 +105,4 @@ def watched(task_class: type[LeggedRobot]) -> type[WatchedRobot]:
 
 def weighted_terms(task: LeggedRobot) -> dict[str, Tensor]:
     """Return the weights of the action terms that have one, by name. Writing to them changes the task."""
-    return {term.name: term.weight for term in task.action_terms() if term.weight is not None}
+    return {term.name: term.weight for term in task.control_law.terms if term.weight is not None}
