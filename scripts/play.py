@@ -17,7 +17,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from legged_torque import resource_path
 from legged_torque.envs import task_registry
 from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
 from legged_torque.utils.args import add_task_args, options_of
@@ -123,7 +122,7 @@ def parse_args() -> argparse.Namespace:
 def show(args: argparse.Namespace, run: LoadedRun) -> None:
     """Show a policy live, and one that it is compared with."""
     compared = load_compared(args, run) if args.compare else None
-    watch, device = import_viewer(args), resolve_device(args.device)  # what is missing is told before anything slow
+    watch, device = import_viewer(args), resolve_device(args.device)  # refuses what is missing, before slow imports
     with slow_imports():
         from legged_torque.viewer.session import Session
     session = Session(task_registry.get_task_class(args.task), run, device)
@@ -132,7 +131,7 @@ def show(args: argparse.Namespace, run: LoadedRun) -> None:
         session.companion = Session(task_registry.get_task_class(compared.config["task"]), compared, device)
     if args.command:
         session.set_command(tuple(args.command))
-    watch(session, resource_path(run.env_cfg.asset.file))
+    watch(session)
 
 
 def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
@@ -164,7 +163,7 @@ def choose_worlds(args: argparse.Namespace) -> None:
 
 
 def check_agent(args: argparse.Namespace) -> None:
-    """Raise a UserError if what is asked for does not go with who acts or what is shown."""
+    """Raise a UserError for options that exclude each other."""
     if args.agent != "policy" and (args.load_run or args.checkpoint is not None or args.viewer != "none"):
         raise UserError(f"--agent {args.agent} has no run: --load_run, --checkpoint and --viewer are for the policy's")
     if args.headless and args.viewer == "native":
@@ -191,8 +190,8 @@ def add_terrain_args(parser: Parser) -> None:
     parser.add_argument("--level", nargs="+", type=finite, default=[], help=hint)
 
 
-def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
-    """Return the function that shows a session of a robot's MJCF; a UserError if a package or a screen is missing."""
+def import_viewer(args: argparse.Namespace) -> Callable[[Session], None]:
+    """Return the function that shows a session; a UserError if a package or a screen is missing."""
     if args.viewer == "native":
         from legged_torque.viewer import native
 

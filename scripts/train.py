@@ -30,7 +30,7 @@ from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.options import DEFAULT_PRESET, Options
 from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, package_versions
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
-from legged_torque.viewer.beside import Beside
+from legged_torque.viewer.training_viewer import TrainingViewer
 
 if TYPE_CHECKING:
     from legged_torque.learning.runner import OnPolicyRunner
@@ -77,13 +77,13 @@ def main() -> None:
     with slow_imports():
         from legged_torque.utils.progress import CompileProgress
     is_first = distributed.rank() == 0
-    beside = Beside(is_first and args.viewer == "web", args.video_interval if is_first else 0)
+    viewer = TrainingViewer(is_first and args.viewer == "web", args.video_interval if is_first else 0)
     set_seed(train_cfg.seed)
     with CompileProgress() if is_first else contextlib.nullcontext():  # one line for all processes
-        train(options, env_cfg, train_cfg, beside)
+        train(options, env_cfg, train_cfg, viewer)
 
 
-def train(options: Options, env_cfg: Any, train_cfg: Any, beside: Beside) -> None:
+def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer) -> None:
     """Build the task and train it, from a pre-trained policy if the task has one."""
     import torch
 
@@ -111,8 +111,8 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, beside: Beside) -> Non
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
     if is_first:
         print_notes(filter(None, [busy_cores_note(torch.get_num_threads()) if env.device == "cpu" else None]))
-        announce(runner, options, env_cfg, train_cfg, total, beside.page)
-        runner.on_checkpoint = functools.partial(beside.show, task_words(options))
+        announce(runner, options, env_cfg, train_cfg, total, viewer.page)
+        runner.on_checkpoint = functools.partial(viewer.show, task_words(options))
     is_complete = False
     try:
         runner.learn(remaining, init_at_random_ep_len=True)
@@ -121,7 +121,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, beside: Beside) -> Non
         runner.close()
         raise
     finally:
-        beside.close(is_waiting=is_complete)
+        viewer.close(is_waiting=is_complete)
     if is_first:
         print(f"The run is in {runner.log_dir}")
         for what, script in {"See it walk": "play", "Measure it": "evaluate", "Take it elsewhere": "export"}.items():
