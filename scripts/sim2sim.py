@@ -82,7 +82,7 @@ def main() -> None:
         from legged_torque.deploy.ground import select_ground
         from legged_torque.deploy.policy import Policy
         from legged_torque.deploy.robot import MujocoRobot
-        from legged_torque.deploy.simulation import Events, Simulation
+        from legged_torque.deploy.simulation import Simulation
         from legged_torque.envs import LeggedRobotCfg
         from legged_torque.utils.display import Counter
         from legged_torque.utils.metrics import UNITS, estimates, ratios
@@ -93,8 +93,7 @@ def main() -> None:
         select_ground(policy.description, LeggedRobotCfg().terrain, args.terrain, args.level)
     xml = args.xml or resource_path(policy.description["robot"]["file"])
     robot = MujocoRobot(xml, policy.description, args.contacts)
-    events = Events(args.command, args.push_velocity, args.push_probability)
-    simulation = Simulation(policy, robot, events)
+    simulation = Simulation(policy, robot, args.command, args.push_velocity, args.push_probability)
     notes = robot.notes + simulation.notes
     recorder = SimulationRecorder(simulation) if args.video else None
     sums = []

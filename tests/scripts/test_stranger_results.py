@@ -15,7 +15,7 @@ from support.strangers import Payload
 from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
-from legged_torque.deploy.simulation import Events, Simulation
+from legged_torque.deploy.simulation import Simulation
 from legged_torque.paper.report.evaluations import CURVE_METRICS
 
 # ------------------------------------------------------------------------------------------------- results
@@ -190,5 +190,5 @@ def test_metrics_that_are_no_numbers(exported):
     """A simulation in which they become infinite is an error."""
     policy = Policy(exported)
     robot = MujocoRobot(resource_path(policy.description["robot"]["file"]), policy.description)
-    simulation = Simulation(policy, robot, Events(push_velocity=1e200, push_probability=1.0))
+    simulation = Simulation(policy, robot, push_velocity=1e200, push_probability=1.0)
     assert "the simulation has diverged" in error_of(simulation.run, 3, 1)
