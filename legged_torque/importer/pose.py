@@ -105,7 +105,7 @@ def _nominal_pose(source: Source, legs: list[Leg], ranges: np.ndarray) -> np.nda
 def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarray, ahead: float) -> float:
     """Bend a leg until its foot is below its hip, or ``ahead`` of that [m], soles being level.
 
-    The trunk is at the origin. Writes the angles of the leg's joints. Returns by how much the foot misses its place [m].
+    The trunk is at the origin. Writes the leg's angles. Returns by how much the foot misses its place [m].
     """
     data, body = zero_pose(model), leg.bodies[-1]
     joints = model.body_jntadr[leg.bodies]
