@@ -13,7 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from legged_torque.utils.cli import Parser, check_at_least, check_output, run_script
+from legged_torque.utils import cli
 from legged_torque.utils.files import write_json
 from tools.attack import attack, table
 from tools.attack_cases import all_cases
@@ -25,16 +25,16 @@ SHOW_EVERY = 200  # cases
 
 def main() -> None:
     """Run the cases, print what was not good and a table, write JSON."""
-    parser = Parser(__doc__)
+    parser = cli.Parser(__doc__)
     parser.add_argument("--only", help="only cases whose name contains this")
     parser.add_argument("--limit", type=int, help="at most so many cases, drawn at random; default: all")
     parser.add_argument("--seed", type=int, default=1, help="of all that is drawn; default: %(default)s")
     parser.add_argument("--json", type=Path, help="file to write: outcome and message of every case")
     args = parser.parse_args()
     if args.limit is not None:
-        check_at_least(args, 1, "limit")
+        cli.check_at_least(args, 1, "limit")
     if args.json:
-        check_output(args.json)
+        cli.check_output(args.json)
     known = dict(parsers())
     warm_up()
     with tempfile.TemporaryDirectory(prefix="attack") as root:
@@ -60,4 +60,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

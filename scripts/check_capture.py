@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import check_at_least, run_script, slow_imports
+from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import set_seed
@@ -20,17 +19,17 @@ if TYPE_CHECKING:
 
 def main() -> None:
     """Train the task with and without CUDA graphs, print how far all numbers are apart, and judge."""
-    parser = Parser(__doc__)
-    add_build_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_options(parser, *cli.SETTINGS, "num_envs")
     parser.add_argument("--iterations", type=int, default=1, help="iterations to compare; default: %(default)s")
     help_text = "how far a quantity may be off (root mean square, in parts of its own), unless two runs without graphs "
     help_text += "are as far apart; default: %(default)s"
     parser.add_argument("--tolerance", type=float, default=1e-2, help=help_text)
     args = parser.parse_args()
-    check_at_least(args, 1, "iterations")
-    check_at_least(args, 0, "tolerance")
-    options = options_of(args)
-    with slow_imports():
+    cli.check_at_least(args, 1, "iterations")
+    cli.check_at_least(args, 0, "tolerance")
+    options = cli.options_of(args)
+    with cli.slow_imports():
         check_env_cfg(task_registry.get_cfgs(options.task, options)[0])  # mistakes are told before anything is built
         device = resolve_device(args.device)
         from tools.capture import KERNEL_TOLERANCE, compare_capture, compare_kernels
@@ -69,4 +68,4 @@ def build_runner(options: Options, capture: bool) -> OnPolicyRunner:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

@@ -6,19 +6,18 @@ No other world may differ by a bit, and a reset must make the world as good as n
 import sys
 
 from legged_torque import RESOURCES_DIR
-from legged_torque.utils.args import Parser, add_options
-from legged_torque.utils.cli import check_at_least, run_script, slow_imports
+from legged_torque.utils import cli
 from legged_torque.utils.devices import resolve_device
 
 
 def main() -> None:
     """Print the counts of both engines."""
-    parser = Parser(__doc__)
+    parser = cli.Parser(__doc__)
     parser.add_argument("--count", type=int, default=400, help="bad numbers per engine; default: %(default)s")
-    add_options(parser, "device")
+    cli.add_options(parser, "device")
     args = parser.parse_args()
-    check_at_least(args, 1, "count")
-    with slow_imports():
+    cli.check_at_least(args, 1, "count")
+    with cli.slow_imports():
         device = resolve_device(args.device)
         from legged_torque.sim.model import build_model, collision_geoms
         from legged_torque.sim.simulator import ENGINES
@@ -35,4 +34,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.args import Parser, add_build_args, options_of, task_file_words
-from legged_torque.utils.cli import check_at_least, run_script, slow_imports
+from legged_torque.utils import cli
 from legged_torque.utils.errors import UserError
 
 SAVE_INTERVAL = 2  # iterations; of trainings that are killed
@@ -17,8 +16,8 @@ SAVE_INTERVAL = 2  # iterations; of trainings that are killed
 
 def main() -> None:
     """Train again and again, compare every checkpoint's last tensor, and judge."""
-    parser = Parser(__doc__)
-    add_build_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_options(parser, *cli.SETTINGS, "num_envs")
     parser.set_defaults(perturbation="low")
     parser.add_argument("--iterations", type=int, default=4, help="iterations to train; default: %(default)s")
     parser.add_argument("--processes", type=int, default=1, help="processes that train together; default: %(default)s")
@@ -27,12 +26,12 @@ def main() -> None:
     help_text = "how often to kill a training of its own at random moments and resume it; default: %(default)s"
     parser.add_argument("--kills", type=int, default=0, help=help_text)
     args = parser.parse_args()
-    check_at_least(args, 1, "iterations", "processes")
-    check_at_least(args, 0, "resumes", "kills")
+    cli.check_at_least(args, 1, "iterations", "processes")
+    cli.check_at_least(args, 0, "resumes", "kills")
     if args.resumes >= args.iterations:
         raise UserError(f"--resumes must be less than --iterations, which is {args.iterations}, not {args.resumes}")
-    with slow_imports():
-        check_env_cfg(task_registry.get_cfgs(args.task, options_of(args))[0])  # mistakes are told first
+    with cli.slow_imports():
+        check_env_cfg(task_registry.get_cfgs(args.task, cli.options_of(args))[0])  # mistakes are told first
     with tempfile.TemporaryDirectory() as folder:
         sys.exit(0 if check(args, Path(folder)) else 1)
 
@@ -75,13 +74,10 @@ def check(args: argparse.Namespace, folder: Path) -> bool:
 
 def train_words(args: argparse.Namespace) -> list[str]:
     """Return the words of ``train.py`` that the options stand for, with two evaluations after every iteration."""
-    names = ("task", "seed", "perturbation", "ranges", "device", "num_envs")
-    words = [f"--{name}={getattr(args, name)}" for name in names if getattr(args, name) is not None]
     changes = ["evaluation.interval=1", f"evaluation.also=[{args.perturbation}]", "evaluation.also_from=1"]
-    changes += [f"runner.save_interval={SAVE_INTERVAL}", *args.set]
-    words += [*task_file_words(args.task_file), "--logger=none"]
-    return [*words, *(f"--set={change}" for change in changes)]
+    args.set = [*changes, f"runner.save_interval={SAVE_INTERVAL}", *args.set]
+    return [*cli.option_words(args, *cli.SETTINGS, "num_envs"), "--logger=none"]
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

@@ -18,20 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 from legged_torque.envs import task_registry
 from legged_torque.experiments.matrix import GROUNDS
-from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import (
-    add_command_arg,
-    check_at_least,
-    check_output,
-    finite,
-    run_script,
-    slow_imports,
-)
+from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.files import write_json
+from legged_torque.utils.files import portable_path, write_json
 from legged_torque.utils.metrics import UNITS
-from legged_torque.utils.paths import portable_path
 from legged_torque.utils.runs import package_versions
 from legged_torque.utils.task_registry import LoadedRun, set_seed
 
@@ -49,10 +40,10 @@ def main() -> None:
     """Roll out a checkpoint with mean actions, print the metrics, write them as JSON."""
     args = parse_args()
     if args.json:
-        check_output(args.json)
-    options = options_of(args)
+        cli.check_output(args.json)
+    options = cli.options_of(args)
     grounds = None
-    with slow_imports():
+    with cli.slow_imports():
         if args.terrain:
             from legged_torque.learning.crossing import Grounds
 
@@ -81,16 +72,16 @@ def main() -> None:
 
 def parse_args() -> argparse.Namespace:
     """Return the command line; a UserError if it makes no sense."""
-    parser = Parser(__doc__)
-    add_task_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_task_args(parser)
     parser.set_defaults(num_envs=16, seed=1)
     parser.add_argument("--steps", type=int, help=f"control steps; default: {STEPS}")
-    add_command_arg(parser)
+    cli.add_command_arg(parser)
     hint = """kinds of rough ground to cross, or all; then --num_envs is for each kind and level, and --command a speed
         straight on, 0.6 0 0 unless it is given"""
     parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
     hint = "difficulties of rough ground, 0 to 1; default: the ten of training, 0 to 0.9"
-    parser.add_argument("--level", nargs="+", type=finite, help=hint)
+    parser.add_argument("--level", nargs="+", type=cli.finite, help=hint)
     parser.add_argument("--json", type=Path, help="file to write")
     args = parser.parse_args()
     if args.terrain and args.steps is not None:
@@ -99,7 +90,7 @@ def parse_args() -> argparse.Namespace:
         raise UserError("--level needs --terrain: the kinds of rough ground")
     args.steps = STEPS if args.steps is None else args.steps
     args.level = args.level or GROUNDS["levels"]
-    check_at_least(args, 1, "steps")
+    cli.check_at_least(args, 1, "steps")
     return args
 
 
@@ -159,4 +150,4 @@ def circumstances(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, ru
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

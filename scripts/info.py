@@ -5,16 +5,16 @@ Versions, processor, GPU and driver, where compiled kernels are kept, and which 
 
 import os
 
-from legged_torque.utils.cli import Parser, run_script, slow_imports
+from legged_torque.utils import cli
+from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import collect_errors
-from legged_torque.utils.rendering import choose_offscreen_renderer
 
 
 def main() -> None:
     """Print a block of lines per topic."""
-    Parser(__doc__).parse_args()
+    cli.Parser(__doc__).parse_args()
     no_renderer = choose_offscreen_renderer()
-    with slow_imports():
+    with cli.slow_imports():
         from legged_torque.benchmark.installation import topics
         from legged_torque.viewer.native import check_display
     no_window: list[str] = []
@@ -26,4 +26,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_script(main, draws=True)
+    cli.run_script(main, draws=True)

@@ -7,8 +7,7 @@ plane for each foot.
 
 from legged_torque import resource_path
 from legged_torque.envs import task_registry
-from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import check_at_least, run_script, slow_imports
+from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.task_registry import set_seed
 
@@ -17,15 +16,15 @@ WALKERS = 32  # worlds that walk
 
 def main() -> None:
     """Let a trained policy walk, keep its states, make the others of them, and step each with both engines."""
-    parser = Parser(__doc__)
-    add_task_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_task_args(parser)
     parser.set_defaults(num_envs=WALKERS, seed=1)
     parser.add_argument("--steps", type=int, default=100, help="control steps to walk; the states after each are kept")
     parser.add_argument("--worlds", type=int, default=1500, help="states of each kind; default: %(default)s")
     args = parser.parse_args()
-    check_at_least(args, 1, "steps", "worlds")
-    options = options_of(args)
-    with slow_imports():
+    cli.check_at_least(args, 1, "steps", "worlds")
+    options = cli.options_of(args)
+    with cli.slow_imports():
         run = task_registry.load_run(options)
         import torch
 
@@ -79,4 +78,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

@@ -8,21 +8,20 @@ import copy
 from pathlib import Path
 
 from legged_torque.envs import task_registry
-from legged_torque.utils.args import add_build_args, options_of
-from legged_torque.utils.cli import Parser, check_output, run_script, slow_imports
+from legged_torque.utils import cli
 from legged_torque.utils.task_registry import set_seed
 
 
 def main() -> None:
     """Build a task, read what it has drawn, and draw a panel per parameter."""
-    parser = Parser(__doc__)
-    add_build_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_options(parser, *cli.SETTINGS, "num_envs")
     parser.set_defaults(task="a1_position", perturbation="low", num_envs=2000)
     parser.add_argument("--out", type=Path, required=True, help="picture to write (png, svg, pdf)")
     args = parser.parse_args()
-    check_output(args.out)
-    options = options_of(args)
-    with slow_imports():
+    cli.check_output(args.out)
+    options = cli.options_of(args)
+    with cli.slow_imports():
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
         from tools.distributions import draw_distributions
     set_seed(train_cfg.seed)
@@ -34,4 +33,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.errors import refuse, unknown_name, with_names
 from legged_torque.utils.mjcf import (
     joint_axes,
     joint_limits,
@@ -18,7 +18,6 @@ from legged_torque.utils.mjcf import (
     torque_range,
     why_no_motor,
 )
-from legged_torque.utils.problems import refuse, with_names
 
 MASS_TOLERANCE = 1e-3  # share of the mass below which robots count as equally heavy
 PARALLEL = 0.999  # least cosine between axes that count as parallel

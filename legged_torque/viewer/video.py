@@ -18,10 +18,10 @@ from legged_torque import resource_path
 from legged_torque.deploy.simulation import Simulation
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.layout import Layout
+from legged_torque.utils.devices import INSTALL_HINT
 from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_whole
-from legged_torque.utils.rendering import INSTALL_HINT
 from legged_torque.viewer.arrows import add_velocities
 from legged_torque.viewer.framing import TRUNK, size_of
 from legged_torque.viewer.ground import Ground, Smooth, drawn_model, ground_of
