@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from legged_torque.deploy.description import interface, missing_extra, read
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.heading import heading
-from legged_torque.utils.problems import refuse
 
 
 @dataclass

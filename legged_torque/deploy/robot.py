@@ -12,7 +12,7 @@ import numpy as np
 
 from legged_torque.deploy import ground
 from legged_torque.deploy.policy import State
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, refuse, unknown_name, with_names
 from legged_torque.utils.mjcf import (
     drawing_notes,
     exclude_self_collisions,
@@ -25,7 +25,6 @@ from legged_torque.utils.mjcf import (
     torque_range,
     why_no_motor,
 )
-from legged_torque.utils.problems import refuse, with_names
 
 MASS_TOLERANCE = 1e-3  # share of the mass below which robots count as equally heavy
 PARALLEL = 0.999  # least cosine between axes that count as parallel

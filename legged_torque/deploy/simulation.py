@@ -131,13 +131,18 @@ class Simulation:
     def _new_episode(self) -> None:
         """Draw an initial state and a command, and reset the policy."""
         rng, start, num_joints = self._rng, self._start, len(self.policy.joint_order)
-        angles = [rng.uniform(*start[name]) for name in ("roll", "pitch", "yaw")]
-        pose = self.policy.nominal_pose * rng.uniform(*start["joint_position_scale"], num_joints)
+
+        def drawn(name: str, size: int) -> np.ndarray:
+            low, high = start[name]
+            return rng.uniform(low, high, size)
+
+        angles = [drawn(name, 1).item() for name in ("roll", "pitch", "yaw")]
+        pose = self.policy.nominal_pose * drawn("joint_position_scale", num_joints)
         sizes = {"trunk_linear_velocity": 3, "trunk_angular_velocity": 3, "joint_velocity": num_joints}
-        velocities = tuple(rng.uniform(*start[name], size) for name, size in sizes.items())
+        velocities = tuple(drawn(name, size) for name, size in sizes.items())
         position = start["trunk_position"] + self._origin
         if any(start["trunk_place"]):
-            position[:2] += rng.uniform(*start["trunk_place"], 2)
+            position[:2] += drawn("trunk_place", 2)
         self.robot.reset(position, quaternion(*angles), pose, velocities)
         self.policy.reset()
         self._draw_command()

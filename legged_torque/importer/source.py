@@ -11,9 +11,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.mjcf import kept_warnings, motors_of, torque_range
-from legged_torque.utils.problems import refuse
 
 MESH_TYPES = (".stl", ".obj", ".msh")  # files that MuJoCo reads
 COLLISION_GROUP = 3  # of Menagerie's collision geoms, also of those that one of its files switches off

@@ -19,7 +19,6 @@ from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import held
 from legged_torque.utils.runs import with_present_names
-from legged_torque.utils.task_registry import all_experiments_dir
 
 SPACES = {
     "env": (
@@ -50,7 +49,7 @@ def pretrained_file(task: str, train_cfg: Any, log_root: str | None = None) -> P
     """Return where a task's pre-trained policy is kept: ``pretraining.file``, or in the folder of all experiments."""
     if train_cfg.pretraining.file:
         return Path(train_cfg.pretraining.file)
-    return all_experiments_dir(log_root) / PRETRAINED / f"{task}.pt"
+    return Path(log_root or "logs") / PRETRAINED / f"{task}.pt"
 
 
 def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> None:

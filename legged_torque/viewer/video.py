@@ -17,10 +17,10 @@ import numpy as np
 from legged_torque.deploy.simulation import Simulation
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.layout import Layout
+from legged_torque.utils.devices import INSTALL_HINT
 from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_whole
-from legged_torque.utils.rendering import INSTALL_HINT
 from legged_torque.viewer.ground import Ground, drawn_model, drawn_task
 from legged_torque.viewer.mujoco_scene import TRUNK, Camera, add_velocities, size_of
 

@@ -25,7 +25,7 @@ XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.
 DRAW = """
 import sys
 from pathlib import Path
-from legged_torque.utils.rendering import choose_offscreen_renderer
+from legged_torque.utils.devices import choose_offscreen_renderer
 reason = choose_offscreen_renderer()
 if reason:
     sys.exit("no renderer: " + reason)
