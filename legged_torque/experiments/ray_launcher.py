@@ -15,10 +15,9 @@ from legged_torque.experiments.job import GPU_JOBS, LOST, Worker
 from legged_torque.experiments.local_launcher import check_jobs
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, last_checkpoint, step_words
 from legged_torque.experiments.ray_node import News, NodeStep, read_files, versions_here, write_files
-from legged_torque.learning.pretrained import PRETRAINED
 from legged_torque.learning.worlds import remove_other_worlds, worlds_file
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.runs import CONFIG_FILE
+from legged_torque.utils.runs import CONFIG_FILE, PRETRAINED
 
 LOOK_EVERY = 5.0  # seconds between looks at what the cluster has
 SEND_EVERY = 60.0  # seconds between checkpoints that are brought home while a training goes on

@@ -8,8 +8,8 @@ from support.rollouts import make_ppo, record_rollout, shift_policy, state_of
 from support.scripts import assert_told_in_one_line, contents, run_here
 from support.settings import error_of, get_cfgs
 
-from legged_torque.learning.pretrained import check_making, check_spaces, read_pretrained
 from legged_torque.paper.gravity import pretraining as gravity_pretraining
+from legged_torque.paper.gravity.pretrained import check_making, check_spaces, read_pretrained
 
 
 @pytest.fixture(scope="module")
