@@ -31,9 +31,9 @@ from legged_torque.utils.task_registry import LoadedRun, set_seed
 if TYPE_CHECKING:
     from rsl_rl.runners import OnPolicyRunner
 
+    from legged_torque.envs.base.crossing import Grounds
     from legged_torque.envs.base.legged_robot import LeggedRobot
     from legged_torque.envs.base.metrics import CommandBreakdown
-    from legged_torque.learning.crossing import Grounds
 
 WORLDS, STEPS = 16, 2000  # of one checkpoint, where robots do not cross tiles
 CURVE_WORLDS, CURVE_STEPS = 256, 1000  # of each of all checkpoints
@@ -47,7 +47,7 @@ def main() -> None:
     grounds = None
     with cli.slow_imports():
         if args.terrain:
-            from legged_torque.learning.crossing import Grounds
+            from legged_torque.envs.base.crossing import Grounds
 
             grounds = Grounds.of(args.terrain, args.level, args.command)
         run = task_registry.load_run(options)
@@ -158,7 +158,7 @@ def print_breakdown(breakdown: CommandBreakdown) -> None:
 
 def cross_tiles(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, grounds: Grounds) -> dict[str, Any]:
     """Let a policy try to cross tiles, print what came out, and return it."""
-    from legged_torque.learning.crossing import cross
+    from legged_torque.envs.base.crossing import cross
 
     results = cross(env, runner.get_inference_policy(env.device), grounds)
     time_limit, trained = grounds.time_limit(env.cfg.terrain.tile_size), runner.logger.tot_timesteps

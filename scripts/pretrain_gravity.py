@@ -58,7 +58,7 @@ def pretrain(args: argparse.Namespace) -> None:
     options = cli.options_of(args)
     with cli.slow_imports():
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
-        from legged_torque.learning.pretrained import make_pretrained, pretrained_file
+        from legged_torque.paper.gravity.pretrained import make_pretrained, pretrained_file
         from legged_torque.utils.progress import CompileProgress
     file, device = pretrained_file(options.task, train_cfg, options.log_root), resolve_device(options.device)
     if args.json:

@@ -86,12 +86,13 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
 
     from legged_torque.envs.base.held_pose import standing_note
     from legged_torque.envs.base.legged_robot import LeggedRobot
-    from legged_torque.learning.pretrained import find_pretrained, pretrained_file, start_from
 
     is_first = distributed.rank() == 0
-    pretrained = pretrained_file(options.task, train_cfg, options.log_root)
     starts_pretrained = bool(train_cfg.pretraining.function) and not options.resume and is_first
     if starts_pretrained:
+        from legged_torque.paper.gravity.pretrained import find_pretrained, pretrained_file, start_from
+
+        pretrained = pretrained_file(options.task, train_cfg, options.log_root)
         find_pretrained(pretrained, options.task, env_cfg, train_cfg, resolve_device(options.device))
     env, _ = task_registry.make_env(options.task, options, env_cfg)
     if is_first and isinstance(env, LeggedRobot) and not options.resume:

@@ -18,6 +18,7 @@ from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 
 CONFIG_FILE = "config.yaml"
 EVALUATIONS_FILE = "evaluations.csv"  # a row per evaluation during training
+PRETRAINED = "pretrained"  # folder of pre-trained policies, in that of all experiments
 MOVED = {"legged_torque.control.gravity_pretraining:pretrain": "legged_torque.paper.gravity.pretraining:pretrain"}
 """Present names of functions that the settings of older runs name by their former modules."""
 _CHECKPOINT = "model_"

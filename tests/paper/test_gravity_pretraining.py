@@ -11,9 +11,9 @@ from support.symmetry import mirror_joints, mirror_policy
 from tensordict import TensorDict
 
 from legged_torque.envs import task_registry
-from legged_torque.learning.pretrained import read_pretrained
 from legged_torque.paper.gravity import pretraining as gravity_pretraining
 from legged_torque.paper.gravity.dynamics import RobotDynamics
+from legged_torque.paper.gravity.pretrained import read_pretrained
 from legged_torque.paper.gravity.pretraining import (
     Collection,
     act_by_controller,

@@ -8,8 +8,8 @@ from support.rollouts import make_ppo, record_rollout, shift_policy, state_of
 from support.scripts import assert_told_in_one_line, contents, run_here
 from support.settings import error_of, get_cfgs
 
-from legged_torque.learning.pretrained import check_making, check_spaces, read_pretrained
 from legged_torque.paper.gravity import pretraining as gravity_pretraining
+from legged_torque.paper.gravity.pretrained import check_making, check_spaces, read_pretrained
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +171,8 @@ def test_critic_warmup():
     """While only the critic learns, it learns as ever; policy and learning rate stay. Then they move."""
     warm, usual = (make_ppo(schedule="adaptive", desired_kl=1e-3) for _ in range(2))
     before = state_of(warm)
-    warm.learn_actor(False)
+    warm.warm_up_iterations = 1
+    warm.set_progress(0, 2)
     usual.schedule = "fixed"
     for alg in (warm, usual):
         record_rollout(alg)
@@ -183,7 +184,7 @@ def test_critic_warmup():
     for key, value in before.items():
         torch.testing.assert_close(learned[key], other[key] if key.startswith("critic") else value)
         assert not key.startswith("critic") or not torch.equal(learned[key], value)
-    warm.learn_actor(True)
+    warm.set_progress(1, 2)
     record_rollout(warm)
     shift_policy(warm, 0.2)
     shifted = state_of(warm)

@@ -149,7 +149,7 @@ EXPORTS = {
     "swapped joints": (reorder_joints, "was exported with other joint_order"),
     "another scale": (lambda d: d["actions"]["terms"][0].update(scale=5.0), "was exported with other actions"),
     "another pose": (set_entry("nominal_pose.FR_hip_joint", 0.2), "was exported with other nominal_pose"),
-    "huge limits": (set_entry("torque_limits.FR_hip_joint", [-1e30, 1e30]), "torque_limits.FR_hip_joint.0"),
+    "huge limits": (set_entry("torque_limits.FR_hip_joint", [-1e30, 1e30]), "torque_limits.FR_hip_joint."),
     "huge speed": (set_entry("initial_state.joint_velocity", [0.0, 1e30]), "initial_state.joint_velocity.1"),
     "huge whole number": (lambda d: d["commands"].update(lin_vel_x=[0, 10**300]), "commands.lin_vel_x.1"),
     "huger one": (lambda d: d["commands"].update(lin_vel_x=[0, 10**400]), "larger than settings are"),
