@@ -27,7 +27,7 @@ def main() -> None:
     with importing():
         device = resolve_device(args.device)
         from legged_torque.sim.model import build_model, collision_geoms
-        from legged_torque.sim.simulator import ENGINES
+        from legged_torque.sim.registry import ENGINES
         from legged_torque.utils.mjcf import read_spec
         from tools import injections
     spec = read_spec(RESOURCES_DIR / "robots/a1/a1.xml")

@@ -36,7 +36,7 @@ def main() -> None:
         import torch
 
         from legged_torque.envs.base.asset import load_asset
-        from legged_torque.sim.simulator import ENGINES, Simulator
+        from legged_torque.sim.registry import ENGINES, make_engine
         from legged_torque.utils.mjcf import read_spec
         from tools.accuracy import (
             KINDS,
@@ -61,10 +61,10 @@ def main() -> None:
             kept.append(copy_state(env.sim))
     walking = {name: torch.cat([state[name] for state in kept]) for name in kept[0]}
     limits, ground, sims, pose = (env.cfg.sim.solver_iterations, env.cfg.sim.ls_iterations), env.terrain.map, {}, None
-    for engine in ENGINES:
-        height_map = ground if engine == "fused" else None
+    for name, engine in ENGINES.items():
+        height_map = ground if "height_map" in engine.capabilities else None
         model = open_motors(load_asset(env.cfg, None if height_map else env.terrain).mj_model)
-        sims[engine] = Simulator(model, args.worlds, env.device, engine, *limits, height_map=height_map)
+        sims[name] = make_engine(name, model, args.worlds, env.device, *limits, height_map)
     if ground:
         spec = read_spec(resource_path(env.cfg.asset.file), env.dof_names)
         planes = PlanePerFoot(spec, env.foot_names, ground)

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import torch
 
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.engine import Engine
 
 TOLERANCE = 1e-3  # a world with a velocity that is further off [m/s, rad/s] counts as wrong
 LARGEST_TORQUE = 1000.0  # [N m]
@@ -24,7 +24,7 @@ Pose = Callable[[mujoco.MjModel, mujoco.MjData], bool]
 """Makes a model fit a state, and says whether it does, as :meth:`~tools.planes.PlanePerFoot.pose`."""
 
 
-def copy_state(sim: Simulator) -> PhysicsState:
+def copy_state(sim: Engine) -> PhysicsState:
     """Return a copy of the arrays that the next physics step depends on."""
     return {name: getattr(sim, name).clone() for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
 
@@ -189,7 +189,7 @@ class Accuracy:
     iterations: float  # mean of the solver's
 
 
-def measure_accuracy(sim: Simulator, state: PhysicsState, expected: np.ndarray, comparable: np.ndarray) -> Accuracy:
+def measure_accuracy(sim: Engine, state: PhysicsState, expected: np.ndarray, comparable: np.ndarray) -> Accuracy:
     """Compare one step of a simulator with as many worlds with a :func:`reference_step`; not finite is wrong."""
     for name, values in state.items():
         getattr(sim, name).copy_(values)
@@ -203,5 +203,5 @@ def measure_accuracy(sim: Simulator, state: PhysicsState, expected: np.ndarray, 
         rms=float(np.sqrt(np.mean(error**2))),
         wrong=float((error.max(axis=1) > TOLERANCE).mean()),
         left_out=float(1.0 - comparable.mean()),
-        iterations=float(sim.data.solver_niter.numpy().mean()),
+        iterations=float(sim.solver_niter.float().mean()),
     )

@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import torch
 
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.engine import Engine
+from legged_torque.sim.registry import make_engine
 
 FIELDS = ("qpos", "qvel", "qacc_warmstart", "ctrl")
 VALUES = (float("nan"), float("inf"), -float("inf"), 1e30)
@@ -28,7 +29,7 @@ def run(model: mujoco.MjModel, engine: str, count: int, device: str, seed: int =
         "not recovered": after how many the world itself differed by a bit once it was reset.
     """
     rng = np.random.default_rng(seed)
-    sims = [Simulator(model, WORLDS, device, engine) for _ in range(2)]
+    sims = [make_engine(engine, model, WORLDS, device) for _ in range(2)]
     everyone = torch.ones(WORLDS, dtype=torch.bool, device=device)
     bent = torch.tensor(model.jnt_range[1:].mean(axis=1), dtype=torch.float32, device=device)
     counts = {"injections": 0, "leaked": 0, "not recovered": 0}
@@ -67,7 +68,7 @@ def run(model: mujoco.MjModel, engine: str, count: int, device: str, seed: int =
     return counts
 
 
-def _same(sims: list[Simulator], worlds: torch.Tensor) -> bool:
+def _same(sims: list[Engine], worlds: torch.Tensor) -> bool:
     """Return whether some worlds are the same in both simulators, to the last bit, and finite."""
     pairs = [[getattr(sim, name)[worlds] for sim in sims] for name in _STATE]
     return all(torch.equal(a, b) and bool(torch.isfinite(a).all()) for a, b in pairs)

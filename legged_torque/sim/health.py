@@ -69,7 +69,7 @@ class Health:
         self._found.zero_()
         for arguments in (self._causes, self._results):
             parts = -(-len(arguments[0]) // kernels.COLUMNS_PER_THREAD)
-            wp.launch(kernels.mend, (len(self._marks), parts), arguments, device=arguments[0].device)
+            wp.launch(kernels.replace_non_finite, (len(self._marks), parts), arguments, device=arguments[0].device)
 
     def end(self) -> None:
         """Count the worlds that are marked."""

@@ -91,7 +91,7 @@ def draw_commands(mask: Mask, seeds: Integers, low: Numbers, span: Numbers, comm
 
 
 @wp.kernel(enable_backward=False)
-def happen(
+def apply_random_events(
     # In:
     is_new: Mask,
     seeds: Integers,
@@ -187,7 +187,7 @@ def number_of(column: Column, world: int) -> Numbers:
 
 
 @wp.kernel(enable_backward=False)
-def mend(
+def replace_non_finite(
     columns: wp.array(dtype=Column),
     excused: Mask,
     diverged: Mask,

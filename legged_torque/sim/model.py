@@ -71,14 +71,13 @@ def max_contacts(model: mujoco.MjModel) -> int:
 _EQUALITY_ROWS = {int(mujoco.mjtEq.mjEQ_CONNECT): 3, int(mujoco.mjtEq.mjEQ_WELD): 6}  # others have one
 
 
-def max_constraints(model: mujoco.MjModel, contacts: int, any_friction: bool = False) -> int:
+def max_constraints(model: mujoco.MjModel, contacts: int) -> int:
     """Return the most constraint rows that one world can have (pyramidal friction cones).
 
-    With ``any_friction``, worlds may have dry friction in joints where the model has none.
+    Every joint may have dry friction in some world.
     """
     rows_per_contact = 2 * (int(model.geom_condim.max()) - 1)
-    friction = model.nv if any_friction else int((model.dof_frictionloss > 0).sum())
-    friction += int((model.tendon_frictionloss > 0).sum())
+    friction = model.nv + int((model.tendon_frictionloss > 0).sum())
     equalities = sum(_EQUALITY_ROWS.get(int(kind), 1) for kind in model.eq_type)
     return (
         contacts * rows_per_contact + friction + int(model.jnt_limited.sum() + model.tendon_limited.sum()) + equalities

@@ -202,9 +202,7 @@ class Session:
         check_numbers("a push", angle, speed)
         w, x, y, z = self.task.base_quat.unbind(dim=1)
         heading = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) + angle
-        velocity = speed * torch.stack([heading.cos(), heading.sin(), torch.zeros_like(heading)], dim=1)
-        everywhere = torch.ones_like(self.task.reset_buf)
-        self.task.sim.push(everywhere, velocity, everywhere)
+        self.task.sim.qvel[:, :2] += speed * torch.stack([heading.cos(), heading.sin()], dim=1)
         if self.companion:
             self.companion.push(angle, speed)
         self._tell(f"pushed with {speed:.1f} m/s")

@@ -104,7 +104,7 @@ def reachable(value, name="env", seen=None):
 def test_every_tensor_comes_back(half, tmp_path):
     """Whatever the task holds after two iterations, a task that has just resumed holds as well."""
     before, after = reachable(half.env), reachable(start(tmp_path, "--resume", f"--load_run={half.log_dir}").env)
-    assert {"env.sim.qpos", "env.sim.qacc_warmstart", "env.actions", "env.sim.model.body_invweight0"} <= before.keys()
+    assert {"env.sim.qpos", "env.sim.qacc_warmstart", "env.actions", "env.sim.fields.body_invweight0"} <= before.keys()
     assert len(before) > 100
     fresh = reachable(start(tmp_path).env)
     assert len(differences(before, fresh)) > 30  # or the comparison would say nothing

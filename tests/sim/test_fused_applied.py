@@ -6,7 +6,7 @@ import pytest
 import torch
 from support.fused import AIR, FIELDS, FLOOR, ROBOTS, compiled, draw_states, put, random
 
-from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.sim.registry import ENGINES, make_engine
 
 
 def step_mujoco(model, states, xfrc, qfrc):
@@ -30,11 +30,11 @@ def test_applied_forces(engine, robot, heights):
     model = compiled(ROBOTS[robot]())
     states = draw_states(model, 20, heights)
     xfrc, qfrc = random((20, model.nbody, 6), -5.0, 5.0, 1), random((20, model.nv), -3.0, 3.0, 2)
-    sim = Simulator(model, 20, "cpu", engine, 100, 50, applied_forces=True)
+    sim = make_engine(engine, model, 20, "cpu", 100, 50)
     for of_bodies, of_joints in ((xfrc, qfrc), (xfrc, 0.0 * qfrc), (0.0 * xfrc, qfrc)):
         put(sim, states)
-        sim.xfrc_applied.copy_(torch.tensor(of_bodies))
-        sim.qfrc_applied.copy_(torch.tensor(of_joints))
+        for applied, values in zip(sim.applied_forces(), (of_bodies, of_joints), strict=True):
+            applied.copy_(torch.tensor(values))
         sim.step()
         expected = step_mujoco(model, states, of_bodies, of_joints)
         error = np.abs(sim.qvel.double().numpy() - expected).max(axis=1)
@@ -47,11 +47,9 @@ def test_applied_forces(engine, robot, heights):
 def test_reset_clears_applied_forces(engine):
     """A reset clears the forces of its worlds and no other's; who did not ask for them has none."""
     model = compiled(ROBOTS["a1"]())
-    sim = Simulator(model, 2, "cpu", engine, applied_forces=True)
-    for forces in (sim.xfrc_applied, sim.qfrc_applied):
+    sim = make_engine(engine, model, 2, "cpu")
+    for forces in sim.applied_forces():
         forces.fill_(1.0)
     sim.reset(torch.tensor([False, True]))
-    for forces in (sim.xfrc_applied, sim.qfrc_applied):
+    for forces in sim.applied_forces():
         assert (forces[0] == 1.0).all() and (forces[1] == 0.0).all()
-    without = Simulator(model, 2, "cpu", engine)
-    assert without.xfrc_applied is None and without.qfrc_applied is None

@@ -7,10 +7,9 @@ from support.fused import assert_alike, compiled, draw_states, make_a1, put, ste
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.envs.base.domain_rand import of_model
-from legged_torque.envs.base.robot_checks import engine_notes
 from legged_torque.sim.fused.tree import read_tree
 from legged_torque.sim.model import build_model, max_constraints
-from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.sim.registry import ENGINES, make_engine
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import read_spec
 
@@ -166,13 +165,13 @@ def test_solver_of_the_file():
 
 def test_engine_that_is_slower():
     """Who takes MuJoCo Warp's own step is told how much slower it is, and whether it had to be."""
-    assert list(engine_notes(compiled(make_a1()), "fused")) == []
-    assert "which can simulate this robot" in next(engine_notes(compiled(make_a1()), "mujoco_warp"))
+    assert not make_engine("fused", compiled(make_a1()), 1).notes
+    assert "which can simulate this robot" in make_engine("mujoco_warp", compiled(make_a1()), 1).notes[0]
     spec = make_a1()
     for key in list(spec.keys):
         spec.delete(key)
     branch(spec.body("FL_thigh"))
-    (note,) = engine_notes(compiled(spec), "mujoco_warp")
+    (note,) = make_engine("mujoco_warp", compiled(spec), 1).notes
     assert note.startswith("sim.engine 'mujoco_warp' steps worlds, about 30 times slower than 'fused'")
     assert note.endswith("which cannot simulate this robot: body 'FL_thigh' branches")
 
@@ -194,19 +193,19 @@ def test_rows_of_closed_loops():
 @pytest.mark.parametrize("name", ["geom_margin", "jnt_margin", "body_gravcomp", "actuator_gainprm", "geom_gap"])
 def test_fields_that_are_not_read(name):
     """Fields that the fused step does not read cannot be had per world; MuJoCo Warp's step takes them."""
-    model = compiled(make_a1())
-    with pytest.raises(UserError, match=f"does not read '{name}' per world"):
-        Simulator(model, 2, "cpu", per_world=["body_mass", name])
-    Simulator(model, 2, "cpu", engine="mujoco_warp", per_world=[name])
-    with pytest.raises(UserError, match="body_mass"):
-        Simulator(model, 2, "cpu", per_world=["body_mas"])
+    sims = {engine: make_engine(engine, compiled(make_a1()), 2) for engine in ENGINES}
+    with pytest.raises(UserError, match=f"unknown field for sim.engine 'fused' '{name}'"):
+        sims["fused"].field(name)
+    assert len(sims["mujoco_warp"].field(name)) == 2
+    with pytest.raises(UserError, match="did you mean 'body_mass'"):
+        sims["fused"].field("body_mas")
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("name", ["dof_damping", "dof_armature", "dof_frictionloss", "jnt_stiffness"])
 def test_the_free_joint_is_not_read(engine, name):
     """Random parameters of the trunk's free joint are refused where they would not act; those of hinges are not."""
-    sim = Simulator(compiled(make_a1()), 2, "cpu", engine, per_world=[name])
+    sim = make_engine(engine, compiled(make_a1()), 2)
     last_of_trunk = 0 if name == "jnt_stiffness" else 5
     sim.check_columns(name, [last_of_trunk + 1])
     if engine == "fused":
@@ -230,10 +229,10 @@ def test_tolerance():
     states, counts = draw_states(model, 30, seed=8), []
     for tolerance in (1e-8, 1e9):
         model.opt.tolerance = tolerance
-        sim = Simulator(model, 30, "cpu")
+        sim = make_engine("fused", model, 30, "cpu")
         put(sim, states)
         sim.step()
-        counts.append(sim.data.solver_niter.numpy().copy())
+        counts.append(sim.solver_niter.numpy().copy())
     assert counts[0].max() > 4 and counts[1].max() <= 2
 
 
@@ -243,7 +242,7 @@ def test_engines_by_name():
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     model = build_model(spec, [])
     with pytest.raises(UserError, match="the friction cone must be pyramidal"):
-        Simulator(model, 1, "cpu")
-    Simulator(model, 1, "cpu", engine="mujoco_warp")
+        make_engine("fused", model, 1, "cpu")
+    make_engine("mujoco_warp", model, 1, "cpu")
     with pytest.raises(UserError, match="fuse"):
-        Simulator(model, 1, "cpu", engine="fuse")
+        make_engine("fuse", model, 1)

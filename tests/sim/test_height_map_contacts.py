@@ -11,8 +11,8 @@ import warp as wp
 from support.fused import assert_alike, compiled, draw_states, invariants, make_a1, put, step_mujoco
 
 from legged_torque.envs import task_registry
-from legged_torque.sim.fused.surface import Surface, Touch, make_surface, touch_map
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.fused.surface import SphereContacts, Surface, make_surface, sphere_map
+from legged_torque.sim.registry import make_engine
 from legged_torque.terrain.rough import RoughGround
 from legged_torque.utils.errors import UserError
 
@@ -69,7 +69,7 @@ def ball(friction=1e-5, kind="sphere", size="0.1", planes=()):
 
 def simulate(model, height_map, places, velocities=0.0, steps=0):
     """A simulator with a trunk at each of some places, after some steps."""
-    sim = Simulator(model, len(places), "cpu", "fused", 50, 30, height_map=height_map)
+    sim = make_engine("fused", model, len(places), "cpu", 50, 30, height_map=height_map)
     sim.qpos[:, :3] = torch.tensor(np.array(places))
     sim.qvel[:, :3] = torch.as_tensor(velocities)
     for _ in range(steps):
@@ -82,17 +82,20 @@ def simulate(model, height_map, places, velocities=0.0, steps=0):
 
 @wp.kernel(enable_backward=False)
 def touch_all(
-    surface: Surface, centre: wp.array(dtype=wp.vec3), radius: wp.array(dtype=float), touch: wp.array(dtype=Touch)
+    surface: Surface,
+    centre: wp.array(dtype=wp.vec3),
+    radius: wp.array(dtype=float),
+    touch: wp.array(dtype=SphereContacts),
 ):
     """Touch a map with spheres."""
     i = wp.tid()
-    touch[i] = touch_map(surface, centre[i], radius[i])
+    touch[i] = sphere_map(surface, centre[i], radius[i])
 
 
 def touches(height_map, centres, radii):
     """Where spheres touch a map."""
     with wp.ScopedDevice("cpu"):
-        out = wp.empty(len(centres), dtype=Touch)
+        out = wp.empty(len(centres), dtype=SphereContacts)
         places, sizes = wp.array(centres, dtype=wp.vec3), wp.array(radii, dtype=float)
         wp.launch(touch_all, len(centres), [make_surface(height_map), places, sizes, out])
     return out.numpy()
@@ -170,7 +173,7 @@ def test_a_plane_as_a_map(slope):
     states = {field: values[kept] for field, values in states.items()}
     height_map = make_map(lambda x, y: along[0] * x + along[1] * y)
     sims = [
-        Simulator(model, len(states["qpos"]), "cpu", "fused", 100, 50, height_map=ground)
+        make_engine("fused", model, len(states["qpos"]), "cpu", 100, 50, height_map=ground)
         for ground in (height_map, None)
     ]
     for sim in sims:
@@ -251,7 +254,7 @@ def test_slopes_under_each_foot():
     rng = np.random.default_rng(2)
     height_map = make_map(lambda x, y: rng.uniform(-0.08, 0.08, x.shape), scale=0.4, cells=8)
     model, states, results = on_facets(height_map, 60)
-    sim = Simulator(model, 60, "cpu", "fused", 100, 50, height_map=height_map)
+    sim = make_engine("fused", model, 60, "cpu", 100, 50, height_map=height_map)
     put(sim, states)
     sim.step()
     counts = np.array([count for _, count in results])
@@ -346,7 +349,7 @@ def test_cylinders_on_a_level_map():
         qpos[2] = 0.06 * np.sin(angle) + 0.05 * abs(np.cos(angle)) - rng.uniform(-0.001, 0.004)
     expected = step_mujoco(model, states)
     assert set(expected[2][:, 0]) == {0, 1, 2}
-    sim = Simulator(model, 80, "cpu", "fused", 100, 50, height_map=make_map(lambda x, y: 0.0 * x))
+    sim = make_engine("fused", model, 80, "cpu", 100, 50, height_map=make_map(lambda x, y: 0.0 * x))
     put(sim, states)
     sim.step()
     found = (sim.qvel, sim.qpos, sim.contact_found, sim.contact_force)
@@ -423,15 +426,15 @@ def test_bad_numbers_stay_in_their_world(value):
 def test_refused():
     """Heights are the world's: a floor that is or goes elsewhere cannot be a map; other engines have their own way."""
     spec, height_map = make_a1(), make_map(rough)
-    with pytest.raises(ValueError, match="hfield"):
-        Simulator(compiled(spec), 1, "cpu", "mujoco_warp", height_map=height_map)
-    sim = Simulator(compiled(spec), 2, "cpu", per_world=["geom_pos"], height_map=height_map)
+    with pytest.raises(UserError, match="'mujoco_warp' lacks the capability 'height_map'"):
+        make_engine("mujoco_warp", compiled(spec), 1, "cpu", height_map=height_map)
+    sim = make_engine("fused", compiled(spec), 2, "cpu", height_map=height_map)
     sim.check_columns("geom_pos", [2 + 3 * sim.mj_model.geom("FR_foot").id])
     with pytest.raises(UserError, match="does not read 'geom_pos' of the floor"):
         sim.check_columns("geom_pos", [2 + 3 * sim.mj_model.geom("floor").id])
     spec.geom("floor").pos = [0.0, 0.0, 0.1]
     with pytest.raises(UserError, match="its floor is not at the origin"):
-        Simulator(compiled(spec), 1, "cpu", height_map=height_map)
+        make_engine("fused", compiled(spec), 1, "cpu", height_map=height_map)
 
 
 def test_a_gpu_without_room(monkeypatch):

@@ -8,8 +8,8 @@ import pytest
 import torch
 from support.simulator import CONVERGED, LEGS, SENSED, WEIGHT, contacts_by_hand
 
-from legged_torque.sim import simulator
-from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.sim import mjwarp
+from legged_torque.sim.registry import ENGINES, make_engine
 
 FEET = [i for i, name in enumerate(SENSED) if name.endswith("foot")]
 LEG_UP = (0.0, 2.6, -0.95)
@@ -238,8 +238,8 @@ def test_buffers_suffice_in_normal_use(make_task):
 def test_full_buffers_are_reported(make_task, monkeypatch, buffer):
     """A buffer that is too small in one world is named, even after that world has been reset."""
     model = make_task("a1_torque", 1).sim.mj_model
-    monkeypatch.setattr(simulator, buffer, lambda *_, **__: {"max_contacts": 6, "max_constraints": 20}[buffer])
-    sim = Simulator(model, 2, "cpu", engine="mujoco_warp", solver_iterations=5, ls_iterations=8)
+    monkeypatch.setattr(mjwarp, buffer, lambda *_: {"max_contacts": 6, "max_constraints": 20}[buffer])
+    sim = make_engine("mujoco_warp", model, 2, "cpu", solver_iterations=5, ls_iterations=8)
     put_deep_into_the_floor(sim)
     sim.qpos[:, 2], sim.qpos[:, 7:] = 10.0, torch.tensor(LEG_UP * 4)
     sim.step()

@@ -6,7 +6,7 @@ import torch
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.sim.model import build_model
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.registry import make_engine
 from legged_torque.utils.mjcf import read_spec
 
 FIELDS = ("qpos", "qvel", "ctrl", "qacc_warmstart")
@@ -149,7 +149,7 @@ def put(sim, states):
 
 def step_fused(model, states, iterations=100, ls_iterations=50):
     """The same after one fused step."""
-    sim = Simulator(model, len(states["qpos"]), "cpu", "fused", iterations, ls_iterations)
+    sim = make_engine("fused", model, len(states["qpos"]), "cpu", iterations, ls_iterations)
     put(sim, states)
     sim.step()
     return [tensor.double().numpy() for tensor in (sim.qvel, sim.qpos, sim.contact_found, sim.contact_force)]

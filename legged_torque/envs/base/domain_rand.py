@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import mujoco
+import torch
 from torch import Tensor
 
 from legged_torque.sim.randomization import Parameter, Range
@@ -15,12 +16,6 @@ from legged_torque.utils.mjcf import joint_limits
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
-
-MODEL_FIELDS = (
-    *("body_mass", "body_inertia", "body_ipos", "geom_size", "geom_pos", "geom_friction", "geom_solref", "gravity"),
-    *("dof_damping", "dof_armature", "jnt_stiffness", "dof_frictionloss"),
-)
-"""Fields of the model of which each world has its own."""
 
 TRUNK = 1  # the trunk's body
 _ROUND = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)}  # types of feet that have a radius
@@ -150,7 +145,9 @@ def mirrors(drawn: list[Parameter], sizes: dict[str, int]) -> dict[str, Mirrorin
 
 def check_fields(task: LeggedRobot, drawn: list[Parameter]) -> None:
     """Refuse parameters in the model that do not name their field: what follows from it would stay as it was."""
-    fields = {task.sim.field(name).untyped_storage().data_ptr(): name for name in MODEL_FIELDS}
+    if not task.cfg.domain_rand.randomize_parameters:
+        return
+    fields = {field.untyped_storage().data_ptr(): name for name, field in task.sim.fields.items()}
     for parameter in drawn:
         name = fields.get(parameter.field.untyped_storage().data_ptr())
         if name != parameter.model_field:
@@ -158,13 +155,19 @@ def check_fields(task: LeggedRobot, drawn: list[Parameter]) -> None:
 
 
 def of_model(task: LeggedRobot, name: str, field: str, columns: Sequence[int], **settings: Any) -> Parameter:
-    """Return a parameter kept in a field of the model: one of :data:`MODEL_FIELDS`.
+    """Return a parameter kept in a field of the model.
 
-    ``columns`` are numbers of a world's part of the field, all of its entries behind each other; ``settings`` is all
-    else that a :class:`~legged_torque.sim.randomization.Parameter` takes.
+    ``columns`` are numbers of a world's part of the field, all of its entries flattened; ``settings`` is all else that
+    a :class:`~legged_torque.sim.randomization.Parameter` takes. Without random parameters, worlds share the field.
     """
-    task.sim.check_columns(field, columns)
-    return Parameter(name, task.sim.field(field).flatten(1), list(columns), model_field=field, **settings)
+    if task.cfg.domain_rand.randomize_parameters:
+        task.sim.check_columns(field, columns)
+        values = task.sim.field(field)
+    else:
+        model = task.sim.mj_model
+        shared = getattr(model.opt if field == "gravity" else model, field)
+        values = torch.tensor(shared, dtype=torch.float32, device=task.device).unsqueeze(0)
+    return Parameter(name, values.flatten(1), list(columns), model_field=field, **settings)
 
 
 def entries(width: int, rows: list[int]) -> list[int]:

@@ -13,7 +13,7 @@ from legged_torque.envs.base.asset import by_joint, load_asset, nominal_pose
 from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.commands import UniformCommands
 from legged_torque.envs.base.control_laws import pd_torque, pd_torques
-from legged_torque.envs.base.domain_rand import MODEL_FIELDS, check_fields, initial_state, mirrors, parameters
+from legged_torque.envs.base.domain_rand import check_fields, initial_state, mirrors, parameters
 from legged_torque.envs.base.health import watched
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
@@ -27,10 +27,11 @@ from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.motors import make_motors
 from legged_torque.motors.action_delay import ActionDelay
 from legged_torque.motors.drive import Drive, in_kernel
+from legged_torque.sim.engine import require
 from legged_torque.sim.health import Health
 from legged_torque.sim.model import indices_matching
 from legged_torque.sim.randomization import Parameter, changes_legs
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.registry import engine_class, make_engine
 from legged_torque.terrain import make_terrain
 from legged_torque.utils.config import section_keys, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
@@ -133,7 +134,7 @@ class LeggedRobot(RewardTerms, BaseTask):
     def run_physics(self) -> None:
         """Do the physics steps of a control step, with torques inside if control law and motors name Warp functions."""
         decimation, refresh = self.cfg.control.decimation, self.cfg.control.refresh_torques
-        drive = self._drive.get() if refresh and self.sim.is_fused else None
+        drive = self._drive.get() if refresh and "torques_in_kernel" in self.sim.capabilities else None
         if drive:
             self.sim.drive(decimation, *drive)
             return
@@ -259,12 +260,16 @@ class LeggedRobot(RewardTerms, BaseTask):
         """Load robot, ground and motors, and build the simulator and its views."""
         cfg, sim = self.cfg, self.cfg.sim
         self.terrain = make_terrain(cfg.terrain, self.num_envs, self.device)
-        height_map = self.terrain.map if sim.engine == "fused" else None  # others find it in their model
+        engine = engine_class(sim.engine)
+        if cfg.domain_rand.randomize_parameters:
+            require(engine, "per_world", "domain_rand.randomize_parameters")
+        if cfg.asset.self_collisions:
+            require(engine, "self_collision", "asset.self_collisions")
+        height_map = self.terrain.map if "height_map" in engine.capabilities else None  # others find it in their model
         self.asset = load_asset(cfg, None if height_map else self.terrain)
         model = self.asset.mj_model
-        per_world = MODEL_FIELDS if cfg.domain_rand.randomize_parameters else ()
         limits = (sim.solver_iterations, sim.ls_iterations)
-        self.sim = Simulator(model, self.num_envs, self.device, sim.engine, *limits, per_world, False, height_map)
+        self.sim = make_engine(sim.engine, model, self.num_envs, self.device, *limits, height_map)
         self.dof_names, self.foot_names = self.asset.dof_names, self.asset.foot_names
         self.num_dof = len(self.dof_names)
         axes = self.asset.dof_axes().tolist()
@@ -345,7 +350,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.events = RandomEvents(cfg, self.sim, self.command_generator, self.init_angles, initial_state(self), drawn)
         self.randomization = self.events.parameters
         self.parameter_mirrors = mirrors(drawn, self.randomization.sizes)
-        self.notes = list(self.asset.notes)
+        self.notes = [*self.asset.notes, *self.sim.notes]
         if cfg.domain_rand.randomize_parameters:
             self.notes += range_notes(drawn, self.torque_limits[1].cpu().numpy())
         if cfg.domain_rand.randomize_parameters and changes_legs(drawn):

@@ -11,8 +11,8 @@ from torch import Tensor
 from legged_torque.envs.base.commands import UniformCommands
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim import kernels
+from legged_torque.sim.engine import Engine
 from legged_torque.sim.randomization import Parameter, Randomization
-from legged_torque.sim.simulator import Simulator
 
 PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one, times ``push_set_factor``
 
@@ -29,7 +29,7 @@ class RandomEvents:
     def __init__(
         self,
         cfg: LeggedRobotCfg,
-        sim: Simulator,
+        sim: Engine,
         commands: UniformCommands,
         init_angles: Tensor,
         initial_state: Sequence[Parameter],
@@ -56,13 +56,13 @@ class RandomEvents:
         self._seeds.random_()
         self._sim.reset(is_new)
         self.initial_state.draw(is_new)
-        commands, data, settings = self._commands, self._sim.data, self._settings
+        commands, sim, settings = self._commands, self._sim, self._settings
         pushes = (wp.vec2(*settings.push_velocity), settings.push_set_factor)
         new, seeds = map(wp.from_torch, (is_new, self._seeds[0]))
         read = map(wp.from_torch, (self.init_angles, commands.low, commands.span))
         written = map(wp.from_torch, (self._new_parameters, commands.values, commands.headings))
-        arguments = [new, seeds, self._chances, *pushes, *read, *written, data.qpos, data.qvel]
-        wp.launch(kernels.happen, self._sim.num_envs, arguments, device=seeds.device)
+        arguments = [new, seeds, self._chances, *pushes, *read, *written, *map(wp.from_torch, (sim.qpos, sim.qvel))]
+        wp.launch(kernels.apply_random_events, sim.num_envs, arguments, device=seeds.device)
         if settings.randomize_parameters:
             self.parameters.draw(self._new_parameters)
-            self._sim.update_constants(self._new_parameters)
+            sim.update_constants(self._new_parameters)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.symmetry import RobotSymmetry
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.engine import Engine
 
 STANDING_COMMAND = 0.1  # norm of a command [m/s, rad/s] up to which robots may stand
 STUMBLING = 5.0
@@ -23,7 +23,7 @@ class RewardTerms(ABC):
     """
 
     cfg: LeggedRobotCfg
-    sim: Simulator
+    sim: Engine
     symmetry: RobotSymmetry
     dt: float
     commands: Tensor

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LinearChange
+from legged_torque.sim.registry import engine_class
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.config import Section, section_keys
 from legged_torque.utils.errors import UserError, unknown_name
@@ -12,6 +13,7 @@ from legged_torque.utils.limits import check_section
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     """Raise a UserError that names the first setting of a task that makes no sense, alone or with others."""
     check_section(cfg)
+    engine_class(cfg.sim.engine)
     _check_changes(cfg)
     for pair in cfg.asset.mirrored_legs:
         if len(pair) != 2:

@@ -4,19 +4,21 @@ The solver minimizes, over accelerations a, the cost 1/2 (a - a_0)^T M (a - a_0)
 accelerations without constraints. Branches are coupled through the trunk only, so the Newton system has the shape of
 an arrow: each branch is eliminated by itself, which leaves six equations for the trunk.
 
-Here is what concerns one branch, in the order of an iteration; ``branches`` loops over those of a thread.
+Here is what concerns one branch, in the order of an iteration; ``newton`` loops over those of a thread.
 """
 
 import warp as wp
 
-from legged_torque.sim.fused.constraint import friction_force, friction_state, row_force
-from legged_torque.sim.fused.contact import (
+from legged_torque.sim.fused.collision import contact_normal
+from legged_torque.sim.fused.constraint import (
     Contact,
     contact_force,
-    contact_normal,
     contact_stiffness,
     expected_rows,
+    friction_force,
+    friction_state,
     pushing_rows,
+    row_force,
     row_values,
 )
 from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, forward_solve, with_column
@@ -69,7 +71,7 @@ def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: An
 def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: AnyContacts):
     """Return a branch with gradient and Hessian of the cost, not factored yet, and what its contacts add for the trunk.
 
-    Those with the ground, that is; see ``self_rows`` for others.
+    Those with the ground, that is; see ``constraint_self`` for others.
     """
     add = TrunkSystem()
     hessian = 1.0 * branch.smooth.mass
@@ -175,7 +177,7 @@ def branch_step(branch: AnyBranch, trunk_step: TrunkMotion):
 
 
 @wp.func
-def turn_to(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts: AnyContacts):
+def along_step(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts: AnyContacts):
     """Return a branch with the changes of its residuals along its step, and the slope of its rows' cost along it."""
     branch.change = joint_rows_times(branch, branch.step)
     slope = float(0.0)

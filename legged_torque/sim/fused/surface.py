@@ -68,7 +68,7 @@ def _greatest(heights: np.ndarray, side: int, around: int) -> np.ndarray:
 
 
 @wp.struct
-class Touch:
+class SphereContacts:
     """The point of the surface that is nearest to the centre of a sphere, and a second one in a concave edge."""
 
     count: wp.int32  # how many of the two touch
@@ -126,7 +126,7 @@ def place_on_map(surface: Surface, centre: wp.vec3, radius: float) -> wp.vec3:
 
 
 @wp.func
-def see_row(surface: Surface, i: int, j: int) -> wp.vec3:
+def load_row(surface: Surface, i: int, j: int) -> wp.vec3:
     """Return the heights of three samples from (i, j) on."""
     first = wp.clamp(i, 0, surface.shape[0] - 1) * surface.shape[1]
     out = wp.vec3()
@@ -136,16 +136,16 @@ def see_row(surface: Surface, i: int, j: int) -> wp.vec3:
 
 
 @wp.func
-def see_patch(surface: Surface, place: wp.vec3, i: int, j: int) -> Patch:
+def load_patch(surface: Surface, place: wp.vec3, i: int, j: int) -> Patch:
     """Return the four cells between samples (i, j) and (i + 2, j + 2) as seen from a place on the map."""
     patch = Patch()
     patch.x = float(i) * surface.scale - place[0]
     patch.z = place[2]
     y = float(j) * surface.scale - place[1]
     patch.y = wp.vec3(y, y + surface.scale, y + 2.0 * surface.scale)
-    patch.first = see_row(surface, i, j)
-    patch.second = see_row(surface, i + 1, j)
-    patch.third = see_row(surface, i + 2, j)
+    patch.first = load_row(surface, i, j)
+    patch.second = load_row(surface, i + 1, j)
+    patch.third = load_row(surface, i + 2, j)
     return patch
 
 
@@ -159,7 +159,7 @@ def next_row(patch: Patch, scale: float) -> Patch:
 
 
 @wp.func
-def see_face(surface: Surface, patch: Patch, b: int, half: int) -> Face:
+def make_face(surface: Surface, patch: Patch, b: int, half: int) -> Face:
     """Return one of the two triangles of a cell of a patch's first two rows.
 
     The diagonal runs from a cell's corner (0, 0) to (1, 1); the half 0 has the corner (1, 0).
@@ -186,7 +186,7 @@ def normal_of(face: Face) -> wp.vec3:
 
 
 @wp.func
-def look_at_face(face: Face, radius: float, best: Nearest) -> Nearest:
+def nearest_on_face(face: Face, radius: float, best: Nearest) -> Nearest:
     """Return what is nearest when a triangle is known, without its edges."""
     away_sq = wp.where(face.is_inside, face.dist * face.dist, FAR_AWAY)
     if away_sq < best.face_sq:
@@ -197,7 +197,7 @@ def look_at_face(face: Face, radius: float, best: Nearest) -> Nearest:
 
 
 @wp.func
-def look_at_edge(start: wp.vec3, edge: wp.vec3, best: Nearest) -> Nearest:
+def nearest_on_edge(start: wp.vec3, edge: wp.vec3, best: Nearest) -> Nearest:
     """Return what is nearest when an edge between two samples is known."""
     point = start + wp.clamp(-wp.dot(start, edge) / wp.length_sq(edge), 0.0, 1.0) * edge
     away_sq = wp.length_sq(point)
@@ -208,18 +208,18 @@ def look_at_edge(start: wp.vec3, edge: wp.vec3, best: Nearest) -> Nearest:
 
 
 @wp.func
-def look_at_row(surface: Surface, patch: Patch, radius: float, best: Nearest) -> Nearest:
+def nearest_on_cells(surface: Surface, patch: Patch, radius: float, best: Nearest) -> Nearest:
     """Return what is nearest when the two cells of a patch's first two rows are known.
 
     Of each cell three edges: the other two are its neighbours'.
     """
     for b in range(2):
         for half in range(2):
-            best = look_at_face(see_face(surface, patch, b, half), radius, best)
+            best = nearest_on_face(make_face(surface, patch, b, half), radius, best)
         start, z = wp.vec3(patch.x, patch.y[b], patch.first[b] - patch.z), patch.first[b]
-        best = look_at_edge(start, wp.vec3(surface.scale, 0.0, patch.second[b] - z), best)
-        best = look_at_edge(start, wp.vec3(0.0, surface.scale, patch.first[b + 1] - z), best)
-        best = look_at_edge(start, wp.vec3(surface.scale, surface.scale, patch.second[b + 1] - z), best)
+        best = nearest_on_edge(start, wp.vec3(surface.scale, 0.0, patch.second[b] - z), best)
+        best = nearest_on_edge(start, wp.vec3(0.0, surface.scale, patch.first[b + 1] - z), best)
+        best = nearest_on_edge(start, wp.vec3(surface.scale, surface.scale, patch.second[b + 1] - z), best)
     return best
 
 
@@ -267,7 +267,7 @@ def make_window(surface: Surface, place: wp.vec3, reach: float) -> Window:
 
 
 @wp.func
-def find_nearest(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
+def nearest_point(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
     """Return what is nearest to the centre of a sphere.
 
     The way out of the ground is as long as the centre is below it, vertically, or shorter.
@@ -279,7 +279,7 @@ def find_nearest(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
     i, j = window.first[0], window.first[1]
     is_first = bool(True)
     while i <= window.last[0]:
-        patch = see_patch(surface, place, i, j)
+        patch = load_patch(surface, place, i, j)
         reach = float(0.0)
         if is_first:
             best.above = height_above(surface, patch)
@@ -287,7 +287,7 @@ def find_nearest(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
         most_sq = wp.max(radius * radius, wp.min(best.face_sq, best.edge_sq))
         rows = wp.where(distance_sq_to_patch(patch, surface.scale) <= (1.0 + ON_EDGE) * most_sq, 2, 0)
         while rows > 0:  # not unrolled: a thread waits for instructions longer than it works on them
-            best = look_at_row(surface, patch, radius, best)
+            best = nearest_on_cells(surface, patch, radius, best)
             patch = next_row(patch, surface.scale)
             rows -= 1
         is_first = False
@@ -313,12 +313,12 @@ def second_face(surface: Surface, place: wp.vec3, radius: float, point: wp.vec3,
     window = make_window(surface, place, radius)
     for i in range(window.first[0], window.last[0] + 1, 2):
         for j in range(window.first[1], window.last[1] + 1, 2):
-            patch = see_patch(surface, place, i, j)
+            patch = load_patch(surface, place, i, j)
             rows = int(2)
             while rows > 0:
                 for b in range(2):
                     for half in range(2):
-                        other = see_face(surface, patch, b, half)
+                        other = make_face(surface, patch, b, half)
                         other_normal = normal_of(other)
                         way = -other.dist * other_normal - point
                         is_concave = wp.min(wp.dot(way, normal), -wp.dot(way, other_normal)) > 10.0 * MIN_DISTANCE
@@ -347,15 +347,15 @@ def is_clear(surface: Surface, centre: wp.vec3, lowest: float, radius: float) ->
 
 
 @wp.func
-def touch_map(surface: Surface, centre: wp.vec3, radius: float) -> Touch:
+def sphere_map(surface: Surface, centre: wp.vec3, radius: float) -> SphereContacts:
     """Return where a sphere touches the surface.
 
     The nearest point of the whole surface is one of a face, or of an edge or vertex that sticks out: edges between
     triangles of one plane are never felt. Of a sphere whose centre is below the surface it is the shortest way out.
     """
-    out = Touch()
+    out = SphereContacts()
     place = place_on_map(surface, centre, radius)
-    nearest = find_nearest(surface, place, radius)
+    nearest = nearest_point(surface, place, radius)
     away = wp.sqrt(nearest.edge_sq)
     is_face = wp.sqrt(nearest.face_sq) < away + MIN_DISTANCE  # of equals the face: it has the better normal
     out.first = normal_of(nearest.face)

@@ -19,7 +19,7 @@ AnyVector = AnyMatrix = AnyColumns = Any
 AnyBranch = AnyLinks = AnyRows = Any
 """``Branch``, ``Links`` and ``JointRows`` of :func:`branch_types`."""
 AnyContacts = Any
-"""``Contacts`` with a plane, ``MapContacts`` with a height map."""
+"""``PlaneContacts`` with a plane, ``MapContacts`` with a height map."""
 
 
 @wp.struct

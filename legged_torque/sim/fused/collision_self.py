@@ -1,4 +1,4 @@
-"""Contacts between parts of a robot: which may be, and where they are; see ``self_rows`` for what they do."""
+"""Contacts between parts of a robot: which may be, and where they are; see ``constraint_self`` for what they do."""
 
 import functools
 
@@ -8,10 +8,11 @@ import numpy as np
 import warp as wp
 from mujoco_warp._src import collision_primitive_core as primitives
 
-from legged_torque.sim.fused.contact import BOX, CAPSULE, Contact, Feel, contact_tangent, mix_feel, set_rows
+from legged_torque.sim.fused.collision import BOX, CAPSULE, contact_tangent
+from legged_torque.sim.fused.constraint import Contact, ContactParams, contact_params, with_rows
 from legged_torque.sim.fused.math import group_sum, quat_to_matrix
+from legged_torque.sim.fused.model import Model, of_world
 from legged_torque.sim.fused.smooth import Pose
-from legged_torque.sim.fused.tables import Tables, of_world
 from legged_torque.sim.fused.tree import Tree, places_of_geoms
 from legged_torque.sim.fused.types import vec4, vec5
 from legged_torque.utils.mjcf import self_pairs
@@ -43,7 +44,7 @@ class SelfContacts:
     normal: wp.array(dtype=wp.vec3)  # of each contact, from the first geom to the second
     jacobian: wp.array2d(dtype=wp.vec3)  # (contact, joint): motion of the second body less that of the first
     joints: wp.array2d(dtype=wp.float32)  # (world, joint): accelerations, or a step
-    matrix: wp.array3d(dtype=wp.float32)  # (world, row, column): the whole Newton system, see ``self_rows``
+    matrix: wp.array3d(dtype=wp.float32)  # (world, row, column): the whole Newton system, see ``constraint_self``
     overflow: wp.array(dtype=wp.int32)  # MuJoCo Warp's, of each world
     first: wp.int32  # a thread's own: the contacts of its world, from the first one on
     end: wp.int32
@@ -95,7 +96,7 @@ class Shape:
 
 
 @wp.struct
-class Touch:
+class PairContacts:
     """The contacts of two geoms, the first ``count`` entries; what does not touch has no negative distance."""
 
     count: wp.int32
@@ -112,17 +113,17 @@ def pose_of(selves: SelfContacts, world: int, geom: int) -> Pose:
 
 
 @wp.func
-def middle_of(tables: Tables, selves: SelfContacts, world: int, geom: int) -> wp.vec3:
+def middle_of(model: Model, selves: SelfContacts, world: int, geom: int) -> wp.vec3:
     """Return where a geom is."""
     pose = pose_of(selves, world, geom)
-    return pose.pos + pose.rot * of_world(tables.geom_pos, world, geom)
+    return pose.pos + pose.rot * of_world(model.geom_pos, world, geom)
 
 
 @wp.func
-def shape_of(tables: Tables, selves: SelfContacts, world: int, geom: int) -> Shape:
+def shape_of(model: Model, selves: SelfContacts, world: int, geom: int) -> Shape:
     """Return a geom in the world."""
-    rot = pose_of(selves, world, geom).rot * quat_to_matrix(of_world(tables.geom_quat, world, geom))
-    return Shape(middle_of(tables, selves, world, geom), rot, of_world(tables.geom_size, world, geom))
+    rot = pose_of(selves, world, geom).rot * quat_to_matrix(of_world(model.geom_quat, world, geom))
+    return Shape(middle_of(model, selves, world, geom), rot, of_world(model.geom_size, world, geom))
 
 
 @wp.func
@@ -132,19 +133,19 @@ def axis_of(shape: Shape) -> wp.vec3:
 
 
 @wp.func
-def reach_of(tables: Tables, world: int, geom: int) -> float:
+def reach_of(model: Model, world: int, geom: int) -> float:
     """Return the radius of a sphere around a geom [m]."""
-    size = of_world(tables.geom_size, world, geom)
+    size = of_world(model.geom_size, world, geom)
     reach = size[0]
-    if tables.geom_type[geom] == CAPSULE:
+    if model.geom_type[geom] == CAPSULE:
         reach = size[0] + size[1]
-    if tables.geom_type[geom] == BOX:
+    if model.geom_type[geom] == BOX:
         reach = wp.length(size)
     return reach
 
 
 @wp.func
-def add_touch(out: Touch, dist: float, pos: wp.vec3, normal: wp.vec3) -> Touch:
+def add_contact(out: PairContacts, dist: float, pos: wp.vec3, normal: wp.vec3) -> PairContacts:
     """Return contacts with one more, if it is one."""
     if dist < 0.0:
         out.dist[out.count] = dist
@@ -155,59 +156,59 @@ def add_touch(out: Touch, dist: float, pos: wp.vec3, normal: wp.vec3) -> Touch:
 
 
 @wp.func
-def no_touch(a: Shape, b: Shape) -> Touch:
+def no_contact(a: Shape, b: Shape) -> PairContacts:
     """Return no contact: in the place of functions that a robot does not need, whose code is long."""
-    return Touch()
+    return PairContacts()
 
 
 @wp.func
-def sphere_sphere(a: Shape, b: Shape) -> Touch:
+def sphere_sphere(a: Shape, b: Shape) -> PairContacts:
     """Return the contact of two spheres."""
     dist, pos, normal = primitives.sphere_sphere(a.pos, a.size[0], b.pos, b.size[0])
-    return add_touch(Touch(), dist, pos, normal)
+    return add_contact(PairContacts(), dist, pos, normal)
 
 
 @wp.func
-def sphere_capsule(a: Shape, b: Shape) -> Touch:
+def sphere_capsule(a: Shape, b: Shape) -> PairContacts:
     """Return the contact of a sphere and a capsule."""
     dist, pos, normal = primitives.sphere_capsule(a.pos, a.size[0], b.pos, axis_of(b), b.size[0], b.size[1])
-    return add_touch(Touch(), dist, pos, normal)
+    return add_contact(PairContacts(), dist, pos, normal)
 
 
 @wp.func
-def sphere_box(a: Shape, b: Shape) -> Touch:
+def sphere_box(a: Shape, b: Shape) -> PairContacts:
     """Return the contact of a sphere and a box."""
     dist, pos, normal = primitives.sphere_box(a.pos, a.size[0], b.pos, b.rot, b.size)
-    return add_touch(Touch(), dist, pos, normal)
+    return add_contact(PairContacts(), dist, pos, normal)
 
 
 @wp.func
-def capsule_capsule(a: Shape, b: Shape) -> Touch:
+def capsule_capsule(a: Shape, b: Shape) -> PairContacts:
     """Return the contacts of two capsules, two if they are parallel."""
     dist, pos, normal = primitives.capsule_capsule(
         a.pos, axis_of(a), a.size[0], a.size[1], b.pos, axis_of(b), b.size[0], b.size[1]
     )
-    return add_touch(add_touch(Touch(), dist[0], pos[0], normal[0]), dist[1], pos[1], normal[1])
+    return add_contact(add_contact(PairContacts(), dist[0], pos[0], normal[0]), dist[1], pos[1], normal[1])
 
 
 @wp.func
-def capsule_box(a: Shape, b: Shape) -> Touch:
+def capsule_box(a: Shape, b: Shape) -> PairContacts:
     """Return the contacts of a capsule and a box, two at most."""
     dist, pos, normal = primitives.capsule_box(a.pos, axis_of(a), a.size[0], a.size[1], b.pos, b.rot, b.size)
-    return add_touch(add_touch(Touch(), dist[0], pos[0], normal[0]), dist[1], pos[1], normal[1])
+    return add_contact(add_contact(PairContacts(), dist[0], pos[0], normal[0]), dist[1], pos[1], normal[1])
 
 
 @wp.func
-def box_box(a: Shape, b: Shape) -> Touch:
+def box_box(a: Shape, b: Shape) -> PairContacts:
     """Return the contacts of two boxes, eight at most."""
-    out = Touch()
+    out = PairContacts()
     count, dist, pos, normal = primitives.box_box(a.pos, a.rot, a.size, b.pos, b.rot, b.size, 0.0)
     for i in range(count):
-        out = add_touch(out, dist[i], pos[i], normal)
+        out = add_contact(out, dist[i], pos[i], normal)
     return out
 
 
-_TOUCH = {
+_COLLIDE = {
     (SPHERE, SPHERE): sphere_sphere,
     (SPHERE, CAPSULE): sphere_capsule,
     (SPHERE, BOX): sphere_box,
@@ -218,21 +219,21 @@ _TOUCH = {
 
 
 @functools.cache
-def touch_function(kinds: tuple[tuple[int, int], ...]) -> wp.Function:
-    """Return ``touch_pair`` for pairs of some types of geoms."""
-    functions = [function if kind in kinds else no_touch for kind, function in _TOUCH.items()]
+def pair_collider(kinds: tuple[tuple[int, int], ...]) -> wp.Function:
+    """Return ``collide_pair`` for pairs of some types of geoms."""
+    functions = [function if kind in kinds else no_contact for kind, function in _COLLIDE.items()]
     two_spheres, on_capsule, on_box, two_capsules, capsule_on_box, two_boxes = functions
 
     @wp.func
-    def touch_pair(tables: Tables, selves: SelfContacts, world: int, geoms: wp.vec2i) -> Touch:
+    def collide_pair(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i) -> PairContacts:
         """Return the contacts of two geoms, as MuJoCo finds them."""
-        apart = middle_of(tables, selves, world, geoms[1]) - middle_of(tables, selves, world, geoms[0])
-        reach = reach_of(tables, world, geoms[0]) + reach_of(tables, world, geoms[1])
+        apart = middle_of(model, selves, world, geoms[1]) - middle_of(model, selves, world, geoms[0])
+        reach = reach_of(model, world, geoms[0]) + reach_of(model, world, geoms[1])
         if wp.length_sq(apart) > reach * reach:
-            return Touch()
-        a, b = shape_of(tables, selves, world, geoms[0]), shape_of(tables, selves, world, geoms[1])
-        kind_a, kind_b = tables.geom_type[geoms[0]], tables.geom_type[geoms[1]]
-        out = Touch()
+            return PairContacts()
+        a, b = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
+        kind_a, kind_b = model.geom_type[geoms[0]], model.geom_type[geoms[1]]
+        out = PairContacts()
         if kind_a == SPHERE and kind_b == SPHERE:
             out = two_spheres(a, b)
         if kind_a == SPHERE and kind_b == CAPSULE:
@@ -247,12 +248,12 @@ def touch_function(kinds: tuple[tuple[int, int], ...]) -> wp.Function:
             out = two_boxes(a, b)
         return out
 
-    return touch_pair
+    return collide_pair
 
 
 @wp.func
 def make_self_contact(
-    tables: Tables, selves: SelfContacts, world: int, pair: int, dist: float, pos: wp.vec3, normal: wp.vec3
+    model: Model, selves: SelfContacts, world: int, pair: int, dist: float, pos: wp.vec3, normal: wp.vec3
 ) -> Contact:
     """Return a contact of a pair at a place [m], of a negative distance [m], with a normal to the second geom."""
     geoms = selves.pair[pair]
@@ -261,22 +262,22 @@ def make_self_contact(
     contact.tangent = contact_tangent(normal, wp.vec3(0.0), False)
     first, second = pose_of(selves, world, geoms[0]), pose_of(selves, world, geoms[1])
     velocity = second.lin_vel - first.lin_vel + wp.cross(second.ang_vel - first.ang_vel, pos)
-    feel = mix_feel(tables, world, geoms[0], geoms[1])
+    params = contact_params(model, world, geoms[0], geoms[1])
     named = selves.named[pair]
     if named >= 0:
         friction = of_world(selves.pair_friction, world, named)[0]
         solref, solimp = of_world(selves.pair_solref, world, named), of_world(selves.pair_solimp, world, named)
-        feel = Feel(friction, solref, solimp)
-    return set_rows(tables, world, geoms[0], geoms[1], feel, dist, velocity, normal, contact)
+        params = ContactParams(friction, solref, solimp)
+    return with_rows(model, world, geoms, params, dist, velocity, normal, contact)
 
 
 @functools.cache
-def finder(kinds: tuple[tuple[int, int], ...], lanes: int) -> wp.Function:
+def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.Function:
     """Return ``find_self_contacts`` for pairs of some types of geoms and a number of threads per world."""
-    touch_pair = touch_function(kinds)
+    collide_pair = pair_collider(kinds)
 
     @wp.func
-    def find_self_contacts(tables: Tables, selves: SelfContacts, world: int, lane: int) -> SelfContacts:
+    def find_self_contacts(model: Model, selves: SelfContacts, world: int, thread: int) -> SelfContacts:
         """Write a world's contacts between parts of the robot, in the order of the pairs, and return where they are.
 
         Each thread looks at a pair at a time; the poses must be there already.
@@ -284,27 +285,27 @@ def finder(kinds: tuple[tuple[int, int], ...], lanes: int) -> wp.Function:
         selves.first = world * MAX_SELF_CONTACTS
         last = selves.first + MAX_SELF_CONTACTS
         end = selves.first + 0
-        for start in range(0, selves.pair.shape[0], wp.static(lanes)):
-            touch = Touch()
+        for start in range(0, selves.pair.shape[0], wp.static(threads)):
+            touch = PairContacts()
             geoms = wp.vec2i(0, 0)
-            if start + lane < selves.pair.shape[0]:
-                geoms = selves.pair[start + lane]
-                touch = touch_pair(tables, selves, world, geoms)
-            new = int(group_sum(float(touch.count), wp.static(lanes)))
+            if start + thread < selves.pair.shape[0]:
+                geoms = selves.pair[start + thread]
+                touch = collide_pair(model, selves, world, geoms)
+            new = int(group_sum(float(touch.count), wp.static(threads)))
             if new > 0:
                 place = end + 0
-                for other in range(wp.static(lanes - 1)):  # threads before this one write first
-                    found = group_sum(wp.where(lane == other, float(touch.count), 0.0), wp.static(lanes))
-                    place += wp.where(other < lane, int(found), 0)
+                for other in range(wp.static(threads - 1)):  # threads before this one write first
+                    found = group_sum(wp.where(thread == other, float(touch.count), 0.0), wp.static(threads))
+                    place += wp.where(other < thread, int(found), 0)
                 for i in range(touch.count):
                     if place + i < last:
                         selves.geoms[place + i] = geoms
                         selves.normal[place + i] = touch.normal[i]
                         selves.found[place + i] = make_self_contact(
-                            tables, selves, world, start + lane, touch.dist[i], touch.pos[i], touch.normal[i]
+                            model, selves, world, start + thread, touch.dist[i], touch.pos[i], touch.normal[i]
                         )
                 end += new
-        if end > last and lane == 0:
+        if end > last and thread == 0:
             selves.overflow[world] = selves.overflow[world] | OVERFLOW
         selves.end = wp.min(end, last)
         return selves
