@@ -6,9 +6,18 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
-from mujoco_warp._src import collision_primitive_core as primitives
 
 from legged_torque.sim.fused.collision import BOX, CAPSULE, contact_tangent
+from legged_torque.sim.fused.collision_primitive import (
+    PairContacts,
+    Shape,
+    box_box,
+    capsule_box,
+    capsule_capsule,
+    sphere_box,
+    sphere_capsule,
+    sphere_sphere,
+)
 from legged_torque.sim.fused.constraint import Contact, ContactParams, contact_params, with_rows
 from legged_torque.sim.fused.math import group_sum, quat_to_matrix
 from legged_torque.sim.fused.model import Model, of_world
@@ -86,25 +95,6 @@ def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree,
     return out
 
 
-@wp.struct
-class Shape:
-    """A geom in the world, from the trunk's origin."""
-
-    pos: wp.vec3
-    rot: wp.mat33
-    size: wp.vec3
-
-
-@wp.struct
-class PairContacts:
-    """The contacts of two geoms, the first ``count`` entries; what does not touch has no negative distance."""
-
-    count: wp.int32
-    dist: primitives.vec8f
-    pos: primitives.mat83f
-    normal: primitives.mat83f
-
-
 @wp.func
 def pose_of(selves: SelfContacts, world: int, geom: int) -> Pose:
     """Return the pose of a geom's body."""
@@ -127,12 +117,6 @@ def shape_of(model: Model, selves: SelfContacts, world: int, geom: int) -> Shape
 
 
 @wp.func
-def axis_of(shape: Shape) -> wp.vec3:
-    """Return the axis of a capsule."""
-    return wp.vec3(shape.rot[0, 2], shape.rot[1, 2], shape.rot[2, 2])
-
-
-@wp.func
 def reach_of(model: Model, world: int, geom: int) -> float:
     """Return the radius of a sphere around a geom [m]."""
     size = of_world(model.geom_size, world, geom)
@@ -145,67 +129,17 @@ def reach_of(model: Model, world: int, geom: int) -> float:
 
 
 @wp.func
-def add_contact(out: PairContacts, dist: float, pos: wp.vec3, normal: wp.vec3) -> PairContacts:
-    """Return contacts with one more, if it is one."""
-    if dist < 0.0:
-        out.dist[out.count] = dist
-        out.pos[out.count] = pos
-        out.normal[out.count] = normal
-        out.count += 1
-    return out
+def are_near(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
+    """Return whether spheres around two geoms overlap."""
+    apart = middle_of(model, selves, world, geoms[1]) - middle_of(model, selves, world, geoms[0])
+    reach = reach_of(model, world, geoms[0]) + reach_of(model, world, geoms[1])
+    return wp.length_sq(apart) <= reach * reach
 
 
 @wp.func
-def no_contact(a: Shape, b: Shape) -> PairContacts:
-    """Return no contact: in the place of functions that a robot does not need, whose code is long."""
+def collide_nothing(types: wp.vec2i, a: Shape, b: Shape) -> PairContacts:
+    """Return no contact."""
     return PairContacts()
-
-
-@wp.func
-def sphere_sphere(a: Shape, b: Shape) -> PairContacts:
-    """Return the contact of two spheres."""
-    dist, pos, normal = primitives.sphere_sphere(a.pos, a.size[0], b.pos, b.size[0])
-    return add_contact(PairContacts(), dist, pos, normal)
-
-
-@wp.func
-def sphere_capsule(a: Shape, b: Shape) -> PairContacts:
-    """Return the contact of a sphere and a capsule."""
-    dist, pos, normal = primitives.sphere_capsule(a.pos, a.size[0], b.pos, axis_of(b), b.size[0], b.size[1])
-    return add_contact(PairContacts(), dist, pos, normal)
-
-
-@wp.func
-def sphere_box(a: Shape, b: Shape) -> PairContacts:
-    """Return the contact of a sphere and a box."""
-    dist, pos, normal = primitives.sphere_box(a.pos, a.size[0], b.pos, b.rot, b.size)
-    return add_contact(PairContacts(), dist, pos, normal)
-
-
-@wp.func
-def capsule_capsule(a: Shape, b: Shape) -> PairContacts:
-    """Return the contacts of two capsules, two if they are parallel."""
-    dist, pos, normal = primitives.capsule_capsule(
-        a.pos, axis_of(a), a.size[0], a.size[1], b.pos, axis_of(b), b.size[0], b.size[1]
-    )
-    return add_contact(add_contact(PairContacts(), dist[0], pos[0], normal[0]), dist[1], pos[1], normal[1])
-
-
-@wp.func
-def capsule_box(a: Shape, b: Shape) -> PairContacts:
-    """Return the contacts of a capsule and a box, two at most."""
-    dist, pos, normal = primitives.capsule_box(a.pos, axis_of(a), a.size[0], a.size[1], b.pos, b.rot, b.size)
-    return add_contact(add_contact(PairContacts(), dist[0], pos[0], normal[0]), dist[1], pos[1], normal[1])
-
-
-@wp.func
-def box_box(a: Shape, b: Shape) -> PairContacts:
-    """Return the contacts of two boxes, eight at most."""
-    out = PairContacts()
-    count, dist, pos, normal = primitives.box_box(a.pos, a.rot, a.size, b.pos, b.rot, b.size, 0.0)
-    for i in range(count):
-        out = add_contact(out, dist[i], pos[i], normal)
-    return out
 
 
 _COLLIDE = {
@@ -219,36 +153,21 @@ _COLLIDE = {
 
 
 @functools.cache
-def pair_collider(kinds: tuple[tuple[int, int], ...]) -> wp.Function:
-    """Return ``collide_pair`` for pairs of some types of geoms."""
-    functions = [function if kind in kinds else no_contact for kind, function in _COLLIDE.items()]
-    two_spheres, on_capsule, on_box, two_capsules, capsule_on_box, two_boxes = functions
+def collider(kinds: tuple[tuple[int, int], ...]) -> wp.Function:
+    """Return the function that collides geoms of some pairs of types: a kernel has no code for others."""
+    if not kinds:
+        return collide_nothing
+    first, second = kinds[0]
+    collide, collide_others = _COLLIDE[kinds[0]], collider(kinds[1:])
 
     @wp.func
-    def collide_pair(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i) -> PairContacts:
-        """Return the contacts of two geoms, as MuJoCo finds them."""
-        apart = middle_of(model, selves, world, geoms[1]) - middle_of(model, selves, world, geoms[0])
-        reach = reach_of(model, world, geoms[0]) + reach_of(model, world, geoms[1])
-        if wp.length_sq(apart) > reach * reach:
-            return PairContacts()
-        a, b = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
-        kind_a, kind_b = model.geom_type[geoms[0]], model.geom_type[geoms[1]]
-        out = PairContacts()
-        if kind_a == SPHERE and kind_b == SPHERE:
-            out = two_spheres(a, b)
-        if kind_a == SPHERE and kind_b == CAPSULE:
-            out = on_capsule(a, b)
-        if kind_a == SPHERE and kind_b == BOX:
-            out = on_box(a, b)
-        if kind_a == CAPSULE and kind_b == CAPSULE:
-            out = two_capsules(a, b)
-        if kind_a == CAPSULE and kind_b == BOX:
-            out = capsule_on_box(a, b)
-        if kind_a == BOX and kind_b == BOX:
-            out = two_boxes(a, b)
-        return out
+    def collide_shapes(types: wp.vec2i, a: Shape, b: Shape) -> PairContacts:
+        """Return the contacts of two geoms of these types, as MuJoCo finds them."""
+        if types[0] == wp.static(first) and types[1] == wp.static(second):
+            return collide(a, b)
+        return collide_others(types, a, b)
 
-    return collide_pair
+    return collide_shapes
 
 
 @wp.func
@@ -274,7 +193,7 @@ def make_self_contact(
 @functools.cache
 def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.Function:
     """Return ``find_self_contacts`` for pairs of some types of geoms and a number of threads per world."""
-    collide_pair = pair_collider(kinds)
+    collide_shapes = collider(kinds)
 
     @wp.func
     def find_self_contacts(model: Model, selves: SelfContacts, world: int, thread: int) -> SelfContacts:
@@ -290,7 +209,10 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
             geoms = wp.vec2i(0, 0)
             if start + thread < selves.pair.shape[0]:
                 geoms = selves.pair[start + thread]
-                touch = collide_pair(model, selves, world, geoms)
+                if are_near(model, selves, world, geoms):
+                    types = wp.vec2i(model.geom_type[geoms[0]], model.geom_type[geoms[1]])
+                    a, b = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
+                    touch = collide_shapes(types, a, b)
             new = int(group_sum(float(touch.count), wp.static(threads)))
             if new > 0:
                 place = end + 0

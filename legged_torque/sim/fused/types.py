@@ -12,7 +12,9 @@ import warp as wp
 vec4 = wp.types.vector(length=4, dtype=wp.float32)
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
+vec8 = wp.types.vector(length=8, dtype=wp.float32)
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
+mat83 = wp.types.matrix(shape=(8, 3), dtype=wp.float32)
 
 AnyVector = AnyMatrix = AnyColumns = Any
 """A number per joint of a branch; a square matrix; a vector in space per joint."""
