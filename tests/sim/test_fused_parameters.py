@@ -10,7 +10,6 @@ from support.fused import (
     draw_states,
     make_a1,
     make_crab,
-    put,
     random,
     step_fused,
     step_mujoco,
@@ -122,33 +121,6 @@ def test_slippery_floors(friction):
     error = np.abs(step_fused(model, states)[0] - velocities).max(axis=1)
     change = np.sqrt(np.square(velocities - states["qvel"]).mean())
     assert np.median(error) < 1e-4 * change and error.max() < 0.1 * change
-
-
-def test_parameters_per_world():
-    """Worlds with arrays of their own move as MuJoCo's models with these numbers; writing them acts at once."""
-    model = compiled(make_a1())
-    states = {name: values.repeat(3, axis=0) for name, values in draw_states(model, 1, (0.1, 0.15)).items()}
-    assert step_mujoco(model, states)[2].sum() > 6
-    sim = make_engine("fused", model, 3)
-    tables = {
-        "dof_damping": random((3, 18), 0.0, 2.0) * (np.arange(18) > 5),
-        "body_mass": random((3, 14), 0.5, 5.0),
-        "geom_friction": random((3, 18, 3), 0.2, 1.0),
-        "dof_armature": random((3, 18), 0.01, 0.05) * (np.arange(18) > 5),
-    }
-    for name, values in tables.items():
-        sim.field(name).copy_(torch.tensor(values))
-    for _ in range(2):
-        put(sim, states)
-        sim.step()
-        for world in range(3):
-            for name, values in tables.items():
-                getattr(model, name)[:] = values[world]
-            expected = step_mujoco(model, states)[0][world]
-            np.testing.assert_allclose(sim.qvel.numpy()[world], expected, rtol=0, atol=1e-3)
-        assert np.abs(np.diff(sim.qvel.numpy(), axis=0)).max(axis=1).min() > 0.1
-        tables["dof_damping"] *= 0.5
-        sim.field("dof_damping").mul_(0.5)
 
 
 def test_derived_constants_of_unlike_legs():

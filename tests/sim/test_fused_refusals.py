@@ -8,8 +8,8 @@ from support.fused import assert_alike, compiled, draw_states, make_a1, put, ste
 from legged_torque import RESOURCES_DIR
 from legged_torque.envs.base.domain_rand import of_model
 from legged_torque.sim.fused.tree import read_tree
-from legged_torque.sim.model import build_model, max_constraints
-from legged_torque.sim.registry import ENGINES, make_engine
+from legged_torque.sim.model import max_constraints
+from legged_torque.sim.registry import make_engine
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import read_spec
 
@@ -190,31 +190,6 @@ def test_rows_of_closed_loops():
     assert rows == 10 == max_constraints(model, 0) - max_constraints(compiled(make_a1()), 0)
 
 
-@pytest.mark.parametrize("name", ["geom_margin", "jnt_margin", "body_gravcomp", "actuator_gainprm", "geom_gap"])
-def test_fields_that_are_not_read(name):
-    """Fields that the fused step does not read cannot be had per world; MuJoCo Warp's step takes them."""
-    sims = {engine: make_engine(engine, compiled(make_a1()), 2) for engine in ENGINES}
-    with pytest.raises(UserError, match=f"unknown field for sim.engine 'fused' '{name}'"):
-        sims["fused"].field(name)
-    assert len(sims["mujoco_warp"].field(name)) == 2
-    with pytest.raises(UserError, match="did you mean 'body_mass'"):
-        sims["fused"].field("body_mas")
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("name", ["dof_damping", "dof_armature", "dof_frictionloss", "jnt_stiffness"])
-def test_the_free_joint_is_not_read(engine, name):
-    """Random parameters of the trunk's free joint are refused where they would not act; those of hinges are not."""
-    sim = make_engine(engine, compiled(make_a1()), 2)
-    last_of_trunk = 0 if name == "jnt_stiffness" else 5
-    sim.check_columns(name, [last_of_trunk + 1])
-    if engine == "fused":
-        with pytest.raises(UserError, match=f"does not read '{name}' of the trunk's free joint"):
-            sim.check_columns(name, [last_of_trunk + 1, last_of_trunk])
-    else:
-        sim.check_columns(name, [last_of_trunk])
-
-
 def test_random_parameters_of_the_free_joint(make_task):
     """A task cannot draw what would not act."""
     task = make_task("a1_torque", 2, **{"domain_rand.randomize_parameters": True})
@@ -234,15 +209,3 @@ def test_tolerance():
         sim.step()
         counts.append(sim.solver_niter.numpy().copy())
     assert counts[0].max() > 4 and counts[1].max() <= 2
-
-
-def test_engines_by_name():
-    """A robot that is refused can be simulated with the other engine, and there is no third one."""
-    spec = read_spec(A1)
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    model = build_model(spec, [])
-    with pytest.raises(UserError, match="the friction cone must be pyramidal"):
-        make_engine("fused", model, 1, "cpu")
-    make_engine("mujoco_warp", model, 1, "cpu")
-    with pytest.raises(UserError, match="fuse"):
-        make_engine("fuse", model, 1)
