@@ -56,7 +56,7 @@ _TRUNK = 1  # the trunk's body
 
 
 def changes_legs(parameters: Sequence[Parameter]) -> bool:
-    """Return whether masses or places of bodies other than the trunk are drawn, see ``Simulator.vary_legs``."""
+    """Return whether masses or places of bodies other than the trunk are drawn, see ``Engine.vary_legs``."""
     widths = [(_NUMBERS_PER_BODY.get(parameter.model_field or ""), parameter) for parameter in parameters]
     return any(width and any(i // width != _TRUNK for i in parameter.columns) for width, parameter in widths)
 

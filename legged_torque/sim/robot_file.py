@@ -1,4 +1,4 @@
-"""What a robot's MJCF must have, whichever engine simulates it; all that it lacks is told at once."""
+"""Requirements on a robot's MJCF that all engines share. Everything that is missing is reported at once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ONE_NUMBER = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE
 
 
 def spec_problems(spec: mujoco.MjSpec) -> Iterator[str]:
-    """Yield what is wrong with the parts of a file: trunk, floor and names of geoms."""
+    """Yield problems with the parts of a file: trunk, floor and names of geoms."""
     trunks = [body for body in spec.worldbody.bodies if any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in body.joints)]
     if len(trunks) != 1:
         yield f"it must have one body with a free joint, the trunk, not {len(trunks)}"
@@ -24,11 +24,11 @@ def spec_problems(spec: mujoco.MjSpec) -> Iterator[str]:
     unnamed = [geom for geom in spec.geoms if not geom.name and (geom.contype or geom.conaffinity)]
     bodies = dict.fromkeys(f"'{geom.parent.name}'" for geom in unnamed)
     if unnamed:
-        yield f"geoms that collide need names, by which settings know them; those of {', '.join(bodies)} have none"
+        yield f"geoms that collide need names, by which settings refer to them; those of {', '.join(bodies)} have none"
 
 
 def model_problems(model: mujoco.MjModel) -> Iterator[str]:
-    """Yield what is wrong with joints, motors and masses."""
+    """Yield problems with joints, motors and masses."""
     yield from joint_problems(model)
     yield from motor_problems(model)
     if not np.isfinite([*model.body_mass, *model.body_inertia.flat]).all():
@@ -36,7 +36,7 @@ def model_problems(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def joint_problems(model: mujoco.MjModel) -> Iterator[str]:
-    """Yield what is wrong with the joints: the trunk's is the first, all others hang on it, and each has a name."""
+    """Yield problems with the joints: the trunk's must be the first, all others hang on it, and each has a name."""
     if not model.njnt or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
         yield "its first joint must be the trunk's free joint"
         return
@@ -54,7 +54,7 @@ def joint_problems(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def motor_problems(model: mujoco.MjModel) -> Iterator[str]:
-    """Yield what is wrong with the motors: one of its own for each joint, with limits."""
+    """Yield problems with the motors: each joint needs one of its own, with limits."""
     yield from actuator_problems(model)
     wrong: dict[str, list[str]] = {}
     for joint in range(1, model.njnt):
@@ -69,7 +69,7 @@ def motor_problems(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def actuator_problems(model: mujoco.MjModel) -> Iterator[str]:
-    """Yield which actuators are no motors: their controls would not be the torques that tasks send."""
+    """Yield actuators that are no motors, whose controls are not torques."""
     wrong: dict[str, list[str]] = {}
     for actuator in range(model.nu):
         reason = why_no_motor(model, actuator)
@@ -79,21 +79,21 @@ def actuator_problems(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _with_names(wrong: dict[str, list[str]]) -> Iterator[str]:
-    """Yield problems with the names of the parts that have them."""
+    """Yield problems, each with the names of its parts."""
     for problem, names in wrong.items():
         yield f"{problem} ({', '.join(names)})"
 
 
 def refuse(problems: list[str], what: str) -> None:
-    """Raise a UserError with all problems in one line, behind ``what`` they are problems of; none is fine."""
+    """Raise a UserError with all problems in one line, after ``what`` has them, unless there are none."""
     if problems:
         raise UserError(f"{what}: {'; '.join(problems)}")
 
 
 def use_plain_motors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
-    """Put the motors of a file without problems in the order of its joints, so that controls are torques of joints.
+    """Put the motors of a file without problems into the order of its joints, so that controls are joint torques.
 
-    Each becomes a motor without gear, whose only limits are the tightest of the file's. Returns whether anything has
+    Each becomes a motor without gear, whose only limits are the tightest of the file. Returns whether anything has
     changed, so that ``model``, compiled from ``spec``, is out of date.
     """
     joints = range(1, model.njnt)
@@ -116,7 +116,7 @@ def use_plain_motors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
 
 
 def _is_plain(model: mujoco.MjModel, motor: int) -> bool:
-    """Return whether a motor has no gear, and its own two ranges are the same and its only limits."""
+    """Return whether a motor has no gear, and its two ranges are equal and its only limits."""
     limited = model.actuator_ctrllimited[motor] and model.actuator_forcelimited[motor]
     same = (model.actuator_ctrlrange[motor] == model.actuator_forcerange[motor]).all()
     no_gear = model.actuator_gainprm[motor, 0] == 1.0 and model.actuator_gear[motor, 0] == 1.0
@@ -124,7 +124,7 @@ def _is_plain(model: mujoco.MjModel, motor: int) -> bool:
 
 
 def _name(model: mujoco.MjModel, actuator: int) -> str:
-    """Return the name of an actuator, or of what it acts on if it has none."""
+    """Return the name of an actuator, or of the joint that it drives if it has none."""
     joint = model.actuator_trnid[actuator, 0]
     on_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
     return model.actuator(actuator).name or (model.joint(joint).name if on_joint else str(actuator))

@@ -208,7 +208,7 @@ REFUSED = {
     ),
     "unnamed geom": (
         [setting(".//geom[@name='RL_calf']", name=None)],
-        "need names, by which settings know them; those of 'RL_calf'",
+        "need names, by which settings refer to them; those of 'RL_calf'",
     ),
     "no floor": ([setting(".//geom[@name='floor']", name="ground")], "it must have a geom 'floor' in its worldbody"),
     "no free joint": ([remove(".//freejoint")], "must have one body with a free joint, the trunk, not 0"),

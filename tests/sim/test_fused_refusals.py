@@ -87,7 +87,7 @@ REFUSED = [
     (f"spec.geom('floor').contype = 0; spec.worldbody.add_geom({SPHERE}, condim=3)", "it needs one plane"),
     ("spec.geom('floor').surfacevel = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]", "surfaces move or stick"),
     ("spec.geom('FR_foot').adhesion = 10.0", "surfaces move or stick"),
-    ("branch(spec.worldbody)", "something beside the trunk hangs on the world"),
+    ("branch(spec.worldbody)", "something besides the trunk hangs on the world"),
     ("for _ in range(13): branch(spec.body('trunk'))", "it has 17 legs, not 1 to 16"),
     ("spec.geom('FR_foot').solref = (-500, 0.7)", "a solref mixes its two formats"),
     ("spec.joint('FR_calf_joint').solref_limit = (0.02, -1)", "a solref mixes its two formats"),

@@ -37,6 +37,6 @@ def watched(task: LeggedRobot) -> list[Watched]:
     return [
         *(Watched("buffer", name, numbers) for name, numbers in per_world.items()),
         *(Watched("observation", term.name, numbers) for term, numbers in observations),
-        Watched("buffer", "torques", task.torques, is_result=True),
-        *(Watched("reward term", name, numbers, is_result=True) for name, numbers in rewards),
+        Watched("buffer", "torques", task.torques, is_derived=True),
+        *(Watched("reward term", name, numbers, is_derived=True) for name, numbers in rewards),
     ]

@@ -10,7 +10,7 @@ from legged_torque.sim.fused.types import AnyBranch, AnyLinks, Trunk
 
 @wp.func
 def wrench_on(model: Model, state: State, world: int, body: int, pose: Pose):
-    """Return the force on a body, which acts at its centre of mass, and its torque about the trunk's origin."""
+    """Return the force on a body, at its centre of mass, and the torque about the trunk's origin."""
     wrench = state.xfrc_applied[world, body]
     force = wp.vec3(wrench[0], wrench[1], wrench[2])
     com = pose.pos + pose.rot * of_world(model.body_ipos, world, body)
@@ -19,7 +19,7 @@ def wrench_on(model: Model, state: State, world: int, body: int, pose: Pose):
 
 @wp.func
 def apply_to_trunk(model: Model, state: State, world: int, trunk: Trunk, pose: Pose) -> Trunk:
-    """Return the trunk with the forces on it; those on its rotation are about its own axes."""
+    """Return the trunk with the forces on it; generalized torques are about its own axes."""
     force, torque = wrench_on(model, state, world, 1, pose)
     qfrc = state.qfrc_applied
     force += wp.vec3(qfrc[world, 0], qfrc[world, 1], qfrc[world, 2])

@@ -23,12 +23,12 @@ class MapContacts:
     pushing: wp.array(dtype=vec4)  # 1 for the rows that push, else 0
     change: wp.array(dtype=vec4)  # of the residual per unit of the solver's step
     normal: wp.array(dtype=wp.vec3)
-    surface: Surface  # a thread's own reference
+    surface: Surface  # of the map
 
 
 @wp.func
 def place_map(model: Model, ground: Surface, world: int, contacts: MapContacts) -> MapContacts:
-    """Return the contacts with the height map that they are with."""
+    """Return the contacts with the height map."""
     contacts.surface = ground
     return contacts
 

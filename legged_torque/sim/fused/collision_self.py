@@ -1,4 +1,4 @@
-"""Contacts between parts of a robot: which may be, and where they are; see ``constraint_self`` for what they do."""
+"""Collision between parts of a robot; ``constraint_self`` has its effect in the solver."""
 
 import functools
 
@@ -27,7 +27,7 @@ from legged_torque.sim.fused.types import vec4, vec5
 from legged_torque.utils.mjcf import self_pairs
 
 MAX_SELF_CONTACTS = wp.constant(24)
-"""Most contacts of a world between parts of its robot. Of more the first ones count, which ``overflow`` tells."""
+"""Most contacts of a world between parts of its robot. Further ones are dropped and reported in ``overflow``."""
 SPHERE = wp.constant(2)
 """MuJoCo's mjGEOM_SPHERE."""
 OVERFLOW = wp.constant(int(mjw.OverflowType.NARROWPHASE))
@@ -37,6 +37,7 @@ OVERFLOW = wp.constant(int(mjw.OverflowType.NARROWPHASE))
 class SelfContacts:
     """The pairs of geoms that may touch, and the contacts between them."""
 
+    # Model:
     pair: wp.array(dtype=wp.vec2i)  # its geoms, first that of the simpler type
     named: wp.array(dtype=wp.int32)  # of each pair: number of the MJCF's <pair>, -1 of others
     pair_friction: wp.array2d(dtype=vec5)  # of each <pair>, fields of MuJoCo Warp's model
@@ -44,8 +45,9 @@ class SelfContacts:
     pair_solimp: wp.array2d(dtype=vec5)
     geom_place: wp.array(dtype=wp.vec2i)  # of each geom: branch, and depth of its body; 0 is the trunk
     airborne: wp.array(dtype=wp.int32)  # addresses of the sensors of those geoms that the ground lets through
+    # Scratch:
     poses: wp.array3d(dtype=Pose)  # (world, branch, depth)
-    found: wp.array(dtype=Contact)  # each world has room for MAX_SELF_CONTACTS; these four as in Contacts
+    found: wp.array(dtype=Contact)  # MAX_SELF_CONTACTS for each world; the next three as in PlaneContacts
     residual: wp.array(dtype=vec4)
     pushing: wp.array(dtype=vec4)
     change: wp.array(dtype=vec4)
@@ -54,10 +56,12 @@ class SelfContacts:
     jacobian: wp.array2d(dtype=wp.vec3)  # (contact, joint): motion of the second body less that of the first
     joints: wp.array2d(dtype=wp.float32)  # (world, joint): accelerations, or a step
     matrix: wp.array3d(dtype=wp.float32)  # (world, row, column): the whole Newton system, see ``constraint_self``
+    # Out:
     overflow: wp.array(dtype=wp.int32)  # MuJoCo Warp's, of each world
-    first: wp.int32  # a thread's own: the contacts of its world, from the first one on
+    # A thread's own:
+    first: wp.int32  # contacts of its world, from the first one on
     end: wp.int32
-    coupled: wp.bool  # likewise: whether one between two branches pushes
+    coupled: wp.bool  # whether a contact between two branches pushes
 
 
 def ordered_pairs(model: mujoco.MjModel) -> np.ndarray:
@@ -67,7 +71,7 @@ def ordered_pairs(model: mujoco.MjModel) -> np.ndarray:
 
 
 def pair_kinds(model: mujoco.MjModel) -> tuple[tuple[int, int], ...]:
-    """Return the types of the geoms of these pairs, each once."""
+    """Return the pairs of types of these geoms, each once."""
     return tuple(sorted({(int(a), int(b)) for a, b in model.geom_type[ordered_pairs(model)]}))
 
 
@@ -104,7 +108,7 @@ def pose_of(selves: SelfContacts, world: int, geom: int) -> Pose:
 
 @wp.func
 def middle_of(model: Model, selves: SelfContacts, world: int, geom: int) -> wp.vec3:
-    """Return where a geom is."""
+    """Return the position of a geom from the trunk's origin."""
     pose = pose_of(selves, world, geom)
     return pose.pos + pose.rot * of_world(model.geom_pos, world, geom)
 
@@ -197,9 +201,9 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
 
     @wp.func
     def find_self_contacts(model: Model, selves: SelfContacts, world: int, thread: int) -> SelfContacts:
-        """Write a world's contacts between parts of the robot, in the order of the pairs, and return where they are.
+        """Write a world's contacts between parts of the robot, in the order of the pairs, and return their range.
 
-        Each thread looks at a pair at a time; the poses must be there already.
+        Each thread collides one pair at a time, after all poses have been written.
         """
         selves.first = world * MAX_SELF_CONTACTS
         last = selves.first + MAX_SELF_CONTACTS

@@ -10,7 +10,7 @@ import warp as wp
 
 from legged_torque.sim.fused.collision_self import make_self_contacts, pair_kinds
 from legged_torque.sim.fused.constraint import Contact
-from legged_torque.sim.fused.layout import Layout, scratch_type
+from legged_torque.sim.fused.layout import Layout, branches_of
 from legged_torque.sim.fused.model import Model, State, make_model, unread_columns
 from legged_torque.sim.fused.step import make_kernel
 from legged_torque.sim.fused.surface import make_surface
@@ -62,7 +62,7 @@ class FusedEngine(WarpEngine):
             self._state = State()
             for name in State.vars:
                 setattr(self._state, name, getattr(data, name))
-            self._scratch = scratch = scratch_type(layout)()
+            self._scratch = scratch = branches_of(layout).Scratch()
             for name in ("residual", "pushing", "change"):
                 setattr(scratch.contacts, name, wp.empty(room * layout.points, dtype=vec4))
             scratch.contacts.found = wp.empty(room * layout.points, dtype=Contact)

@@ -1,4 +1,4 @@
-"""From accelerations to the state after a step, and to what the contact sensors say."""
+"""Integration of accelerations to the state after a step, and the contact sensors."""
 
 import warp as wp
 
@@ -16,7 +16,7 @@ from legged_torque.sim.fused.types import AnyBranch, AnyContacts, Trunk
 def integrate_trunk(timestep: float, state: State, world: int, trunk: Trunk, acc: TrunkMotion, damped: TrunkMotion):
     """Write the trunk's state after the step: velocities first, then positions with the new velocities.
 
-    ``damped`` is what implicit damping adds to the accelerations; the next solution starts without it, as in MuJoCo.
+    Implicit damping adds ``damped`` to the accelerations; the next solution starts without it, as in MuJoCo.
     """
     lin = trunk.lin_vel + timestep * (acc.lin + damped.lin)
     ang = wp.transpose(trunk.rot) * trunk.ang_vel + timestep * (acc.ang + damped.ang)
@@ -38,7 +38,7 @@ def integrate_trunk(timestep: float, state: State, world: int, trunk: Trunk, acc
 def integrate_branch(
     model: Model, state: State, world: int, b: int, joints: int, branch: AnyBranch, damped: TrunkMotion
 ):
-    """Write a branch's state after the step, given what implicit damping adds to the trunk's accelerations."""
+    """Write a branch's state after the step; implicit damping adds ``damped`` to the trunk's accelerations."""
     change = branch_step(branch, damped)
     for j in range(len(branch.acc)):
         if j < joints:
@@ -76,7 +76,7 @@ def sense_branch(model: Model, state: State, world: int, b: int, branch: AnyBran
 
 @wp.func
 def sense_self_contacts(model: Model, state: State, world: int, selves: SelfContacts):
-    """Add contacts between parts of the robot to the sensors of both geoms, which those with the ground have set."""
+    """Add contacts between parts of the robot to the sensors of both geoms, after those with the ground."""
     for k in range(selves.airborne.shape[0]):
         for r in range(4):
             state.sensordata[world, selves.airborne[k] + r] = 0.0

@@ -1,4 +1,4 @@
-"""How the branches of a robot are spread over the threads of its world.
+"""Assignment of a robot's branches to the threads of its world.
 
 On a GPU a thread has one branch, which stays in registers: functions hand it on as ``branch``. On a CPU a thread has
 all branches of its world, and ``Scratch.branch`` holds those that are not in use.
@@ -18,7 +18,7 @@ from legged_torque.sim.fused.types import AnyBranch, branch_types
 
 
 class Layout(NamedTuple):
-    """What a kernel is compiled for: a robot's structure, and the threads of its world."""
+    """A robot's structure and the threads of its world, for which kernels are compiled."""
 
     branches: int
     depth: int  # most joints of a branch
@@ -45,52 +45,35 @@ class Layout(NamedTuple):
         return -(-self.branches // self.threads)
 
 
+class Branches(NamedTuple):
+    """The parts of a layout that functions over the branches of a thread use."""
+
+    threads: int
+    per_thread: int
+    collide: bool  # whether parts of the robot may touch each other
+    Scratch: Any
+    owns: wp.Function
+    load: wp.Function
+    store: wp.Function
+    num_joints: wp.Function
+
+
 @functools.cache
-def scratch_type(layout: Layout) -> Any:
-    """Return the struct of what a step keeps for itself."""
-    Branch = branch_types(layout.depth).Branch
-    Contacts = MapContacts if layout.on_map else PlaneContacts
-    Selves = SelfContacts if layout.self_kinds else wp.int32
+def branches_of(layout: Layout) -> Branches:
+    """Return the struct ``Scratch`` of a layout, and functions on the branches of a thread.
+
+    ``owns`` returns whether a thread has a branch number ``i``; ``load`` and ``store`` do nothing if it has only one,
+    which stays in registers. ``num_joints`` is a constant if all branches are alike, so that nothing is masked.
+    """
+    branches, depth, _, threads, on_map, alike, _, self_kinds = layout
+    per_thread, Branch = layout.per_thread, branch_types(depth).Branch
+    Contacts, Selves = MapContacts if on_map else PlaneContacts, SelfContacts if self_kinds else wp.int32
 
     @wp.struct
     class Scratch:
         contacts: Contacts  # with the ground
         selves: Selves  # contacts between parts of the robot; 0 if there are none
         branch: wp.array(dtype=Branch)  # the branches of threads that have several
-
-    return Scratch
-
-
-@functools.cache
-def joint_counter(layout: Layout) -> wp.Function:
-    """Return ``num_joints``, of a branch: a constant if all branches are alike, so that nothing is masked."""
-    depth, alike = layout.depth, layout.alike
-
-    @wp.func
-    def num_joints(model: Model, b: int) -> int:
-        if wp.static(alike):
-            return wp.static(depth)
-        return model.joint_count[b]
-
-    return num_joints
-
-
-class Storage(NamedTuple):
-    """How threads keep their branches, see :func:`storage`."""
-
-    owns: wp.Function
-    load: wp.Function
-    store: wp.Function
-
-
-@functools.cache
-def storage(layout: Layout) -> Storage:
-    """Return functions that load and store branch number ``i`` of a thread, and say whether a thread owns so many.
-
-    A thread that has only one branch keeps it in registers: loading and storing do nothing.
-    """
-    branches, threads, per_thread = layout.branches, layout.threads, layout.per_thread
-    Scratch = scratch_type(layout)
 
     @wp.func
     def owns(thread: int, i: int) -> bool:
@@ -108,4 +91,10 @@ def storage(layout: Layout) -> Storage:
         if wp.static(per_thread > 1):
             scratch.branch[world * wp.static(per_thread) + i] = branch
 
-    return Storage(owns, load, store)
+    @wp.func
+    def num_joints(model: Model, b: int) -> int:
+        if wp.static(alike):
+            return wp.static(depth)
+        return model.joint_count[b]
+
+    return Branches(threads, per_thread, bool(self_kinds), Scratch, owns, load, store, num_joints)

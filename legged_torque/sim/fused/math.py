@@ -1,4 +1,4 @@
-"""What the kernels calculate with: quaternions, small matrices, and sums over the threads of one world."""
+"""Quaternions, small matrices, and sums over the threads of one world."""
 
 import warp as wp
 
@@ -28,7 +28,7 @@ def group_sum(value: float, threads: int) -> float:
 #endif
 """)
 def sync_group(threads: int):
-    """Let the threads of a world wait for each other, and see what the others have written to memory."""
+    """Synchronize the threads of a world, with their writes to memory."""
     ...
 
 
@@ -63,7 +63,7 @@ def group_sum33_symmetric(value: wp.mat33, threads: int) -> wp.mat33:
 
 @wp.func
 def quat_multiply(a: wp.quat, b: wp.quat) -> wp.quat:
-    """Return the product of two quaternions (w, x, y, z), the order of MuJoCo's that Warp's functions do not share."""
+    """Return the product of two quaternions (w, x, y, z), in MuJoCo's order, not Warp's."""
     return wp.quat(
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -119,7 +119,7 @@ def with_column(m: AnyColumns, j: int, v: wp.vec3):
 #endif
 """)
 def inverse_sqrt(value: float) -> float:
-    """Return one over the square root: on a GPU one instruction instead of two that wait for each other."""
+    """Return one over the square root, a single instruction on a GPU."""
     ...
 
 

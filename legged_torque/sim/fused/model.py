@@ -1,4 +1,4 @@
-"""What the kernels read and write: a robot's model, and the worlds' state, in MuJoCo Warp's own arrays."""
+"""The structs Model and State of the kernels, on MuJoCo Warp's own arrays."""
 
 from typing import Any
 
@@ -11,9 +11,9 @@ from legged_torque.sim.fused.tree import Tree, find_floor
 from legged_torque.sim.fused.types import vec5
 
 UNLIMITED = 1e10
-"""Of a range that does not limit: MuJoCo's mjMAXVAL, beyond which it takes a state as diverged."""
+"""Bound of a range that does not limit: MuJoCo's mjMAXVAL, beyond which a state has diverged."""
 MIN_TOLERANCE = 1e-9
-"""Of ``opt.tolerance``: float32 resolves no smaller decrease of the cost."""
+"""Least ``opt.tolerance``: float32 resolves no smaller decrease of the cost."""
 
 
 @wp.struct
@@ -81,7 +81,7 @@ class Model:
 
 
 def unread_columns(name: str) -> int:
-    """Return how many of the first entries of a world's part of a field are the free joint's, which nobody reads."""
+    """Return how many of the first entries of a field belong to the free joint, and are never read."""
     return {"dof_": 6, "jnt_": 1, "qpos": 7}.get(name[:4], 0)
 
 
@@ -120,13 +120,13 @@ def local_copy(data: State) -> State:
 
 @wp.func
 def row(world: int, rows: int) -> int:
-    """Return a world's row in a table that has one row per world or one for all."""
+    """Return the row of a world in a table with one row per world or one for all."""
     return wp.where(rows == 1, 0, world)
 
 
 @wp.func
 def of_world(field: wp.array2d(dtype=Any), world: int, i: int):
-    """Return what a world has in column ``i`` of a field of the model."""
+    """Return column ``i`` of a world's row of a field of the model."""
     return field[row(world, field.shape[0]), i]
 
 
@@ -138,7 +138,7 @@ def dof(joint: int) -> int:
 
 @wp.func
 def qadr(joint: int) -> int:
-    """Return the place of a hinge's angle in ``qpos``; joint 0 has seven numbers."""
+    """Return the index of a hinge's angle in ``qpos``; joint 0 has seven numbers."""
     return joint + 6
 
 
@@ -147,13 +147,13 @@ _RANGES = {
     "actuator_ctrlrange": "actuator_ctrllimited",
     "actuator_forcerange": "actuator_forcelimited",
 }
-"""Fields that are ranges, and those that say which of them limit."""
+"""Fields that are ranges, and the flags that switch them on."""
 
 
 def make_model(mj_model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Model:
-    """Return a robot's model on the current device; parameters stay those of MuJoCo Warp's model, not copies.
+    """Return a robot's model on the current device. Its parameters are the arrays of MuJoCo Warp's model, not copies.
 
-    There, ranges that do not limit become so wide that they do not.
+    Ranges there that do not limit become infinitely wide.
     """
     for name, limited in _RANGES.items():
         ranges = getattr(warp_model, name).numpy()

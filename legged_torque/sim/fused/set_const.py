@@ -1,4 +1,4 @@
-"""What MuJoCo's ``mj_setConst`` derives from masses: inverse weights, recomputed in the worlds whose masses changed."""
+"""MuJoCo's ``mj_setConst``: inverse weights, recomputed in worlds whose masses have changed."""
 
 import functools
 from typing import Any
@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from torch import Tensor
 
-from legged_torque.sim.fused.layout import Layout, joint_counter
+from legged_torque.sim.fused.layout import Layout, branches_of
 from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, forward_solve
 from legged_torque.sim.fused.model import Model, State, dof, make_model, of_world, row
 from legged_torque.sim.fused.smooth import Pose, add_bodies, body_dynamics, links_maker, make_equations, make_trunk
@@ -23,7 +23,7 @@ ROWS = 3  # rows of Jacobians per inverse weight, their mean: one per axis; the 
 
 
 class DerivedConstants:
-    """Keeps ``body_invweight0`` and ``dof_invweight0`` of every world in step with its other parameters.
+    """Recomputes ``body_invweight0`` and ``dof_invweight0`` of worlds from their other parameters.
 
     They scale the softness of contacts, limits and dry friction, and follow from masses, inertias and armatures in the
     model's reference pose. Worlds are expected to differ in their trunks and armatures only: branches without armatures
@@ -31,7 +31,7 @@ class DerivedConstants:
     """
 
     def __init__(self, mj_model: mujoco.MjModel, model: mjw.Model, num_envs: int) -> None:
-        """Prepare, before worlds differ in ``model``, the one on the device, in which both fields will have rows.
+        """Prepare, while worlds are alike in ``model``, in which both fields have a row per world.
 
         A UserError if the robot's structure is not a trunk with branches.
         """
@@ -50,7 +50,7 @@ class DerivedConstants:
         self._measure_worlds(1)
 
     def vary_branches(self) -> None:
-        """Expect that worlds differ in their branches as well, from the next :meth:`update` on."""
+        """Take differences between the worlds' branches into account, from the next :meth:`update` on."""
         self._branches_vary = True
         self._measure_worlds(self._dim[0])
 
@@ -64,7 +64,7 @@ class DerivedConstants:
         wp.launch(self._derive, self._dim, inputs, outputs, device=self._device)
 
     def _measure_worlds(self, num_worlds: int) -> None:
-        """Allocate and measure the branches of all worlds, or of one for all."""
+        """Measure the branches of all worlds, or of one that stands for all."""
         branches, depth, *_ = self._layout
         with wp.ScopedDevice(self._device):
             self._measured = wp.zeros((num_worlds, branches), dtype=branch_types(depth).Smooth)
@@ -141,7 +141,7 @@ def write_weight(
 
 @wp.func
 def branch_at_rest(branch: AnyBranch, model: Model, world: int, b: int, joints: int):
-    """Return a branch, given its inertia matrix without armatures, with the matrix with them factorized."""
+    """Return a branch, with its inertia matrix without armatures, with the factor of the matrix with them."""
     for j in range(len(branch.acc)):
         if j < joints:
             branch.smooth.mass[j, j] += of_world(model.dof_armature, world, dof(model.branch_joint[b, j]))
@@ -151,7 +151,7 @@ def branch_at_rest(branch: AnyBranch, model: Model, world: int, b: int, joints: 
 @functools.cache
 def make_measure(layout: Layout) -> wp.Kernel:
     """Return the kernel that measures branches."""
-    depth, num_joints = layout.depth, joint_counter(layout)
+    depth, num_joints = layout.depth, branches_of(layout).num_joints
     Smooth, make_links = branch_types(depth).Smooth, links_maker(depth)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -202,7 +202,7 @@ def make_derive(layout: Layout) -> wp.Kernel:
     All of them run the same loop, which is short, since code that runs once must first be fetched.
     """
     branches, depth, _, threads, _, alike, *_ = layout
-    per_thread, num_joints, (Branch, _, Smooth) = layout.per_thread, joint_counter(layout), branch_types(depth)
+    per_thread, num_joints, (Branch, _, Smooth) = layout.per_thread, branches_of(layout).num_joints, branch_types(depth)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def derive_constants(

@@ -15,7 +15,7 @@ from legged_torque.sim.fused.types import AnyBranch, AnyLinks, Body, Trunk, bran
 
 @wp.struct
 class Pose:
-    """Where a body is, from the trunk's origin, and how it moves, at the trunk's origin; both in world axes."""
+    """Position of a body from the trunk's origin, orientation, and velocity at the trunk's origin, in world axes."""
 
     pos: wp.vec3
     rot: wp.mat33
@@ -69,7 +69,7 @@ def trunk_pose(trunk: Trunk) -> Pose:
 
 @wp.func
 def trunk_acc(model: Model, world: int, trunk: Trunk) -> wp.vec3:
-    """Return the linear acceleration to start from at the trunk's origin: gravity's, and that of turning axes."""
+    """Return the linear acceleration at the trunk's origin without forces: gravity, and that of rotating axes."""
     return wp.cross(trunk.lin_vel, trunk.ang_vel) - model.gravity[row(world, model.gravity.shape[0])]
 
 
@@ -109,7 +109,7 @@ def joint_force(
 
 @wp.func
 def turn_hinge(model: Model, world: int, joint: int, angle: float, pos: wp.vec3, quat: wp.quat):
-    """Return position and orientation of the body behind a hinge, given its parent's, and its anchor and axis."""
+    """Return position and orientation of the body behind a hinge from its parent's, and the anchor and axis."""
     body = joint + 1
     origin = pos + quat_to_matrix(quat) * of_world(model.body_pos, world, body)
     unturned = quat_multiply(quat, of_world(model.body_quat, world, body))
@@ -124,12 +124,12 @@ def turn_hinge(model: Model, world: int, joint: int, angle: float, pos: wp.vec3,
 
 @functools.cache
 def links_maker(n: int) -> wp.Function:
-    """Return ``make_links`` for branches of ``n`` joints; a function for any number would get a copy of the poses."""
+    """Return ``make_links`` for branches of ``n`` joints; a generic function would copy the poses."""
     Branch, Links, _ = branch_types(n)
 
     @wp.func
     def make_links(model: Model, state: State, world: int, b: int, joints: int, trunk: Trunk, poses: Poses):
-        """Return a branch with its joints, and its bodies; fill their poses. Places of no joint stay zero."""
+        """Return a branch with its joints, and its bodies, and write their poses. Entries without a joint stay zero."""
         branch = Branch()
         links = Links()
         pose = trunk_pose(trunk)
@@ -173,9 +173,9 @@ def links_maker(n: int) -> wp.Function:
 
 @wp.func
 def make_equations(branch: AnyBranch, links: AnyLinks, model: Model, world: int, b: int, joints: int, rot: wp.mat33):
-    """Return a branch with its equations of motion, added up from its last body to its first.
+    """Return a branch with its equations of motion, summed from its last body to its first.
 
-    Places of no joint get an equation of their own, whose solution is zero.
+    Entries without a joint get an equation of their own, whose solution is zero.
     """
     smooth = branch.smooth
     total = Body()

@@ -2,7 +2,7 @@
 
 MuJoCo Warp runs a step as some hundred small kernels, which wait for each other and for memory. A legged robot on
 the ground is small: a trunk and a few branches of hinge joints that meet only there. Here a thread holds a branch in
-registers from kinematics to integration, and the threads of a world add up what concerns the trunk.
+registers from kinematics to integration, and the threads of a world sum up the terms of the trunk.
 
 A launch may do several steps, each under torques that a Warp function computes from the state of the joints.
 """
@@ -16,7 +16,7 @@ from legged_torque.sim.fused.applied import apply_to_trunk
 from legged_torque.sim.fused.collision import place_plane
 from legged_torque.sim.fused.collision_map import place_map
 from legged_torque.sim.fused.integrate import integrate_trunk
-from legged_torque.sim.fused.layout import Layout, scratch_type
+from legged_torque.sim.fused.layout import Layout, branches_of
 from legged_torque.sim.fused.model import Model, State, local_copy
 from legged_torque.sim.fused.newton import newton_solver
 from legged_torque.sim.fused.smooth import make_trunk, trunk_pose
@@ -33,7 +33,7 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
     solve = newton_solver(layout)
     assemble_damping = forward.damping_assembler(layout)
     integrate = forward.integrator(layout)
-    Scratch, threads = scratch_type(layout), layout.threads
+    own = branches_of(layout)
     Ground, place_ground = (Surface, place_map) if layout.on_map else (wp.int32, place_plane)
     Reads = next(iter(law.input_types.values())) if law else wp.int32  # the law's first argument
 
@@ -46,7 +46,7 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
         reads: Reads,
         # Data, in and out:
         data: State,
-        scratch: Scratch,
+        scratch: own.Scratch,
         # Steps of this launch:
         first_step: int,
         end_step: int,
@@ -64,10 +64,10 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
             write_torques(model, state, world, thread, step, reads)
             branch, total = make_branches(model, state, scratch, world, thread, trunk, acc)
             scratch = make_self_constraints(model, scratch, world, thread, branch)
-            whole = whole_body(trunk, total, wp.static(threads))
+            whole = whole_body(trunk, total, wp.static(own.threads))
             branch, acc, used = solve(model, scratch, world, thread, whole, branch, trunk.rot, acc)
             branch, system = assemble_damping(model, scratch, world, thread, branch)
-            damped = solve_trunk(whole, TrunkMotion(), system, wp.static(threads))
+            damped = solve_trunk(whole, TrunkMotion(), system, wp.static(own.threads))
             integrate(model, state, scratch, world, thread, branch, damped, sense and step == end_step - 1)
             if thread == 0:
                 integrate_trunk(model.timestep, state, world, trunk, acc, damped)

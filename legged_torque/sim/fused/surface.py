@@ -1,4 +1,4 @@
-"""The surface of a height map, two triangles per cell, and where a sphere touches it."""
+"""The surface of a height map, two triangles per cell, and its contacts with a sphere."""
 
 import math
 
@@ -9,12 +9,11 @@ from legged_torque.sim.fused.math import inverse_sqrt
 from legged_torque.sim.height_map import HeightMap
 
 NEAR, FAR = 0.05, 0.2
-"""Spheres up to the first size, and geoms up to the second [m], that are high enough above the ground are known to be
-so from one number."""
+"""A sphere up to the first size, or a geom up to the second [m], is known to be clear of the ground from one number."""
 BLOCK = wp.constant(2)
-"""Cells along a side of what shares such a number for geoms."""
+"""Cells along a side of a block that shares such a number for geoms."""
 MAX_REACH = wp.constant(0.2)
-"""How far around the centre of a sphere that is below the surface the way out is looked for [m]."""
+"""Range in which the shortest way out is searched for a sphere whose centre is below the surface [m]."""
 ALIKE = wp.constant(0.999)
 """Faces whose normals have this cosine, 2.6 degrees, are one face: a sphere never touches both."""
 ON_EDGE = wp.constant(1.0e-5)
@@ -22,12 +21,12 @@ ON_EDGE = wp.constant(1.0e-5)
 MIN_DISTANCE = wp.constant(1.0e-6)
 """A direction over a shorter way [m] is lost in float32."""
 FAR_AWAY = wp.constant(1.0e10)
-"""Squared distance of what has not been found [m^2]."""
+"""Squared distance of a feature that has not been found [m^2]."""
 
 
 @wp.struct
 class Surface:
-    """Heights on a square grid, continued at the borders with the heights there."""
+    """Heights on a square grid, extended beyond the borders at the same heights."""
 
     heights: wp.array(dtype=wp.float32)  # in the world [m], row by row; rows along x, columns along y
     shape: wp.vec2i  # rows and columns
@@ -35,9 +34,9 @@ class Surface:
     density: wp.float32  # cells per metre
     corner: wp.vec2  # x and y of the first height [m]
     ceiling: wp.array2d(dtype=wp.float32)  # the greatest height near each cell [m]. Shape: (rows - 1, cols - 1)
-    near: wp.float32  # how far around a cell that is [m]
+    near: wp.float32  # radius of that neighbourhood [m]
     far_ceiling: wp.array2d(dtype=wp.float32)  # the greatest height in a wider neighbourhood of each block of cells [m]
-    far: wp.float32  # how far around a block that is [m]
+    far: wp.float32  # radius of that neighbourhood [m]
 
 
 def make_surface(height_map: HeightMap) -> Surface:
@@ -69,9 +68,9 @@ def _greatest(heights: np.ndarray, side: int, around: int) -> np.ndarray:
 
 @wp.struct
 class SphereContacts:
-    """The point of the surface that is nearest to the centre of a sphere, and a second one in a concave edge."""
+    """Contacts of a sphere: the nearest point of the surface, and a second one in a concave edge."""
 
-    count: wp.int32  # how many of the two touch
+    count: wp.int32  # 0, 1 or 2
     dist: wp.vec2  # distances between the surface and the sphere [m], negative where they overlap
     first: wp.vec3  # unit normals, towards the sphere
     second: wp.vec3
@@ -79,7 +78,7 @@ class SphereContacts:
 
 @wp.struct
 class Patch:
-    """Nine samples of a map, the corners of four cells, as seen from the centre of a sphere."""
+    """Nine samples of a map, the corners of four cells, relative to the centre of a sphere."""
 
     x: wp.float32  # of the first row
     y: wp.vec3  # of the three columns
@@ -91,9 +90,9 @@ class Patch:
 
 @wp.struct
 class Face:
-    """A triangle as seen from the centre of a sphere."""
+    """A triangle relative to the centre of a sphere."""
 
-    falls: wp.vec2  # how much it falls along x and y, per metre
+    falls: wp.vec2  # descent along x and y, per metre
     upright: wp.float32  # its upward unit normal is this times (falls, 1)
     dist: wp.float32  # of the centre above its plane [m]
     is_inside: wp.bool  # whether the point of its plane that is nearest to the centre is inside of it
@@ -101,14 +100,14 @@ class Face:
 
 @wp.struct
 class Nearest:
-    """What is nearest to the centre of a sphere, as far as the surface has been looked at."""
+    """The nearest face and edge to the centre of a sphere, among those seen so far."""
 
     face: Face  # of the triangles, where it is inside of one
     face_sq: wp.float32  # its squared distance
     edge: wp.vec3  # of the edges, the point from the centre
     edge_sq: wp.float32  # its squared distance
     above: wp.float32  # how far the centre is above the surface, vertically [m]
-    num_faces: wp.int32  # how many triangles the sphere touches inside of them
+    num_faces: wp.int32  # number of triangles that the sphere touches inside of them
 
 
 @wp.func
@@ -127,7 +126,7 @@ def place_on_map(surface: Surface, centre: wp.vec3, radius: float) -> wp.vec3:
 
 @wp.func
 def load_row(surface: Surface, i: int, j: int) -> wp.vec3:
-    """Return the heights of three samples from (i, j) on."""
+    """Return the heights of three samples of a row from (i, j) on."""
     first = wp.clamp(i, 0, surface.shape[0] - 1) * surface.shape[1]
     out = wp.vec3()
     for b in range(3):
@@ -137,7 +136,7 @@ def load_row(surface: Surface, i: int, j: int) -> wp.vec3:
 
 @wp.func
 def load_patch(surface: Surface, place: wp.vec3, i: int, j: int) -> Patch:
-    """Return the four cells between samples (i, j) and (i + 2, j + 2) as seen from a place on the map."""
+    """Return the four cells between samples (i, j) and (i + 2, j + 2), relative to a place on the map."""
     patch = Patch()
     patch.x = float(i) * surface.scale - place[0]
     patch.z = place[2]
@@ -187,7 +186,7 @@ def normal_of(face: Face) -> wp.vec3:
 
 @wp.func
 def nearest_on_face(face: Face, radius: float, best: Nearest) -> Nearest:
-    """Return what is nearest when a triangle is known, without its edges."""
+    """Update the nearest features with a triangle, without its edges."""
     away_sq = wp.where(face.is_inside, face.dist * face.dist, FAR_AWAY)
     if away_sq < best.face_sq:
         best.face_sq = away_sq
@@ -198,7 +197,7 @@ def nearest_on_face(face: Face, radius: float, best: Nearest) -> Nearest:
 
 @wp.func
 def nearest_on_edge(start: wp.vec3, edge: wp.vec3, best: Nearest) -> Nearest:
-    """Return what is nearest when an edge between two samples is known."""
+    """Update the nearest features with an edge between two samples."""
     point = start + wp.clamp(-wp.dot(start, edge) / wp.length_sq(edge), 0.0, 1.0) * edge
     away_sq = wp.length_sq(point)
     if away_sq < best.edge_sq:
@@ -209,9 +208,9 @@ def nearest_on_edge(start: wp.vec3, edge: wp.vec3, best: Nearest) -> Nearest:
 
 @wp.func
 def nearest_on_cells(surface: Surface, patch: Patch, radius: float, best: Nearest) -> Nearest:
-    """Return what is nearest when the two cells of a patch's first two rows are known.
+    """Update the nearest features with the two cells of a patch's first two rows.
 
-    Of each cell three edges: the other two are its neighbours'.
+    A cell has three edges here: the other two belong to its neighbours.
     """
     for b in range(2):
         for half in range(2):
@@ -225,7 +224,7 @@ def nearest_on_cells(surface: Surface, patch: Patch, radius: float, best: Neares
 
 @wp.func
 def height_above(surface: Surface, patch: Patch) -> float:
-    """Return how far the centre of a sphere is above the surface, vertically, if it is over the patch [m]."""
+    """Return the vertical height of a sphere's centre above the surface, if it is over the patch [m]."""
     if patch.x + surface.scale <= 0.0:
         patch = next_row(patch, surface.scale)
     is_second = patch.y[1] <= 0.0
@@ -240,7 +239,7 @@ def height_above(surface: Surface, patch: Patch) -> float:
 
 @wp.func
 def distance_sq_to_patch(patch: Patch, scale: float) -> float:
-    """Return the squared distance from the centre to a patch, filled up to its highest sample."""
+    """Return the squared distance from the centre to the box below a patch's highest sample."""
     top = wp.max(wp.max(wp.max(patch.first), wp.max(patch.second)), wp.max(patch.third))
     x, y = wp.max(patch.x, -patch.x - 2.0 * scale), wp.max(patch.y[0], -patch.y[2])
     return wp.length_sq(wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(patch.z - top, 0.0)))
@@ -268,9 +267,9 @@ def make_window(surface: Surface, place: wp.vec3, reach: float) -> Window:
 
 @wp.func
 def nearest_point(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
-    """Return what is nearest to the centre of a sphere.
+    """Return the nearest features to the centre of a sphere.
 
-    The way out of the ground is as long as the centre is below it, vertically, or shorter.
+    The shortest way out of the ground is not longer than the vertical one.
     """
     best = Nearest()
     best.face_sq = FAR_AWAY
@@ -304,9 +303,9 @@ def nearest_point(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
 
 @wp.func
 def second_face(surface: Surface, place: wp.vec3, radius: float, point: wp.vec3, normal: wp.vec3) -> Face:
-    """Return the deepest other face that a sphere touches at a concave edge, given where it touches the surface.
+    """Return the deepest other face that a sphere touches at a concave edge, besides a point with a normal.
 
-    Both points are in front of the other's face. One at the distance of the radius if there is none.
+    Each of the two points is in front of the other's face. If there is none, the result has the radius as distance.
     """
     best = Face()
     best.dist = radius
@@ -332,9 +331,9 @@ def second_face(surface: Surface, place: wp.vec3, radius: float, point: wp.vec3,
 
 @wp.func
 def is_clear(surface: Surface, centre: wp.vec3, lowest: float, radius: float) -> bool:
-    """Return whether what is within a radius along x and y of a point is above all that is near.
+    """Return whether a body within a radius along x and y of a point is known to be above the ground.
 
-    ``lowest`` is the height of its lowest point. That is all that most points and geoms need to know.
+    ``lowest`` is the height of its lowest point. Most points and geoms need no other test.
     """
     i = int(wp.clamp((centre[0] - surface.corner[0]) * surface.density, 0.0, float(surface.ceiling.shape[0] - 1)))
     j = int(wp.clamp((centre[1] - surface.corner[1]) * surface.density, 0.0, float(surface.ceiling.shape[1] - 1)))
@@ -348,10 +347,10 @@ def is_clear(surface: Surface, centre: wp.vec3, lowest: float, radius: float) ->
 
 @wp.func
 def sphere_map(surface: Surface, centre: wp.vec3, radius: float) -> SphereContacts:
-    """Return where a sphere touches the surface.
+    """Return the contacts of a sphere with the surface.
 
-    The nearest point of the whole surface is one of a face, or of an edge or vertex that sticks out: edges between
-    triangles of one plane are never felt. Of a sphere whose centre is below the surface it is the shortest way out.
+    The nearest point of the whole surface is on a face, or on an edge or vertex that sticks out: edges between
+    triangles of one plane have no effect. For a centre below the surface it is the shortest way out.
     """
     out = SphereContacts()
     place = place_on_map(surface, centre, radius)

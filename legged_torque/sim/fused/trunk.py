@@ -1,4 +1,4 @@
-"""The trunk's six equations, which are left when all branches are eliminated."""
+"""The six equations of the trunk that remain when all branches are eliminated."""
 
 import warp as wp
 
@@ -46,7 +46,7 @@ class TrunkSystem:
 
 @wp.func
 def warm_start(state: State, world: int) -> TrunkMotion:
-    """Return the trunk's accelerations from which the solver starts."""
+    """Return the trunk's accelerations at the start of the solver."""
     qacc = state.qacc_warmstart
     out = TrunkMotion()
     out.lin = wp.vec3(qacc[world, 0], qacc[world, 1], qacc[world, 2])
@@ -56,7 +56,7 @@ def warm_start(state: State, world: int) -> TrunkMotion:
 
 @wp.func
 def whole_inertia(trunk: Trunk, branches: Body, threads: int) -> WholeBody:
-    """Return the inertia of the trunk with its branches, given the sum over the branches of this thread; no bias."""
+    """Return the inertia of the trunk with its branches, from the sum over the branches of this thread; no bias."""
     out = WholeBody()
     moment = trunk.body.moment + group_sum3(branches.moment, threads)
     inertia = trunk.body.inertia + group_sum33_symmetric(branches.inertia, threads)
@@ -68,7 +68,7 @@ def whole_inertia(trunk: Trunk, branches: Body, threads: int) -> WholeBody:
 
 @wp.func
 def whole_body(trunk: Trunk, branches: Body, threads: int) -> WholeBody:
-    """Return the equations of the trunk with its branches, given the sum over the branches of this thread."""
+    """Return the equations of the trunk with its branches, from the sum over the branches of this thread."""
     out = whole_inertia(trunk, branches, threads)
     torque = trunk.body.torque + group_sum3(branches.torque, threads)
     out.bias_lin = trunk.body.force + group_sum3(branches.force, threads)
@@ -78,7 +78,7 @@ def whole_body(trunk: Trunk, branches: Body, threads: int) -> WholeBody:
 
 @wp.func
 def trunk_residual(whole: WholeBody, acc: TrunkMotion) -> TrunkMotion:
-    """Return M a + bias of the trunk, without what accelerations of the branches add."""
+    """Return M a + bias of the trunk, without the terms of the branches' accelerations."""
     out = TrunkMotion()
     out.lin = whole.mass * acc.lin + whole.coupling * acc.ang + whole.bias_lin
     out.ang = wp.transpose(whole.coupling) * acc.lin + whole.rotation * acc.ang + whole.bias_ang
@@ -87,7 +87,7 @@ def trunk_residual(whole: WholeBody, acc: TrunkMotion) -> TrunkMotion:
 
 @wp.func
 def trunk_slopes(whole: WholeBody, residual: TrunkMotion, step: TrunkMotion) -> wp.vec3:
-    """Return the trunk's slope of the cost along a step, the same for its smooth part, and its curvature."""
+    """Return the slope of the trunk's cost along a step, the same of its smooth part, and the curvature."""
     slope = wp.dot(step.lin, residual.lin) + wp.dot(step.ang, residual.ang)
     curvature = whole.mass * wp.dot(step.lin, step.lin) + 2.0 * wp.dot(step.lin, whole.coupling * step.ang)
     return wp.vec3(slope, slope, curvature + wp.dot(step.ang, whole.rotation * step.ang))
@@ -95,7 +95,7 @@ def trunk_slopes(whole: WholeBody, residual: TrunkMotion, step: TrunkMotion) -> 
 
 @wp.func
 def trunk_matrix(whole: WholeBody, branches: TrunkSystem, threads: int) -> mat66:
-    """Return the matrix of the trunk's equations, given what the branches of this thread add."""
+    """Return the matrix of the trunk's equations, from the terms of this thread's branches."""
     lin = group_sum33_symmetric(branches.lin, threads) + whole.mass * wp.identity(n=3, dtype=float)
     coupling = group_sum33(branches.coupling, threads) + whole.coupling
     ang = group_sum33_symmetric(branches.ang, threads) + whole.rotation
@@ -111,7 +111,7 @@ def trunk_matrix(whole: WholeBody, branches: TrunkSystem, threads: int) -> mat66
 
 @wp.func
 def solve_trunk(whole: WholeBody, residual: TrunkMotion, branches: TrunkSystem, threads: int) -> TrunkMotion:
-    """Return the trunk's Newton step, given what the branches of this thread add."""
+    """Return the trunk's Newton step, from the terms of this thread's branches."""
     lin = group_sum3(branches.rhs_lin, threads) - residual.lin
     ang = group_sum3(branches.rhs_ang, threads) - residual.ang
     factor = cholesky(trunk_matrix(whole, branches, threads))
