@@ -18,6 +18,7 @@ setup(
         "legged_torque.deploy": ["policy.schema.json"],
         "legged_torque.resources": ["robots/**"],
         "legged_torque.descriptions": ["*.yaml"],
+        "legged_torque.paper.report": ["*.jinja"],
     },
     include_package_data=False,  # what a wheel holds stands here; MANIFEST.in is for the source archive
 )

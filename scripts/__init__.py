@@ -1,1 +1,1 @@
-"""What a user runs: ``python scripts/train.py`` in a checkout, ``python -m legged_torque.scripts.train`` anywhere."""
+"""Scripts for users: ``python scripts/train.py`` in a checkout, ``python -m legged_torque.scripts.train`` anywhere."""

@@ -4,10 +4,6 @@ Every setting and option with bad values, every kind of file damaged: about 4000
 CPU. A case is good if it is refused with exit status 2 and one line, and nothing is written, or may be accepted.
 """
 
-from legged_torque.utils.rendering import without_renderer
-
-without_renderer()  # before anything imports mujoco
-
 import os
 
 os.environ["OMP_NUM_THREADS"] = "1"  # cases are forks, which torch's threads do not survive
@@ -17,7 +13,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from legged_torque.utils.cli import Parser, check_at_least, check_output, run_script, write_json
+from legged_torque.utils.cli import Parser, check_at_least, check_output, run_script
+from legged_torque.utils.files import write_json
 from tools.attack import attack, table
 from tools.attack_cases import all_cases
 from tools.attack_fixture import make_fixture, parsers, warm_up

@@ -4,11 +4,6 @@ from __future__ import annotations
 
 import os
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
 os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or torch's profiler writes to standard error when it starts
 
 import argparse
@@ -22,9 +17,10 @@ from legged_torque.benchmark.baseline import Baseline
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.args import Parser, add_settings_args, options_of, task_file_words
-from legged_torque.utils.cli import check_at_least, check_output, importing, run_script, write_json
+from legged_torque.utils.cli import check_at_least, check_output, run_script, slow_imports
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError, is_out_of_memory
+from legged_torque.utils.files import write_json
 from legged_torque.utils.paths import without_machine
 from legged_torque.utils.runs import package_versions
 
@@ -79,7 +75,7 @@ def main() -> None:
     args = parse_args()
     changes = ["evaluation.interval=0", *args.set]  # without evaluations iterations are alike
     sizes = []
-    with importing():
+    with slow_imports():
         for num_envs in args.num_envs or [None]:
             options = dataclasses.replace(options_of(args), num_envs=num_envs, set=changes)
             sizes.append(task_registry.get_cfgs(args.task, options))
@@ -148,7 +144,7 @@ def parse_args() -> argparse.Namespace:
     if args.profile and len(args.num_envs or [None]) > 1:
         raise UserError("--profile writes one trace: give one number of worlds")
     if args.learn:
-        with importing():
+        with slow_imports():
             _, cfg = task_registry.get_cfgs(args.task, dataclasses.replace(options_of(args), num_envs=None))
         if not 0 < cfg.evaluation.interval <= cfg.runner.total_steps:
             steps = f"evaluation.interval is {cfg.evaluation.interval}, of {cfg.runner.total_steps} steps"

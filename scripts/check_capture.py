@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 import sys
 from dataclasses import astuple
 from typing import TYPE_CHECKING
@@ -15,7 +9,7 @@ from typing import TYPE_CHECKING
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import check_at_least, importing, run_script
+from legged_torque.utils.cli import check_at_least, run_script, slow_imports
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import set_seed
@@ -36,7 +30,7 @@ def main() -> None:
     check_at_least(args, 1, "iterations")
     check_at_least(args, 0, "tolerance")
     options = options_of(args)
-    with importing():
+    with slow_imports():
         check_env_cfg(task_registry.get_cfgs(options.task, options)[0])  # mistakes are told before anything is built
         device = resolve_device(args.device)
         from tools.capture import KERNEL_TOLERANCE, compare_capture, compare_kernels

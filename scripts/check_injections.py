@@ -3,17 +3,11 @@
 No other world may differ by a bit, and a reset must make the world as good as new. Exits with 1 otherwise.
 """
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 import sys
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.utils.args import Parser, add_options
-from legged_torque.utils.cli import check_at_least, importing, run_script
+from legged_torque.utils.cli import check_at_least, run_script, slow_imports
 from legged_torque.utils.devices import resolve_device
 
 
@@ -24,7 +18,7 @@ def main() -> None:
     add_options(parser, "device")
     args = parser.parse_args()
     check_at_least(args, 1, "count")
-    with importing():
+    with slow_imports():
         device = resolve_device(args.device)
         from legged_torque.sim.model import build_model, collision_geoms
         from legged_torque.sim.registry import ENGINES

@@ -1,11 +1,5 @@
 """Check that a training gives the same bits again, also resumed: ``python scripts/check_reproducible.py``."""
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 import argparse
 import random
 import sys
@@ -15,7 +9,7 @@ from pathlib import Path
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.args import Parser, add_build_args, options_of, task_file_words
-from legged_torque.utils.cli import check_at_least, importing, run_script
+from legged_torque.utils.cli import check_at_least, run_script, slow_imports
 from legged_torque.utils.errors import UserError
 
 SAVE_INTERVAL = 2  # iterations; of trainings that are killed
@@ -37,7 +31,7 @@ def main() -> None:
     check_at_least(args, 0, "resumes", "kills")
     if args.resumes >= args.iterations:
         raise UserError(f"--resumes must be less than --iterations, which is {args.iterations}, not {args.resumes}")
-    with importing():
+    with slow_imports():
         check_env_cfg(task_registry.get_cfgs(args.task, options_of(args))[0])  # mistakes are told first
     with tempfile.TemporaryDirectory() as folder:
         sys.exit(0 if check(args, Path(folder)) else 1)

@@ -11,12 +11,6 @@ Examples:
 
 from __future__ import annotations
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 import argparse
 from dataclasses import asdict
 from pathlib import Path
@@ -30,12 +24,12 @@ from legged_torque.utils.cli import (
     check_at_least,
     check_output,
     finite,
-    importing,
     run_script,
-    write_json,
+    slow_imports,
 )
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import write_json
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.paths import portable_path
 from legged_torque.utils.runs import package_versions
@@ -58,7 +52,7 @@ def main() -> None:
         check_output(args.json)
     options = options_of(args)
     grounds = None
-    with importing():
+    with slow_imports():
         if args.terrain:
             from legged_torque.learning.crossing import Grounds
 
@@ -67,7 +61,7 @@ def main() -> None:
         import torch
 
         from legged_torque.envs.base.commands import fix_command
-        from legged_torque.learning.evaluator import evaluation_cfg
+        from legged_torque.envs.base.evaluation import evaluation_cfg
     if grounds:
         env_cfg = grounds.cfg(run.env_cfg, run.env_cfg.env.num_envs)
     else:

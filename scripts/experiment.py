@@ -8,12 +8,6 @@ Examples:
     python scripts/experiment.py my.yaml --device cpu --jobs 2 --out results
 """
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 import argparse
 import contextlib
 import sys
@@ -26,7 +20,7 @@ from legged_torque.experiments.matrix import SETTINGS_FILE, cell_state, check_sa
 from legged_torque.experiments.mps import multi_process_service
 from legged_torque.experiments.run import ExperimentRun, claim_folder
 from legged_torque.utils.args import Parser, add_options
-from legged_torque.utils.cli import check_output, importing, run_script
+from legged_torque.utils.cli import check_output, run_script, slow_imports
 from legged_torque.utils.errors import UserError, unknown_name
 
 
@@ -49,7 +43,7 @@ def main() -> None:
     parser.add_argument("--dry-run", action="store_true", help="only list what is left to do")
     add_options(parser, "task_file")
     args = parser.parse_args()
-    with importing():
+    with slow_imports():
         matrix = read_matrix(experiment_path(args.file), args.task_file)
     out = (args.out or Path("logs", "experiments", args.file.stem)).resolve()
     check_output(out / SETTINGS_FILE)
@@ -72,7 +66,7 @@ def make_launcher(args: argparse.Namespace) -> Launcher:
             raise UserError("--mps is for this machine; on a cluster, start the service on each node")
         if args.task_file:
             raise UserError("--task_file is for this machine; on a cluster, install the tasks: docs/howto/own_tasks.md")
-        with importing():
+        with slow_imports():
             from legged_torque.experiments.ray_launcher import RayLauncher
         return RayLauncher(args.address or "auto", args.device, args.jobs)
     if args.launcher != "local":

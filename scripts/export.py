@@ -5,22 +5,16 @@ Examples:
     python scripts/export.py --task=a1_torque_multihead --load_run=RUN --checkpoint=500 --out=exported
 """
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 from pathlib import Path
 
 from legged_torque.deploy.description import DESCRIPTION_FILE
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, check_output, importing, run_script, script_command
+from legged_torque.utils.cli import Parser, check_output, run_script, script_command, slow_imports
 
 
 def main() -> None:
-    """Load a checkpoint and write policy.onnx, policy.pt and policy.yaml."""
+    """Load a checkpoint and write policy.onnx, policy.pt and policy.yaml; print what the latter does not describe."""
     parser = Parser(__doc__)
     add_task_args(parser)
     parser.add_argument("--out", type=Path, help="folder to write; default: exported_<checkpoint> in the run's folder")
@@ -28,7 +22,7 @@ def main() -> None:
     if args.out:
         check_output(args.out / DESCRIPTION_FILE)
     options = options_of(args)
-    with importing():
+    with slow_imports():
         run = task_registry.load_run(options)
         from legged_torque.deploy.export import export_policy, nominal_cfg
     env, runner = task_registry.make_loaded(run, options, nominal_cfg(run.env_cfg))
@@ -36,11 +30,15 @@ def main() -> None:
     out = args.out or run.folder / f"exported_{iterations}"
     training = {"run": run.folder.name, "checkpoint": run.checkpoint.name}
     training |= {"iterations": iterations, "total_steps": int(env.total_steps)}
-    difference = export_policy(env, runner.alg.get_policy(), out, args.task, training)
+    difference, unsupported = export_policy(env, runner.alg.policy(), out, args.task, training)
     print(f"{run.checkpoint}, after {training['total_steps']:,} steps of training:")
     print(f"  exported to {out}: policy.onnx, policy.pt, policy.yaml")
     print(f"  largest difference to the checkpoint's network: {difference:.2g}")
-    print(f"See it in plain MuJoCo: {script_command('sim2sim')} {out}")
+    if unsupported:
+        print("  policy.yaml does not describe the whole task, so sim2sim.py refuses it; the networks are complete:")
+        print("".join(f"  - {problem}\n" for problem in unsupported), end="")
+    else:
+        print(f"See it in plain MuJoCo: {script_command('sim2sim')} {out}")
 
 
 if __name__ == "__main__":

@@ -9,10 +9,10 @@ from pathlib import Path
 from legged_torque import RESOURCES_DIR
 from legged_torque import __file__ as package
 from legged_torque.envs import task_registry
-from legged_torque.utils.cli import Parser, check_output, finite, importing, run_script, script_command
+from legged_torque.utils.cli import Parser, check_output, finite, run_script, script_command, slow_imports
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_whole
-from legged_torque.utils.rendering import choose_offscreen_renderer, without_renderer
+from legged_torque.utils.rendering import choose_offscreen_renderer, disable_renderer
 
 
 def main() -> None:
@@ -27,12 +27,12 @@ def main() -> None:
     args = parser.parse_args()
     if args.torque_limit is not None and args.torque_limit <= 0:
         raise UserError(f"--torque_limit must be above 0, not {args.torque_limit}")
-    no_picture = choose_offscreen_renderer() if args.check else without_renderer()
-    with importing():
+    no_picture = choose_offscreen_renderer() if args.check else disable_renderer()
+    with slow_imports():
         from legged_torque.importer.mjcf import mjcf
         from legged_torque.importer.robot import import_robot
         from legged_torque.importer.settings import settings
-        from legged_torque.importer.standing import draw, fused_problem, measure, parse
+        from legged_torque.importer.trial import draw, fused_problem, parse, stand
     robot = import_robot(args.file, args.name, args.torque_limit)
     folder = args.out or RESOURCES_DIR / "robots" / robot.name
     model_file = folder / f"{robot.name}.xml"
@@ -50,19 +50,19 @@ def main() -> None:
     problem = fused_problem(model)
     code = settings(robot, path, is_fused=not problem)
     compile(code, code_file, "exec")  # a file with a mistake would be in every later command's way
-    write_whole(model_file, text.encode())
-    write_whole(code_file, code.encode())
+    write_whole(model_file, text)
+    write_whole(code_file, code)
     for note in robot.notes:
         print(f"- {note}")
     print(f"wrote {model_file}\nwrote {code_file}")
     print(problem or "sim.engine 'fused' simulates it")
     if args.check:
-        result, data = measure(model, *robot.gains())
+        result, data = stand(model, robot.gains())
         print(f"5 s under PD: {result}")
         if no_picture:
             print(f"no picture: {no_picture}")
         else:
-            draw(model, data, folder / f"{robot.name}.png")
+            draw(data, folder / f"{robot.name}.png")
             print(f"wrote {folder / robot.name}.png")
     if args.out:
         print(f"To have its tasks, put {code_file.name} into {Path(package).parent / 'envs' / 'robots'}")
@@ -70,4 +70,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, draws=True)

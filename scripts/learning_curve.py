@@ -1,18 +1,13 @@
 """Measure every checkpoint of a run with mean actions: ``python scripts/learning_curve.py --task=a1_position``."""
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 from pathlib import Path
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import check_at_least, check_output, importing, run_script, write_json
+from legged_torque.utils.cli import check_at_least, check_output, run_script, slow_imports
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
+from legged_torque.utils.files import write_json
 from legged_torque.utils.paths import without_machine
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import set_seed
@@ -31,7 +26,7 @@ def main() -> None:
     args = parser.parse_args()
     check_at_least(args, 1, "steps")
     options = options_of(args)
-    with importing():
+    with slow_imports():
         run = task_registry.load_run(options)
         from legged_torque.envs.base.metrics import measure
     file = args.json or run.folder / "curve.json"

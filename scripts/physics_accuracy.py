@@ -5,16 +5,10 @@ compared are those in which only feet are near the ground, and where it is a pla
 plane for each foot.
 """
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 from legged_torque import resource_path
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import check_at_least, importing, run_script
+from legged_torque.utils.cli import check_at_least, run_script, slow_imports
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.task_registry import set_seed
 
@@ -31,7 +25,7 @@ def main() -> None:
     args = parser.parse_args()
     check_at_least(args, 1, "steps", "worlds")
     options = options_of(args)
-    with importing():
+    with slow_imports():
         run = task_registry.load_run(options)
         import torch
 

@@ -10,12 +10,6 @@ Examples:
 
 from __future__ import annotations
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import choose_offscreen_renderer
-
-end_on_interrupt()
-NO_RENDERER = choose_offscreen_renderer()  # before anything imports mujoco
-
 import argparse
 import functools
 import math
@@ -27,11 +21,20 @@ from legged_torque import resource_path
 from legged_torque.envs import task_registry
 from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
 from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, add_command_arg, check_at_least, check_output, finite, importing, run_script
+from legged_torque.utils.cli import (
+    Parser,
+    add_command_arg,
+    check_at_least,
+    check_output,
+    finite,
+    run_script,
+    slow_imports,
+)
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.options import Options
+from legged_torque.utils.rendering import choose_offscreen_renderer
 from legged_torque.utils.runs import load_config
 from legged_torque.utils.task_registry import LoadedRun, experiment_dir, set_seed
 
@@ -50,9 +53,12 @@ MAX_GRID = 25  # maximum number of tiles; more would be unreadable
 def main() -> None:
     """Roll a policy out or show it live; without a policy, roll out zero or random actions."""
     args = parse_args()
+    args.no_renderer = choose_offscreen_renderer()
     kinds, levels = named_kinds(args.terrain), rising_levels(args.level)
     options = options_of(args)
-    with importing():
+    with slow_imports():
+        import rsl_rl.runners  # noqa: F401  # before MuJoCo: Triton's LLVM cannot be loaded after that of Mesa's renderer
+
         run = task_registry.load_run(options) if args.agent == "policy" else None
         env_cfg, train_cfg = (run.env_cfg, run.train_cfg) if run else task_registry.get_cfgs(args.task, options)
         from legged_torque.envs.base.commands import fix_command
@@ -118,7 +124,7 @@ def show(args: argparse.Namespace, run: LoadedRun) -> None:
     """Show a policy live, and one that it is compared with."""
     compared = load_compared(args, run) if args.compare else None
     watch, device = import_viewer(args), resolve_device(args.device)  # what is missing is told before anything slow
-    with importing():
+    with slow_imports():
         from legged_torque.viewer.session import Session
     session = Session(task_registry.get_task_class(args.task), run, device)
     session.follow_newest(args.checkpoint in (None, -1))
@@ -196,7 +202,7 @@ def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
         from legged_torque.viewer.web import watch
     except ImportError as error:
         raise UserError(f"--viewer web needs the extra: pip install 'legged_torque[viewer]' ({error})") from None
-    return functools.partial(watch, title=args.task, host=args.host, port=args.port, no_renderer=NO_RENDERER)
+    return functools.partial(watch, title=args.task, host=args.host, port=args.port, no_renderer=args.no_renderer)
 
 
 def roll_out(
@@ -211,8 +217,8 @@ def roll_out(
     print(f"{title}:")
     for name, value in metrics.means().items():
         print(f"  {name:<18} {value:8.4f} {UNITS[name]}")
-    return recorder is not None and recorder.save(args.video or video, NO_RENDERER) and not args.video
+    return recorder is not None and recorder.save(args.video or video, args.no_renderer) and not args.video
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, draws=True)

@@ -7,15 +7,9 @@ controller use. Every random parameter of the task has a panel.
 import copy
 from pathlib import Path
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import add_build_args, options_of
-from legged_torque.utils.cli import Parser, check_output, importing, run_script
+from legged_torque.utils.cli import Parser, check_output, run_script, slow_imports
 from legged_torque.utils.task_registry import set_seed
 
 
@@ -28,7 +22,7 @@ def main() -> None:
     args = parser.parse_args()
     check_output(args.out)
     options = options_of(args)
-    with importing():
+    with slow_imports():
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
         from tools.distributions import draw_distributions
     set_seed(train_cfg.seed)

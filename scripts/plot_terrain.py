@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from legged_torque.utils.args import Parser
-from legged_torque.utils.cli import check_at_least, check_output, importing, run_script
+from legged_torque.utils.cli import check_at_least, check_output, run_script, slow_imports
 from legged_torque.utils.errors import UserError
 
 
@@ -18,7 +18,7 @@ def main() -> None:
         raise UserError(f"--difficulty must be from 0 to 1, not {args.difficulty}")
     check_at_least(args, 0, "seed")
     check_output(args.out)
-    with importing():
+    with slow_imports():
         from legged_torque.terrain.picture import draw_tiles
     draw_tiles(args.out, args.difficulty, args.seed)
 

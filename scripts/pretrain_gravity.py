@@ -1,39 +1,64 @@
-"""Teach a torque policy to stand by supervision: ``python scripts/pretrain_gravity.py --task=a1_torque_gravity``.
+"""Teach a torque policy to stand by supervision.
 
 The policy is kept where ``train.py`` looks for it, which also makes it itself if it is missing.
+
+Examples:
+    python scripts/pretrain_gravity.py --task=a1_torque_gravity
+    python scripts/pretrain_gravity.py --check_standing --num_envs=1000
 """
 
+import argparse
 import shlex
 from pathlib import Path
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 from legged_torque.envs import task_registry
 from legged_torque.utils.args import Parser, add_build_args, options_of, task_file_words
-from legged_torque.utils.cli import check_output, importing, run_script, script_command, write_json
+from legged_torque.utils.cli import check_output, run_script, script_command, slow_imports
 from legged_torque.utils.devices import device_name, resolve_device
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import write_json
 from legged_torque.utils.paths import without_machine
 
 
 def main() -> None:
-    """Parse the command line and make the policy."""
+    """Parse the command line, and make the policy or check it."""
     parser = Parser(__doc__)
     add_build_args(parser)
     parser.set_defaults(task="a1_torque_gravity")
     parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in the current directory")
-    parser.add_argument("--num_configurations", type=int, help="random initial states; default: that of the task")
-    parser.add_argument("--num_steps", type=int, help="control steps for which each is followed; default: likewise")
+    parser.add_argument("--num_configurations", type=int, help="random initial states; default: as in the task")
+    parser.add_argument("--num_steps", type=int, help="control steps to follow each state; default: as in the task")
     parser.add_argument("--json", type=Path, help="write the report with its histograms to this file as well")
+    hint = "count how often the controller and the policy made before stand up from random states; makes no policy"
+    parser.add_argument("--check_standing", action="store_true", help=hint)
     args = parser.parse_args()
+    if args.check_standing:
+        check(args)
+    else:
+        pretrain(args)
+
+
+def check(args: argparse.Namespace) -> None:
+    """Count how often controller and policy stand up."""
+    for name in ("num_configurations", "num_steps", "json"):
+        if getattr(args, name) is not None:
+            raise UserError(f"--{name} is for making a policy, which --check_standing does not do")
+    options = options_of(args)
+    with slow_imports():
+        env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+        from legged_torque.paper.gravity.trials import check_standing
+        from legged_torque.utils.progress import CompileProgress
+    with CompileProgress():
+        check_standing(options, env_cfg, train_cfg)
+
+
+def pretrain(args: argparse.Namespace) -> None:
+    """Make the policy, print what it learned, and the command that trains from it."""
     for name in ("num_configurations", "num_steps", "seed"):
         if getattr(args, name) is not None:
             args.set.append(f"pretraining.{name}={getattr(args, name)}")
     options = options_of(args)
-    with importing():
+    with slow_imports():
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
         from legged_torque.learning.pretrained import make_pretrained, pretrained_file
         from legged_torque.utils.progress import CompileProgress

@@ -3,20 +3,11 @@
 Takes the folder of an experiment, a folder with runs of train.py (logs/a1_torque, or all of logs), or a single run.
 """
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 from pathlib import Path
 
-from legged_torque.paper.report.blocks import to_html, to_markdown
-from legged_torque.paper.report.figures import draw_all
-from legged_torque.paper.report.report import find_videos, missing_lines, report
-from legged_torque.paper.report.results import read_experiment, summarize, write_tables
+from legged_torque.paper.report import check_extra
 from legged_torque.utils.args import Parser
-from legged_torque.utils.cli import check_at_least, check_output, run_script
+from legged_torque.utils.cli import check_at_least, check_output, run_script, slow_imports
 
 
 def main() -> None:
@@ -29,28 +20,23 @@ def main() -> None:
         "step from which evaluations count; default: the last 18%% of a training: from 90 of 110 million, as in Table I"
     )
     parser.add_argument("--from_step", type=float, help=help_text)
-    help_text = "folder with videos <task>.mp4, .webm or .gif, which the page is to hold"
+    help_text = "folder with videos <task>.mp4, .webm or .gif, to be shown in the page"
     parser.add_argument("--videos", type=Path, help=help_text)
     args = parser.parse_args()
     if args.from_step is not None:
         check_at_least(args, 0, "from_step")
     out = args.out or args.experiment / "report"
-    file, page = out / "report.md", out / "report.html"
-    check_output(file)
-    check_output(page)
+    check_output(out / "report.md")
+    check_output(out / "report.html")
+    with slow_imports():
+        check_extra()
+        from legged_torque.paper.report.experiment import read_experiment
+        from legged_torque.paper.report.report import find_videos, write_report
     experiment = read_experiment(args.experiment)
     videos = find_videos(args.videos, experiment.plan.tasks) if args.videos else {}
     from_step = experiment.last_part() if args.from_step is None else args.from_step
-    table = summarize(experiment, from_step)
-    out.mkdir(parents=True, exist_ok=True)
-    figures = draw_all(experiment, table, out)
-    blocks = report(experiment, table, from_step, figures, out, videos)
-    title = f"Results of {experiment.folder.resolve().name}"
-    file.write_text(to_markdown(title, blocks), encoding="utf-8")
-    page.write_text(to_html(title, blocks), encoding="utf-8")
-    write_tables(experiment, table, out)
-    missing = len(missing_lines(experiment, from_step))
-    print(f"{file}, {page.name}, {len(figures)} figures; missing or not finished: {missing} lines")
+    figures, missing = write_report(experiment, from_step, out, videos)
+    print(f"{out / 'report.md'}, report.html, {figures} figures; missing or not finished: {missing} lines")
 
 
 if __name__ == "__main__":

@@ -8,14 +8,6 @@ Examples:
 
 from __future__ import annotations
 
-import sys
-
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import choose_offscreen_renderer
-
-end_on_interrupt()
-NO_RENDERER = None if "--viewer" in sys.argv else choose_offscreen_renderer()  # before anything imports mujoco
-
 import argparse
 import contextlib
 import importlib.metadata
@@ -29,15 +21,15 @@ from legged_torque.utils.cli import (
     check_at_least,
     check_output,
     finite,
-    importing,
     run_script,
-    write_json,
+    slow_imports,
 )
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import write_json
+from legged_torque.utils.rendering import choose_offscreen_renderer
 
 if TYPE_CHECKING:
     from legged_torque.deploy.policy import Policy
-    from legged_torque.deploy.robot import MujocoRobot
     from legged_torque.utils.metrics import Estimate
 
 
@@ -59,6 +51,8 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
     hint = "difficulties of rough ground, 0 to 1; default: those of training"
     parser.add_argument("--level", nargs="+", type=finite, default=(), help=hint)
+    hint = "with height fields: corrected to those of training, or MuJoCo's own; default: %(default)s"
+    parser.add_argument("--contacts", choices=("training", "mujoco"), default="training", help=hint)
     parser.add_argument("--video", type=Path, help="mp4 of the first robot")
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
@@ -81,7 +75,8 @@ def parse_args() -> argparse.Namespace:
 def main() -> None:
     """Load a policy and a robot, simulate, print the metrics, and write JSON and video if asked to."""
     args = parse_args()
-    with importing():
+    no_renderer = None if args.viewer else choose_offscreen_renderer()
+    with slow_imports():
         import numpy as np
 
         from legged_torque.deploy.ground import select_ground
@@ -97,15 +92,16 @@ def main() -> None:
     if args.terrain:
         select_ground(policy.description, LeggedRobotCfg().terrain, args.terrain, args.level)
     xml = args.xml or resource_path(policy.description["robot"]["file"])
-    robot = MujocoRobot(xml, policy.description)
+    robot = MujocoRobot(xml, policy.description, args.contacts)
     events = Events(args.command, args.push_velocity, args.push_probability)
     simulation = Simulation(policy, robot, events)
+    notes = robot.notes + simulation.notes
     recorder = SimulationRecorder(simulation) if args.video else None
     sums = []
     with simulation_window(simulation) if args.viewer else contextlib.nullcontext(lambda: None) as show:
         training = policy.description["training"]
         print(f"{policy.description['task']}, {training['checkpoint']} of {training['run']}, in MuJoCo with '{xml}':")
-        for note in robot.notes:
+        for note in notes:
             print(f"  note: {note}")
         with Counter("simulating, step", args.robots * args.steps) as counter:
             for number in range(args.robots):
@@ -118,22 +114,20 @@ def main() -> None:
     for name, value in metrics.items():
         print(f"  {name:<18} {value.mean:10.4f} +- {value.standard_error:.4f} {UNITS[name]}")
     if args.json:
-        write_results(args, policy, robot, metrics)
+        write_results(args, policy, notes, metrics)
     if recorder:
-        recorder.save(args.video, NO_RENDERER)
+        recorder.save(args.video, no_renderer)
 
 
-def write_results(args: argparse.Namespace, policy: Policy, robot: MujocoRobot, metrics: dict[str, Estimate]) -> None:
-    """Write arguments and results; null stands for what was not measured."""
+def write_results(args: argparse.Namespace, policy: Policy, notes: list[str], metrics: dict[str, Estimate]) -> None:
+    """Write arguments and results; null stands for values that were not measured."""
     result = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
     result["task"], result["training"] = policy.description["task"], policy.description["training"]
-    result["notes"], result["versions"] = (
-        robot.notes,
-        {name: importlib.metadata.version(name) for name in ("mujoco", "numpy")},
-    )
+    result["notes"] = notes
+    result["versions"] = {name: importlib.metadata.version(name) for name in ("mujoco", "numpy")}
     result["metrics"] = {name: vars(estimate) for name, estimate in metrics.items()}
     write_json(args.json, result)
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, draws=True)

@@ -13,12 +13,6 @@ Examples:
 
 from __future__ import annotations
 
-from legged_torque.utils.interrupt import end_on_interrupt
-from legged_torque.utils.rendering import without_renderer
-
-end_on_interrupt()
-without_renderer()  # before anything imports mujoco
-
 import contextlib
 import functools
 import shlex
@@ -28,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 from legged_torque.envs import task_registry
 from legged_torque.utils import distributed
 from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of, task_file_words
-from legged_torque.utils.busy_cores import BusyCores
-from legged_torque.utils.cli import check_at_least, check_output, importing, run_script, script_command
+from legged_torque.utils.busy_cores import busy_cores_note
+from legged_torque.utils.cli import check_at_least, check_output, run_script, script_command, slow_imports
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
@@ -54,7 +48,6 @@ def main() -> None:
     parser.add_argument("--video_interval", type=int, default=0, metavar="N", help=hint)
     args = parser.parse_args()
     check_at_least(args, 0, "video_interval")
-    cores = BusyCores()
     options = options_of(args)
     if args.list:
         print("\n".join(task_registry.names()))
@@ -62,11 +55,11 @@ def main() -> None:
     if options.resume:
         if options.preset:
             raise UserError("--preset cannot be given with --resume, which keeps the settings of the run")
-        with importing():
+        with slow_imports():
             if distributed.world_size() > 1:
-                from legged_torque.learning.run_of_first import take_run_of_first
+                from legged_torque.learning.first_run import use_first_run
 
-                take_run_of_first(options)
+                use_first_run(options)
             run = task_registry.load_run(options)
         env_cfg, train_cfg = run.env_cfg, run.train_cfg
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
@@ -76,21 +69,21 @@ def main() -> None:
     elif options.load_run or options.checkpoint is not None:
         raise UserError("--load_run and --checkpoint need --resume")
     else:
-        with importing():
+        with slow_imports():
             env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     folder = experiment_dir(train_cfg, options.log_root)
     if distributed.rank() == 0:  # the others write nothing
         check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)
-    with importing():
+    with slow_imports():
         from legged_torque.utils.progress import CompileProgress
     is_first = distributed.rank() == 0
     beside = Beside(is_first and args.viewer == "web", args.video_interval if is_first else 0)
     set_seed(train_cfg.seed)
     with CompileProgress() if is_first else contextlib.nullcontext():  # one line for all processes
-        train(options, env_cfg, train_cfg, cores, beside)
+        train(options, env_cfg, train_cfg, beside)
 
 
-def train(options: Options, env_cfg: Any, train_cfg: Any, cores: BusyCores, beside: Beside) -> None:
+def train(options: Options, env_cfg: Any, train_cfg: Any, beside: Beside) -> None:
     """Build the task and train it, from a pre-trained policy if the task has one."""
     import torch
 
@@ -117,7 +110,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, cores: BusyCores, besi
     if remaining < 1:
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
     if is_first:
-        print_notes(filter(None, [cores.note(torch.get_num_threads()) if env.device == "cpu" else None]))
+        print_notes(filter(None, [busy_cores_note(torch.get_num_threads()) if env.device == "cpu" else None]))
         announce(runner, options, env_cfg, train_cfg, total, beside.page)
         runner.on_checkpoint = functools.partial(beside.show, task_words(options))
     is_complete = False

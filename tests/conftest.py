@@ -10,9 +10,17 @@ import torch
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # before anything imports triton: kernels of the update run on the CPU
 
+from support.last_run import Recorder
+
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.options import Options
+
+
+def pytest_configure(config):
+    """Keep a record of the tests that need a GPU; with pytest-xdist, only its controller does."""
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(Recorder(config))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -8,6 +8,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LEVELS = [
     ("utils",),
+    ("learning.settings",),
     ("sim", "terrain", "motors"),
     ("envs.base",),
     ("envs.robots", "envs.approaches", "envs.grounds", "importer"),

@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ("CHANGELOG.md", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml", "setup.py")
-FOLDERS = ("experiments", "legged_torque", "resources", "scripts", "tests")
+FOLDERS = ("experiments", "legged_torque", "paper", "resources", "scripts", "tests")
 SMALL = ["--num_envs=2", "--set=runner.num_steps_per_env=4", "--max_iterations=1", "--logger=none"]
 EXPERIMENT = """
 tasks: [a1_position]
@@ -84,7 +84,7 @@ def files(folder):
 def test_contents(installed):
     """The package holds its own files, the robots and the scripts, each once."""
     expected = files(ROOT / "legged_torque")
-    folders = {"resources": "resources", "scripts": "scripts", "experiments": "descriptions"}
+    folders = {"resources": "resources", "scripts": "scripts", "experiments": "descriptions", "paper": "paper"}
     expected |= {f"{inside}/{name}" for folder, inside in folders.items() for name in files(ROOT / folder)}
     assert files(installed / "legged_torque") == expected
     assert {path.name for path in installed.iterdir() if path.suffix != ".dist-info"} == {"legged_torque"}
@@ -119,4 +119,6 @@ def test_scripts_from_another_directory(installed, tmp_path):
     finish(experiment)
     (result,) = (tmp_path / "logs" / "experiments" / "tiny").glob("*/result_*.json")
     assert result.is_file()
+    finish(start(installed, tmp_path, ["report", "logs/experiments/tiny"]))
+    assert (tmp_path / "logs" / "experiments" / "tiny" / "report" / "report.html").is_file()
     assert {path.name for path in tmp_path.iterdir()} <= {"tiny.yaml", "logs", "walk.mp4"}

@@ -32,14 +32,13 @@ READERS = {
     fixtures.CONFIG: ("evaluate.py", "export.py", "play.py", "learning_curve.py", "physics_accuracy.py", "train.py"),
     fixtures.CHECKPOINT: ("evaluate.py", "export.py", "play.py", "learning_curve.py", "train.py"),
     fixtures.WORLDS: ("train.py",),
-    fixtures.PRETRAINED: ("check_standing.py", "train.py"),
+    fixtures.PRETRAINED: ("train.py",),
     fixtures.DESCRIPTION: ("sim2sim.py",),
     fixtures.NETWORK: ("sim2sim.py",),
     fixtures.ROBOT: ("import_robot.py", "sim2sim.py", "train.py"),
     fixtures.PLAN: ("experiment.py",),
-    fixtures.CURVE: ("plot_curves.py",),
-    fixtures.EVALUATIONS: ("plot_curves.py",),
-    fixtures.REPORT: ("plot_pretraining.py",),
+    fixtures.CURVE: ("plot.py",),
+    fixtures.EVALUATIONS: ("plot.py",),
     f"{fixtures.RESULTS}/experiment.yaml": ("report.py",),
     f"{fixtures.CELL}/result_none.json": ("report.py",),
     f"{fixtures.CELL}/run/config.yaml": ("report.py",),
@@ -235,8 +234,10 @@ def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 def file_case(file: str, script: str, what: str, value: Any, content: str | bytes, must_refuse: bool = True) -> Case:
     """Return the case of a script that reads a file of this content."""
     words = (*WORDS[script], *_MORE_WORDS.get((file, script), ()))
-    if file in (fixtures.DESCRIPTION, fixtures.NETWORK) or script == "plot_curves.py":
+    if file in (fixtures.DESCRIPTION, fixtures.NETWORK):
         words = (file, *words[1:])
+    if script == "plot.py":
+        words = ("curves", file, *words[2:])
     data = content if isinstance(content, bytes) else content.encode()
     return Case(
         f"{script} {Path(file).name} {what} {str(value)[:30]}".strip(), script, words, must_refuse, {file: data}

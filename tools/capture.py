@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +10,6 @@ from torch import Tensor
 from torch.nn.utils import parameters_to_vector
 
 from legged_torque.learning.runner import OnPolicyRunner
-from legged_torque.learning.worlds import world_tensors
 from legged_torque.utils.task_registry import set_seed
 
 WARM_UP_ITERATIONS = 2  # iterations before everything is replayed: the first runs as it is, the second captures
@@ -49,7 +49,7 @@ def compare_capture(plain: OnPolicyRunner, captured: OnPolicyRunner, seed: int) 
     Returns:
         By quantity: observations by group, actions, rewards, returns, the changes of actor and critic, and all losses.
     """
-    start = [tensor.clone() for tensor in _state(plain)]
+    start = [tensor.clone() for tensor in _state(plain)], copy.deepcopy(plain.env.world_state_dict())
     expected, rollout = _iterate(plain, start, seed)
     repeated, _ = _iterate(plain, start, seed, rollout)
     actual, _ = _iterate(captured, start, seed, rollout)
@@ -64,15 +64,15 @@ def compare_kernels(runner: OnPolicyRunner) -> dict[str, float]:
         By network: the norm of the difference, relative to that of autograd's gradient; nothing without kernels.
     """
     alg = runner.alg
-    if not alg.fused:
+    if not hasattr(alg, "gradients"):
         return {}
     alg.indices.copy_(torch.arange(alg.batch_size))
-    before, rate = [tensor.clone() for tensor in alg.fused.state()], alg.learning_rate.clone()
-    alg.fused.update_minibatch()
-    fused = [gradient.clone() for gradient in alg.fused.gradients()]
-    for tensor, value in zip([*alg.fused.state(), alg.learning_rate], [*before, rate], strict=True):
+    before, rate = [tensor.clone() for tensor in alg.tensors()], alg.learning_rate.clone()
+    alg.update_minibatch()
+    fused = [gradient.clone() for gradient in alg.gradients()]
+    for tensor, value in zip([*alg.tensors(), alg.learning_rate], [*before, rate], strict=True):
         tensor.copy_(value)
-    alg.fused.round_weights()
+    alg.round_weights()
     alg.optimizer.zero_grad()
     with torch.enable_grad():
         alg.loss()[0].backward()
@@ -97,21 +97,22 @@ def warm_up(runner: OnPolicyRunner) -> None:
 
 
 def _state(runner: OnPolicyRunner) -> list[Tensor]:
-    """Return the tensors that training carries between iterations: networks, optimizer, counters, worlds."""
+    """Return the tensors that training carries between iterations besides the worlds: networks, optimizer, counters."""
     alg = runner.alg
     networks = [*alg.actor.state_dict().values(), *alg.critic.state_dict().values()]
     moments = [tensor for entry in alg.optimizer.state.values() for tensor in entry.values()]
-    worlds = [tensor for _, tensor in sorted(world_tensors(runner.env).items())]
-    return [*networks, *moments, alg.learning_rate, runner.env.total_steps, *worlds]
+    return [*networks, *moments, alg.learning_rate, runner.env.total_steps]
 
 
 def _iterate(
-    runner: OnPolicyRunner, start: list[Tensor], seed: int, rollout: list[Tensor] | None = None
+    runner: OnPolicyRunner, start: tuple[list[Tensor], dict], seed: int, rollout: list[Tensor] | None = None
 ) -> tuple[dict[str, Tensor], list[Tensor]]:
-    """Run one iteration from ``start`` (see :func:`_state`); return all quantities, and the rollout learned from."""
+    """Run one iteration from a :func:`_state` and worlds; return all quantities, and the rollout learned from."""
     env, storage = runner.env, runner.alg.storage
-    for tensor, value in zip(_state(runner), start, strict=True):
+    state, worlds = start
+    for tensor, value in zip(_state(runner), state, strict=True):
         tensor.copy_(value)
+    env.load_world_state_dict(worlds)
     set_seed(seed)
     env.reset()
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
@@ -129,7 +130,7 @@ def _iterate(
     losses = runner.alg.update()
     for name, network in networks.items():
         result[f"change of {name}"] = parameters_to_vector(network.parameters()).detach() - before[name]
-    result |= {f"loss {name}": torch.tensor([value]) for name, value in losses.items()}
+    result |= {f"loss {name}": torch.tensor([float(value)]) for name, value in losses.items()}
     return result, rollout
 
 

@@ -127,11 +127,11 @@ def settings_page() -> str:
     return "\n".join([SETTINGS_HEAD, *(settings_table(module, name, known) for module, name in CONFIGS)])
 
 
-def help_text(script: Path) -> str:
-    """Return what a script prints for --help."""
+def help_text(script: Path, *words: str) -> str:
+    """Return what a script prints for --help, after other words."""
     output, arguments, path = io.StringIO(), sys.argv, list(sys.path)
     os.environ["COLUMNS"] = "110"
-    sys.argv = [f"scripts/{script.name}", "--help"]
+    sys.argv = [f"scripts/{script.name}", *words, "--help"]
     try:
         with contextlib.redirect_stdout(output), contextlib.suppress(SystemExit):
             runpy.run_path(str(script), run_name="__main__")
@@ -144,6 +144,9 @@ def scripts_page() -> str:
     """Return scripts.md."""
     scripts = [script for script in sorted(SCRIPTS_DIR.glob("*.py")) if script.stem != "__init__"]
     parts = [f"## {script.name}\n\n```text\n{help_text(script)}\n```\n" for script in scripts]
+    plot = SCRIPTS_DIR / "plot.py"
+    for figure in runpy.run_path(str(plot))["FIGURES"]:
+        parts.append(f"## plot.py {figure}\n\n```text\n{help_text(plot, figure)}\n```\n")
     return "\n".join([SCRIPTS_HEAD, *parts])
 
 

@@ -119,7 +119,7 @@ def measure(
         physics, step = time_physics(task, rounds)
         row = summarize(times, physics, step, task.num_envs, train_cfg.runner.num_steps_per_env) | peak
         row |= zip(("build_s", "log_s", "first_iteration_s", "capture_s"), np.diff(marks).tolist(), strict=True)
-        row |= {"startup_s": marks[-1] - marks[0], "compiled_modules": compilation.modules}
+        row |= {"startup_s": marks[-1] - marks[0], "compiled_modules": len(compilation.modules)}
         row |= roofline.work(runner.alg, task.sim, env_cfg.control.decimation)
         if endurance:
             row["endurance"] = measure_endurance(runner, endurance, memory)

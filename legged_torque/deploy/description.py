@@ -1,4 +1,4 @@
-"""Reading, checking and writing ``policy.yaml``, which describes how to run a policy on a robot."""
+"""Reading, checking and writing ``policy.yaml``, the description of how to run a policy on a robot."""
 
 from __future__ import annotations
 
@@ -10,53 +10,20 @@ from typing import Any
 
 import yaml
 
-from legged_torque.utils.config import Dumper, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import LARGEST
+from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 
 DESCRIPTION_FILE = "policy.yaml"
 NETWORK_FILE = "policy.onnx"
 SCHEMA_FILE = Path(__file__).with_name("policy.schema.json")
 FORMAT_VERSION = 1
 
-COMMENTS = {
-    "format_version": "How to run policy.onnx on a robot; docs/deploy.md of legged_torque explains it.",
-    "training": "total_steps: environment steps over all worlds",
-    "robot": "of the training; mass [kg] of all its parts; self_collisions: whether they collided with each other",
-    "network": "one row of observations per robot in, one row of actions out; mean actions, normalization is inside",
-    "joint_order": "order of joints in observations, actions and torques",
-    "nominal_pose": "[rad]",
-    "nominal_trunk_height": "[m] above the ground",
-    "observations": "terms in order, each clip(scale * value); with history_length > 1 the newest step comes first,\n"
-    "and an episode starts with copies of its first step; scan: height of the trunk's origin above the ground at each\n"
-    "y of points_y for each x of points_x [m], level, along the heading; less offset, then clipped to +-limit;\n"
-    "delay: how many control steps old they are, but not older than the episode",
-    "actions": "terms in order; actions are clipped first. Torque: the sum over terms of mixing_weight times\n"
-    "position_residual: stiffness * (nominal_pose + scale * action - q) - damping * qd\n"
-    "torque: scale * action\n"
-    "then clipped to torque_limits; actions of a term with an interval are held for as many control steps, from the\n"
-    "start of an episode on: those in between do not count, nor as last_action",
-    "gains": "stiffness Kp [N m/rad], damping Kd [N m s/rad]",
-    "torque_limits": "[N m]",
-    "joints": "of the robot in training: axis in the trunk's frame where all angles are 0, damping [N m s/rad],\n"
-    "armature [kg m^2], frictionloss [N m]",
-    "timing": "[Hz]; actions hold for decimation physics steps; refresh_torques: torques are computed anew from q and\n"
-    "qd at every physics step, otherwise once per control step",
-    "commands": "[m/s, m/s, rad/s] in the trunk's frame, as trained; resampling_probability per control step; with a\n"
-    "heading [rad], yaw rates are heading_gain [1/s] times what is left to it, inside of ang_vel_yaw",
-    "initial_state": "of an episode in training, drawn uniformly: [m], [rad], [m/s], [rad/s];\n"
-    "trunk_place is added to x and y of trunk_position;\n"
-    "joint positions are nominal_pose times joint_position_scale, then inside the joint limits",
-    "episode": "length [s]; parts of names of geoms whose contact ends an episode",
-    "terrain": "ground of the training, from which its map follows",
-}
-"""Comment above each section of the file."""
-
 
 def read(path: str | Path) -> tuple[dict[str, Any], Path]:
     """Read and check the description of a policy; return it and the file of the network.
 
-    ``path`` is ``policy.yaml``, a network beside it, or the folder of both. A UserError tells what is missing or wrong.
+    ``path`` is ``policy.yaml``, a network in its folder, or that folder. A UserError names what is missing or wrong.
     """
     path = Path(path)
     if not path.exists():
@@ -82,11 +49,11 @@ def read(path: str | Path) -> tuple[dict[str, Any], Path]:
 
 
 def to_yaml(description: dict[str, Any]) -> str:
-    """Return the text of a description, section by section with a comment above each."""
-    parts = []
+    """Return the text of a description, section by section with the schema's comment above each."""
+    parts, sections = [], _schema()["properties"]
     for key, value in description.items():
-        comment = "".join(f"# {line}\n" for line in COMMENTS.get(key, "").splitlines())
-        flow = None if isinstance(value, (dict, list)) else False  # one line for what holds only plain values
+        comment = "".join(f"# {line}\n" for line in sections[key].get("description", "").splitlines())
+        flow = None if isinstance(value, (dict, list)) else False  # plain values on one line
         parts.append(
             comment + yaml.dump({key: value}, Dumper=Dumper, sort_keys=False, width=100, default_flow_style=flow)
         )
@@ -94,7 +61,7 @@ def to_yaml(description: dict[str, Any]) -> str:
 
 
 def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
-    """Check structure, values and how they fit together; a UserError names the first wrong entry, and ``where``."""
+    """Check structure, values and their consistency; a UserError names the first wrong entry, and ``where`` it is."""
     _check_schema(description, where)
     for path, value in _numbers(description):
         if not abs(value) <= LARGEST and not path.startswith("training."):
@@ -108,13 +75,8 @@ def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
 
 
 def interface(description: dict[str, Any]) -> dict[str, str]:
-    """Return what a network's inputs and outputs mean, as texts that are kept with the network, by their keys."""
+    """Return the meaning of a network's inputs and outputs as strings by key, which are stored in the network."""
     return {key: json.dumps(description[key]) for key in ("joint_order", "nominal_pose", "observations", "actions")}
-
-
-def term_names(kind: str) -> list[str]:
-    """Return the names of the terms that a description may have; ``kind`` is "observation" or "action"."""
-    return _schema()["$defs"][f"{kind}_term"]["properties"]["name"]["enum"]
 
 
 def _schema() -> dict[str, Any]:
@@ -128,7 +90,7 @@ def _check_schema(description: Any, where: str) -> None:
         import jsonschema
     except ImportError:
         raise missing_extra("jsonschema") from None
-    draft = jsonschema.Draft202012Validator  # for which 4.0 is an integer, but it cannot count anything here
+    draft = jsonschema.Draft202012Validator  # which would take 4.0 as an integer
     types = draft.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
     validator = jsonschema.validators.extend(draft, type_checker=types)(_schema())
     error = jsonschema.exceptions.best_match(validator.iter_errors(description))
@@ -141,8 +103,7 @@ def _check_schema(description: Any, where: str) -> None:
 def _check_joints(description: dict[str, Any], where: str) -> None:
     """Check that values by joint cover all joints and no others."""
     joints = description["joint_order"]
-    keys = ("nominal_pose", "torque_limits", "joints")  # older files lack the last one
-    by_joint = {key: description[key] for key in keys if key in description}
+    by_joint = {key: description[key] for key in ("nominal_pose", "torque_limits", "joints")}
     by_joint |= {f"gains.{key}": values for key, values in description["gains"].items()}
     for path, values in by_joint.items():
         for name in values:
@@ -154,33 +115,27 @@ def _check_joints(description: dict[str, Any], where: str) -> None:
 
 
 def _check_terms(description: dict[str, Any], where: str) -> None:
-    """Check the sizes of the terms of observations and actions."""
-    num_joints = len(description["joint_order"])
+    """Check the sizes of the terms of observations and actions; terms of a user's task may have any size."""
     observations, actions, network = (description[key] for key in ("observations", "actions", "network"))
-    num_actions = sum(term["size"] for term in actions["terms"])
-    sizes = {
-        "joint_position": num_joints,
-        "joint_velocity": num_joints,
-        "last_action": num_actions,
-        "position_phase": 1,
-    }
-    for section, default in ((observations, 3), (actions, num_joints)):
-        names = [term["name"] for term in section["terms"]]
-        for term in section["terms"]:
-            name, size, scan = term["name"], sizes.get(term["name"], default), term.get("scan")
+    num_joints, num_actions = len(description["joint_order"]), sum(term["size"] for term in actions["terms"])
+    sizes = dict.fromkeys(("projected_gravity", "angular_velocity", "command"), 3)
+    sizes |= dict.fromkeys(("joint_position", "joint_velocity", "position_residual", "torque"), num_joints)
+    sizes |= {"last_action": num_actions, "position_phase": 1}
+    for terms in (observations["terms"], actions["terms"]):
+        names = [term["name"] for term in terms]
+        for term in terms:
+            name, scan = term["name"], term.get("scan")
             if (name == "height_scan") != (scan is not None):
                 raise UserError(f"{where}: the term 'height_scan' must have an entry scan, and no other term")
-            if scan:
-                size = len(scan["points_x"]) * len(scan["points_y"])
+            size = len(scan["points_x"]) * len(scan["points_y"]) if scan else sizes.get(name, term["size"])
             if names.count(name) > 1:
                 raise UserError(f"{where}: the term '{name}' occurs more than once")
             if term["size"] != size:
                 raise UserError(f"{where}: the term '{name}' must have size {size}, not {term['size']}")
             if isinstance(term["scale"], list) and len(term["scale"]) != size:
                 raise UserError(f"{where}: the term '{name}' must have one scale or {size}, not {len(term['scale'])}")
-    now = sum(term["size"] for term in observations["terms"])
-    expected = {"num_observations": now * observations["history_length"], "num_actions": num_actions}
-    for key, value in expected.items():
+    num_observations = sum(term["size"] for term in observations["terms"]) * observations["history_length"]
+    for key, value in {"num_observations": num_observations, "num_actions": num_actions}.items():
         if network[key] != value:
             raise UserError(f"{where}: network.{key} is {network[key]}, but the terms have {value} numbers")
 

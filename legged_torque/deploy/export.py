@@ -1,4 +1,4 @@
-"""Writes the files that a robot needs from a checkpoint: ``policy.onnx``, ``policy.pt`` and ``policy.yaml``."""
+"""Export of a checkpoint for a robot: ``policy.onnx``, ``policy.pt`` and ``policy.yaml``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import importlib.util
 import os
-import shutil
 import tempfile
 import warnings
 from collections.abc import Sequence
@@ -26,13 +25,14 @@ from legged_torque.deploy.description import (
     check,
     interface,
     missing_extra,
-    term_names,
     to_yaml,
 )
-from legged_torque.deploy.policy import Policy, State
+from legged_torque.deploy.policy import Policy, State, load_network, parts_without_function
 from legged_torque.envs.base.commands import HEADING_GAIN
-from legged_torque.envs.base.height_scan import CLIP, OFFSET
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.motors.ideal import IdealMotor
+from legged_torque.motors.motor import Motor
+from legged_torque.sensors.height_scan import CLIP, OFFSET
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.runs import package_versions
@@ -47,7 +47,7 @@ INITIAL_STATE = {
     "trunk_angular_velocity": "init_ang_vel",
     "joint_velocity": "init_dof_vel",
 }
-"""Which of the task's settings each entry of ``initial_state`` is."""
+"""The setting in ``domain_rand`` of each entry of ``initial_state``."""
 TOLERANCE = 1e-5  # largest difference between an exported number and the task's; relative for numbers larger than 1
 SCAN_TOLERANCE = 1e-3  # the same for the height scan: at a wall, rounding of a place is a hundred times as large
 
@@ -56,12 +56,18 @@ def nominal_cfg(cfg: Any) -> Any:
     """Turn off all randomization in a task's settings, in place, for :func:`export_policy`."""
     cfg.env.num_envs = 4
     cfg.domain_rand.randomize_parameters = cfg.domain_rand.push_robots = cfg.noise.add_noise = False
-    cfg.domain_rand.action_delay = [0, 0]
+    cfg.motors.delay.range = [0, 0]
     return cfg
 
 
-def export_policy(task: LeggedRobot, model: MLPModel, folder: Path, name: str, training: dict[str, Any]) -> float:
+def export_policy(
+    task: LeggedRobot, model: MLPModel, folder: Path, name: str, training: dict[str, Any]
+) -> tuple[float, list[str]]:
     """Write a policy with everything that is needed to run it, and check the files.
+
+    The networks of any task are exported. What the task computes otherwise than
+    :class:`~legged_torque.deploy.policy.Policy` would is listed in the section ``unsupported`` of ``policy.yaml``; a
+    file with such a list is refused where it would be run without the task.
 
     Args:
         task: The task, with settings of :func:`nominal_cfg` and the counters of the checkpoint. Its state is changed.
@@ -71,49 +77,41 @@ def export_policy(task: LeggedRobot, model: MLPModel, folder: Path, name: str, t
         training: "run", "checkpoint", "iterations" and "total_steps" of the policy.
 
     Returns:
-        Largest difference between the exported networks and the model.
+        Largest difference between the exported networks and the model, and what is unsupported.
 
     Raises:
-        UserError: If ``policy.yaml`` cannot describe the policy, or a package is missing.
+        UserError: If the network has memory or reads other observations than those of the policy, or a package is
+            missing.
     """
     for package in ("onnx", "onnxruntime", "jsonschema"):
         if importlib.util.find_spec(package) is None:
             raise missing_extra(package)
     if model.is_recurrent or list(model.obs_groups) != ["policy"]:
         raise UserError("only policies without memory that read the observation group 'policy' can be exported")
-    check_terms(task)
     description = describe(task, name, training)
     folder.parent.mkdir(parents=True, exist_ok=True)
     if folder.exists() and not folder.is_dir():
         raise UserError(f"'{folder}' is not a folder")
-    part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
+        part = Path(temporary)
         write_networks(model, part, interface(description))
         description["network"]["sha256"] = hashlib.sha256((part / NETWORK_FILE).read_bytes()).hexdigest()
         check(description)
-        (part / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
-        policy = Policy(part)
-        difference = check_networks(model, policy, part)
-        check_task(task, policy)
-        _move(part, folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return difference
-
-
-def check_terms(task: LeggedRobot) -> None:
-    """Raise a UserError at the first term that :class:`~legged_torque.deploy.policy.Policy` cannot compute."""
-    for kind, terms in (("observation", task.observations.policy_terms()), ("action", task.action_terms())):
-        known = term_names(kind)
-        for name in [term.name for term in terms]:
-            if name not in known:
-                raise UserError(f"{DESCRIPTION_FILE} has no {kind} term '{name}'; it has {', '.join(known)}")
+        difference = check_networks(model, load_network(part / NETWORK_FILE, description), part)
+        _write(description, part)
+        unknown = parts_without_function(description) + motors_without_description(task)
+        description["unsupported"] = unknown or differences(task, Policy(part))
+        _write(description, part)
+        folder.mkdir(exist_ok=True)
+        for file in (NETWORK_FILE, TORCHSCRIPT_FILE, DESCRIPTION_FILE):
+            os.replace(part / file, folder / file)
+    return difference, description["unsupported"]
 
 
 def write_networks(model: MLPModel, folder: Path, meaning: dict[str, str]) -> None:
     """Write the mean policy as ONNX and TorchScript, normalization of observations included.
 
-    The ONNX network keeps its :func:`~legged_torque.deploy.description.interface`, the ``meaning``.
+    The ONNX network stores its :func:`~legged_torque.deploy.description.interface`, the ``meaning``.
     """
     import onnx
 
@@ -148,6 +146,7 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
     return {
         "format_version": FORMAT_VERSION,
         "task": name,
+        "unsupported": [],
         "robot": {"name": file.stem, "file": file.as_posix(), "trunk": model.body(1).name}
         | {"mass": round(float(model.body_mass.sum()), 6), "self_collisions": asset.self_collisions},
         "versions": package_versions() | {"legged_torque": __version__},
@@ -161,6 +160,7 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
         "actions": {"clip": [-clip, clip], "terms": _action_terms(task)},
         "gains": {"stiffness": _by_joint(task, task.p_gains[0]), "damping": _by_joint(task, task.d_gains[0])},
         "torque_limits": _by_joint(task, task.torque_limits.T),
+        "motors": task.motors.describe(),
         "joints": _joints(task),
         "timing": {
             "control_frequency": 1.0 / task.dt,
@@ -173,6 +173,7 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
         | ({"heading": list(ranges.heading), "heading_gain": HEADING_GAIN} if cfg.commands.heading_command else {}),
         "initial_state": {"trunk_position": list(cfg.init_state.pos)}
         | {name: list(getattr(cfg.domain_rand, setting)) for name, setting in INITIAL_STATE.items()},
+        "pushes": {"set_factor": cfg.domain_rand.push_set_factor},
         "episode": {"length": cfg.env.episode_length_s, "ends_on_contact_of": list(asset.terminate_after_contacts_on)},
         **({"terrain": dataclasses.asdict(Layout.of(cfg.terrain))} if is_rough else {}),
     }
@@ -197,7 +198,7 @@ def _observation_terms(task: LeggedRobot) -> list[dict[str, Any]]:
 
 
 def _joints(task: LeggedRobot) -> dict[str, Any]:
-    """Return axes and passive forces of the joints, by which other files of the robot are compared with this one."""
+    """Return axes and passive forces of the joints, for comparison with other files of the robot."""
     result = {}
     for name, axis in zip(task.dof_names, task.asset.dof_axes(), strict=True):
         joint = task.sim.mj_model.joint(name)
@@ -218,25 +219,32 @@ def _action_terms(task: LeggedRobot) -> list[dict[str, Any]]:
             "meaning": term.meaning,
             **({"interval": term.interval} if term.interval > 1 else {}),
         }
-        for term in task.action_terms()
+        for term in task.control_law.terms
     ]
 
 
-def check_networks(model: MLPModel, policy: Policy, folder: Path) -> float:
+def motors_without_description(task: LeggedRobot) -> list[str]:
+    """Return a line for each link of the motors that does not say what it does: it may do anything over time."""
+    links = task.motors.links.items()
+    silent = [name for name, link in links if type(link) is not IdealMotor and type(link).describe is Motor.describe]
+    return [f"the motor '{name}' has no describe()" for name in silent]
+
+
+def check_networks(model: MLPModel, session: Any, folder: Path) -> float:
     """Return the largest difference of the exported networks on random observations; too large, it is a UserError."""
     obs = torch.randn(NUM_SAMPLES, model.obs_dim, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         expected = model.as_jit().cpu().eval()(obs).numpy()
         scripted = torch.jit.load(str(folder / TORCHSCRIPT_FILE))(obs).numpy()
-    run = policy.session.run(["actions"], {"obs": obs.numpy()})[0]
+    run = session.run(["actions"], {"obs": obs.numpy()})[0]
     difference = max(_difference(run, expected), _difference(scripted, expected))
     if not difference <= TOLERANCE:
         raise UserError(f"the exported network differs from the checkpoint's by {difference:.3g}; nothing was written")
     return difference
 
 
-def check_task(task: LeggedRobot, policy: Policy) -> None:
-    """Raise a UserError if the exported policy's observations or torques differ from the task's in random states."""
+def differences(task: LeggedRobot, policy: Policy) -> list[str]:
+    """Return which of the exported policy's observations or torques differ from the task's in random states."""
     generator = torch.Generator().manual_seed(0)
 
     def draw(like: Tensor, scale: float) -> Tensor:
@@ -248,16 +256,26 @@ def check_task(task: LeggedRobot, policy: Policy) -> None:
     task.actions.copy_(draw(task.actions, 3.0))
     task.reset_buf.fill_(True)  # the history starts with copies
     task.set_state(qpos, draw(task.sim.qvel, 3.0))
-    task.motors.apply(task._compute_torques(task.actions), task.dof_vel, out=task.torques)
-    for world in range(task.num_envs):
-        for what, difference, tolerance in _differences(task, policy, world):
-            if not difference <= tolerance:
-                why = f"are not what {DESCRIPTION_FILE} can describe: they differ by {difference:.3g}"
-                raise UserError(f"the {what} of {type(task).__name__} {why}")
+    wanted = task._compute_torques(task.actions)
+    task.torques.copy_(task.motors.apply(wanted, task.dof_pos, task.dof_vel, 0))
+    obs, torques = map(np.array, zip(*(_computed(task, policy, world) for world in range(task.num_envs)), strict=True))
+    expected = task.obs_buf["policy"].cpu().numpy()
+    columns = task.observations.policy_columns("height_scan") if policy.scan else []
+    compared = [
+        ("observations", np.delete(obs, columns, axis=1), np.delete(expected, columns, axis=1), TOLERANCE),
+        ("heights of the scan", obs[:, columns], expected[:, columns], SCAN_TOLERANCE),
+        ("torques", torques, task.torques.cpu().numpy(), TOLERANCE),
+    ]
+    found = [(name, _difference(ours, theirs), tolerance) for name, ours, theirs, tolerance in compared]
+    return [
+        f"the {name} of {type(task).__name__} differ by {difference:.3g} from those of the terms in policy.yaml"
+        for name, difference, tolerance in found
+        if not difference <= tolerance
+    ]
 
 
-def _differences(task: LeggedRobot, policy: Policy, world: int) -> list[tuple[str, float, float]]:
-    """Return what a policy computes otherwise than a world of the task: its name, how much, and how much it may."""
+def _computed(task: LeggedRobot, policy: Policy, world: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a policy's observations and torques in the state of one world. Shapes: (observations,), (joints,)."""
     parts = (task.base_ang_vel, task.dof_pos, task.dof_vel, task.projected_gravity, task.base_pos, task.base_quat)
     *measured, position, quat = (part[world].cpu().numpy() for part in parts)
     points = np.pad(policy.scan_places(position, quat), [(0, 0), (0, 1)], constant_values=position[2])
@@ -266,32 +284,17 @@ def _differences(task: LeggedRobot, policy: Policy, world: int) -> list[tuple[st
     policy.reset()
     policy.last_action = actions = task.actions[world].cpu().numpy()
     obs = policy.observation(state, task.commands[world].cpu().numpy())
-    torques = policy.torques(actions, state.joint_positions, state.joint_velocities)
-    expected = task.obs_buf["policy"][world].cpu().numpy()
-    scan = task.observations.policy_columns("height_scan") if len(policy.scan_points) else []
-    seen = [np.delete(numbers, scan) for numbers in (obs, expected)]
-    return [
-        ("observations", _difference(*seen), TOLERANCE),
-        ("heights of the scan", _difference(obs[scan], expected[scan]), SCAN_TOLERANCE),
-        ("torques", _difference(torques, task.torques[world].cpu().numpy()), TOLERANCE),
-    ]
+    return obs, policy.torques(actions, state.joint_positions, state.joint_velocities)
 
 
 def _difference(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Return the largest difference, relative where numbers are larger than 1; infinite for other sizes."""
-    if ours.shape != theirs.shape:
-        return float("inf")
+    """Return the largest difference, relative where numbers are larger than 1."""
     return float((np.abs(ours - theirs) / np.maximum(np.abs(theirs), 1.0)).max(initial=0.0))
 
 
-def _move(part: Path, folder: Path) -> None:
-    """Move a finished folder to its place, or its files into an existing folder, the description last."""
-    part.chmod(0o755)
-    if not folder.exists():
-        os.replace(part, folder)
-        return
-    for name in (NETWORK_FILE, TORCHSCRIPT_FILE, DESCRIPTION_FILE):
-        os.replace(part / name, folder / name)
+def _write(description: dict[str, Any], folder: Path) -> None:
+    """Write ``policy.yaml``."""
+    (folder / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
 
 
 def _by_joint(task: LeggedRobot, values: Tensor) -> dict[str, Any]:
@@ -300,5 +303,5 @@ def _by_joint(task: LeggedRobot, values: Tensor) -> dict[str, Any]:
 
 
 def _plain(values: Tensor) -> Any:
-    """Return a float32 tensor as nested lists of the shortest decimals that stand for its numbers."""
+    """Return a float32 tensor as nested lists of the shortest decimals that round to its numbers."""
     return [_plain(value) for value in values] if values.dim() else float(str(values.detach().cpu().numpy()))

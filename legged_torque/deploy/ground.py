@@ -1,4 +1,4 @@
-"""The ground of a policy's training in plain MuJoCo, and how high any ground is."""
+"""The ground of a policy's training in plain MuJoCo, and heights of any ground."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.selection import COLUMNS, named_kinds, rising_levels, select_tiles
 from legged_torque.utils.config import update_from_dict
 
-_ABOVE = 100.0  # [m] height from which one looks down on the ground
+_ABOVE = 100.0  # height from which rays look down on the ground [m]
 
 
 def select_ground(description: dict[str, Any], settings: Any, kinds: Sequence[str], levels: Sequence[float]) -> None:
-    """Change the ground of ``policy.yaml`` to tiles of some kinds at some difficulties, those of training without any.
+    """Change the ground of ``policy.yaml`` to tiles of some kinds at some difficulties, by default those of training.
 
-    Of ``settings``, a section ``terrain``, a policy of a plane takes the size of tiles and all else; they are changed.
+    A policy of a plane takes everything else, such as the size of tiles, from ``settings``, a section ``terrain`` that
+    is changed.
     """
     update_from_dict(settings, {**description.get("terrain", {}), "terrain_proportions": {}})
     select_tiles(settings, named_kinds(kinds), rising_levels(levels), COLUMNS)
@@ -29,10 +30,10 @@ def select_ground(description: dict[str, Any], settings: Any, kinds: Sequence[st
 
 
 def place_ground(spec: mujoco.MjSpec, description: dict[str, Any], notes: list[str]) -> np.ndarray:
-    """Put the ground of ``policy.yaml`` into an MJCF, in place of its plane, and return where robots may start.
+    """Put the ground of ``policy.yaml`` into an MJCF in place of its plane, and return where robots may start.
 
-    An MJCF with other ground than one plane keeps its own. What is added or kept is told in ``notes``. A UserError if
-    there can be no such ground. Returns the middles of all tiles, or the origin. Shape: (tiles, 3) [m].
+    An MJCF with other ground than one plane keeps its own. Adds to ``notes`` what is added or kept. Returns the middles
+    of all tiles, or the origin. Shape: (tiles, 3) [m]. A UserError if there can be no such ground.
     """
     grounds = [geom for geom in spec.worldbody.geoms if geom.contype or geom.conaffinity]
     if not grounds:
@@ -53,9 +54,9 @@ def place_ground(spec: mujoco.MjSpec, description: dict[str, Any], notes: list[s
 
 
 def ground_heights(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return how high the highest of some geoms is at x and y of places; -inf where there is none [m].
+    """Return the height of the highest of some geoms at x and y of places; -inf where there is none [m].
 
-    Shapes: (geoms,) numbers, (places, 2) [m], (places,). The geoms' places must be known in ``data``.
+    Shapes: (geoms,) numbers, (places, 2) [m], (places,). ``data`` must have the geoms' positions.
     """
     heights = np.full(len(places), -np.inf)
     for i, (x, y) in enumerate(places):
@@ -67,12 +68,12 @@ def ground_heights(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray
 
 
 def _depth(model: mujoco.MjModel, data: mujoco.MjData, geom: int, point: np.ndarray) -> float:
-    """Return how far a geom is below a point [m]; -1 if it is not."""
+    """Return the distance from a point straight down to a geom [m]; -1 if there is none."""
     kind, down = model.geom_type[geom], np.array([0.0, 0.0, -1.0])
     if kind == mujoco.mjtGeom.mjGEOM_HFIELD:
         return mujoco.mj_rayHfield(model, data, geom, point, down)
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         return mujoco.mj_rayMesh(model, data, geom, point, down)
-    drawn_only = kind == mujoco.mjtGeom.mjGEOM_PLANE  # robots stand on a plane beyond its size, too
-    size = np.zeros(3) if drawn_only else model.geom_size[geom]
+    is_plane = kind == mujoco.mjtGeom.mjGEOM_PLANE  # which is infinite; its size is only drawn
+    size = np.zeros(3) if is_plane else model.geom_size[geom]
     return mujoco.mju_rayGeom(data.geom_xpos[geom], data.geom_xmat[geom], size, point, down, kind)

@@ -1,9 +1,9 @@
-"""Steps of plain MuJoCo, with the contacts of height fields that their surfaces have.
+"""Steps of plain MuJoCo in which contacts with height fields are those of their surfaces, as in training.
 
-MuJoCo lets a geom touch every triangle of a height field that it overlaps, each as if it were a column that stands
-alone. Feet that sink into level ground by a centimetre also touch edges of the columns around them, with normals that
-are tilted by up to 60 degrees, and where they sink deeper, the shortest way out is sideways. A trained A1 hardly walks
-there. So contacts are corrected before the forces are computed.
+In MuJoCo, a geom touches every triangle of a height field that it overlaps, each as if it were a column of its own.
+Feet that sink into level ground by a centimetre also touch edges of the columns around them, with normals tilted by up
+to 60 degrees; where they sink deeper, the shortest way out is sideways. A trained A1 hardly walks there. Corrected
+contacts follow the same law as training's, so on rough ground they are no independent evidence.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import math
 import mujoco
 import numpy as np
 
-ALIKE = math.cos(math.radians(2.6))  # cosine of the angle up to which two normals are of one face, as in training
-_ABOVE = 10.0  # [m] from how far above a place one looks down on it
+SAME_FACE = math.cos(math.radians(2.6))  # least cosine between normals of one face, as in training
+_ABOVE = 10.0  # height over a place from which rays look down on it [m]
 
 
 def step(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Do what ``mj_step`` does, with corrected contacts of height fields; with these, RK4 counts as Euler."""
+    """Do what ``mj_step`` does, with corrected contacts of height fields; RK4 becomes Euler where there are any."""
     if not model.nhfield:
         mujoco.mj_step(model, data)
         return
@@ -52,7 +52,7 @@ def correct_contacts(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
 def _push_out(
     contacts: list[mujoco.MjContact], spheres: np.ndarray, under: list[tuple[float, np.ndarray]], radius: float
 ) -> None:
-    """Let spheres of which one has its centre below the surface touch the triangles that are under or over them."""
+    """Replace the contacts of spheres, one of which has its centre below the surface, by those with its triangles."""
     distances = [depth * normal[2] - radius for depth, normal in under]
     touching = [i for i in np.argsort(distances) if distances[i] < 0.0]
     for contact, i in zip(contacts, touching, strict=False):
@@ -65,10 +65,10 @@ def _push_out(
 
 
 def _drop_ghosts(model: mujoco.MjModel, data: mujoco.MjData, hfield: int, contacts: list[mujoco.MjContact]) -> None:
-    """Take out contacts of a geom that the surface does not have; the deepest is the first of them.
+    """Exclude contacts of a geom that the whole surface does not have; the first is the deepest.
 
-    The deepest is with the nearest point of the whole surface, and stays. Others stay where they are with the face of a
-    triangle, not with its edge; of a sphere's, one for each direction.
+    The deepest is with the nearest point of the surface, and stays. Others stay if they are with the face of a
+    triangle, not with its edge; a sphere keeps one for each direction.
     """
     deepest, *others = contacts
     kept = [deepest.frame[:3]]
@@ -77,14 +77,14 @@ def _drop_ghosts(model: mujoco.MjModel, data: mujoco.MjData, hfield: int, contac
         normal = contact.frame[:3]
         on_surface = contact.pos - 0.5 * contact.dist * normal  # contacts are half-way between the surfaces
         _, face = _surface(model, data, hfield, on_surface)
-        if normal @ face < ALIKE or (is_sphere and any(normal @ other > ALIKE for other in kept)):
+        if normal @ face < SAME_FACE or (is_sphere and any(normal @ other > SAME_FACE for other in kept)):
             contact.exclude = 1
         else:
             kept.append(normal)
 
 
 def _spheres(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
-    """Return the centres of the spheres at the ends of a sphere or capsule; none of other geoms. Shape: (n, 3) [m]."""
+    """Return the centres of the spheres at the ends of a sphere or capsule; none for other geoms. Shape: (n, 3) [m]."""
     kind, centre = model.geom_type[geom], data.geom_xpos[geom]
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         return centre[np.newaxis]
@@ -95,7 +95,16 @@ def _spheres(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarra
 
 
 def _surface(model: mujoco.MjModel, data: mujoco.MjData, hfield: int, point: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return how high a point is above the surface [m], and the normal there; infinite and upwards beside the map."""
+    """Return the height of a point above the surface [m] and the normal there; infinite and upwards outside the map."""
     normal, above = np.array([0.0, 0.0, 1.0]), point + np.array([0.0, 0.0, _ABOVE])
-    way = mujoco.mj_rayHfield(model, data, hfield, above, np.array([0.0, 0.0, -1.0]), normal)
-    return (way - _ABOVE, normal) if way >= 0.0 else (math.inf, np.array([0.0, 0.0, 1.0]))
+    depth = mujoco.mj_rayHfield(model, data, hfield, above, np.array([0.0, 0.0, -1.0]), normal)
+    return (depth - _ABOVE, normal) if depth >= 0.0 else (math.inf, np.array([0.0, 0.0, 1.0]))
+
+
+STEPS = {"training": step, "mujoco": mujoco.mj_step}
+NOTES = {
+    "training": "contacts with height fields are corrected to those of training, so they are not tested independently; "
+    "--contacts=mujoco leaves MuJoCo's",
+    "mujoco": "contacts with height fields are MuJoCo's own: feet also touch edges inside of level ground",
+}
+"""Physics steps by whose contacts act, and what to say of them."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import numpy as np
 
 from legged_torque.deploy.description import interface, missing_extra, read
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.heading import heading
+from legged_torque.utils.problems import refuse
 
 
 @dataclass
@@ -40,10 +43,14 @@ class Policy:
     Call :meth:`observation` and :meth:`act` once per control step, and :meth:`torques` at every physics step, or once
     if ``refresh_torques`` is false.
 
+    Its terms are computed by :data:`OBSERVATIONS` and :data:`ACTIONS`.
+
     Attributes:
         description: Contents of ``policy.yaml``.
         joint_order: Names of the joints, in the order of all vectors of joints.
         nominal_pose: Shape: (joints,) [rad].
+        stiffness: Gains [N m/rad]. Shape: (joints,).
+        damping: Gains [N m s/rad]. Shape: (joints,).
         torque_limits: Lowest and highest torques. Shape: (2, joints) [N m].
         scan: Entry ``scan`` of the observations; None if the policy does not see the ground.
         scan_points: Where the height scan measures: x along the trunk's heading and y to its left, from the trunk's
@@ -56,24 +63,26 @@ class Policy:
         """Load a policy.
 
         Args:
-            path: ``policy.yaml``, ``policy.onnx`` beside it, or the folder of both.
+            path: ``policy.yaml``, ``policy.onnx`` in the same folder, or that folder.
             dtype: Type of observations, actions and torques: ``np.float32`` as in training, or ``np.float64``.
 
         Raises:
-            UserError: If a file is missing, damaged or does not fit the other one.
+            UserError: If a file is missing, damaged or does not fit the other one, or a term has no function here.
         """
         self.description, network = read(path)
+        refuse(self.description.get("unsupported", []), f"'{path}' can only be run by its task")
+        refuse(parts_without_function(self.description), f"'{path}'")
         self.dtype = dtype
         self.joint_order: list[str] = self.description["joint_order"]
         self.nominal_pose = self._by_joint(self.description["nominal_pose"])
         self.torque_limits = self._by_joint(self.description["torque_limits"]).T
         gains = self.description["gains"]
-        self._stiffness, self._damping = self._by_joint(gains["stiffness"]), self._by_joint(gains["damping"])
+        self.stiffness, self.damping = self._by_joint(gains["stiffness"]), self._by_joint(gains["damping"])
         self._action_terms = self.description["actions"]["terms"]
         self._intervals = {term["name"]: term.get("interval", 1) for term in self._action_terms}
         self._action_clip = self.description["actions"]["clip"]
         terms = self.description["observations"]["terms"]
-        self._terms = [term["name"] for term in terms]
+        self._observations = [OBSERVATIONS[term["name"]] for term in terms]
         sizes = [term["size"] for term in terms]
         self._scale = np.concatenate([np.full(term["size"], term["scale"], dtype) for term in terms])
         self._clip: np.ndarray = np.repeat(np.array([term["clip"] for term in terms], dtype), sizes, axis=0).T
@@ -96,17 +105,7 @@ class Policy:
         Call it once per control step, since it keeps the history. The command is v_x, v_y [m/s] and the yaw rate
         [rad/s] in the trunk's frame. Shape: (3,).
         """
-        values = {
-            "projected_gravity": state.gravity(),
-            "angular_velocity": state.angular_velocity,
-            "command": command,
-            "joint_position": self._joints(state.joint_positions) - self.nominal_pose,
-            "joint_velocity": self._joints(state.joint_velocities),
-            "last_action": self.last_action,
-            "position_phase": [self._phase("position_residual")],
-            "height_scan": self._height_scan(state.heights),
-        }
-        now = np.concatenate([np.asarray(values[name], self.dtype) for name in self._terms])
+        now = np.concatenate([np.asarray(value(self, state, command), self.dtype) for value in self._observations])
         if now.shape != self._scale.shape:
             raise ValueError(f"a state and a command make {now.size} observations, not {self._scale.size}")
         now = np.clip(now * self._scale, *self._clip)
@@ -125,7 +124,7 @@ class Policy:
         if not np.isfinite(actions).all():  # such actions must not reach a robot
             raise UserError("the network's actions are not finite: check the observations")
         new = np.clip(actions[0], *self._action_clip).astype(self.dtype)
-        is_due = np.repeat([self._phase(name) == 0.0 for name in self._intervals], len(self.joint_order))
+        is_due = np.repeat([self.phase(term["name"]) == 0.0 for term in self._action_terms], len(self.joint_order))
         self.last_action = np.where(is_due, new, self.last_action)
         self._steps += 1
         return self.last_action.copy()
@@ -136,13 +135,11 @@ class Policy:
         Joint positions [rad] and velocities [rad/s] are the present ones. Shapes: (joints,).
         """
         actions = np.asarray(actions, self.dtype).reshape(len(self._action_terms), len(self.joint_order))
+        positions, velocities = self.joints(joint_positions), self.joints(joint_velocities)
         total = np.zeros_like(self.nominal_pose)
         for i, term in enumerate(self._action_terms):
-            torque = self.dtype(term["scale"]) * actions[i]
-            if term["name"] == "position_residual":
-                error = self.nominal_pose + torque - self._joints(joint_positions)
-                torque = self._stiffness * error - self._damping * self._joints(joint_velocities)
-            total += self.dtype(term["mixing_weight"]) * torque
+            torques = ACTIONS[term["name"]](self, self.dtype(term["scale"]) * actions[i], positions, velocities)
+            total += self.dtype(term["mixing_weight"]) * torques
         return np.clip(total, *self.torque_limits)
 
     def scan_places(self, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
@@ -150,21 +147,19 @@ class Policy:
 
         The trunk's position [m] and orientation (w, x, y, z) have shapes (2 or more,), (4,). Shape: (points, 2).
         """
-        w, _, _, z = quaternion
-        norm = max(w * w + z * z, 1e-12)  # 0 upside down, where there is no heading
-        cos, sin = (w * w - z * z) / norm, 2.0 * w * z / norm
+        ahead, left, length = heading(np.asarray(quaternion))
+        cos, sin = ahead / length, left / length
         return np.asarray(position)[:2] + self.scan_points @ np.array([[cos, sin], [-sin, cos]])
 
-    def _height_scan(self, heights: np.ndarray | None) -> np.ndarray:
+    def height_scan(self, heights: np.ndarray | None) -> np.ndarray:
         """Return the height scan for heights above the ground, in the policy's precision. Shapes: (points,) [m]."""
-        if self.scan is None:
-            return np.zeros(0, self.dtype)
+        assert self.scan  # the description has it with the term
         if heights is None or np.shape(heights) != (len(self.scan_points),):
             raise ValueError(f"a state needs {len(self.scan_points)} heights above the ground, at scan_places")
         limit = self.scan["limit"]
         return np.clip(np.asarray(heights, self.dtype) - self.dtype(self.scan["offset"]), -limit, limit)
 
-    def _phase(self, name: str) -> float:
+    def phase(self, name: str) -> float:
         """Return the share of its interval for which the actions of a term have been held; 0: new ones are due."""
         interval = self._intervals.get(name, 1)
         return self._steps % interval / interval
@@ -173,12 +168,49 @@ class Policy:
         """Return values by joint in the policy's order. Shape: (joints, ...)."""
         return np.array([values[name] for name in self.joint_order], self.dtype)
 
-    def _joints(self, values: np.ndarray) -> np.ndarray:
-        """Return one number per joint in the policy's precision. Shape: (joints,)."""
+    def joints(self, values: np.ndarray) -> np.ndarray:
+        """Return one number per joint in the policy's precision; a ValueError for others. Shape: (joints,)."""
         values = np.asarray(values, self.dtype)
         if values.shape != self.nominal_pose.shape:
             raise ValueError(f"there are {self.nominal_pose.size} joints, the array has shape {values.shape}")
         return values
+
+
+OBSERVATIONS: dict[str, Callable[[Policy, State, np.ndarray], Any]] = {
+    "projected_gravity": lambda policy, state, command: state.gravity(),
+    "angular_velocity": lambda policy, state, command: state.angular_velocity,
+    "command": lambda policy, state, command: command,
+    "joint_position": lambda policy, state, command: policy.joints(state.joint_positions) - policy.nominal_pose,
+    "joint_velocity": lambda policy, state, command: policy.joints(state.joint_velocities),
+    "last_action": lambda policy, state, command: policy.last_action,
+    "position_phase": lambda policy, state, command: [policy.phase("position_residual")],
+    "height_scan": lambda policy, state, command: policy.height_scan(state.heights),
+}
+"""Returns the unscaled values of an observation term, by its name.
+
+Exports compare these with the task's. A task with terms of its own may add their functions here and to :data:`ACTIONS`;
+without one, the network is exported, and running it here is refused.
+"""
+
+ACTIONS: dict[str, Callable[[Policy, np.ndarray, np.ndarray, np.ndarray], np.ndarray]] = {
+    "position_residual": lambda policy, scaled, q, qd: (
+        policy.stiffness * (policy.nominal_pose + scaled - q) - policy.damping * qd
+    ),
+    "torque": lambda policy, scaled, q, qd: scaled,
+}
+"""Returns the torques [N m] of an action term for scale times action, q [rad] and qd [rad/s], by the term's name."""
+
+
+def parts_without_function(description: dict[str, Any]) -> list[str]:
+    """Return a line for each term or motor of a description that has no function here; no motor has one."""
+    functions: dict[str, Any] = {"observation": OBSERVATIONS, "action": ACTIONS}
+    terms = [
+        f"no numpy function for the {kind} term '{term['name']}'; there are {', '.join(known)}"
+        for kind, known in functions.items()
+        for term in description[f"{kind}s"]["terms"]
+        if term["name"] not in known
+    ]
+    return terms + [f"no numpy function for the motor '{name}'" for name in description.get("motors", {})]
 
 
 def load_network(file: Path, description: dict[str, Any]) -> Any:
@@ -187,7 +219,7 @@ def load_network(file: Path, description: dict[str, Any]) -> Any:
         import onnxruntime
     except ImportError:
         raise missing_extra("onnxruntime") from None
-    content, expected = file.read_bytes(), description["network"]
+    content, network = file.read_bytes(), description["network"]
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
@@ -195,17 +227,14 @@ def load_network(file: Path, description: dict[str, Any]) -> Any:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has an exception class per kind of damage
         raise UserError(f"'{file}' is not a readable network: {' '.join(str(error).split())[:160]}") from None
-    ends = ("input", session.get_inputs()), ("output", session.get_outputs())
-    sizes = expected["num_observations"], expected["num_actions"]
-    for (kind, nodes), size in zip(ends, sizes, strict=True):
-        if len(nodes) != 1 or nodes[0].name != expected[kind]:
-            raise UserError(f"'{file}' must have one {kind} '{expected[kind]}', not {[node.name for node in nodes]}")
-        if len(nodes[0].shape) != 2 or nodes[0].shape[1] != size:
-            raise UserError(f"'{file}': {kind} '{nodes[0].name}' has shape {nodes[0].shape}, not [batch, {size}]")
-    if hashlib.sha256(content).hexdigest() != expected.get("sha256", hashlib.sha256(content).hexdigest()):
+    ends = [(node.name, node.shape[1:]) for node in (*session.get_inputs(), *session.get_outputs())]
+    expected = [("obs", [network["num_observations"]]), ("actions", [network["num_actions"]])]
+    if ends != expected:
+        raise UserError(f"'{file}' has the input and output {ends}, not {expected}")
+    if hashlib.sha256(content).hexdigest() != network["sha256"]:
         raise UserError(f"'{file}' is not the network that was exported with its policy.yaml (sha256 differs)")
-    kept = session.get_modelmeta().custom_metadata_map  # empty in exports of older versions
+    stored = session.get_modelmeta().custom_metadata_map
     for key, meaning in interface(description).items():
-        if kept.get(key, meaning) != meaning:
+        if stored.get(key) != meaning:
             raise UserError(f"'{file}' was exported with other {key} than those of its policy.yaml, which was changed")
     return session

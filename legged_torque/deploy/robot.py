@@ -1,4 +1,4 @@
-"""The robot of an MJCF file: finds joints, motors and ground, and compares them with ``policy.yaml``."""
+"""The robot of an MJCF file in plain MuJoCo, compared with ``policy.yaml``."""
 
 from __future__ import annotations
 
@@ -10,23 +10,13 @@ import mujoco
 import numpy as np
 
 from legged_torque.deploy import hfield_contacts
-from legged_torque.deploy.differences import axis_signs, joint_notes, policy_limits
 from legged_torque.deploy.ground import ground_heights, place_ground
+from legged_torque.deploy.joints import find_joints
 from legged_torque.deploy.policy import State
-from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.mjcf import (
-    drawing_notes,
-    exclude_self_collisions,
-    loading,
-    motors_of,
-    self_pairs,
-    torque_per_control,
-    torque_range,
-    why_no_motor,
-)
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.mjcf import drawing_notes, exclude_self_collisions, loading, self_pairs
 
 _WARNINGS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-_JOINTS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 class MujocoRobot:
@@ -36,20 +26,27 @@ class MujocoRobot:
         file: The MJCF.
         model: The compiled MJCF, with the policy's time step.
         data: Its state.
-        notes: Differences of the MJCF from ``policy.yaml``, a line each.
+        notes: Differences from the training, a line each.
         trunk: Number of the trunk's body.
         position: The trunk's position in the world, a view of the state like the next ones [m]. Shape: (3,).
         quat: The trunk's orientation (w, x, y, z). Shape: (4,).
         velocity: The trunk's linear velocity in the world [m/s]. Shape: (3,).
         angular_velocity: The trunk's angular velocity in its own frame [rad/s]. Shape: (3,).
+        joints: The policy's joints and motors.
         weight: m g of the whole robot [N].
         origins: Where episodes may start: the middles of the ground's tiles, or the origin [m]. Shape: (places, 3).
     """
 
-    def __init__(self, xml: str | Path, description: dict[str, Any]) -> None:
-        """Load the robot of an MJCF file, with or without a floor; ``description`` are the contents of ``policy.yaml``.
+    def __init__(self, xml: str | Path, description: dict[str, Any], contacts: str = "training") -> None:
+        """Load the robot of an MJCF file.
 
-        A UserError if the file cannot be read, or lacks a joint or a motor that the policy needs.
+        Args:
+            xml: The file, with or without a floor.
+            description: Contents of ``policy.yaml``.
+            contacts: Whose contacts with height fields act, "training" or "mujoco".
+
+        Raises:
+            UserError: If the file cannot be read, or lacks a joint or a motor that the policy needs.
         """
         self.notes: list[str] = []
         self.file = Path(xml)
@@ -59,12 +56,17 @@ class MujocoRobot:
         if not np.isclose(old, step, rtol=1e-6):
             self.notes.append(f"time step: the MJCF has {old:g} s, policy.yaml's {step:g} s is used")
         self.model.opt.timestep = step
+        self._step = hfield_contacts.STEPS[contacts]
+        if self.model.nhfield:
+            self.notes.append(hfield_contacts.NOTES[contacts])
         self._find_root()
-        self._find_joints(description)
-        self.notes += joint_notes(self.model, self._joint_ids, description)
-        self._find_motors(description)
+        self.joints = find_joints(self.model, description)
+        self.notes += self.joints.notes
+        others = self.model.nu - len(self.joints.motors)
+        if others:
+            self.notes.append(f"{others} motors of the MJCF are not driven by the policy and get 0")
         self._find_geoms(description["episode"]["ends_on_contact_of"])
-        collides = description["robot"].get("self_collisions", False)
+        collides = description["robot"]["self_collisions"]
         self._is_felt = self._is_ground | (collides & (self.model.body_rootid[self.model.geom_bodyid] == self.trunk))
         self.weight = float(self.model.body_mass.sum() * np.linalg.norm(self.model.opt.gravity))
 
@@ -77,20 +79,20 @@ class MujocoRobot:
 
     def joint_positions(self) -> np.ndarray:
         """Return joint positions. Shape: (joints,) [rad]."""
-        return self._signs * self.data.qpos[self._qpos]
+        return self.joints.signs * self.data.qpos[self.joints.qpos]
 
     def joint_velocities(self) -> np.ndarray:
         """Return joint velocities. Shape: (joints,) [rad/s]."""
-        return self._signs * self.data.qvel[self._dofs]
+        return self.joints.signs * self.data.qvel[self.joints.dofs]
 
     def applied_torques(self) -> np.ndarray:
         """Return the motors' torques in the last physics step. Shape: (joints,) [N m]."""
-        return self._signs * self.data.qfrc_actuator[self._dofs]
+        return self.joints.signs * self.data.qfrc_actuator[self.joints.dofs]
 
     def step(self, torques: np.ndarray) -> None:
         """Advance by one physics step with torques of shape (joints,) [N m]."""
-        self.data.ctrl[self._motors] = torques / self._torque_per_ctrl
-        hfield_contacts.step(self.model, self.data)
+        self.data.ctrl[self.joints.motors] = torques / self.joints.torque_per_control
+        self._step(self.model, self.data)
 
     def planar_velocity(self) -> np.ndarray:
         """Return v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame, as commands are. Shape: (3,)."""
@@ -101,34 +103,38 @@ class MujocoRobot:
     def reset(
         self, position: np.ndarray, quat: np.ndarray, joint_positions: np.ndarray, velocities: tuple[np.ndarray, ...]
     ) -> None:
-        """Put the robot into a state, everything else as in the MJCF; joint positions are brought inside their limits.
+        """Put the robot into a state, everything else as in the MJCF.
 
-        Position [m], quaternion (w, x, y, z), and of ``velocities`` the linear one (world) [m/s] and the angular one
-        (trunk) [rad/s], are the trunk's; the third of ``velocities`` is that of the joints. Shape: (joints,) [rad/s].
+        Args:
+            position: Of the trunk [m]. Shape: (3,).
+            quat: Orientation of the trunk (w, x, y, z). Shape: (4,).
+            joint_positions: Clipped to the joint limits [rad]. Shape: (joints,).
+            velocities: Linear velocity of the trunk in the world [m/s], angular velocity in its own frame [rad/s],
+                and velocities of the joints [rad/s]. Shapes: (3,), (3,), (joints,).
         """
         mujoco.mj_resetData(self.model, self.data)
         self.position[:], self.quat[:] = position, quat
-        self.data.qpos[self._qpos] = self._signs * np.clip(joint_positions, *self._joint_limits)
+        self.data.qpos[self.joints.qpos] = self.joints.signs * np.clip(joint_positions, *self.joints.limits)
         self.velocity[:], self.angular_velocity[:] = velocities[:2]
-        self.data.qvel[self._dofs] = self._signs * velocities[2]
+        self.data.qvel[self.joints.dofs] = self.joints.signs * velocities[2]
         mujoco.mj_kinematics(self.model, self.data)  # places the ground
 
     # ---- the ground --------------------------------------------------------------------------------------------------
 
     def ground_heights(self, places: np.ndarray) -> np.ndarray:
-        """Return how high the ground is at x and y of places, -inf where there is none. Shapes: (n, 2), (n,) [m]."""
+        """Return heights of the ground at x and y of places, -inf where there is none. Shapes: (n, 2), (n,) [m]."""
         return ground_heights(self.model, self.data, self._grounds, places)
 
     def height(self) -> float:
-        """Return how high the trunk's origin is above the ground under it; infinite where there is none [m]."""
+        """Return the height of the trunk's origin above the ground; infinite where there is none [m]."""
         return float(self.position[2] - self.ground_heights(self.position[np.newaxis, :2])[0])
 
     # ---- contacts ----------------------------------------------------------------------------------------------------
 
     def has_fallen(self) -> bool:
-        """Return whether a geom that ends an episode touched something in the last step, or the state diverged.
+        """Return whether a geom that ends episodes touched the ground or another part of the robot in the last step.
 
-        That is the ground or another part of the robot. A robot that has left the ground's edge has fallen, too.
+        A robot has also fallen if it has left the ground, or its state has diverged.
         """
         if any(self.data.warning[kind].number for kind in _WARNINGS) or math.isinf(self.height()):
             return True
@@ -145,7 +151,7 @@ class MujocoRobot:
     def _contacts(self) -> list[tuple[int, int, float]]:
         """Return number, geom of the robot, and the force's sign on it, of each contact with the ground.
 
-        Those between parts of the robot are there as well, twice each, if these collided in training.
+        Contacts between parts of the robot are included, twice each, if these collided in training.
         """
         result = []
         for number, contact in enumerate(self.data.contact):
@@ -158,18 +164,18 @@ class MujocoRobot:
     # ---- reading the MJCF --------------------------------------------------------------------------------------------
 
     def _load(self, file: Path, description: dict[str, Any]) -> tuple[mujoco.MjModel, np.ndarray]:
-        """Compile the file with the policy's ground, and return it with the places where episodes may start."""
+        """Compile the file with the policy's ground; return it with the places where episodes may start."""
         with loading(file):
             spec = mujoco.MjSpec.from_file(str(file))
             self.notes += drawing_notes(spec)
             origins = place_ground(spec, description, self.notes)
             model = spec.compile()
-            collided, pairs = description["robot"].get("self_collisions", True), len(self_pairs(model))
+            collided, pairs = description["robot"]["self_collisions"], len(self_pairs(model))
             if pairs and not collided:
                 exclude_self_collisions(spec, model)
                 model = spec.compile()
                 self.notes.append(f"{pairs} pairs of parts that the MJCF lets collide do not, as in training")
-            if "self_collisions" in description["robot"] and collided and not pairs:
+            if collided and not pairs:
                 self.notes.append("parts of the robot collided with each other in training, those of the MJCF do not")
             return model, origins
 
@@ -183,51 +189,8 @@ class MujocoRobot:
         self.position, self.quat = qpos[:3], qpos[3:]
         self.velocity, self.angular_velocity = qvel[:3], qvel[3:]
 
-    def _find_joints(self, description: dict[str, Any]) -> None:
-        """Find the policy's joints by name, and which of them turn about an axis that points the other way."""
-        joint_order = description["joint_order"]
-        model, problems = self.model, list[str]()
-        names = {model.joint(i).name: i for i in range(model.njnt) if model.jnt_type[i] in _JOINTS}
-        for name in joint_order:
-            if name not in names:
-                problems.append(str(unknown_name("joint of the policy in the MJCF", name, names)))
-        _refuse(problems)
-        self._joint_ids = np.array([names[name] for name in joint_order])
-        self._qpos, self._dofs = model.jnt_qposadr[self._joint_ids], model.jnt_dofadr[self._joint_ids]
-        self._signs = axis_signs(model, self._joint_ids, description)
-        self._joint_limits = policy_limits(model, self._joint_ids, self._signs)
-
-    def _find_motors(self, description: dict[str, Any]) -> None:
-        """Find the motor of each joint by its transmission, and compare its limits with the policy's."""
-        model, motors, problems = self.model, list[int](), list[str]()
-        different: dict[tuple[tuple[float, float], tuple[float, float]], list[str]] = {}
-        for name, joint, sign in zip(description["joint_order"], self._joint_ids, self._signs, strict=True):
-            found = motors_of(model, joint)
-            reason = why_no_motor(model, found[0]) if len(found) == 1 else ""
-            if len(found) != 1:
-                problems.append(f"the MJCF must have one motor for the joint '{name}', it has {len(found)}")
-            elif reason:
-                problems.append(
-                    f"the MJCF's actuator of the joint '{name}' must be a motor, ctrl its torque; it {reason}"
-                )
-            else:
-                motors.append(found[0])
-                low, high = sorted(sign * limit for limit in torque_range(model, found[0]))
-                if not np.allclose((low, high), description["torque_limits"][name], rtol=1e-4):
-                    different.setdefault(((low, high), tuple(description["torque_limits"][name])), []).append(name)
-        _refuse(problems)
-        self._motors = np.array(motors)
-        self._torque_per_ctrl = self._signs * [torque_per_control(model, motor) for motor in motors]
-        for (limits, expected), names in different.items():
-            self.notes.append(
-                f"motor limits: the MJCF has {limits[0]:g} to {limits[1]:g} N m, policy.yaml {expected[0]:g} to "
-                f"{expected[1]:g} N m; the tighter ones act ({', '.join(names)})"
-            )
-        if model.nu > len(motors):
-            self.notes.append(f"{model.nu - len(motors)} motors of the MJCF are not driven by the policy and get 0")
-
     def _find_geoms(self, ends_on_contact_of: list[str]) -> None:
-        """Find the ground, and the geoms whose contact with it ends an episode: by name, or those of the trunk."""
+        """Find the ground and the geoms whose contact ends an episode: by parts of names, else those of the trunk."""
         model = self.model
         self._is_ground = model.body_weldid[model.geom_bodyid] == 0
         (self._grounds,) = np.nonzero(self._is_ground & (model.geom_contype | model.geom_conaffinity != 0))
@@ -242,9 +205,3 @@ class MujocoRobot:
             self.notes.append(f"no geom's name contains {missing}: those of '{trunk}' end an episode")
             is_ending = model.geom_bodyid == self.trunk
         self._is_ending = is_ending
-
-
-def _refuse(problems: list[str]) -> None:
-    """Raise a UserError with all problems of a MJCF in one line, if there are any."""
-    if problems:
-        raise UserError("; ".join(problems))

@@ -13,9 +13,10 @@ import numpy as np
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.heading import heading
 from legged_torque.utils.metrics import NUM_SUMS, step_sums
 
-PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one
+PUSH_ADDED = 0.5  # share of pushes that add a velocity, as in training; the others set one
 
 
 @dataclass
@@ -23,14 +24,20 @@ class Events:
     """Commands and pushes."""
 
     command: tuple[float, float, float] | None = None  # fixed, [m/s, m/s, rad/s]; None draws them as in training
-    push_velocity: float = 0.0  # pushes draw each axis of the trunk's velocity from -this to this [m/s]
+    push_velocity: float = 0.0  # largest draw of each axis of a push's velocity, either way [m/s]
     push_probability: float = 0.0  # of a push per control step
 
 
 class Simulation:
     """Runs a policy as in evaluation: random initial states and commands, pushes, new episodes.
 
-    On rough ground, all episodes of a run start on one tile, which is drawn.
+    On rough ground, all episodes of a run start on one tile, which is drawn. Pushes that set a velocity set
+    ``pushes.set_factor`` of ``policy.yaml`` times the draw, as in training. Exports that do not name the factor are
+    simulated with 1.0, and a note says so.
+
+    Attributes:
+        command: Present v_x, v_y [m/s] and yaw rate [rad/s]. Shape: (3,).
+        notes: Differences from the training, a line each.
     """
 
     def __init__(self, policy: Policy, robot: MujocoRobot, events: Events) -> None:
@@ -47,7 +54,13 @@ class Simulation:
         self._resampling_probability = commands["resampling_probability"]
         self._headings, self._heading_gain = commands.get("heading"), commands.get("heading_gain", 0.0)
         self._scan_delay = policy.scan["delay"] if policy.scan else 0
-        self.command = np.zeros(3)  # the present one
+        self._push_set_factor = description.get("pushes", {}).get("set_factor", 1.0)
+        self.notes: list[str] = []
+        if events.push_probability and "pushes" not in description:
+            self.notes.append(
+                "pushes: policy.yaml does not name pushes.set_factor, so 1.0 is taken; trainings have 1.1 by default"
+            )
+        self.command = np.zeros(3)
         self._steps, self._heights = 0, list[np.ndarray]()
 
     def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:
@@ -65,7 +78,7 @@ class Simulation:
         self._new_episode()
         self._follow_heading()
         sums = np.zeros(NUM_SUMS)
-        with np.errstate(over="ignore", invalid="ignore"):  # told below, in one line
+        with np.errstate(over="ignore", invalid="ignore"):  # reported below, in one line
             for _ in range(num_steps):
                 command = self.command.copy()
                 self._control_step()
@@ -109,10 +122,10 @@ class Simulation:
         return step_sums(np, *arrays, tracked=2 if self._headings else 3)[:, 0]
 
     def _push(self) -> None:
-        """Push the trunk: half of the pushes set its velocity, the others add to it."""
+        """Push the trunk: half of the pushes add to its velocity, the others set it."""
         velocity = self.robot.velocity
         drawn = self._rng.uniform(-self.events.push_velocity, self.events.push_velocity, 3)
-        velocity[:] = drawn + velocity if self._rng.random() < PUSH_ADDED else drawn
+        velocity[:] = velocity + drawn if self._rng.random() < PUSH_ADDED else self._push_set_factor * drawn
 
     def _new_episode(self) -> None:
         """Draw an initial state and a command, and reset the policy."""
@@ -122,7 +135,7 @@ class Simulation:
         sizes = {"trunk_linear_velocity": 3, "trunk_angular_velocity": 3, "joint_velocity": num_joints}
         velocities = tuple(self._draw(name, size) for name, size in sizes.items())
         position = start["trunk_position"] + self._origin
-        if any(start.get("trunk_place", ())):
+        if any(start["trunk_place"]):
             position[:2] += self._draw("trunk_place", 2)
         self.robot.reset(position, quaternion(*angles), pose, velocities)
         self.policy.reset()
@@ -138,7 +151,8 @@ class Simulation:
     def _follow_heading(self) -> None:
         """Command the yaw rate that turns the trunk to its heading, if there is one, as in training."""
         if self._headings:
-            left = (self._heading - yaw(self.robot.quat) + math.pi) % (2.0 * math.pi) - math.pi
+            x_ahead, y_ahead, _ = heading(self.robot.quat)
+            left = (self._heading - math.atan2(y_ahead, x_ahead) + math.pi) % (2.0 * math.pi) - math.pi
             self.command[2] = np.clip(self._heading_gain * left, *self._command_range[:, 2])
 
     def _draw(self, name: str, size: int) -> np.ndarray:
@@ -147,17 +161,8 @@ class Simulation:
         return self._rng.uniform(low, high, size)
 
 
-def yaw(quat: np.ndarray) -> float:
-    """Return the angle about the world's z axis by which a trunk with an orientation (w, x, y, z) is turned [rad]."""
-    return 2.0 * math.atan2(quat[3], quat[0])
-
-
 def quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:
     """Return the quaternion (w, x, y, z) of turns about x, then y, then z of the world [rad]. Shape: (4,)."""
-    result = np.array([1.0, 0.0, 0.0, 0.0])
-    for axis, angle in enumerate((roll, pitch, yaw)):
-        turn, product = np.zeros(4), np.zeros(4)
-        mujoco.mju_axisAngle2Quat(turn, np.eye(3)[axis], angle)
-        mujoco.mju_mulQuat(product, turn, result)
-        result = product
+    result = np.zeros(4)
+    mujoco.mju_euler2Quat(result, np.array([roll, pitch, yaw]), "XYZ")
     return result

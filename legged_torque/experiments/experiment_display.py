@@ -1,18 +1,19 @@
-"""What an experiment shows on a terminal while it runs: how many cells are done, and how far each running step is."""
+"""The display of an experiment on a terminal: how many cells are done, and how far each running step is."""
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
+from rich.progress import Task
 from rich.table import Table
 from rich.text import Text
 
-from legged_torque.utils.display import Display, bar
+from legged_torque.utils import display
+from legged_torque.utils.display import Display
 
 
 @dataclass(frozen=True)
@@ -31,23 +32,31 @@ class ExperimentDisplay(Display):
 
     def __init__(self, title: str) -> None:
         """Prepare to show an experiment that is called so."""
-        super().__init__()
-        self._title = title
+        super().__init__("", 1)
+        self._title, self._updated = title, -math.inf
         self._state: tuple[str, float, float | None, Sequence[Row]] = ("", 0.0, None, ())
 
-    def show(self, text: str, share: float, left: float | None, rows: Sequence[Row]) -> None:
-        """Show how far all is, in words and as a share, the time left [s], None if unknown, and what runs."""
-        self._state = text, share, left, rows
-        self.update(line_every=math.inf)
+    def is_due(self) -> bool:
+        """Return whether there is a panel whose state is to be set anew."""
+        return self._live is not None and self._clock() - self._updated >= display.REDRAW_EVERY
 
-    def picture(self) -> RenderableType:
+    def set_state(self, text: str, share: float, left: float | None, rows: Sequence[Row]) -> None:
+        """Set how far all is, in words and as a share, the time left [s], None if unknown, and the steps that run."""
+        self._state, self._updated = (text, share, left, rows), self._clock()
+
+    def update_bar(self) -> Task:
+        """Update the bar, and return its task."""
+        text, share, left, _ = self._state
+        self.bar.update(self._id, completed=share, description=text, left=left)
+        return self.bar.tasks[0]
+
+    def view(self) -> RenderableType:
         """Return the panel."""
-        text, share, left, rows = self._state
         grid = Table(box=None, padding=(0, 2, 0, 0), expand=True, header_style="dim")
         grid.add_column("running", no_wrap=True, overflow="ellipsis", ratio=1)
         for name in ("device", "step", "tracking", "left"):
             grid.add_column(name, no_wrap=True)
-        for row in rows:
+        for row in self._state[3]:
             grid.add_row(*astuple(row))
-        content = Group(bar(text, share, time.monotonic() - self.start, left), grid)
+        content = Group(super().view(), grid)
         return Panel(content, title=Text(self._title, "bold"), title_align="left", border_style="dim")

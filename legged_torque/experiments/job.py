@@ -15,7 +15,7 @@ from typing import BinaryIO, Protocol
 from legged_torque.experiments.experiment_display import Row
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, cell_state, command_of, is_json, step_words
 from legged_torque.experiments.times import read_times, write_times
-from legged_torque.learning.training_display import WHAT, read_tracking
+from legged_torque.learning.training_display import UNIT, read_tracking
 from legged_torque.utils.display import read_progress
 from legged_torque.utils.errors import UserError
 
@@ -134,7 +134,7 @@ class Job:
         if self.state.step == "evaluate":
             return 1.0
         found = read_progress(self.output()[-_LAST_LINES:])
-        if found and found[0] == WHAT:
+        if found and found[0] == UNIT:
             return found[1] / max(found[2], 1)
         return self.state.iterations / (self.state.total or 1)
 
@@ -142,7 +142,7 @@ class Job:
         """Return what is shown of the step, which runs on a device."""
         text = self.output()[-_LAST_LINES:]
         what, done, total, left = read_progress(text) or ("", 0, 1, "")
-        doing = self._step_name if what in ("", WHAT) or self.state.step == "evaluate" else what.partition(",")[0]
+        doing = self._step_name if what in ("", UNIT) or self.state.step == "evaluate" else what.partition(",")[0]
         share = f" {done / max(total, 1):.0%}" if what else ""
         return Row(self.cell.name, device or "waiting", f"{doing}{share}", read_tracking(text), left)
 

@@ -15,9 +15,10 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
 from legged_torque.utils.args import task_file_words
-from legged_torque.utils.config import convert, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.limits import check_value
 from legged_torque.utils.options import Options
+from legged_torque.utils.plain_yaml import parse_yaml
 from legged_torque.utils.runs import (
     checkpoint_number,
     evaluations_file,
@@ -39,6 +40,7 @@ EVALUATION = {"num_envs": 256, "num_steps": 2000}
 """Worlds and control steps of an evaluation, unless the description has others."""
 GROUNDS = {"kinds": ["all"], "levels": [level / 10 for level in range(10)], "num_envs": 40}
 """Which tiles are crossed after training, and by how many robots each, unless the description has others."""
+GROUNDS_TYPES = {"kinds": list[str], "levels": list[float], "num_envs": int}
 ROUGH_GROUND = "rough ground"
 """Stands for the evaluation on :data:`GROUNDS` where others have the name of an environment, which has no space."""
 
@@ -201,7 +203,7 @@ def read_plan(file: Path) -> Matrix:
     for key, value in values["grounds"].items():
         if key not in GROUNDS:
             raise unknown_name("grounds key", str(key), GROUNDS)
-        new = values["grounds"][key] = convert(value, GROUNDS[key], f"grounds.{key}")
+        new = values["grounds"][key] = check_value(f"grounds.{key}", value, GROUNDS_TYPES[key])
         if not new or (isinstance(new, int) and new < 1):
             raise UserError(f"grounds.{key} must hold something, not {value!r}")
     values["grounds"] = values["grounds"] and GROUNDS | values["grounds"]

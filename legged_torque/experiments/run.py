@@ -206,7 +206,7 @@ class ExperimentRun:
         if display.is_due():
             rows = [worker.job.row(worker.name) for worker in self._launcher.workers() if worker.job is not None]
             share = (self._num_done + sum(job.fraction() for job in self._jobs())) / self._num_cells
-            display.show(f"{self._num_done} of {self._num_cells} cells done", share, self._time_left(), rows)
+            display.set_state(f"{self._num_done} of {self._num_cells} cells done", share, self._time_left(), rows)
 
 
 def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:

@@ -1,1 +1,1 @@
-"""From a published MJCF or URDF to a robot of this library: its MJCF and its settings."""
+"""Import of a published MJCF or URDF as a robot of this library: its MJCF and its settings."""

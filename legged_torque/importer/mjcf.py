@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 
 import mujoco
+import numpy as np
 
 from legged_torque.importer.robot import FOOT, Robot
-from legged_torque.importer.shapes import Shape
 
-HEAD = """<!-- {title}: written by scripts/import_robot.py.
-     Source: {file}
-     Changes:
-{notes} -->
-<mujoco model="{name}">
-  <compiler angle="radian" autolimits="true"/>
+SCENE = """
+<mujoco>
+  <compiler angle="radian"/>
   <option timestep="0.005" solver="Newton" cone="pyramidal" integrator="implicitfast" impratio="100"/>
-  <statistic center="0 0 {center}" extent="{extent}"/>
   <visual>
     <global offwidth="1920" offheight="1080" azimuth="140" elevation="-18"/>
     <headlight ambient="0.3 0.3 0.3" diffuse="0.3 0.3 0.3" specular="0.1 0.1 0.1"/>
@@ -32,7 +27,6 @@ HEAD = """<!-- {title}: written by scripts/import_robot.py.
     <material name="rubber" rgba="0.05 0.05 0.05 1" specular="0.1"/>
   </asset>
   <default>
-    <!-- One bit on the floor, one on the robot: the robot meets the floor and never itself. -->
     <geom group="1" contype="0" conaffinity="1" condim="3" friction="1.0 0.005 0.0001" solref="-1000 -80"
           material="body"/>
     <default class="foot">
@@ -41,92 +35,76 @@ HEAD = """<!-- {title}: written by scripts/import_robot.py.
   </default>
   <worldbody>
     <geom name="floor" type="plane" size="0 0 0.05" material="floor" contype="1" conaffinity="0"/>
+    <body>
+      <freejoint name="root"/>
+      <light name="sun" mode="trackcom" pos="1 -1 4" dir="-0.25 0.25 -1" cutoff="89" exponent="0"/>
+      <camera name="track" mode="trackcom" xyaxes="0.7071 0.7071 0 -0.2126 0.2126 0.9537" fovy="40"/>
+    </body>
+  </worldbody>
+</mujoco>
 """
-CAMERA = """{pad}<light name="sun" mode="trackcom" pos="1 -1 4" dir="-0.25 0.25 -1" cutoff="89" exponent="0"/>
-{pad}<camera name="track" mode="trackcom" pos="{x} -{x} {z}" xyaxes="0.7071 0.7071 0 -0.2126 0.2126 0.9537" fovy="40"/>
+"""Everything but the robot's own parts. The robot's geoms touch the floor and never each other."""
+COMMENT = """<!-- {name}: written by scripts/import_robot.py. Its geoms touch the floor and never each other.
+     Source: {file}
+     Changes:
+{notes} -->
 """
-
-
-def _numbers(values: Iterable[float]) -> str:
-    """Return numbers as MJCF, to nine digits; what is as good as 0 is 0."""
-    return " ".join(f"{0.0 if abs(value) < 1e-12 else value:.9g}" for value in values)
-
-
-def _comment(text: str) -> str:
-    """Return a text without the end of a comment, which XML forbids inside of one."""
-    return re.sub("-(?=-)", "- ", text)
+DISTANCE, ELEVATION = 2.5, 1.0  # of the camera along x and -y, and over the trunk; in heights of the trunk
 
 
 def mjcf(robot: Robot) -> str:
-    """Return the text of a robot's MJCF."""
+    """Return the text of a robot's MJCF, with the changes to its source in a comment. Numbers have six digits."""
     model, height = robot.source.model, robot.stance.height
-    notes = "\n".join(f"       - {_comment(note)}" for note in robot.notes)
-    head = HEAD.format(
-        title=robot.name,
-        name=robot.name,
-        file=_comment(ascii(robot.source.file.name)),
-        notes=notes,
-        center=_numbers([round(0.8 * height, 3)]),
-        extent=_numbers([round(2.3 * height, 3)]),
-    )
-    motors = [
-        f'    <motor name="{joint}" joint="{joint}" ctrlrange="{_numbers([-limit, limit])}" '
-        f'forcerange="{_numbers([-limit, limit])}"/>\n'
-        for joint, limit in zip(robot.joints, robot.torques, strict=True)
-    ]
-    pose = _numbers([0, 0, height, 1, 0, 0, 0, *robot.stance.angles.round(4)])
-    return (
-        f"{head}{_body(robot, model, 1, 4)}  </worldbody>\n  <actuator>\n{''.join(motors)}  </actuator>\n"
-        f'  <keyframe>\n    <key name="home" qpos="{pose}"/>\n  </keyframe>\n</mujoco>\n'
-    )
+    spec = mujoco.MjSpec.from_string(SCENE)
+    spec.modelname = robot.name
+    spec.stat.center, spec.stat.extent = [0.0, 0.0, round(0.8 * height, 3)], round(2.3 * height, 3)
+    trunk = spec.worldbody.first_body()
+    trunk.pos = [0.0, 0.0, height]
+    spec.camera("track").pos = np.round([DISTANCE * height, -DISTANCE * height, ELEVATION * height], 2)
+    bodies = {1: trunk}
+    for number in range(2, model.nbody):
+        parent = bodies[int(model.body_parentid[number])]
+        bodies[number] = parent.add_body(pos=model.body_pos[number], quat=model.body_quat[number])
+        _add_joint(robot, bodies[number], int(model.body_jntadr[number]))
+    for number, body in bodies.items():
+        body.name = model.body(number).name or robot.shapes[number][0].name
+        body.mass, body.inertia = model.body_mass[number], model.body_inertia[number]
+        body.ipos, body.iquat, body.explicitinertial = model.body_ipos[number], model.body_iquat[number], True
+        for shape in robot.shapes[number]:
+            default = spec.find_default("foot" if shape.name.endswith(FOOT) else "main")
+            kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.kind.upper()}")
+            geom = body.add_geom(default, name=shape.name, type=kind, pos=shape.pos)
+            geom.size[: len(shape.size)] = shape.size
+            if shape.kind != "sphere":
+                geom.quat = shape.quat
+    for joint, limit in zip(robot.joints, robot.torques, strict=True):
+        motor = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.ctrlrange = motor.forcerange = [-limit, limit]
+    spec.add_key(name="home", qpos=[0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0, *robot.stance.angles])
+    spec.compile()
+    notes = "\n".join(f"       - {_in_comment(note)}" for note in robot.notes)
+    comment = COMMENT.format(name=robot.name, file=_in_comment(ascii(robot.source.file.name)), notes=notes)
+    return comment + spec.to_xml()
 
 
-def _body(robot: Robot, model: mujoco.MjModel, body: int, indent: int) -> str:
-    """Return the text of a body and all that hangs on it."""
-    pad, inner = " " * indent, " " * (indent + 2)
-    name = model.body(body).name or robot.shapes[body][0].name
-    quat = model.body_quat[body]
-    pos = [0, 0, robot.stance.height] if body == 1 else model.body_pos[body]
-    turned = "" if body == 1 or abs(quat[0]) > 1 - 1e-12 else f' quat="{_numbers(quat)}"'
-    lines = [f'{pad}<body name="{name}" pos="{_numbers(pos)}"{turned}>\n']
-    lines.append(
-        f'{inner}<inertial pos="{_numbers(model.body_ipos[body])}" quat="{_numbers(model.body_iquat[body])}" '
-        f'mass="{_numbers([model.body_mass[body]])}"\n{inner}          '
-        f'diaginertia="{_numbers(model.body_inertia[body])}"/>\n'
-    )
-    if body == 1:
-        size = 2.5 * robot.stance.height
-        lines.append(f'{inner}<freejoint name="root"/>\n')
-        lines.append(CAMERA.format(pad=inner, x=_numbers([round(size, 2)]), z=_numbers([round(0.4 * size, 2)])))
-    else:
-        lines.append(f"{inner}{_joint(robot, model, body)}\n")
-    lines += [f"{inner}{_geom(shape)}\n" for shape in robot.shapes[body]]
-    children = [child for child in range(2, model.nbody) if model.body_parentid[child] == body]
-    lines += [_body(robot, model, child, indent + 2) for child in children]
-    return "".join(lines) + f"{pad}</body>\n"
-
-
-def _joint(robot: Robot, model: mujoco.MjModel, body: int) -> str:
-    """Return the text of the joint of a body."""
-    joint = int(model.body_jntadr[body])
-    place, dof = joint - 1, int(model.jnt_dofadr[joint])
-    pos = f' pos="{_numbers(model.jnt_pos[joint])}"' if model.jnt_pos[joint].any() else ""
-    others = {"stiffness": model.jnt_stiffness[joint], "damping": model.dof_damping[dof]}
-    others |= {"frictionloss": model.dof_frictionloss[dof], "ref": model.qpos0[model.jnt_qposadr[joint]]}
-    if model.jnt_stiffness[joint]:
-        others["springref"] = model.qpos_spring[model.jnt_qposadr[joint]]
-    extra = "".join(f' {name}="{_numbers([value])}"' for name, value in others.items() if value)
-    return (
-        f'<joint name="{robot.joints[place]}"{pos} axis="{_numbers(model.jnt_axis[joint])}" '
-        f'range="{_numbers(robot.ranges[place])}" armature="{_numbers([robot.stance.armature[place]])}"{extra}/>'
+def _add_joint(robot: Robot, body: mujoco.MjsBody, number: int) -> None:
+    """Add a joint of the source to a body."""
+    model, place = robot.source.model, number - 1
+    dof, address = int(model.jnt_dofadr[number]), int(model.jnt_qposadr[number])
+    body.add_joint(
+        name=robot.joints[place],
+        pos=model.jnt_pos[number],
+        axis=model.jnt_axis[number],
+        range=robot.ranges[place],
+        armature=robot.stance.armature[place],
+        stiffness=model.jnt_stiffness[number],
+        damping=model.dof_damping[dof],
+        frictionloss=model.dof_frictionloss[dof],
+        ref=model.qpos0[address],
+        springref=model.qpos_spring[address],
     )
 
 
-def _geom(shape: Shape) -> str:
-    """Return the text of a shape."""
-    kind = ' class="foot"' if shape.name.endswith(FOOT) else ""
-    quat = "" if shape.kind == "sphere" else f' quat="{_numbers(shape.quat)}"'
-    return (
-        f'<geom name="{shape.name}"{kind} type="{shape.kind}" size="{_numbers(shape.size)}" '
-        f'pos="{_numbers(shape.pos)}"{quat}/>'
-    )
+def _in_comment(text: str) -> str:
+    """Return a text without the end of a comment, which XML forbids in one."""
+    return re.sub("-(?=-)", "- ", text)

@@ -1,4 +1,4 @@
-"""How a robot stands: its nominal pose, the height of its trunk, and gains that hold it."""
+"""The nominal pose of a robot, the height of its trunk, and gains that hold it."""
 
 from __future__ import annotations
 
@@ -6,19 +6,23 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from mujoco.minimize import least_squares
 
-from legged_torque.importer.legs import Leg, world_shape, zero_pose
+from legged_torque.importer.legs import PITCHING, Leg, lowest_point, zero_pose
 from legged_torque.importer.source import GRAVITY, Source
 
-BANDWIDTH = 4.0  # [Hz] natural frequency of a joint under its gains, with the inertia of the leg below it
+BANDWIDTH = 4.0  # natural frequency of a joint under its gains, with the inertia of the leg below it [Hz]
 DAMPING_RATIO = 0.5  # of the same
-SAG = 0.1  # [rad] by which a joint may give way under the robot's weight
-TIPPING = 2.0  # times the stiffness below which a robot with level trunk tips over its feet, shared by its legs
-BALANCING = 5  # times that both feet of a robot are moved below its center of mass
-MISSED = 0.02  # [m] by which a foot may miss its place
-CROUCH = {False: 0.75, True: 0.95}  # height of hips over feet in stance, of stretched legs'; without and with ankles
-BEND = {False: (0.8, -1.6), True: (-0.4, 0.8)}  # [rad] angles of thigh and knee about y to start from, likewise
-ARMATURE = 0.01 / 33.5  # [kg m^2 per N m] rotor's inertia per torque, that of the A1, where a file has none
+SAG = 0.1  # largest deflection of a joint under the robot's weight [rad]
+TIPPING = 2.0  # multiple of the stiffness below which a robot with level trunk tips over its feet, shared by its legs
+BALANCING = 5  # iterations in which both feet of a biped are moved below its center of mass
+MISSED = 0.02  # distance by which a foot may miss its place [m]
+CROUCH = {False: 0.75, True: 0.95}  # height of hips over feet as a share of stretched legs; without and with soles
+BEND = {False: (0.8, -1.6, 0.0), True: (-0.4, 0.8, 0.0)}
+"""First angles of thigh, knee and ankle about y, for knees that bend backwards and forwards [rad]."""
+UNDECIDED = 0.3  # middle of a knee's range, either way, up to which it bends as the kind of leg suggests [rad]
+LEVELING = 0.3  # weight of a sole's inclination against its distance [m/rad]
+ARMATURE = 0.01 / 33.5  # rotor inertia per torque of the A1, for joints without one [kg m^2 per N m]
 
 
 @dataclass
@@ -30,11 +34,10 @@ class Stance:
     armature: np.ndarray  # [kg m^2]
     stiffness: np.ndarray  # [N m/rad]
     damping: np.ndarray  # [N m s/rad]
-    holding: np.ndarray  # [N m] torques that hold the weight, shared evenly by the feet
 
 
 def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np.ndarray) -> Stance:
-    """Return how a robot stands: in its file's keyframe, otherwise as inverse kinematics finds. Adds notes.
+    """Return how a robot stands: in its file's keyframe, otherwise by inverse kinematics. Adds notes.
 
     ``ranges`` [rad] and ``torques`` [N m] are the joints' limits. Shapes: (joints, 2), (joints,).
     """
@@ -49,7 +52,7 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
             f"{bare.sum()} joints without rotor inertia (armature): assumed 0.01 kg m^2 per 33.5 N m, as on the A1; "
             "put the motor's own there if you know it"
         )
-    lows = [world_shape(data, leg.bodies[-1], leg.foot) for leg in legs]
+    lows = [lowest_point(data, leg.bodies[-1], leg.foot) for leg in legs]
     inertia, holding = _inertias(model, data) + armature, _holding_torques(model, data, legs, lows)
     height = -float(np.mean([low[2] for low in lows]))
     stiffness = np.maximum((2 * np.pi * BANDWIDTH) ** 2 * inertia, np.abs(holding) / SAG)
@@ -58,11 +61,11 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
         joints = model.body_jntadr[leg.bodies] - 1
         stiffness[joints] = np.maximum(stiffness[joints], TIPPING * weight * height / len(legs))
     damping = 2 * DAMPING_RATIO * np.sqrt(stiffness * inertia)
-    return Stance(angles, height, armature, stiffness, damping, holding)
+    return Stance(angles, height, armature, stiffness, damping)
 
 
 def _nominal_pose(source: Source, legs: list[Leg], ranges: np.ndarray) -> np.ndarray:
-    """Return the angles [rad] of the file's keyframe, otherwise those that inverse kinematics finds. Adds notes."""
+    """Return the angles of the file's keyframe, otherwise those of inverse kinematics [rad]. Adds notes."""
     model = source.model
     if source.pose is not None:
         angles = source.pose
@@ -73,9 +76,9 @@ def _nominal_pose(source: Source, legs: list[Leg], ranges: np.ndarray) -> np.nda
         for _ in range(BALANCING if len(legs) == 2 else 1):
             missed = {leg.name: _bend(model, leg, angles, ranges, ahead) for leg in legs}
             data = zero_pose(model, angles)
-            feet = [world_shape(data, leg.bodies[-1], leg.foot)[0] for leg in legs]
+            feet = [lowest_point(data, leg.bodies[-1], leg.foot)[0] for leg in legs]
             ahead += float(data.subtree_com[1][0] - np.mean(feet))
-        share = CROUCH[legs[0].is_walking_on_soles]
+        share = CROUCH[legs[0].has_sole]
         source.notes.append(
             f"nominal pose: inverse kinematics, feet below {'the center of mass' if len(legs) == 2 else 'hips'}, "
             f"legs {share:.0%} stretched"
@@ -87,60 +90,67 @@ def _nominal_pose(source: Source, legs: list[Leg], ranges: np.ndarray) -> np.nda
     if outside:
         source.notes.append(f"the nominal pose was beyond the limits of {', '.join(outside)} and is moved inside")
     low, high = np.ceil(1e3 * ranges[:, 0]) / 1e3, np.floor(1e3 * ranges[:, 1]) / 1e3
-    return np.clip(angles.round(3), low, high)  # as the settings have them, inside the limits
+    return np.clip(angles.round(3), low, high)  # rounded as in the settings, inside the limits
 
 
 def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarray, ahead: float) -> float:
-    """Bend a leg until its foot is below its hip, or ``ahead`` of that [m], and return by how much it missed [m].
+    """Bend a leg until its foot is below its hip, or ``ahead`` of that [m], soles being level.
 
-    Writes the angles of its joints.
+    Writes the angles of the leg's joints. Returns by how much the foot misses its place [m].
     """
-    data = zero_pose(model)
-    joints = np.array([model.body_jntadr[body] for body in leg.bodies])
-    places = [*data.xanchor[joints], world_shape(data, leg.bodies[-1], leg.foot)]
-    pitch = [i for i, joint in enumerate(joints) if abs(data.xaxis[joint][1]) > 0.7]
-    if not pitch:
+    data, body = zero_pose(model), leg.bodies[-1]
+    joints = model.body_jntadr[leg.bodies]
+    pitch = joints[np.abs(data.xaxis[joints, 1]) > PITCHING]
+    if not pitch.size:
         return 0.0
-    links = np.diff([place[::2] for place in places[pitch[0] :]], axis=0)  # in the plane of x and z
-    lengths = CROUCH[leg.is_walking_on_soles] * np.linalg.norm(links, axis=1)
-    if leg.is_walking_on_soles:
-        lengths[-1] = abs(links[-1][1])  # feet stay flat
-    goal = places[pitch[0]] + np.array([ahead, 0, -lengths.sum()])
-    if leg.is_walking_on_soles or len(pitch) == len(joints):  # feet stay beside hips
-        goal[1] = places[-1][1]
-    start, (low, high) = angles[joints - 1], ranges[joints - 1].T
-    knee = joints[pitch[1]] if len(pitch) > 1 else None
-    forwards = leg.is_walking_on_soles
-    if knee is not None:  # knees bend to the side where there is more room
-        middle = np.clip(ranges[knee - 1].mean(), -1.6, 1.6) * np.sign(data.xaxis[knee][1])
-        forwards = middle > 0.3 or (forwards and middle > -0.3)
-    for place, angle in zip(pitch, (*BEND[forwards], 0.0), strict=False):
-        start[place] = angle * np.sign(data.xaxis[joints[place]][1])
-    flat = data.xmat[leg.bodies[-1]].reshape(3, 3).copy()
-    q = np.clip(start, low, high)
-    for _ in range(200):
-        angles[joints - 1] = q
-        data = zero_pose(model, angles)
-        foot = world_shape(data, leg.bodies[-1], leg.foot)
-        jacp, jacr = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-        mujoco.mj_jac(model, data, jacp, jacr, foot, leg.bodies[-1])
-        rows, error = jacp[:, joints + 5], goal - foot
-        if leg.is_walking_on_soles:
-            turned = flat @ data.xmat[leg.bodies[-1]].reshape(3, 3).T
-            lean = 0.5 * np.array(
-                [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
-            )
-            rows, error = np.vstack([rows, 0.3 * jacr[:, joints + 5]]), np.concatenate([error, 0.3 * lean])
-        step = rows.T @ np.linalg.solve(rows @ rows.T + 1e-4 * np.eye(len(rows)), error)
-        before, q = q, np.clip(q + step * 0.2 / max(0.2, np.abs(step).max()), low, high)
-        if np.abs(q - before).max() < 1e-5:
-            break
-    angles[joints - 1] = q
-    return float(np.linalg.norm(goal - foot))
+    goal, level = _goal(data, leg, joints, pitch, ahead), data.xmat[body].reshape(3, 3).copy()
+    low, high = ranges[joints - 1].T
+    angles[pitch[:3] - 1] = _first_bend(data, leg, pitch, ranges)
+
+    def misses(columns: np.ndarray) -> np.ndarray:
+        """Return by how much the foot misses its place [m] and is not level, for each column of angles."""
+        rows = []
+        for q in columns.reshape(len(joints), -1).T:
+            angles[joints - 1] = q
+            data = zero_pose(model, angles)
+            turned = data.xmat[body].reshape(3, 3) @ level.T
+            lean = 0.5 * (turned - turned.T)[[2, 0, 1], [1, 2, 0]]
+            rows.append([*(lowest_point(data, body, leg.foot) - goal), *(LEVELING * leg.has_sole * lean)])
+        return np.transpose(rows)
+
+    start = np.clip(angles[joints - 1], low, high)
+    found, _ = least_squares(start, misses, bounds=(low, high), verbose=0)
+    return float(np.linalg.norm(misses(found)[:3]))
+
+
+def _goal(data: mujoco.MjData, leg: Leg, joints: np.ndarray, pitch: np.ndarray, ahead: float) -> np.ndarray:
+    """Return where the foot of a leg shall be, the trunk being at the origin [m]. Shape: (3,).
+
+    ``pitch`` are those of its joints that turn about y, in ``data`` at angles of 0.
+    """
+    foot = lowest_point(data, leg.bodies[-1], leg.foot)
+    chain = [*data.xanchor[joints[list(joints).index(pitch[0]) :]], foot]
+    links = np.diff([place[::2] for place in chain], axis=0)  # in the plane of x and z
+    lengths = CROUCH[leg.has_sole] * np.linalg.norm(links, axis=1)
+    if leg.has_sole:
+        lengths[-1] = abs(links[-1][1])  # feet stay level
+    goal = chain[0] + np.array([ahead, 0.0, -lengths.sum()])
+    if leg.has_sole or len(pitch) == len(joints):  # which keeps its feet to the side of its hips
+        goal[1] = foot[1]
+    return goal
+
+
+def _first_bend(data: mujoco.MjData, leg: Leg, pitch: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+    """Return angles of the first joints in ``pitch`` to start from [rad]; knees bend to where they have more room."""
+    forwards, signs = leg.has_sole, np.sign(data.xaxis[pitch, 1])
+    if len(pitch) > 1:
+        middle = ranges[pitch[1] - 1].mean() * signs[1]
+        forwards = middle > UNDECIDED or (forwards and middle > -UNDECIDED)
+    return np.array([angle * sign for angle, sign in zip(BEND[forwards], signs, strict=False)])
 
 
 def _inertias(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Return the inertia [kg m^2] about each joint of what it moves, without armature."""
+    """Return the inertia about each joint of all that it moves, without armature [kg m^2]. Shape: (joints,)."""
     mujoco.mj_crb(model, data)
     matrix = np.zeros((model.nv, model.nv))
     for row, unit in zip(matrix, np.eye(model.nv), strict=True):
@@ -149,7 +159,7 @@ def _inertias(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def _holding_torques(model: mujoco.MjModel, data: mujoco.MjData, legs: list[Leg], lows: list[np.ndarray]) -> np.ndarray:
-    """Return the torques [N m] that hold the robot still, the ground pushing up evenly on all feet."""
+    """Return the torques that hold the robot still, evenly supported on all feet [N m]. Shape: (joints,)."""
     mujoco.mj_comVel(model, data)
     mujoco.mj_rne(model, data, 0, data.qfrc_bias)
     torques = data.qfrc_bias.copy()

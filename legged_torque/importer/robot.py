@@ -1,4 +1,4 @@
-"""An imported robot: everything that its MJCF and its settings need, and what was decided on the way."""
+"""An imported robot: all that its MJCF and its settings need, and notes on what was changed."""
 
 from __future__ import annotations
 
@@ -9,23 +9,24 @@ from pathlib import Path
 
 import numpy as np
 
-from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names, mirrored_legs, world_shape, zero_pose
+from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names, lowest_point, mirrored_legs, zero_pose
 from legged_torque.importer.pose import Stance, find_stance
 from legged_torque.importer.shapes import Shape
 from legged_torque.importer.source import GRAVITY, Source, read_source
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import counterparts
 
-UNLIMITED = np.pi  # [rad] to both sides, of joints without a range
-IMPLAUSIBLE = 20.0  # times weight x height: torque limits beyond this are none
-SPEED = 20.0  # [rad/s] of joints without a speed limit
-FASTEST = 100.0  # [rad/s] speed limits from here on are none
+UNLIMITED = np.pi  # range of joints without one, to both sides [rad]
+IMPLAUSIBLE = 20.0  # multiple of weight times height from which torque limits count as missing
+SPEED = 20.0  # highest speed of joints without a limit [rad/s]
+FASTEST = 100.0  # speed from which limits count as missing [rad/s]
+MUCH_DAMPING = 0.25  # share of the gains' damping from which that of the file may be a servo's
 FOOT, TRUNK = "foot", "trunk"  # in the names of the geoms of feet and trunk
 
 
 @dataclass
 class Robot:
-    """A robot as it will be written; lists are by joint, in the order of the file."""
+    """A robot to be written; lists are by joint, in the order of the file."""
 
     name: str
     source: Source
@@ -35,7 +36,7 @@ class Robot:
     kinds: list[str]  # names of the joints without that of their leg
     ranges: np.ndarray  # [rad]. Shape: (joints, 2)
     torques: np.ndarray  # [N m]
-    speed: float  # [rad/s] the highest
+    speed: float  # highest of the joints [rad/s]
     mirrored: list[list[str]]  # pairs of right and left legs
     symmetric: bool  # whether every joint has a mirror image
     stance: Stance
@@ -54,20 +55,20 @@ class Robot:
 
     @property
     def weight(self) -> float:
-        """Its weight [N]."""
+        """Weight [N]."""
         return GRAVITY * float(self.source.model.body_mass.sum())
 
     @property
     def notes(self) -> list[str]:
-        """What was changed and why, a line each."""
+        """Changes and reasons, a line each."""
         return self.source.notes
 
 
 def import_robot(file: Path, name: str = "", torque_limit: float | None = None) -> Robot:
-    """Read a file and decide everything about its robot.
+    """Read a file and derive its robot.
 
-    ``name`` is that of its files and classes, that of the file by default. A ``torque_limit`` [N m] replaces those of
-    the file. A UserError says why the file cannot be imported.
+    ``name`` is that of the robot's files and classes, by default that of the file. A ``torque_limit`` [N m] replaces
+    those of the file. A UserError says why the file cannot be imported.
     """
     name = name or re.sub(r"\W", "_", file.stem).lower()
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
@@ -89,7 +90,7 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     symmetric = _is_symmetric(source, joints, mirrored)
     kinds = [next((j.removeprefix(p) for p in prefixes if j.startswith(p)), j) for j in joints]
     damped = source.model.dof_damping[6:]
-    if (damped > stance.damping / 4).any():
+    if (damped > MUCH_DAMPING * stance.damping).any():
         source.notes.append(
             f"joint damping up to {damped.max():g} N m s/rad is kept; it often stands for a servo's and is too much "
             "for torque control: set it to 0 if it is not friction that you measured"
@@ -100,7 +101,7 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
 
 
 def _is_symmetric(source: Source, joints: list[str], mirrored: list[list[str]]) -> bool:
-    """Return whether every joint has its counterpart, which training with mirror images needs; note if not."""
+    """Return whether every joint has a counterpart, as training with mirror images needs. Adds a note if not."""
     try:
         counterparts(joints, mirrored)
     except UserError as error:
@@ -110,7 +111,7 @@ def _is_symmetric(source: Source, joints: list[str], mirrored: list[list[str]]) 
 
 
 def _ranges(source: Source) -> np.ndarray:
-    """Return the ranges of the joints [rad]; those without one get a wide one. Shape: (joints, 2)."""
+    """Return the ranges of the joints, a wide one for those without [rad]. Shape: (joints, 2). Adds a note."""
     model = source.model
     ranges, limited = model.jnt_range[1:].copy(), model.jnt_limited[1:].astype(bool)
     free = [name for name, known in zip(source.joints, limited, strict=True) if not known]
@@ -121,27 +122,27 @@ def _ranges(source: Source) -> np.ndarray:
 
 
 def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None) -> np.ndarray:
-    """Return the torque limits of the joints [N m]."""
+    """Return the torque limits of the joints [N m]. Shape: (joints,). Adds a note."""
     model = source.model
     if given is not None:
         return np.full(model.njnt - 1, given)
     data = zero_pose(model, source.pose)
-    lowest = min(world_shape(data, body, shape)[2] for body, found in shapes.items() for shape in found)
+    lowest = min(lowest_point(data, body, shape)[2] for body, found in shapes.items() for shape in found)
     enough = float(-GRAVITY * model.body_mass.sum() * lowest)
-    known = source.torque_limits
-    odd = [name for name, limit in zip(source.joints, known, strict=True) if not 0 < limit < IMPLAUSIBLE * enough]
-    if odd:
+    known = (source.torque_limits > 0) & (source.torque_limits < IMPLAUSIBLE * enough)
+    if not known.all():
+        names = ", ".join(name for name, is_known in zip(source.joints, known, strict=True) if not is_known)
         source.notes.append(
-            f"no torque limit that means anything at {', '.join(odd)}: weight x height, {enough:.1f} N m, assumed; "
+            f"no torque limit that means anything at {names}: weight x height, {enough:.1f} N m, assumed; "
             "give --torque_limit"
         )
-    return np.where((known > 0) & (known < IMPLAUSIBLE * enough), known, enough)
+    return np.where(known, source.torque_limits, enough)
 
 
 def _name_shapes(source: Source, legs: list[Leg], shapes: dict[int, list[Shape]]) -> None:
     """Name all shapes after their bodies: trunk, <leg>_<kind>, <leg>_foot; feet join the shapes of their bodies.
 
-    Those that would get a name that another one has are numbered on.
+    Shapes of the same name are numbered.
     """
     model, taken = source.model, {f"{leg.name}_{FOOT}" for leg in legs}
     owner = {body: leg for leg in legs for body in leg.bodies}

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from itertools import groupby
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.importer.pose import BANDWIDTH, DAMPING_RATIO, SAG
 from legged_torque.importer.robot import FOOT, TRUNK, Robot
 
-WEIGHT_TIMES_HEIGHT = 37.0  # [N m] of an A1 with its trunk at 0.303 m
+WEIGHT_TIMES_HEIGHT = 37.0  # of an A1 with its trunk at 0.303 m [N m]
+DROP = 1.3  # height of the trunk at the start of an episode, as a multiple of the nominal one; as for the A1
+TORQUE_SCALE = 0.12  # torque of an action of 1 as a share of the strongest motor's; as for the A1
+LINE = 90  # most characters of a table in one line
 
 TEMPLATE = '''"""{title}: imported settings; each number is a proposal to look at."""
 
@@ -63,17 +67,16 @@ SYMMETRY = """
 
 
 def class_name(name: str) -> str:
-    """Return the beginning of the names of a robot's classes: Go2 of go2, AnymalC of anymal_c."""
+    """Return the prefix of the names of a robot's classes: Go2 for go2, AnymalC for anymal_c."""
     return "".join(part.capitalize() for part in name.split("_"))
 
 
 def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
-    """Return the text of the module with a robot's settings. What comes from the file is written as literals.
+    """Return the text of the module with a robot's settings. Everything from its file is written as literals.
 
-    ``path`` is that of its MJCF, as it is to be found; ``is_fused`` says whether the fused step can simulate it.
+    ``path`` is that of its MJCF, as in ``asset.file``; ``is_fused`` says whether the fused step can simulate it.
     """
     stance = robot.stance
-    kept = {shape.name for found in robot.shapes.values() for shape in found}
     return TEMPLATE.format(
         title=robot.name,
         file=ascii(robot.source.file.name),
@@ -82,26 +85,27 @@ def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
         engine="" if is_fused else ENGINE,
         foot=FOOT,
         trunk=TRUNK,
-        penalized=_literal(_penalized(robot, kept)),
+        penalized=_literal(_penalized(robot)),
         mirrored=_literal(robot.mirrored),
         speed=f"{robot.speed:.4g}" if "." in f"{robot.speed:.4g}" else f"{robot.speed:.1f}",
-        drop=round(1.3 * stance.height, 2),
+        drop=round(DROP * stance.height, 2),
         angles=_angles(robot),
         bandwidth=BANDWIDTH,
         sag=SAG,
         ratio=DAMPING_RATIO,
         stiffness=_table(robot.by_kind(stance.stiffness)),
         damping=_table(robot.by_kind(stance.damping)),
-        torque_scale=float(f"{0.12 * max(robot.torques):.2g}"),
+        torque_scale=float(f"{TORQUE_SCALE * max(robot.torques):.2g}"),
         height=round(stance.height, 3),
         torques=LeggedRobotCfg.rewards.scales.torques * (WEIGHT_TIMES_HEIGHT / (robot.weight * stance.height)) ** 2,
         symmetry=SYMMETRY if robot.symmetric else "",
     )
 
 
-def _penalized(robot: Robot, geoms: set[str]) -> list[str]:
-    """Return parts of names that mean all geoms but feet and the links next to the trunk."""
+def _penalized(robot: Robot) -> list[str]:
+    """Return parts of names that match all geoms but feet and the links next to the trunk."""
     model = robot.source.model
+    geoms = {shape.name for found in robot.shapes.values() for shape in found}
     first = {body for body in range(2, model.nbody) if model.body_parentid[body] == 1}
     spared = {s.name for body in first for s in robot.shapes[body] if len(robot.legs[0].bodies) > 2}
     spared |= {leg.foot.name for leg in robot.legs}
@@ -110,8 +114,8 @@ def _penalized(robot: Robot, geoms: set[str]) -> list[str]:
         leg = next((leg.name for leg in robot.legs if name.startswith(leg.name + "_")), "")
         part = name.removeprefix(leg).strip("_")
         if not any(known in name for known in parts):
-            means_spared = any(part in other for other in spared)
-            parts.append(name if means_spared else part)
+            matches_spared = any(part in other for other in spared)
+            parts.append(name if matches_spared else part)
     return parts
 
 
@@ -127,19 +131,14 @@ def _table(numbers: dict[str, float]) -> str:
     ordered = sorted(numbers, key=len, reverse=True)  # the first part that matches counts
     entries = [f"{_literal(kind)}: {numbers[kind]}" for kind in ordered]
     line = "{" + ", ".join(entries) + "}"
-    return line if len(line) < 90 else "{\n" + "".join(f"            {entry},\n" for entry in entries) + "        }"
+    return line if len(line) < LINE else "{\n" + "".join(f"            {entry},\n" for entry in entries) + "        }"
 
 
 def _angles(robot: Robot) -> str:
-    """Return the lines of the nominal pose: a dictionary per leg, joined."""
-    groups: list[tuple[str, list[str]]] = []
-    for joint, kind, angle in zip(robot.joints, robot.kinds, robot.stance.angles, strict=True):
-        leg = joint.removesuffix(kind)
-        if not groups or groups[-1][0] != leg or (not leg and len(groups[-1][1]) > 3):
-            groups.append((leg, []))
-        groups[-1][1].append(f"{_literal(joint)}: {round(float(angle), 3) + 0.0}")
+    """Return the lines of the nominal pose: dictionaries of up to three joints of a leg, joined."""
     rows: list[str] = []
-    for _, entries in groups:
-        for start in range(0, len(entries), 3):
-            rows.append("{" + ", ".join(entries[start : start + 3]) + "}")
+    named = zip(robot.joints, robot.kinds, robot.stance.angles.tolist(), strict=True)
+    for _, group in groupby(named, key=lambda each: each[0].removesuffix(each[1])):
+        entries = [f"{_literal(joint)}: {round(angle, 3) + 0.0}" for joint, _, angle in group]
+        rows += ["{" + ", ".join(entries[start : start + 3]) + "}" for start in range(0, len(entries), 3)]
     return "\n".join(f"            {'| ' if number else ''}{row}" for number, row in enumerate(rows))

@@ -1,4 +1,4 @@
-"""Plain geoms in place of any others: spheres, capsules and boxes, which are cheap and right on any ground."""
+"""Plain geoms in place of all others: spheres, capsules and boxes, which are cheap and exact on any ground."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-ROUND = 1.4  # half sizes that differ by less than this factor make a sphere
-LONG = 1.6  # a body this much longer than wide, and round across, makes a capsule
+ROUND = 1.4  # factor between half sizes up to which they make a sphere
+LONG = 1.6  # least factor between length and width of a capsule, and largest between its widths
+SIZES = {"sphere": 1, "capsule": 2, "box": 3}  # numbers of sizes of the plain kinds
 GEOM = mujoco.mjtGeom
 
 
@@ -34,14 +35,14 @@ class Shape:
         return local @ rotation(self.quat).T + self.pos
 
     def half_sizes(self) -> list[float]:
-        """Return how far it reaches from its centre along its axes [m]."""
+        """Return its half sizes along its axes [m]."""
         if self.kind == "box":
             return self.size
         return [self.size[0], self.size[0], sum(self.size)]
 
     @property
     def radius(self) -> float:
-        """How thick it is around its ends [m]."""
+        """Its thickness around its ends [m]."""
         return 0.0 if self.kind == "box" else self.size[0]
 
 
@@ -53,54 +54,48 @@ def rotation(quat: np.ndarray) -> np.ndarray:
 
 
 def fit_geom(model: mujoco.MjModel, geom: int) -> tuple[Shape, str]:
-    """Return the plain shape of a geom, and what it was if it was another ("" otherwise).
+    """Return the plain shape of a geom, and the kind that it replaces ("" if the geom is plain).
 
-    A cylinder becomes the capsule inside of it, or the sphere of its radius if it is flat; what is neither plain nor
-    a cylinder is fitted by the box around it.
+    A cylinder becomes the capsule inside of it, or the sphere of its radius if it is flat; other geoms are fitted by
+    the boxes around them.
     """
     kind, size = GEOM(model.geom_type[geom]), model.geom_size[geom]
     pos, quat = model.geom_pos[geom].copy(), model.geom_quat[geom].copy()
-    if kind == GEOM.mjGEOM_SPHERE:
-        return Shape("sphere", [size[0]], pos, quat), ""
-    if kind == GEOM.mjGEOM_CAPSULE:
-        return Shape("capsule", [size[0], size[1]], pos, quat), ""
-    if kind == GEOM.mjGEOM_BOX:
-        return Shape("box", list(size), pos, quat), ""
+    name = kind.name.removeprefix("mjGEOM_").lower()
+    if name in SIZES:
+        return Shape(name, size[: SIZES[name]].tolist(), pos, quat), ""
     if kind == GEOM.mjGEOM_CYLINDER:
         if size[1] > size[0]:
-            return Shape("capsule", [size[0], size[1] - size[0]], pos, quat), "cylinder"
-        return Shape("sphere", [size[0]], pos, quat), "cylinder"
+            return Shape("capsule", [size[0], size[1] - size[0]], pos, quat), name
+        return Shape("sphere", [size[0]], pos, quat), name
     center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-    name = "mesh" if kind == GEOM.mjGEOM_MESH else kind.name.removeprefix("mjGEOM_").lower()
     return fit_box(pos + rotation(quat) @ center, quat, half), name
 
 
 def fit_inertia(model: mujoco.MjModel, body: int) -> Shape:
-    """Return the plain shape with the inertia of a body, if its mass filled it evenly."""
+    """Return the plain shape that has the inertia of a body if filled evenly with its mass."""
     inertia, mass = model.body_inertia[body], model.body_mass[body]
     half = np.sqrt(np.maximum(1.5 * (inertia.sum() - 2 * inertia) / mass, 1e-6))
     return fit_box(model.body_ipos[body].copy(), model.body_iquat[body].copy(), half)
 
 
 def fit_box(pos: np.ndarray, quat: np.ndarray, half: np.ndarray) -> Shape:
-    """Return a sphere, a capsule or a box for what has these half sizes [m] along the axes of its frame."""
+    """Return a sphere, a capsule or a box of about these half sizes [m] along the axes of its frame."""
     order = np.argsort(half)
     small, middle, large = half[order]
     if large < ROUND * small:
         return Shape("sphere", [float(half.mean())], pos, quat)
     if large > LONG * middle and middle < LONG * small:
         radius = float(np.sqrt(small * middle))
-        turn = np.zeros(4)  # which turns z to the longest axis
-        axis = np.eye(3)[order[2]]
-        mujoco.mju_quatZ2Vec(turn, axis)
-        whole = np.zeros(4)
+        turn, whole = np.zeros(4), np.zeros(4)
+        mujoco.mju_quatZ2Vec(turn, np.eye(3)[order[2]])  # from z to the longest axis
         mujoco.mju_mulQuat(whole, quat, turn)
         return Shape("capsule", [radius, float(large - radius)], pos, whole)
     return Shape("box", [float(x) for x in half], pos, quat)
 
 
 def box_around(shapes: list[Shape], axes: np.ndarray) -> Shape:
-    """Return the box around shapes with the directions of ``axes`` (columns, in the body's frame)."""
+    """Return the box around shapes along ``axes``, columns in the body's frame. Shape: (3, 3)."""
     low = np.min([((s.ends() @ axes) - s.radius).min(axis=0) for s in shapes], axis=0)
     high = np.max([((s.ends() @ axes) + s.radius).max(axis=0) for s in shapes], axis=0)
     quat = np.zeros(4)

@@ -1,11 +1,11 @@
-"""Reading somebody's MJCF or URDF: its parts as MuJoCo understands them, and what had to be told on the way."""
+"""Reading a published MJCF or URDF: its parts as MuJoCo understands them, and notes on what was changed."""
 
 from __future__ import annotations
 
 import re
 import warnings
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -13,39 +13,37 @@ import numpy as np
 
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import kept_warnings, motors_of, torque_range
+from legged_torque.utils.problems import refuse
 
-MESH_TYPES = (".stl", ".obj", ".msh")  # what MuJoCo reads
-VISUAL_GROUP = 3  # in which Menagerie keeps collision geoms, also those that one of its files switches off
-TINY = 1e-6  # [kg m^2], [kg] what counts as no inertia or mass of a fixed link; MuJoCo refuses less
-GRAVITY = 9.81  # [m/s^2], whatever the file has
+MESH_TYPES = (".stl", ".obj", ".msh")  # files that MuJoCo reads
+COLLISION_GROUP = 3  # of Menagerie's collision geoms, also of those that one of its files switches off
+TINY = 1e-6  # inertia and mass up to which a fixed link has none; MuJoCo refuses less [kg m^2], [kg]
+GRAVITY = 9.81  # of all robots; that of the file does not count [m/s^2]
 NAME = re.compile(r"[A-Za-z0-9_.:/-]*")  # names of bodies and joints, which become parts of settings and of a MJCF
-SITE = "link:"  # with which the names of sites begin that say where fixed links were
+SITE = "link:"  # prefix of the names of sites in the places of fixed links
+PARENTS = 4  # folders above that of the file in which meshes are looked for
 
 
 @dataclass
 class Source:
     """A robot as its file describes it: a floating trunk, every other body with one hinge joint.
 
-    Fixed links are part of the bodies that they are fixed to; ``sites`` keep where they were: by body, their names and
-    places [m] in its frame.
+    Fixed links are parts of the bodies that they are fixed to; ``sites`` has their places: by body, their names and
+    positions [m] in its frame.
     """
 
     file: Path
     model: mujoco.MjModel
     sites: dict[int, list[tuple[str, np.ndarray]]]
-    pose: np.ndarray | None  # angles [rad] of the file's keyframe, by joint but the free one
-    torque_limits: np.ndarray  # [N m] the tightest of the file, by joint; infinite without any
-    speed_limits: list[float]  # [rad/s] those that an URDF has
-    notes: list[str] = field(default_factory=list)  # what was changed and why, a line each
+    pose: np.ndarray | None  # angles of the file's keyframe, by hinge joint [rad]
+    torque_limits: np.ndarray  # tightest of the file, by joint; infinite without any [N m]
+    speed_limits: list[float]  # of a URDF [rad/s]
+    notes: list[str]  # changes and reasons, a line each
 
     @property
     def joints(self) -> list[str]:
         """Names of the hinge joints, in the order of the file."""
         return [self.model.joint(i).name for i in range(1, self.model.njnt)]
-
-    def body_of(self, joint: int) -> int:
-        """Return the body that a hinge joint, counted without the free one, moves."""
-        return int(self.model.jnt_bodyid[joint + 1])
 
 
 def read_source(file: Path) -> Source:
@@ -53,15 +51,16 @@ def read_source(file: Path) -> Source:
     if not file.is_file():
         raise UserError(f"cannot import '{file}': there is no such file")
     with kept_warnings(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what matters is told when the result is loaded
+        warnings.simplefilter("ignore")  # problems are reported when the result is loaded
         try:
             root = ET.parse(file).getroot()
-            _refuse_macros(root, file)
+            if any("xacro" in part.tag for part in root.iter()):  # MuJoCo would read the rest and nothing else
+                raise UserError(f"cannot import '{file}': it is a xacro; make a URDF of it: xacro {file} > robot.urdf")
             spec = mujoco.MjSpec.from_file(str(file))
             _check_names(spec, file)
             notes = _prepare(spec, file, root.tag == "robot")
             model = _compile(spec, notes)
-            speed_limits = _speed_limits(root)
+            speeds = [float(limit.get("velocity", 0)) for limit in root.findall("joint/limit")]  # of a URDF
         except (ValueError, ET.ParseError, mujoco.FatalError) as error:
             raise UserError(f"cannot import '{file}': {' '.join(str(error).split())}") from None
     _check(model, file)
@@ -69,9 +68,11 @@ def read_source(file: Path) -> Source:
     for site in range(model.nsite):
         name = model.site(site).name.removeprefix(SITE)
         sites.setdefault(int(model.site_bodyid[site]), []).append((name, model.site_pos[site].copy()))
-    pose = model.key_qpos[_home(model)][7:].copy() if model.nkey else None
+    keys = [model.key(i).name for i in range(model.nkey)]
+    home = keys.index("home") if "home" in keys else 0
+    pose = model.key_qpos[home][7:].copy() if keys else None
     limits = _torque_limits(model, notes)
-    return Source(file, model, sites, pose, limits, speed_limits, notes)
+    return Source(file, model, sites, pose, limits, [speed for speed in speeds if speed > 0], notes)
 
 
 def _check_names(spec: mujoco.MjSpec, file: Path) -> None:
@@ -83,7 +84,7 @@ def _check_names(spec: mujoco.MjSpec, file: Path) -> None:
 
 
 def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
-    """Make a file compile to one floating robot without anything else; return what was changed."""
+    """Make a file compile to one floating robot without anything else; return notes on the changes."""
     notes = _find_meshes(spec, file, is_urdf)
     in_pairs = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     for part in [*spec.sensors, *spec.lights, *spec.cameras, *spec.sites, *spec.excludes, *spec.pairs]:
@@ -92,13 +93,14 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
     for geom in spec.geoms:
         geom.material = ""
         if is_urdf:
-            geom.mass = 0.0  # links weigh what <inertial> says, those without it nothing
-        if not (geom.contype or geom.conaffinity) and (geom.group == VISUAL_GROUP or geom.name in in_pairs):
+            geom.mass = 0.0  # only <inertial> has masses
+        if not (geom.contype or geom.conaffinity) and (geom.group == COLLISION_GROUP or geom.name in in_pairs):
             geom.conaffinity = 1
             if geom.name not in in_pairs:
                 switched_on[geom.parent.name] = None
     if switched_on:
-        notes.append(f"geoms of group {VISUAL_GROUP}, which the file switches off, collide: {', '.join(switched_on)}")
+        bodies = ", ".join(switched_on)
+        notes.append(f"geoms of group {COLLISION_GROUP}, which the file switches off, collide: {bodies}")
     for part in [*spec.materials, *spec.textures]:
         spec.delete(part)
     roots = [body for body in spec.worldbody.bodies if body.find_all("joint")]
@@ -124,7 +126,7 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
 
 
 def _drop_footprint(root: mujoco.MjsBody, notes: list[str]) -> None:
-    """Put the trunk's origin where its first real link is, below a root of a URDF that is nothing but a frame."""
+    """Put the trunk's origin at its first real link if the root of a URDF is an empty frame above it."""
     (link, *others) = root.bodies
     is_frame = not (others or root.explicitinertial or list(root.geoms))
     if is_frame and not link.joints:
@@ -133,7 +135,7 @@ def _drop_footprint(root: mujoco.MjsBody, notes: list[str]) -> None:
 
 
 def _compile(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
-    """Compile; inertias that no body can have, which MuJoCo refuses, are mended where links are fixed, and told."""
+    """Compile; impossible inertias, which MuJoCo refuses, are replaced where links are fixed. Adds notes."""
     for body in spec.bodies:
         moves = any(joint.type != mujoco.mjtJoint.mjJNT_FREE for joint in body.joints)
         if moves or not body.explicitinertial or np.isnan(body.fullinertia[0]):
@@ -154,85 +156,63 @@ def _compile(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
 
 
 def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
-    """Point meshes to their files; leave those out that are nowhere near or that MuJoCo cannot read, and say so."""
-    missing = {}
-    for mesh in list(spec.meshes):
-        if not mesh.file:
-            continue
-        found = _find(mesh.file, Path(file).absolute().parent, spec.meshdir)
-        name = mesh.name or Path(mesh.file).stem
+    """Set the paths of meshes; drop those that are missing or that MuJoCo cannot read, and return notes."""
+    missing, lost, types = {}, dict[str, None](), ", ".join(MESH_TYPES)
+    for mesh in [mesh for mesh in spec.meshes if mesh.file]:
+        found = _find(mesh.file, file.absolute().parent, spec.meshdir)
+        mesh.name = mesh.name or Path(mesh.file).stem
         if found:
-            mesh.name, mesh.file = name, str(found)
+            mesh.file = str(found)
         else:
-            missing[name] = mesh
+            missing[mesh.name] = mesh
     spec.meshdir = ""
-    lost = []
-    for geom in list(spec.geoms):
-        if geom.meshname in missing:
-            collides = bool(geom.contype or geom.conaffinity)
-            weighs = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-            if not is_urdf and (weighs or not geom.parent.explicitinertial):
-                raise UserError(
-                    f"cannot import '{file}': the inertia of '{geom.parent.name}' follows from the mesh "
-                    f"'{missing[geom.meshname].file}', which is missing or of a type other than {', '.join(MESH_TYPES)}"
-                )
-            if collides:
-                lost.append(geom.parent.name)
-            spec.delete(geom)
+    weighs = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    for geom in [geom for geom in spec.geoms if geom.meshname in missing]:
+        if not is_urdf and (weighs or not geom.parent.explicitinertial):
+            raise UserError(
+                f"cannot import '{file}': the inertia of '{geom.parent.name}' follows from the mesh "
+                f"'{missing[geom.meshname].file}', which is missing or of a type other than {types}"
+            )
+        if geom.contype or geom.conaffinity:
+            lost[geom.parent.name] = None
+        spec.delete(geom)
     for mesh in missing.values():
         spec.delete(mesh)
-    if not lost:
-        return []
-    links = ", ".join(dict.fromkeys(lost))
-    return [f"collision meshes of {links} are missing or not {', '.join(MESH_TYPES)}: shapes follow from inertias"]
+    links = ", ".join(lost)
+    return [f"collision meshes of {links} are missing or not {types}: shapes follow from inertias"] if lost else []
 
 
 def _find(name: str, folder: Path, meshdir: str) -> Path | None:
-    """Return where a mesh is: as the file says, or with the end of its path below a parent folder."""
+    """Return the path of a mesh: that in the file, or the end of it below a parent folder; None if there is none."""
     parts = Path(name.split("://")[-1]).parts
-    roots = [folder / meshdir, folder, *list(folder.parents)[:4]]
-    ends = [Path(*parts[start:]) for start in range(len(parts))]
-    for path in (root / end for root in roots for end in ends):
-        for kind in (path.suffix, *MESH_TYPES):
-            candidate = path.with_suffix(kind)
-            if candidate.suffix.lower() in MESH_TYPES and candidate.is_file():
-                return candidate
-    return None
+    roots = [folder / meshdir, folder, *list(folder.parents)[:PARENTS]]
+    paths = [root.joinpath(*parts[start:]) for root in roots for start in range(len(parts))]
+    files = (path.with_suffix(kind) for path in paths for kind in (path.suffix, *MESH_TYPES))
+    return next((file for file in files if file.suffix.lower() in MESH_TYPES and file.is_file()), None)
 
 
 def _check(model: mujoco.MjModel, file: Path) -> None:
-    """Raise a UserError, with all reasons, for what is not a floating trunk and bodies with a hinge each."""
+    """Raise a UserError, with all reasons, unless the model is a floating trunk and bodies with a hinge each."""
     hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
-    reasons = []
-    if model.njnt < 2 or model.jnt_type[0] != free:
-        reasons.append("its trunk does not float")
     others = [model.joint(i).name for i in range(1, model.njnt) if model.jnt_type[i] != hinge]
-    if others:
-        reasons.append(f"only hinge joints can be imported, not {', '.join(others)}")
     several = [model.body(b).name for b in range(1, model.nbody) if model.body_jntnum[b] > 1]
-    if several:
-        reasons.append(f"a body may have one joint, {', '.join(several)} have more")
-    if model.neq:
-        reasons.append(f"its {model.neq} equalities (closed loops, mimicked joints) cannot be imported")
-    if model.ntendon:
-        reasons.append(f"its {model.ntendon} tendons cannot be imported")
-    if reasons:
-        raise UserError(f"cannot import '{file}': {'; '.join(reasons)}")
-
-
-def _home(model: mujoco.MjModel) -> int:
-    """Return the keyframe to stand in: "home", if there is one, or the first."""
-    names = [model.key(i).name for i in range(model.nkey)]
-    return names.index("home") if "home" in names else 0
+    rules = {
+        "its trunk does not float": model.njnt < 2 or model.jnt_type[0] != free,
+        f"only hinge joints can be imported, not {', '.join(others)}": others,
+        f"a body may have one joint, {', '.join(several)} have more": several,
+        f"its {model.neq} equalities (closed loops, mimicked joints) cannot be imported": model.neq,
+        f"its {model.ntendon} tendons cannot be imported": model.ntendon,
+    }
+    refuse([reason for reason, is_broken in rules.items() if is_broken], f"cannot import '{file}'")
 
 
 def _torque_limits(model: mujoco.MjModel, notes: list[str]) -> np.ndarray:
-    """Return the tightest torque limit of each hinge [N m], the smaller of both directions. Adds notes."""
+    """Return the tightest torque limit of each hinge in either direction [N m]. Shape: (joints,). Adds notes."""
     for actuator in range(model.nu):
         if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
             raise UserError(f"the actuator '{model.actuator(actuator).name}' does not act on a joint")
     is_servo = model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE
-    model.actuator_ctrllimited[is_servo] = False  # their controls are no torques
+    model.actuator_ctrllimited[is_servo] = False  # their controls are not torques
     if is_servo.any():
         notes.append(f"{is_servo.sum()} position or velocity servos became motors; their gains are left out")
     if model.actuator_dyntype.any():
@@ -241,30 +221,16 @@ def _torque_limits(model: mujoco.MjModel, notes: list[str]) -> np.ndarray:
         notes.append("the compensation of gravity is left out")
     limits, bare, uneven = [], list[str](), list[str]()
     for joint in range(1, model.njnt):
-        motors = motors_of(model, joint)
+        motors, name = motors_of(model, joint), model.joint(joint).name
         ranges = [torque_range(model, motor) for motor in motors]
         if model.jnt_actfrclimited[joint]:
             ranges.append(tuple(model.jnt_actfrcrange[joint]))
-        down, up = (min([np.inf, *(sign * each[side] for each in ranges)]) for side, sign in ((0, -1), (1, 1)))
+        down, up = min((-low for low, _ in ranges), default=np.inf), min((high for _, high in ranges), default=np.inf)
         limits.append(min(down, up))
-        if model.nu and not motors:
-            bare.append(model.joint(joint).name)
-        if down != up:
-            uneven.append(model.joint(joint).name)
+        bare += [name] if model.nu and not motors else []
+        uneven += [name] if down != up else []
     if bare:
         notes.append(f"no actuator of the file drives {', '.join(bare)}: given motors, as every joint must have one")
     if uneven:
         notes.append(f"torque limits that differ by direction are the smaller of both: {', '.join(uneven)}")
     return np.array(limits)
-
-
-def _refuse_macros(root: ET.Element, file: Path) -> None:
-    """Raise a UserError for a xacro, of which MuJoCo would read what is no macro and nothing else."""
-    if any("xacro" in part.tag for part in root.iter()):
-        raise UserError(f"cannot import '{file}': it is a xacro; make a URDF of it: xacro {file} > robot.urdf")
-
-
-def _speed_limits(root: ET.Element) -> list[float]:
-    """Return the speed limits [rad/s] of an URDF's joints, which MuJoCo does not read; none of a MJCF."""
-    limits = [float(limit.get("velocity", 0)) for limit in root.findall("joint/limit")]
-    return [limit for limit in limits if limit > 0]

@@ -1,1 +1,1 @@
-"""What this project adds to rsl_rl: the runner, the PPO update that never waits for the host, the multi-head actor."""
+"""Learning: the trainer, rsl_rl's runner on top of it, PPO on the device, evaluation during training."""

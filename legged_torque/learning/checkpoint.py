@@ -1,4 +1,4 @@
-"""Files of tensors: written atomically, checked, and read without running code of theirs."""
+"""Files of tensors: written atomically, checked, and read without running code in them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from legged_torque.utils.files import is_whole_archive, write_whole
 def write(file: Path, content: dict[str, Any]) -> str:
     """Write tensors and plain values, and return the :func:`digest` of the file.
 
-    The file is either complete or absent, whoever else writes it; a UserError if it cannot be written.
+    The file is either complete or absent at any time; a UserError if it cannot be written.
     """
     buffer = io.BytesIO()
     torch.save(content, buffer)
@@ -26,17 +26,20 @@ def write(file: Path, content: dict[str, Any]) -> str:
     return hashlib.sha256(buffer.getvalue()).hexdigest()
 
 
-def read(file: Path, what: str, device: str) -> Any:
-    """Return what :func:`write` has written, on a device; a UserError that names ``what`` if it cannot be used.
-
-    That is, if it is damaged, is no file of tensors and plain values, or holds a number that is not finite.
-    """
+def load(file: Path, what: str, device: str) -> Any:
+    """Return what :func:`write` has written, on a device; a UserError names ``what`` if the file is broken."""
     try:
         content = torch.load(file, weights_only=True, map_location=device)
-    except Exception as error:  # torch raises about anything for a file that is not its own
+    except Exception as error:  # torch raises about anything for other files
         raise UserError(f"'{file}' is not a readable {what}: {last_line(error)}") from None
     if not is_whole_archive(file):
         raise UserError(f"'{file}' is not a readable {what}: it is damaged")
+    return content
+
+
+def read(file: Path, what: str, device: str) -> Any:
+    """Return what :func:`load` does; a UserError also if it holds a number that is not finite."""
+    content = load(file, what, device)
     try:
         bad = not_finite(content)
     except RecursionError:
@@ -47,7 +50,7 @@ def read(file: Path, what: str, device: str) -> Any:
 
 
 def check_counters(state: dict[str, Any], file: str) -> None:
-    """Refuse a checkpoint whose counters are no numbers, by UserError."""
+    """Raise a UserError if the counters of a checkpoint are not numbers."""
     if not isinstance(state, dict) or not isinstance(state.get("infos"), dict):
         raise UserError(f"'{file}' is not a usable checkpoint: it lacks the entry infos")
     infos = state["infos"]
@@ -59,7 +62,7 @@ def check_counters(state: dict[str, Any], file: str) -> None:
 
 
 def digest(file: Path) -> str:
-    """Return a number by which a file is known, as text; empty if there is no such file."""
+    """Return the SHA-256 of a file in hexadecimal; empty if there is no such file."""
     return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
 
 

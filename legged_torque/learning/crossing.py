@@ -1,7 +1,7 @@
-"""Which ground a policy masters: whether robots cross tiles of all kinds and levels in time, in one batch of worlds.
+"""Trials on rough ground: which tiles a policy crosses in time, of all kinds and levels in one batch of worlds.
 
-A trial is one episode: a robot starts in the middle of its tile, heads along x or y, is told to walk on in that
-direction, and crosses the tile if its trunk gets over the tile's edge before it falls, and before the trial is over.
+A trial is one episode. A robot starts in the middle of its tile, heads along x or y, and is commanded to walk on in
+that direction. It crosses the tile if its trunk gets over the tile's edge before it falls and before the trial is over.
 """
 
 from __future__ import annotations
@@ -17,33 +17,33 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.envs.base.evaluation import evaluation_cfg
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import WalkingMetrics
-from legged_torque.learning.evaluator import evaluation_cfg
 from legged_torque.terrain.rough import RoughGround
 from legged_torque.terrain.selection import COLUMNS, named_kinds, rising_levels, select_tiles
 from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.math import quat_rotate_yaw
-from legged_torque.utils.metrics import Estimate, estimate, estimates
+from legged_torque.utils.metrics import Estimate, estimates
 
 SPEED = 0.6
-"""What robots are told to walk forwards, unless something else is asked for [m/s]."""
+"""Commanded forward speed, unless another command is given [m/s]."""
 SLOWNESS = 2.0
 """A trial lasts this many times as long as the commanded speed needs: as in the curriculum, half of it is enough."""
 MIN_SPEED = 0.1
-"""Least commanded speed [m/s]; one that is slower would need minutes."""
+"""Least commanded speed [m/s]; trials at a lower one would take minutes."""
 SEED = 10_000
 """Added to the seed of the map, so that its random tiles are not those of the training."""
 
 
 @dataclass(frozen=True)
 class Grounds:
-    """Which tiles robots shall cross.
+    """Tiles to be crossed, and the command.
 
     Attributes:
-        kinds: Their kinds, each once.
-        levels: Their difficulties, in rising order.
+        kinds: Kinds of tiles, each once.
+        levels: Difficulties, in rising order.
         command: Commanded v_x, v_y [m/s] in the trunk's frame.
     """
 
@@ -62,9 +62,9 @@ class Grounds:
         return cls(chosen, rising, (v_x, v_y))
 
     def cfg(self, cfg: Any, worlds_per_tile: int) -> Any:
-        """Return settings of a task for trials of so many worlds on each kind and level.
+        """Return a copy of a task's settings for trials of ``worlds_per_tile`` worlds on each kind and level.
 
-        What the policy sees is as in the settings given, whichever ground they are for; what the critic sees may not.
+        The policy sees what it does with the settings given, whatever ground these are for; the critic may not.
         """
         cfg = evaluation_cfg(cfg, worlds_per_tile * len(self.kinds) * len(self.levels))
         terrain, ranges = cfg.terrain, cfg.commands.ranges
@@ -78,13 +78,13 @@ class Grounds:
         return cfg
 
     def time_limit(self, tile_size: float) -> float:
-        """Return how long a trial lasts at most, on tiles with sides of this length [s]."""
+        """Return the longest duration of a trial [s], on tiles with sides of ``tile_size`` [m]."""
         return SLOWNESS * 0.5 * tile_size / math.hypot(*self.command)
 
 
 @dataclass
 class Result:
-    """What came out on tiles of one kind and level."""
+    """Outcome of the trials on tiles of one kind and level."""
 
     kind: str
     level: float
@@ -98,7 +98,7 @@ def cross(task: LeggedRobot, policy: Callable[[TensorDict], Tensor], grounds: Gr
     """Let a policy try to cross the tiles of a task with the settings of :meth:`Grounds.cfg`, once in each world.
 
     Returns:
-        What came out, by kind and then by level.
+        Results by kind and then by level.
     """
     ground = task.terrain
     assert isinstance(ground, RoughGround), "tiles are those of rough ground"
@@ -117,7 +117,8 @@ def cross(task: LeggedRobot, policy: Callable[[TensorDict], Tensor], grounds: Gr
             fell |= is_trying & task.reset_buf
             crossed |= is_trying & ~task.reset_buf & (distance > half)
             counter.add()
-    return _results(ground, grounds, walking, crossed, fell)
+    ones = torch.ones_like(task.rew_buf)
+    return _results(ground, grounds, {"crossed": (crossed, ones), "fell": (fell, ones), **walking.ratios()})
 
 
 def _start(task: LeggedRobot, ground: RoughGround, command: tuple[float, float]) -> TensorDict:
@@ -136,21 +137,14 @@ def _start(task: LeggedRobot, ground: RoughGround, command: tuple[float, float])
     return task.get_observations()
 
 
-def _results(
-    ground: RoughGround, grounds: Grounds, walking: WalkingMetrics, crossed: Tensor, fell: Tensor
-) -> list[Result]:
-    """Return what came out, in each group of worlds."""
-    kinds = ground.layout.kinds()
-    of_kind = [kinds[column] for column in ground.columns.tolist()]
-    of_level = [grounds.levels[row] for row in ground.levels.tolist()]
-    groups: dict[tuple[str, float], list[int]] = {group: [] for group in product(grounds.kinds, grounds.levels)}
-    for world, group in enumerate(zip(of_kind, of_level, strict=True)):
-        groups[group].append(world)
-    shares = {name: ended.double().cpu().numpy() for name, ended in {"crossed": crossed, "fell": fell}.items()}
-    ratios = {name: [part.double().cpu().numpy() for part in parts] for name, parts in walking.ratios().items()}
+def _results(ground: RoughGround, grounds: Grounds, ratios: dict[str, tuple[Tensor, Tensor]]) -> list[Result]:
+    """Return results from numerators and denominators of each world. Shapes: (num_envs,)."""
+    of_kind = np.array(ground.layout.kinds())[ground.columns.cpu().numpy()]
+    of_level = np.array(grounds.levels)[ground.levels.cpu().numpy()]
+    arrays = {name: [part.double().cpu().numpy() for part in parts] for name, parts in ratios.items()}
     results = []
-    for (kind, level), worlds in groups.items():
-        share = {name: estimate(ended[worlds], np.ones(len(worlds))) for name, ended in shares.items()}
-        metrics = estimates({name: (above[worlds], below[worlds]) for name, (above, below) in ratios.items()})
-        results.append(Result(kind, level, len(worlds), share["crossed"], share["fell"], metrics))
+    for kind, level in product(grounds.kinds, grounds.levels):
+        worlds = (of_kind == kind) & (of_level == level)
+        found = estimates({name: (above[worlds], below[worlds]) for name, (above, below) in arrays.items()})
+        results.append(Result(kind, level, int(worlds.sum()), found.pop("crossed"), found.pop("fell"), found))
     return results

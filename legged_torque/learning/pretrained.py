@@ -1,7 +1,7 @@
-"""Policies that were made by supervision before reinforcement learning: their files, and trainings that start from one.
+"""Policies made by supervision before reinforcement learning: their files, and trainings that start from one.
 
-A file holds the policy's network and the settings that decide what its inputs and outputs mean, so that it is used
-again wherever these are the same, and refused where they are not.
+A file holds the policy's network and the settings that give its inputs and outputs their meaning. It is used again
+wherever these are the same, and refused where they differ.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from legged_torque.utils.cli import check_output
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import held
+from legged_torque.utils.runs import with_present_names
 from legged_torque.utils.task_registry import all_experiments_dir
 
 SPACES = {
@@ -37,12 +38,12 @@ SPACES = {
         "obs_groups.actor",
     ),
 }
-"""Settings of task and training, if they have them, in which a pre-trained policy must agree: what it sees and does."""
+"""Settings of task and training that a pre-trained policy must share, as far as there are such settings."""
 OF_TRAINING = ("file", "critic_warmup_iterations")
-"""Settings of ``pretraining`` that say how a training starts from a policy, not how the policy is made."""
+"""Settings of ``pretraining`` about a training that starts from the policy, not about the making of the policy."""
 PRETRAINED = "pretrained"  # folder of pre-trained policies, in that of all experiments
 STANDARD_DEVIATION = "distribution."
-"""Start of the names of parameters that are not taken over: how much a training explores is its own setting."""
+"""Start of the names of parameters that are not taken over: a training has its own setting of exploration."""
 
 
 def pretrained_file(task: str, train_cfg: Any, log_root: str | None = None) -> Path:
@@ -53,10 +54,13 @@ def pretrained_file(task: str, train_cfg: Any, log_root: str | None = None) -> P
 
 
 def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> None:
-    """Make a task's pre-trained policy if its file is missing; a UserError if the file's does not fit the task.
+    """Make a task's pre-trained policy if its file is missing.
 
-    A policy that was made with other settings of ``pretraining`` does not fit: it may not even stand. Of trainings that
-    start at the same time one makes the policy, and the others wait.
+    Of trainings that start at the same time, one makes the policy and the others wait.
+
+    Raises:
+        UserError: If the policy does not fit the task, or was made with other settings of ``pretraining``, with which
+            it may not even stand.
     """
     if not file.exists():
         check_output(file)
@@ -70,7 +74,7 @@ def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device:
 
 
 def make_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> dict[str, Any]:
-    """Make a task's pre-trained policy, and return what its making reports; a UserError if it has no pre-training."""
+    """Make a task's pre-trained policy and return the report on it; a UserError if the task has no pre-training."""
     if not train_cfg.pretraining.function:
         raise UserError(f"task '{task}' has no pre-training: its pretraining.function is empty")
     check_output(file)
@@ -81,12 +85,12 @@ def make_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device:
 
 
 def start_from(runner: OnPolicyRunner, file: Path) -> None:
-    """Give the actor of a runner the network of a pre-trained policy, all but its standard deviation.
+    """Give the actor of a runner the network of a pre-trained policy, without its standard deviation.
 
-    A UserError names the first parameter that the two do not have in the same shape, or that is not finite; then the
-    actor is as it was.
+    Raises:
+        UserError: If a parameter is missing, of another shape or not finite; the actor is unchanged then.
     """
-    actor = runner.alg.actor
+    actor = runner.alg.policy()
     state, pretrained = actor.state_dict(), read_pretrained(file)["actor_state_dict"]
     for name in dict.fromkeys((*state, *map(str, pretrained))):
         if not name.startswith(STANDARD_DEVIATION):
@@ -102,7 +106,7 @@ def check_spaces(file: Path, env_cfg: Any, train_cfg: Any) -> None:
     """Refuse a pre-trained policy whose inputs, outputs or network are not those of a task, naming what differs."""
     of_file = read_pretrained(file)["spaces"]
     for name, value in spaces(env_cfg, train_cfg).items():
-        if name in of_file and repr(of_file[name]) != repr(value):  # files of older versions lack the nominal pose
+        if name in of_file and repr(of_file[name]) != repr(value):
             raise UserError(
                 f"the pre-trained policy '{file}' does not fit this task: its {name} is {of_file[name]!r}, here it "
                 f"is {value!r}; make another one in a file of its own: --set pretraining.file=FILE"
@@ -111,7 +115,7 @@ def check_spaces(file: Path, env_cfg: Any, train_cfg: Any) -> None:
 
 def check_making(file: Path, train_cfg: Any) -> None:
     """Refuse a pre-trained policy that was made with other settings of ``pretraining``, naming the first one."""
-    settings = read_pretrained(file)["report"].get("settings")  # a function of the user's own may report none
+    settings = with_present_names(read_pretrained(file)["report"].get("settings"))  # a user's function may report none
     made_with = flat(settings) if isinstance(settings, dict) else {}
     for name, value in flat(to_dict(train_cfg.pretraining)).items():
         if name not in OF_TRAINING and repr(made_with.get(name, value)) != repr(value):
@@ -124,7 +128,7 @@ def check_making(file: Path, train_cfg: Any) -> None:
 
 
 def read_pretrained(file: Path) -> dict[str, Any]:
-    """Return what a file of a pre-trained policy holds; a UserError if it is not one."""
+    """Return the contents of a file of a pre-trained policy; a UserError if it is not one."""
     content = checkpoint.read(file, "pre-trained policy", "cpu")
     parts = ("actor_state_dict", "spaces", "report")
     if not isinstance(content, dict) or not all(isinstance(content.get(part), dict) for part in parts):

@@ -1,62 +1,66 @@
-"""What a training shows while it runs: how far it is, how well the policy walks, whether its numbers are healthy."""
+"""The display of a training: its progress, how well the policy walks, and whether its numbers are healthy."""
 
 from __future__ import annotations
 
 import math
 import re
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise, zip_longest
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from statistics import fmean
 from typing import TYPE_CHECKING
 
+from rich.columns import Columns
 from rich.console import Group, RenderableType
 from rich.panel import Panel
-from rich.table import Table
 from rich.text import Text
 
-from legged_torque.utils.display import LINE_EVERY, Display, Pace, bar, progress_text
+from legged_torque.utils.display import LINE_EVERY, Display
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-WHAT = "iteration"
+UNIT = "iteration"
 LINE_AFTER_EVALUATION = 2.0  # seconds between two plain lines if there is a new evaluation
 TREND = 10  # evaluations with whose mean the last one is compared
 CELLS = 12  # characters of the curve of the tracking
-NAMES = 15  # width of names [characters]
-TWO_COLUMNS = 76  # width of the panel from which on numbers stand in two columns [characters]
+ENTRY = 36  # width of a name and its value in the panel [characters]
+NAME = 16  # width of the name in that
 _BLOCKS = "▁▂▃▄▅▆▇█"
-_CURRICULUM, _EVALUATION = "Curriculum/", "Evaluation"
-_TRACK, _FALLS = f"{_EVALUATION}/track_percentage", f"{_EVALUATION}/falls_per_minute"
+_EVALUATION = "Evaluation"
 _ELSEWHERE = re.compile(rf"{_EVALUATION}_(\w+)/track_percentage")
 _TRACKING = re.compile(r"; tracking (\d\.\d+) \(best ")
-
-Column = list[tuple[str, str | Text]]
-"""Names and values, below each other."""
-
-
-@dataclass(frozen=True)
-class State:
-    """What is known of a training after an iteration."""
-
-    steps: int = 0  # of all worlds
-    numbers: Mapping[str, float] = field(default_factory=dict)  # of the last iteration, by their names in the logs
-    measured: Mapping[str, float] = field(default_factory=dict)  # the last evaluations, likewise
-    tracking: tuple[float, ...] = ()  # of the evaluations in this process
-    diverged: int = 0  # worlds, in this process
-    skipped: int = 0  # updates, in this process
 
 
 class TrainingDisplay(Display):
     """Shows a training: a panel on a terminal, elsewhere a line after an evaluation or every ten seconds."""
 
-    def __init__(self, title: str, folder: str, pace: Pace, steps_per_iteration: int, is_quiet: bool) -> None:
-        """Prepare; ``folder`` is that of the run, and ``pace`` counts iterations. A quiet display shows nothing."""
-        super().__init__(stays=True)
-        self._title, self._folder, self._pace, self._steps = title, folder, pace, steps_per_iteration
-        self._is_quiet, self._state = is_quiet, State()
+    def __init__(
+        self,
+        title: str,
+        folder: str,
+        total: int,
+        done: int,
+        steps_per_iteration: int,
+        is_quiet: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Prepare to show iterations.
+
+        Args:
+            title: Of the panel.
+            folder: Folder of the run.
+            total: Iterations of the whole training.
+            done: Iterations before this process.
+            steps_per_iteration: Of all worlds.
+            is_quiet: Whether nothing is shown.
+            clock: Returns the time [s].
+        """
+        super().__init__(UNIT, total, done, stays=True, clock=clock)
+        self._title, self._folder, self._steps, self._is_quiet = title, folder, steps_per_iteration, is_quiet
+        self._env_steps, self._numbers = 0, dict[str, float]()  # so far; of the last iteration
+        self._measured, self._tracking = dict[str, float](), list[float]()  # of the last evaluations; of all of them
+        self._bad = {"diverged worlds": 0, "skipped updates": 0}  # in this process
 
     def __enter__(self) -> Self:
         """Begin to show; the first line follows the first iteration."""
@@ -66,114 +70,62 @@ class TrainingDisplay(Display):
         return self
 
     def add_iteration(self, done: int, steps: int, numbers: Mapping[str, float]) -> None:
-        """Show the state after an iteration: how many are done, steps so far, and numbers by their names in the logs.
+        """Show the state after an iteration.
 
-        Besides those there are "kl", "skipped_updates", "noise" and "learning_rate", and, once an episode has ended,
-        "reward" and "length" [s].
+        Args:
+            done: Iterations so far.
+            steps: Steps of all worlds so far.
+            numbers: Numbers by their names in the logs, and "kl", "skipped_updates", "noise" and "learning_rate". Once
+                an episode has ended, "reward" and "length" [s] as well.
         """
-        old, now = self._state, numbers.get(_TRACK, math.nan)
         measured = {name: number for name, number in numbers.items() if name.startswith(_EVALUATION)}
-        self._pace.add(done)
-        self._state = State(
-            steps,
-            numbers,
-            {**old.measured, **measured},
-            old.tracking if math.isnan(now) else (*old.tracking, now),
-            old.diverged + int(numbers.get("Health/diverged_worlds", 0.0)),
-            old.skipped + int(numbers["skipped_updates"]),
-        )
+        self.done, self._env_steps, self._numbers = done, steps, dict(numbers)
+        self._measured = {**self._measured, **measured}
+        if not math.isnan(tracking := numbers.get(f"{_EVALUATION}/track_percentage", math.nan)):
+            self._tracking = [*self._tracking, tracking]
+        new = (numbers.get("Health/diverged_worlds", 0.0), numbers["skipped_updates"])
+        self._bad = {name: count + int(more) for (name, count), more in zip(self._bad.items(), new, strict=True)}
         if not self._is_quiet:
-            self.update(LINE_AFTER_EVALUATION if measured else LINE_EVERY)
+            self.show(LINE_AFTER_EVALUATION if measured else LINE_EVERY)
 
     def line(self) -> str:
         """Return the state in a line."""
-        state, numbers = self._state, self._state.numbers
-        parts = [progress_text(WHAT, self._pace, time.monotonic() - self.start)]
-        parts.append(", ".join(filter(None, (f"{state.steps:,} steps", self._speed()))))
-        if "reward" in numbers:
-            parts.append(f"reward {numbers['reward']:.2f}, episodes {numbers['length']:.1f} s")
-        if state.tracking:
-            tracking = f"tracking {state.tracking[-1]:.3f} (best {max(state.tracking):.3f})"
-            parts.append(f"{tracking}, {state.measured[_FALLS]:.1f} falls/min")
-        parts.append(", ".join(f"{name} {text}" for name, text in updates(numbers)))
-        bad = {"diverged worlds": state.diverged, "skipped updates": state.skipped}
-        return "; ".join([*parts, *(f"{count} {name}" for name, count in bad.items() if count)])
+        bad = {name: f"{count:,}" for name, count in self._bad.items() if count}
+        return "; ".join([super().line(), *(f"{name} {text}" for name, text in (self._entries() | bad).items())])
 
-    def picture(self) -> RenderableType:
+    def view(self) -> RenderableType:
         """Return the panel."""
-        columns = [self._of_training(), self._of_evaluations()]
-        if self.width < TWO_COLUMNS:
-            tables = [table([[*columns[1], *columns[0], *self._of_run()]])]
-        else:
-            tables = [table(columns), table([self._of_run()])]
-        notices = [Text(text, "bold yellow") for text in (self.activity, self.notice) if text]
-        seconds, left = time.monotonic() - self.start, self._pace.left()
-        progress = bar(f"{WHAT} {self._pace}", self._pace.share, seconds, left)
-        content = Group(progress, *notices, *tables)  # the end is cut off where a terminal is low
+        entries: dict[str, str | Text] = {**self._entries()}
+        if self._tracking:
+            change = self._tracking[-1] - fmean(self._tracking[-1 - TREND : -1] or self._tracking)
+            entries["trend"] = Text.assemble(f"{change:+.3f} ", (blocks(self._tracking), "green"))
+        entries |= {name: Text(f"{count:,}", "yellow" if count else "") for name, count in self._bad.items()}
+        cells = [Text.assemble((f"{name:<{NAME}}", "dim"), text) for name, text in entries.items()]
+        curricula = {name.partition("/")[2]: f"{n:.3g}" for name, n in self._numbers.items() if "Curriculum/" in name}
+        below = (
+            [Text.assemble(("curricula: ", "dim"), ", ".join(map(" ".join, curricula.items())))] if curricula else []
+        )
+        if self.warnings:
+            below.append(Text(f"warnings: {len(self.warnings)}, last: {self.warnings[-1]}", "yellow"))
+        below.append(Text.assemble(("run: ", "dim"), self._folder))
+        content = Group(super().view(), Columns(cells, width=min(ENTRY, self.width - 4), column_first=True), *below)
         return Panel(content, title=Text(self._title, "bold"), title_align="left", border_style="dim")
 
-    def _speed(self) -> str:
-        """Return the steps per second; empty if they are not known yet."""
-        rate = self._pace.per_second()
-        return "" if rate is None else f"{rate * self._steps:,.0f} steps/s"
-
-    def _of_training(self) -> Column:
-        """Return what the training itself tells."""
-        state, numbers = self._state, self._state.numbers
-        column: Column = [("steps", f"{state.steps:,}"), ("speed", self._speed())]
+    def _entries(self) -> dict[str, str]:
+        """Return the state as names and values."""
+        numbers, speed = self._numbers, self.bar.tasks[0].speed
+        entries = {"steps": f"{self._env_steps:,}"}
+        if speed is not None:
+            entries["steps/s"] = f"{speed * self._steps:,.0f}"
         if "reward" in numbers:
-            column += [("reward", f"{numbers['reward']:.2f}"), ("episode length", f"{numbers['length']:.1f} s")]
-        else:
-            column.append(("reward", "no episode has ended"))
-        return column + updates(numbers)
-
-    def _of_evaluations(self) -> Column:
-        """Return what was measured last, and whether numbers were bad."""
-        state, column = self._state, Column()
-        if state.tracking:
-            now, before = state.tracking[-1], state.tracking[-1 - TREND : -1] or state.tracking
-            column.append(("tracking", Text.assemble((f"{now:.3f}", "bold"), f", best {max(state.tracking):.3f}")))
-            column.append(("trend", Text.assemble(f"{now - fmean(before):+.3f} ", (blocks(state.tracking), "green"))))
-            column.append(("falls", f"{state.measured[_FALLS]:.1f} per minute"))
-        else:
-            column.append(("tracking", "not measured yet"))
-        for name, number in state.measured.items():
-            environment = _ELSEWHERE.fullmatch(name)
-            if environment:
-                column.append((f"in {environment[1]}", f"{number:.3f}"))
-        for name, count in {"diverged worlds": state.diverged, "skipped updates": state.skipped}.items():
-            column.append((name, Text(f"{count:,}", "yellow" if count else "")))
-        return column
-
-    def _of_run(self) -> Column:
-        """Return what may take a whole line: curricula, warnings, and where the run is."""
-        numbers, column = self._state.numbers.items(), Column()
-        curricula = [f"{name[len(_CURRICULUM) :]} {number:.3g}" for name, number in numbers if _CURRICULUM in name]
-        if curricula:
-            column.append(("curricula", Text(", ".join(curricula), no_wrap=False)))
-        if self.warnings:
-            text = f"{len(self.warnings)}, last: {self.warnings[-1]}"
-            column.append(("warnings", Text(text, "yellow", no_wrap=False)))
-        room = self.width - NAMES - 8  # beside borders and gaps
-        folder = self._folder if len(self._folder) <= room else f"...{self._folder[3 - room :]}"
-        return [*column, ("run", folder)]
-
-
-def updates(numbers: Mapping[str, float]) -> Column:
-    """Return what tells of the updates."""
-    formats = {"kl": ("KL", ".4f"), "noise": ("noise", ".2f"), "learning_rate": ("learning rate", ".1e")}
-    return [(name, f"{numbers[key]:{style}}") for key, (name, style) in formats.items() if key in numbers]
-
-
-def table(columns: Sequence[Column]) -> Table:
-    """Return columns side by side; lines that do not fit are cut off, unless they may wrap."""
-    grid = Table.grid(padding=(0, 2), expand=True)
-    for _ in columns:
-        grid.add_column(style="dim", no_wrap=True, width=NAMES)
-        grid.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
-    for cells in zip_longest(*columns, fillvalue=("", "")):
-        grid.add_row(*(part for cell in cells for part in cell))
-    return grid
+            entries |= {"reward": f"{numbers['reward']:.2f}", "episode length": f"{numbers['length']:.1f} s"}
+        formats = {"kl": ("KL", ".4f"), "noise": ("noise", ".2f"), "learning_rate": ("learning rate", ".1e")}
+        entries |= {name: f"{numbers[key]:{style}}" for key, (name, style) in formats.items() if key in numbers}
+        if self._tracking:
+            entries["tracking"] = f"{self._tracking[-1]:.3f} (best {max(self._tracking):.3f})"
+            entries["falls"] = f"{self._measured[f'{_EVALUATION}/falls_per_minute']:.1f} per minute"
+        elsewhere = {_ELSEWHERE.fullmatch(name): number for name, number in self._measured.items()}
+        return entries | {f"in {found[1]}": f"{number:.3f}" for found, number in elsewhere.items() if found}
 
 
 def blocks(values: Sequence[float]) -> str:

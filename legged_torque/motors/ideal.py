@@ -2,34 +2,41 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import warp as wp
 from torch import Tensor
 
-from legged_torque.motors.drive import in_kernel
-from legged_torque.motors.motors import Motors
+from legged_torque.motors.kernel import read
+from legged_torque.motors.motor import Motor
 
 
 @wp.struct
-class IdealMotor:
-    """What :func:`ideal_torque` reads, see :class:`Motors`."""
+class TorqueLimits:
+    """Inputs of :func:`limited_torque`."""
 
-    limits: wp.array2d[float]
-    strength: wp.array2d[float]
+    limits: wp.array2d[float]  # lowest and highest [N m]; (2, num_dof)
 
 
 @wp.func
-def ideal_torque(motors: IdealMotor, world: int, joint: int, wanted: float, vel: float) -> float:
-    """Return strength times torque, clipped to the limits; NaN stays NaN, as in torch."""
-    torque = motors.strength[world, joint] * wanted
+def limited_torque(
+    motors: TorqueLimits, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float
+) -> float:
+    """Return the torque, clipped to the limits; NaN stays NaN, as in torch."""
     low, high = motors.limits[0, joint], motors.limits[1, joint]
-    return wp.where(torque < low, low, wp.where(torque > high, high, torque))
+    return wp.where(wanted < low, low, wp.where(wanted > high, high, wanted))
 
 
-class IdealMotors(Motors):
-    """Strength and limits, whatever the speed."""
+class IdealMotor(Motor):
+    """Limits of the torques, the same at any speed."""
 
-    @in_kernel(ideal_torque)
-    def apply(self, wanted: Tensor, dof_vel: Tensor, out: Tensor) -> None:
-        """Write strength times torque, clipped to the limits."""
-        torch.clamp(self.strength * wanted, self.limits[0], self.limits[1], out=out)
+    kernel = limited_torque
+
+    def apply(self, wanted: Tensor, pos: Tensor, vel: Tensor, substep: int) -> Tensor:
+        """Return the torques, clipped to the limits."""
+        return torch.clamp(wanted, *self.joints.torque_limits)
+
+    def kernel_reads(self) -> Any:
+        """Return the limits."""
+        return read(TorqueLimits, limits=self.joints.torque_limits)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, Protocol
 
 import mujoco
+import torch
 import warp as wp
 from torch import Tensor
 
@@ -134,29 +135,19 @@ class Engine(Protocol):
 
     # ---- "per_world" -------------------------------------------------------------------------------------------------
 
-    def field(self, name: str) -> Tensor:
-        """Return a writable field of the model with a row per world, which it gets at the first request.
+    def field(self, name: str, columns: Sequence[int] | None = None) -> Tensor:
+        """Return a field of the model with a row per world, which it gets at the first request, to change ``columns``.
 
-        The first request must precede the first step that is captured into a graph. Shape: (num_envs, ...). A UserError
-        if the engine reads no such field.
-        """
-        raise lacks(self, "per_world")
-
-    def check_columns(self, name: str, columns: Sequence[int]) -> None:
-        """Refuse columns of a world's part of a field, all entries flattened, that the engine never reads."""
-        raise lacks(self, "per_world")
-
-    def vary_legs(self) -> None:
-        """Expect :meth:`update_constants` after changes of masses or places of bodies other than the trunk.
-
-        Otherwise it takes only changes of the trunk's mass and of armatures into account, which is faster.
+        These are numbers of a row, all entries flattened; None stands for all. The first request must precede the first
+        step that is captured into a graph. Shape: (num_envs, ...). A UserError if the engine does not read the field,
+        or one of the columns.
         """
         raise lacks(self, "per_world")
 
     def update_constants(self, mask: Tensor) -> None:
         """Recompute what MuJoCo derives from masses and armatures, after these changed in the worlds of ``mask``.
 
-        Shape: (num_envs,), bool; see :meth:`vary_legs`.
+        Shape: (num_envs,), bool.
         """
         raise lacks(self, "per_world")
 
@@ -170,6 +161,12 @@ def require(engine: Engine | type[Engine], capability: str, what: str) -> None:
     """Raise a UserError that names engine, capability, and ``what`` needs it, unless the engine has it."""
     if capability not in engine.capabilities:
         raise lacks(engine, capability, what)
+
+
+def shared_field(engine: Engine, name: str, columns: Sequence[int] | None = None) -> Tensor:
+    """Return a copy of a field of the model that all worlds share. Shape: (1, ...)."""
+    owner = engine.mj_model.opt if name == "gravity" else engine.mj_model
+    return torch.tensor(getattr(owner, name), dtype=torch.float32, device=engine.device).unsqueeze(0)
 
 
 def copy_tensors(state: dict[str, Tensor], into: dict[str, Tensor]) -> None:

@@ -10,8 +10,9 @@ from legged_torque.sim.engine import Engine, require
 from legged_torque.sim.fused.engine import FusedEngine
 from legged_torque.sim.height_map import HeightMap
 from legged_torque.sim.mjwarp import MuJoCoWarpEngine
-from legged_torque.sim.robot_file import actuator_problems, refuse
+from legged_torque.sim.robot_file import actuator_problems
 from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.problems import refuse
 
 ENGINES: dict[str, type[Engine]] = {engine.name: engine for engine in (FusedEngine, MuJoCoWarpEngine)}
 """What ``sim.engine`` may be. A file of a user's may add an engine of its own."""

@@ -1,21 +1,22 @@
-"""Requirements on a robot's MJCF that all engines share. Everything that is missing is reported at once."""
+"""Requirements on a robot's MJCF that hold for every engine."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 
 from legged_torque.sim.model import FLOOR
-from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import motors_of, torque_range, why_no_motor
+from legged_torque.utils.problems import with_names
 
 _ONE_NUMBER = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))  # types of joints
 
 
 def spec_problems(spec: mujoco.MjSpec) -> Iterator[str]:
-    """Yield problems with the parts of a file: trunk, floor and names of geoms."""
+    """Yield problems with the trunk, the floor and names of geoms."""
     trunks = [body for body in spec.worldbody.bodies if any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in body.joints)]
     if len(trunks) != 1:
         yield f"it must have one body with a free joint, the trunk, not {len(trunks)}"
@@ -24,7 +25,7 @@ def spec_problems(spec: mujoco.MjSpec) -> Iterator[str]:
     unnamed = [geom for geom in spec.geoms if not geom.name and (geom.contype or geom.conaffinity)]
     bodies = dict.fromkeys(f"'{geom.parent.name}'" for geom in unnamed)
     if unnamed:
-        yield f"geoms that collide need names, by which settings refer to them; those of {', '.join(bodies)} have none"
+        yield f"geoms that collide need names, by which settings know them; those of {', '.join(bodies)} have none"
 
 
 def model_problems(model: mujoco.MjModel) -> Iterator[str]:
@@ -36,7 +37,7 @@ def model_problems(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def joint_problems(model: mujoco.MjModel) -> Iterator[str]:
-    """Yield problems with the joints: the trunk's must be the first, all others hang on it, and each has a name."""
+    """Yield problems with the joints: the trunk's must be the first, all others below it, and each must have a name."""
     if not model.njnt or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
         yield "its first joint must be the trunk's free joint"
         return
@@ -54,47 +55,35 @@ def joint_problems(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def motor_problems(model: mujoco.MjModel) -> Iterator[str]:
-    """Yield problems with the motors: each joint needs one of its own, with limits."""
+    """Yield problems with the motors: each joint must have one of its own, with limits."""
     yield from actuator_problems(model)
-    wrong: dict[str, list[str]] = {}
+    wrong = defaultdict[str, list[str]](list)
     for joint in range(1, model.njnt):
         name, motors = model.joint(joint).name, motors_of(model, joint)
         if len(motors) != 1:
-            wrong.setdefault(f"each joint must have one motor, not {len(motors)}", []).append(name)
+            wrong[f"each joint must have one motor, not {len(motors)}"].append(name)
         elif not -np.inf < np.subtract(*torque_range(model, motors[0])) < 0.0:  # lowest less highest
-            wrong.setdefault("motors need torque limits, for example a forcerange", []).append(name)
-    yield from _with_names(wrong)
+            wrong["motors need torque limits, for example a forcerange"].append(name)
+    yield from with_names(wrong)
     if model.opt.disableactuator or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
         yield "its options switch actuators off"
 
 
 def actuator_problems(model: mujoco.MjModel) -> Iterator[str]:
-    """Yield actuators that are no motors, whose controls are not torques."""
-    wrong: dict[str, list[str]] = {}
+    """Yield actuators that are not motors: their controls would not be the torques that tasks send."""
+    wrong = defaultdict[str, list[str]](list)
     for actuator in range(model.nu):
         reason = why_no_motor(model, actuator)
         if reason:
-            wrong.setdefault(f"make a <motor> with a forcerange of what {reason}", []).append(_name(model, actuator))
-    yield from _with_names(wrong)
-
-
-def _with_names(wrong: dict[str, list[str]]) -> Iterator[str]:
-    """Yield problems, each with the names of its parts."""
-    for problem, names in wrong.items():
-        yield f"{problem} ({', '.join(names)})"
-
-
-def refuse(problems: list[str], what: str) -> None:
-    """Raise a UserError with all problems in one line, after ``what`` has them, unless there are none."""
-    if problems:
-        raise UserError(f"{what}: {'; '.join(problems)}")
+            wrong[f"make a <motor> with a forcerange of what {reason}"].append(_name(model, actuator))
+    yield from with_names(wrong)
 
 
 def use_plain_motors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
-    """Put the motors of a file without problems into the order of its joints, so that controls are joint torques.
+    """Put the motors of a file without problems in the order of its joints and make their controls torques.
 
-    Each becomes a motor without gear, whose only limits are the tightest of the file. Returns whether anything has
-    changed, so that ``model``, compiled from ``spec``, is out of date.
+    Each becomes a motor without gear, limited by the tightest limits in the file. Returns whether this changes
+    ``spec``, so that ``model``, compiled from it, is out of date.
     """
     joints = range(1, model.njnt)
     motors = [motors_of(model, joint)[0] for joint in joints]
@@ -103,7 +92,7 @@ def use_plain_motors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
     if motors == list(range(model.nu)) and all(_is_plain(model, motor) for motor in motors):
         return False
     for place, actuator in enumerate(spec.actuators):
-        actuator.name = f"motor {place}"  # no two may have the same name, even for a moment
+        actuator.name = f"motor {place}"  # names must be unique at all times
     for actuator, joint, name, limit in zip(spec.actuators, joints, names, limits, strict=True):
         actuator.name, actuator.target = name, model.joint(joint).name
         actuator.gainprm[0], actuator.gear = 1.0, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
@@ -116,7 +105,7 @@ def use_plain_motors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
 
 
 def _is_plain(model: mujoco.MjModel, motor: int) -> bool:
-    """Return whether a motor has no gear, and its two ranges are equal and its only limits."""
+    """Return whether a motor has no gear, and its own two ranges are equal and the only limits."""
     limited = model.actuator_ctrllimited[motor] and model.actuator_forcelimited[motor]
     same = (model.actuator_ctrlrange[motor] == model.actuator_forcerange[motor]).all()
     no_gear = model.actuator_gainprm[motor, 0] == 1.0 and model.actuator_gear[motor, 0] == 1.0
@@ -124,7 +113,7 @@ def _is_plain(model: mujoco.MjModel, motor: int) -> bool:
 
 
 def _name(model: mujoco.MjModel, actuator: int) -> str:
-    """Return the name of an actuator, or of the joint that it drives if it has none."""
+    """Return the name of an actuator, or of its joint if it has none."""
     joint = model.actuator_trnid[actuator, 0]
     on_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
     return model.actuator(actuator).name or (model.joint(joint).name if on_joint else str(actuator))

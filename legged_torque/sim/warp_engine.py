@@ -20,6 +20,9 @@ from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.model import CONTACT_DATA, use_known_options
 from legged_torque.utils.errors import UserError, unknown_name
 
+_OF_LEGS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat")
+"""Fields on which the inverse weights of legs depend, apart from armatures."""
+_TRUNK = 1  # its body
 _BUFFERS = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CONTACT_MATCH")
 
 
@@ -108,21 +111,21 @@ class WarpEngine(Engine):
             self._carried[name] = wp.to_torch(getattr(self._data, name))
         return self._carried["xfrc_applied"], self._carried["qfrc_applied"]
 
-    def field(self, name: str) -> Tensor:
-        """Return a writable field of the model with a row per world, which it gets at the first request."""
+    def field(self, name: str, columns: Sequence[int] | None = None) -> Tensor:
+        """Return a field of the model with a row per world, which it gets at the first request, to change ``columns``.
+
+        Constants of legs are recomputed from then on if other bodies than the trunk may change.
+        """
         if name not in self._field_names():
             raise unknown_name(f"field for sim.engine '{self.name}'", name, self._field_names())
-        _ = self._constants  # while worlds are alike
+        constants = self._constants  # while worlds are alike
         if name not in self.fields:
             self._give_rows(name)
-        return self.fields[name]
-
-    def check_columns(self, name: str, columns: Sequence[int]) -> None:
-        """Refuse columns that the engine never reads; MuJoCo Warp reads all."""
-
-    def vary_legs(self) -> None:
-        """Expect :meth:`update_constants` after changes of masses or places of bodies other than the trunk."""
-        self._constants.vary_branches()
+        field = self.fields[name]
+        width = field[0, 0].numel()
+        if name in _OF_LEGS and (columns is None or any(column // width != _TRUNK for column in columns)):
+            constants.vary_branches()
+        return field
 
     def update_constants(self, mask: Tensor) -> None:
         """Recompute what MuJoCo derives from masses and armatures in the worlds of ``mask`` (num_envs,), bool."""

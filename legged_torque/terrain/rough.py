@@ -85,6 +85,10 @@ class RoughGround(Terrain):
         levels = torch.where(levels < num_rows, levels, torch.randint_like(self.levels, num_rows))
         self.levels.copy_(torch.where(mask, levels, self.levels))
 
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the levels."""
+        return {"levels": self.levels}
+
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the mean level of all worlds."""
         return {"terrain_level": self.levels.float().mean()}

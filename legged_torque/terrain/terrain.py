@@ -1,4 +1,4 @@
-"""What every ground can tell. All points are in the world frame [m]; nothing here waits for the host."""
+"""The interface of grounds. All points are in the world frame [m]; nothing here waits for the host."""
 
 from __future__ import annotations
 
@@ -52,6 +52,10 @@ class Terrain(ABC):
     @abstractmethod
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the scalars by which one sees how hard the ground is, for logging."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what differs between worlds and changes from episode to episode."""
+        return {}
 
     def height_above(self, points: Tensor) -> Tensor:
         """Return how high points are above the ground under them [m]. Shapes: (..., 3), (...,)."""

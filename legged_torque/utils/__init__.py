@@ -1,1 +1,1 @@
-"""What every part uses: configuration, errors, the task registry, run folders, math. Imports no other part."""
+"""Used by every other folder, and imports none of them: settings, errors, the task registry, run folders, math."""

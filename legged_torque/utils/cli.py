@@ -1,4 +1,4 @@
-"""What every script needs: a parser of its command line, and an end that a user expects. Needs no torch."""
+"""Parsing of command lines, and errors as one line with an exit status. Needs no torch."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ import argparse
 import contextlib
 import errno
 import gc
-import json
 import math
 import os
 import re
 import shutil
+import signal
 import sys
 import tempfile
 import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.utils.errors import TrainingError, UserError, is_out_of_memory, unknown_name
-from legged_torque.utils.interrupt import end_on_interrupt, raise_on_interrupt
+from legged_torque.utils.rendering import disable_renderer
 
 MAX_NAME = 255  # bytes of the name of a file, on the usual systems
 COMMAND = "legged-torque"  # the console command that runs every script
@@ -64,7 +64,7 @@ class Parser(argparse.ArgumentParser):
     def parse_args(self, args=None, namespace=None):
         """Parse the command line; an option that does not exist, or a value that is empty, is a UserError.
 
-        When a shell asks how a command line may go on, it is told so, and the script ends.
+        When a shell asks for completions of a command line, they are printed, and the script ends.
         """
         if "_ARGCOMPLETE" in os.environ:
             import argcomplete
@@ -73,7 +73,7 @@ class Parser(argparse.ArgumentParser):
         words = sys.argv[1:] if args is None else list(args)
         for before, word in zip(["", *words], words, strict=False):
             name, equals, value = word.partition("=") if word.startswith("--") else (before, "", word)
-            if not value and (equals or not word):
+            if (equals or not word) and value in ("", "--"):  # argparse would take --option=-- as no value
                 raise UserError(f"the value of {name} is empty" if name else "an argument is empty")
         namespace, unknown = self.parse_known_args(words, namespace)
         if unknown:
@@ -83,56 +83,66 @@ class Parser(argparse.ArgumentParser):
 
 
 @contextlib.contextmanager
-def importing() -> Iterator[None]:
-    """Import inside what takes seconds, torch and Warp, after all that can be told without it.
+def slow_imports() -> Iterator[None]:
+    """Context for imports that take seconds, of torch and Warp. Check the command line before.
 
-    Ctrl-C ends the process without a traceback. The garbage collector rests, and what has been imported stays out of
-    its sight: searching that took a third of the time, and would take a second or two at the end.
+    Ctrl-C ends the process without a traceback. The garbage collector is off, and never searches what was imported:
+    that took a third of the time, and a second or two at the end.
     """
-    end_on_interrupt()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     gc.disable()
     try:
         yield
     finally:
         gc.freeze()
         gc.enable()
-        raise_on_interrupt()
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
     if "mujoco" in sys.modules:  # which would write its warnings to a file in the current folder
         sys.modules["mujoco"].set_mju_user_warning(lambda text: print(f"MuJoCo: {text}", file=sys.stderr))
 
 
-def run_script(main: Callable[[], None]) -> None:
-    """Run a script's main function; expected errors exit without a traceback.
+def run_script(main: Callable[[], None], draws: bool = False) -> None:
+    """Run the main function of a script; expected errors are one line without a traceback.
 
-    Exit status 2 for a user's mistake, a file that cannot be used or too little memory, 130 for Ctrl-C, 1 for a
-    training that cannot learn or an output that nobody reads any more (``| head``).
+    The exit status is 2 for a mistake of the user, a file that cannot be used or too little memory, 130 after Ctrl-C,
+    and 1 for a training that cannot learn or an output that is not read any more (``| head``).
+
+    Args:
+        main: Takes no arguments.
+        draws: Whether the script chooses a renderer; others must not depend on one.
     """
+    if not draws:
+        disable_renderer()
     try:
-        raise_on_interrupt()
         main()
-    except UserError as error:
-        print("error:", " ".join(str(error).splitlines()), file=sys.stderr)
-        sys.exit(2)
     except TrainingError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
+        _end(1, f"error: {error}")
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
-    except BrokenPipeError:  # nobody reads the output any more (| head)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes what is left when it ends
+        _end(130, "interrupted")
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python writes when it ends
         sys.exit(1)
     except Exception as error:
-        if isinstance(error, OSError) and error.filename is not None:
-            print(f"error: {error.strerror}: {str(error.filename)!r}", file=sys.stderr)
+        if isinstance(error, UserError):
+            message = " ".join(str(error).splitlines())
+        elif isinstance(error, OSError):
+            message = f"{error.strerror or error}" + (f": {str(error.filename)!r}" if error.filename else "")
         elif isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("legged_torque"):
-            print(f"error: '{error.name}' is not installed; pip install legged_torque brings it along", file=sys.stderr)
+            message = f"'{error.name}' is not installed; pip install legged_torque brings it along"
         elif is_out_of_memory(error):
-            reason = str(error).strip().splitlines() or ["nothing is left"]
-            print("error: this does not fit in memory, lower --num_envs:", reason[0], file=sys.stderr)
+            reason = (str(error).strip() or "no reason is given").splitlines()[0]
+            message = f"this does not fit in memory, lower --num_envs: {reason}"
         else:
             raise
-        sys.exit(2)
+        _end(2, f"error: {message}")
+
+
+def _end(status: int, message: str) -> NoReturn:
+    """End the process with a line on standard error."""
+    print(message, file=sys.stderr)
+    sys.exit(status)
 
 
 def check_at_least(args: object, lowest: int, *names: str) -> None:
@@ -158,22 +168,8 @@ def add_command_arg(parser: Parser) -> None:
     parser.add_argument("--command", type=finite, nargs=3, metavar=("X", "Y", "YAW"), help=hint)
 
 
-def write_json(file: Path, value: Any) -> None:
-    """Write a value with null in place of what is not a finite number, which JSON does not know."""
-
-    def without_nan(part: Any) -> Any:
-        if isinstance(part, dict):
-            return {key: without_nan(entry) for key, entry in part.items()}
-        if isinstance(part, list):
-            return [without_nan(entry) for entry in part]
-        return None if isinstance(part, float) and not math.isfinite(part) else part
-
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(without_nan(value), indent=1) + "\n", encoding="utf-8")
-
-
 def check_output(file: Path) -> None:
-    """Raise a UserError if a file cannot be written when the work is done; nothing is created or changed yet."""
+    """Raise a UserError if a file cannot be written later; nothing is created or changed yet."""
     try:
         if file.is_dir():
             raise UserError(f"cannot write '{file}': it is a folder")

@@ -14,7 +14,7 @@ from legged_torque.utils.cli import COMMAND, Parser, run_script
 from legged_torque.utils.errors import unknown_name
 
 USUAL = ("train", "play", "evaluate", "export", "sim2sim", "experiment", "report", "import_robot", "info")
-"""What most users need, in the order of ``--help``."""
+"""Scripts for most users, in the order of ``--help``."""
 
 
 def main() -> None:
@@ -27,7 +27,7 @@ def main() -> None:
     if words and not words[0].startswith("-"):
         run_script(lambda: start(*words))
     else:
-        run_script(tell)
+        run_script(show_overview)
 
 
 def start(name: str, *words: str) -> None:
@@ -41,7 +41,7 @@ def start(name: str, *words: str) -> None:
     spec.loader.exec_module(module)
 
 
-def tell() -> None:
+def show_overview() -> None:
     """Answer ``--help`` and ``--version``, and complete the name of a script."""
     parser = Parser(str(legged_torque.__doc__))
     parser.prog, parser.epilog = COMMAND, f"commands:\n{overview()}"
@@ -57,11 +57,11 @@ def scripts() -> list[str]:
 
 
 def overview() -> str:
-    """Return a line per script, with what it does by the first line of its docstring."""
+    """Return a line per script, with the first line of its docstring."""
     return "\n".join(f"  {name:<20} {purpose(SCRIPTS_DIR / f'{name}.py')}" for name in scripts())
 
 
 def purpose(file: Path) -> str:
-    """Return what a script does."""
+    """Return the purpose of a script, by its docstring."""
     text = ast.get_docstring(ast.parse(file.read_text("utf-8"))) or ""
     return text.partition("\n")[0].partition(":")[0].rstrip(".")

@@ -1,19 +1,16 @@
-"""Configuration classes in legged_gym's style, and plain dictionaries and dotted paths to read and change them."""
+"""Configuration classes in legged_gym's style; dictionaries and dotted paths to read and change them."""
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import inspect
-import itertools
-import re
+from collections.abc import Callable
 from typing import Any
 
-import yaml
-
 from legged_torque.utils.errors import UserError, unknown_name
-
-MAX_LENGTH, MAX_DEPTH, MAX_ENTRIES = 1_000_000, 50, 100_000
-"""Characters and levels of a YAML text, and values of a level; settings have about 10 000, 6 and 100."""
+from legged_torque.utils.limits import check_value, types_of
+from legged_torque.utils.plain_yaml import parse_value
 
 
 class Section:
@@ -34,12 +31,9 @@ class Section:
         """Refuse unknown names of a new class with a UserError, and let its nested classes inherit."""
         super().__init_subclass__()
         _check_names(cls)
-        names = [name for owner in reversed(cls.__mro__) for name in vars(owner)]
-        for name in dict.fromkeys(names):
-            if not name.startswith("_") and inspect.isclass(getattr(cls, name)):
-                merged = _merge(cls, name)
-                if merged is not getattr(cls, name):
-                    setattr(cls, name, merged)
+        for name in _entries(cls):
+            if inspect.isclass(getattr(cls, name)):
+                setattr(cls, name, _merge(cls, name))
 
     def __init__(self) -> None:
         """Instantiate the nested sections, all the way down."""
@@ -52,53 +46,68 @@ class Section:
             setattr(self, key, value)
 
 
-def _check_names(cls: type[Section]) -> None:
-    """Refuse names of a class that no base class has and that it does not declare new."""
-    known = [name for base in cls.__bases__ for name in dir(base) if not name.startswith("_")]
-    annotated = inspect.get_annotations(cls)
-    where = cls.__qualname__.rpartition("<locals>.")[2]
-    for name, value in vars(cls).items():
-        if name.startswith("_") or inspect.isroutine(value):
-            continue
-        declared_new = name in annotated or (inspect.isclass(value) and issubclass(value, Section))
-        if known and name not in known and not declared_new:
-            raise UserError(
-                f"{unknown_name(f'setting or section of {where}', name, known)}; to declare it new, annotate a setting "
-                f"({name}: float = ...), derive a section from Section"
-            )
-        for base in cls.__bases__:
-            if inspect.isclass(getattr(base, name, value)) != inspect.isclass(value):
-                kinds = ("a setting", "a section") if inspect.isclass(value) else ("a section", "a setting")
-                raise UserError(f"{where}.{name} is {kinds[1]}, but in {base.__qualname__} it is {kinds[0]}")
+def _is_entry(name: str, value: Any) -> bool:
+    """Return whether an attribute of a class is a setting or a section."""
+    return not name.startswith("_") and not inspect.isroutine(value)
+
+
+def _entries(owner: type) -> list[str]:
+    """Return the names of all settings and sections of a class, inherited ones included and first."""
+    found = [(name, value) for base in reversed(owner.__mro__[:-1]) for name, value in vars(base).items()]
+    return list(dict.fromkeys(name for name, value in found if _is_entry(name, value)))
 
 
 def _merge(cls: type[Section], name: str) -> type[Section]:
-    """Return the nested class ``name`` of ``cls``; its bases are the sections of that name in all bases of ``cls``."""
-    own = vars(cls).get(name)
-    inherited = [getattr(base, name) for base in cls.__bases__ if hasattr(base, name)]
-    named = [] if own is None else [base for base in own.__bases__ if base not in (object, Section)]
-    # What it names as bases itself comes first, unless it is among theirs anyway.
-    foreign = [base for base in named if not any(issubclass(section, base) for section in inherited)]
-    bases = list(dict.fromkeys([*foreign, *inherited])) or [Section]
-    bases = [base for base in bases if not any(other is not base and issubclass(other, base) for other in bases)]
-    if own is None and len(bases) == 1:
-        return bases[0]
-    of_every_class = ("__dict__", "__weakref__")  # Python adds them by itself
-    members = {} if own is None else {key: value for key, value in vars(own).items() if key not in of_every_class}
-    members["__qualname__"] = f"{cls.__qualname__}.{name}"
-    return type(name, tuple(bases), members)
+    """Return the section ``name`` of ``cls``: its own nested class, and those of all its bases, as bases of a class."""
+    found = [getattr(owner, name) for owner in (cls, *cls.__bases__) if hasattr(owner, name)]
+    parts = [part for part in dict.fromkeys(found) if not any(o is not part and issubclass(o, part) for o in found)]
+    if len(parts) == 1 and issubclass(parts[0], Section):
+        return parts[0]
+    bases = [*parts, *(() if any(issubclass(part, Section) for part in parts) else (Section,))]
+    return type(name, tuple(bases), {"__qualname__": f"{cls.__qualname__}.{name}", "__module__": cls.__module__})
+
+
+def _check_names(cls: type[Section]) -> None:
+    """Refuse names of a class, and of its bases that are no sections yet, that they do not have from a section."""
+    where = cls.__qualname__.rpartition("<locals>.")[2]
+    for owner in (cls, *(base for base in cls.__bases__ if not issubclass(base, Section))):
+        own = {name: value for name, value in vars(owner).items() if _is_entry(name, value)}
+        sections = [base for base in cls.__bases__ if issubclass(base, Section)] if own else []
+        known = [name for section in sections for name in _entries(section)]
+        annotated = inspect.get_annotations(owner)
+        for name, value in own.items():
+            declared_new = name in annotated or (inspect.isclass(value) and issubclass(value, Section))
+            if known and name not in known and not declared_new:
+                raise UserError(
+                    f"{unknown_name(f'setting or section of {where}', name, known)}; to declare it new, annotate a "
+                    f"setting ({name}: float = ...), derive a section from Section"
+                )
+            for section in sections:
+                if inspect.isclass(getattr(section, name, value)) != inspect.isclass(value):
+                    kinds = ("a setting", "a section") if inspect.isclass(value) else ("a section", "a setting")
+                    raise UserError(f"{where}.{name} is {kinds[1]}, but in {section.__qualname__} it is {kinds[0]}")
 
 
 class BaseConfig(Section):
-    """A whole configuration: settings in sections, and nothing but sections on top."""
+    """A whole configuration."""
+
+    def check(self) -> None:
+        """Raise a UserError that names the first setting with a value that is not allowed, alone or with others."""
+        check_section(self)
+
+    def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Return the settings of an earlier run, as nested dictionaries, in today's layout."""
+        return values
+
+    def renamed(self) -> dict[str, str]:
+        """Return the new dotted paths of settings and sections by their old ones, which users may still give."""
+        return {}
 
 
 def section_keys(section: Any) -> list[str]:
     """Return the names of a section's entries, inherited ones included, in the order of their definition."""
-    classes = reversed(type(section).__mro__[:-1])
-    keys = dict.fromkeys(key for cls in classes for key in vars(cls))
-    keys.update(dict.fromkeys(vars(section)))
-    return [key for key in keys if not key.startswith("_") and not inspect.isroutine(getattr(section, key))]
+    names = dict.fromkeys([*_entries(type(section)), *vars(section)])
+    return [name for name in names if not name.startswith("_")]
 
 
 def to_dict(section: Any) -> dict[str, Any]:
@@ -115,115 +124,66 @@ def flat(values: Any, path: str = "") -> dict[str, Any]:
     return {name: value for part in parts for name, value in part.items()}
 
 
+def check_section(section: Any, path: str = "") -> None:
+    """Raise a UserError that names the first setting of a section, or below it, whose value is not allowed."""
+    for key in section_keys(section):
+        value, dotted = getattr(section, key), f"{path}.{key}" if path else key
+        if isinstance(value, Section):
+            check_section(value, dotted)
+        else:
+            check_value(dotted, value, _type_of(section, key))
+
+
+def _type_of(section: Any, key: str) -> Any:
+    """Return the declared type of a setting; that of its value if a class of its own has declared none."""
+    return types_of(type(section)).get(key, type(getattr(section, key)))
+
+
 def update_from_dict(section: Any, values: dict[str, Any], path: str = "") -> None:
-    """Write nested dictionaries into a ``section``, which stands at ``path``; what does not fit is a UserError."""
+    """Write nested dictionaries into a ``section`` at ``path``; a UserError names what does not fit."""
     if not isinstance(values, dict):
         raise UserError(f"config key '{path}' is a section with entries, it cannot be the value {values!r}")
     for key, value in values.items():
-        set_entry(section, [str(key)], value, path)
+        _set(section, [str(key)], value, path)
 
 
 def set_by_path(section: Any, dotted_path: str, value: Any) -> None:
-    """Set one entry, e.g. ``set_by_path(cfg, "rewards.scales.torques", -1e-4)``; errors as of update_from_dict."""
-    set_entry(section, dotted_path.split("."), value, "")
+    """Set one entry, e.g. ``set_by_path(cfg, "rewards.scales.torques", -1e-4)``.
 
-
-def set_entry(section: Any, keys: list[str], value: Any, path: str) -> None:
-    """Set the entry below ``section`` that ``keys`` lead to; ``path`` is where ``section`` itself stands."""
-    key, rest = keys[0], keys[1:]
-    dotted = f"{path}.{key}" if path else key
-    is_dict = isinstance(section, dict)
-    allowed = list(section) if is_dict else section_keys(section)
-    if key not in allowed:
-        raise unknown_name("config key", dotted, [f"{path}.{name}" if path else name for name in allowed])
-    old = section[key] if is_dict else getattr(section, key)
-    if rest:
-        if not isinstance(old, (Section, dict)):
-            raise UserError(f"config key '{dotted}' is a value, it has no entry '{'.'.join(rest)}'")
-        set_entry(old, rest, value, dotted)
-    elif isinstance(old, Section):
-        update_from_dict(old, value, dotted)
-    else:
-        new = convert(value, old, dotted)
-        if is_dict:
-            section[key] = new
-        else:
-            setattr(section, key, new)
-
-
-def convert(value: Any, old: Any, path: str) -> Any:
-    """Return ``value`` in the type of ``old``, the entry that it replaces; a UserError if that is not possible."""
-    if isinstance(value, str) and not isinstance(old, str):
-        value = parse_value(value)
-    if old is None or value is None:  # whether it may be null, its type says: see check_section
-        return value
-    if isinstance(old, bool) or isinstance(value, bool):
-        matches = isinstance(old, bool) and isinstance(value, bool)
-    elif isinstance(old, float) and isinstance(value, int):
-        return float(str(value))  # too large a number is infinite, not an error
-    elif isinstance(old, int) and isinstance(value, float):
-        matches = value.is_integer()
-        value = int(value) if matches else value
-    else:
-        matches = isinstance(value, type(old))
-    if matches and isinstance(old, list) and old and len({type(item) for item in old}) == 1:
-        value = [convert(item, old[0], f"{path}[{i}]") for i, item in enumerate(value)]
-    if matches and isinstance(old, dict) and len({type(item) for item in old.values()}) == 1:
-        value = {key: convert(item, next(iter(old.values())), f"{path}.{key}") for key, item in value.items()}
-    if not matches:
-        raise UserError(f"config key '{path}' takes a value like {old!r}, not {value!r}")
-    return value
-
-
-def parse_value(text: str) -> Any:
-    """Return the value that a piece of text stands for, see :func:`parse_yaml`."""
-    return parse_yaml(text, f"the value '{text}'")
-
-
-def parse_yaml(text: str, what: str) -> Any:
-    """Return what YAML text holds, see :class:`Loader`; a UserError says ``what`` is no YAML or too large."""
-    try:
-        if len(text) <= MAX_LENGTH and is_small(value := yaml.load(text, Loader)):
-            return value
-    except (yaml.YAMLError, ValueError) as error:  # a whole number of 5000 digits is a ValueError
-        raise UserError(f"{what} is not valid YAML: {' '.join(str(error).split())}") from None
-    except RecursionError:
-        pass
-    raise UserError(f"{what} is nested too deeply or larger than settings are")
-
-
-def is_small(value: Any) -> bool:
-    """Return whether nested lists and dictionaries have at most :data:`MAX_DEPTH` levels of :data:`MAX_ENTRIES` each.
-
-    YAML may name a part again and again, even inside of itself, so that a short text holds more than memory does. Whole
-    numbers must be small enough for a float.
+    Text is read as YAML, unless the setting allows the text itself. A UserError names an entry that does not exist, or
+    what its values must be.
     """
-    level = [value]
-    for _ in range(MAX_DEPTH):
-        if any(isinstance(part, int) and part.bit_length() > 1000 for part in level):
-            return False
-        parts = (part.values() if isinstance(part, dict) else part for part in level if isinstance(part, (dict, list)))
-        level = list(itertools.islice(itertools.chain.from_iterable(parts), MAX_ENTRIES + 1))
-        if not level or len(level) > MAX_ENTRIES:
-            return not level
-    return False
+    _set(section, dotted_path.split("."), value, "")
 
 
-class Loader(yaml.SafeLoader):
-    """Reads words as YAML 1.2 does: 017 is seventeen and 1e-4 a number; 1:30, on, yes and dates are text."""
+def _set(section: Any, keys: list[str], value: Any, path: str) -> None:
+    """Set the entry below ``section``, which is at ``path``, that ``keys`` lead to."""
+    key, *rest = keys
+    dotted = _known(key, section_keys(section), path)
+    old, hint = getattr(section, key), _type_of(section, key)
+    if isinstance(old, Section):
+        _set(old, rest, value, dotted) if rest else update_from_dict(old, value, dotted)
+    elif not rest:
+        setattr(section, key, _read(dotted, value, hint))
+    elif isinstance(old, dict) and not rest[1:]:
+        _known(rest[0], list(old), dotted)
+        setattr(section, key, _read(dotted, value, hint, lambda entry: {**old, rest[0]: entry}))
+    else:
+        raise UserError(f"config key '{dotted}' is a value, it has no entry '{'.'.join(rest)}'")
 
 
-class Dumper(yaml.SafeDumper):
-    """Writes what :class:`Loader` reads again: text that looks like one of its numbers is quoted."""
+def _known(key: str, names: list[str], path: str) -> str:
+    """Return the dotted path of an entry; a UserError if it is not one of the names."""
+    prefix = f"{path}." if path else ""
+    if key not in names:
+        raise unknown_name("config key", f"{prefix}{key}", [f"{prefix}{name}" for name in names])
+    return f"{prefix}{key}"
 
 
-Loader.yaml_implicit_resolvers = {}  # none of YAML 1.1
-for _tag, _pattern in {
-    "null": r"~|null|Null|NULL|",
-    "bool": r"true|True|TRUE|false|False|FALSE",
-    "int": r"[-+]?[0-9]+",
-    "float": r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-}.items():
-    for _class in (Loader, Dumper):
-        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})$"), None)
-Loader.add_constructor("tag:yaml.org,2002:int", lambda _, node: int(node.value))
+def _read(name: str, value: Any, hint: Any, whole: Callable[[Any], Any] = lambda value: value) -> Any:
+    """Return a value, or what a text stands for, in a type; ``whole`` completes it to the value of a setting."""
+    if isinstance(value, str):
+        with contextlib.suppress(UserError):
+            return check_value(name, whole(value), hint)
+        value = parse_value(value)
+    return check_value(name, whole(value), hint)

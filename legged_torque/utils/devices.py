@@ -1,4 +1,4 @@
-"""Which device a process works on."""
+"""The device of a process."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def resolve_device(device: str | None) -> str:
 
 
 def device_name(device: str) -> str:
-    """Return what the machine calls the device."""
+    """Return the name of the hardware."""
     import torch
 
     if torch.device(device).type == "cuda":

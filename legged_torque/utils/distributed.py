@@ -1,6 +1,6 @@
 """Several processes that train one policy, each on a GPU of its own, started by torchrun.
 
-How many there are is known without torch: scripts read their command lines before they import it.
+Their number is known without torch, which scripts import after they have read their command lines.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def _variable(name: str, lowest: int) -> int:
 
 
 def join(device: str) -> None:
-    """Meet the other processes, unless that has happened already, to exchange tensors on a device ("cpu", "cuda:N")."""
+    """Join the other processes, if that is not done yet, to exchange tensors on a device ("cpu", "cuda:N")."""
     import torch
 
     if torch.distributed.is_initialized():
@@ -69,7 +69,7 @@ def average(tensors: list[Tensor]) -> None:
 
 
 def any_process(condition: bool, device: str) -> bool:
-    """Return whether a condition holds in any process, and wait for all of them; a single process asks nobody."""
+    """Return whether a condition holds in any process, and wait for all of them."""
     import torch
 
     if not torch.distributed.is_initialized():
@@ -80,7 +80,7 @@ def any_process(condition: bool, device: str) -> bool:
 
 
 def gather(value: Any) -> list[Any]:
-    """Return the values of all processes, in their order; a single process asks nobody."""
+    """Return the values of all processes, in their order."""
     import torch
 
     if not torch.distributed.is_initialized():
@@ -100,7 +100,7 @@ def from_first(value: Any, device: str) -> Any:
 
 
 def check_same(settings: dict[str, Any]) -> None:
-    """Refuse, by UserError, what is not the same in all processes: each machine has its own command line and files."""
+    """Raise a UserError for a setting that differs between processes: each machine has its own command line."""
     first, *others = gather(settings)
     for number, other in enumerate(others, 1):
         for name in sorted(first.keys() | other.keys()):

@@ -13,13 +13,13 @@ NEAREST = 5  # how many those are
 
 
 class UserError(Exception):
-    """A mistake in what the user gave: one line that says what, what is allowed and the nearest match.
+    """A mistake of the user, in one line: the given value, the allowed ones and the nearest match.
 
     Scripts print the line and exit with status 2; no traceback is shown.
     """
 
     def __init__(self, message: object) -> None:
-        """Write what cannot be printed as its code: names in a stranger's file may hold line ends or worse."""
+        """Replace characters that cannot be printed by their codes: names in a stranger's file may hold line ends."""
         super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(message)))
 
 
@@ -28,9 +28,9 @@ class TrainingError(Exception):
 
 
 def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
-    """Return the error for a name that does not exist; ``kind`` is what it stands for, e.g. "task".
+    """Return the error for a name that does not exist; ``kind`` is the kind of things it names, e.g. "task".
 
-    It lists what is allowed, or of more than :data:`MANY` names the nearest ones.
+    It lists the allowed names, or the nearest ones of more than :data:`MANY`.
     """
     allowed = sorted(allowed)
     by_lower_case = {name.lower(): name for name in allowed}
@@ -42,8 +42,8 @@ def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
 
 
 @contextlib.contextmanager
-def told_in(problems: list[str]) -> Iterator[None]:
-    """Add the UserError raised inside to problems, which are told together later."""
+def collect_errors(problems: list[str]) -> Iterator[None]:
+    """Append the message of a UserError that is raised inside to a list, and go on."""
     try:
         yield
     except UserError as error:
@@ -53,8 +53,8 @@ def told_in(problems: list[str]) -> Iterator[None]:
 def is_out_of_memory(error: BaseException | None) -> bool:
     """Return whether an error, or one that led to it, says that memory has run out."""
     while error is not None:
-        is_told = isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY)
-        if is_told or isinstance(error, MemoryError):
+        is_said = isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY)
+        if is_said or isinstance(error, MemoryError):
             return True
         error = error.__cause__ or error.__context__
     return False

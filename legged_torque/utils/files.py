@@ -1,24 +1,27 @@
-"""Files that are complete or absent, and errors of the system told by name."""
+"""Files that are complete or absent, and errors that name the file."""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import json
+import math
 import os
 import re
 import shutil
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from legged_torque.utils.errors import UserError
 
-_PART = re.compile(r"\.(\d+)\.part$")  # end of the name of what is being written: the process's id
+_PART = re.compile(r"\.(\d+)\.part$")  # end of the name of an unfinished file: the process's id
 
 
 @contextlib.contextmanager
-def told_by_name(path: Path) -> Iterator[None]:
-    """Let a full disk, a read-only folder and the like be a UserError that names what cannot be written."""
+def write_errors(path: Path) -> Iterator[None]:
+    """Turn a full disk, a read-only folder and the like into a UserError that names the file."""
     try:
         yield
     except OSError as error:
@@ -26,14 +29,15 @@ def told_by_name(path: Path) -> Iterator[None]:
 
 
 def part_of(path: Path) -> Path:
-    """Return where this process writes what will become a file or folder."""
+    """Return the path at which this process writes a file or folder until it is finished."""
     return path.with_name(f"{path.name}.{os.getpid()}.part")
 
 
-def write_whole(file: Path, content: bytes) -> None:
+def write_whole(file: Path, content: bytes | str) -> None:
     """Write a file that is complete or absent whenever the process or the machine ends; a UserError if it cannot."""
+    content = content.encode() if isinstance(content, str) else content
     part = part_of(file)
-    with told_by_name(file):
+    with write_errors(file):
         file.parent.mkdir(parents=True, exist_ok=True)
         if file.exists() and not file.is_file():  # a device such as /dev/null is not to be replaced
             file.write_bytes(content)
@@ -48,10 +52,21 @@ def write_whole(file: Path, content: bytes) -> None:
             part.unlink(missing_ok=True)
 
 
+def write_json(file: Path, value: Any) -> None:
+    """Write a JSON file by :func:`write_whole`; numbers that are not finite, which JSON does not know, become null."""
+
+    def finite(part: Any) -> Any:
+        if isinstance(part, (dict, list, tuple)):
+            return {k: finite(v) for k, v in part.items()} if isinstance(part, dict) else [finite(v) for v in part]
+        return None if isinstance(part, float) and not math.isfinite(part) else part
+
+    write_whole(file, json.dumps(finite(value), indent=1) + "\n")
+
+
 @contextlib.contextmanager
 def held(lock: Path) -> Iterator[None]:
-    """Hold a lock file when others have let it go; a UserError if it cannot be written. It stays: others may wait."""
-    with told_by_name(lock):
+    """Hold a lock file, after others have released it; a UserError if it cannot be written. The file is kept."""
+    with write_errors(lock):
         lock.parent.mkdir(parents=True, exist_ok=True)
         stream = lock.open("ab")
     with stream:
@@ -60,7 +75,7 @@ def held(lock: Path) -> Iterator[None]:
 
 
 def remove_stale_parts(folder: Path) -> None:
-    """Remove what processes that have been killed were writing in a folder."""
+    """Remove the unfinished files of killed processes from a folder."""
     for path in folder.glob("*.part"):
         writer = _PART.search(path.name)
         if writer and not is_running(int(writer[1])):
@@ -80,6 +95,8 @@ def is_running(process: int) -> bool:
 
 def is_whole_archive(file: Path) -> bool:
     """Return whether a file is a zip archive, as torch writes, whose parts all have their checksums."""
+    if not file.is_file():  # a pipe or a device might never end
+        return False
     try:
         with zipfile.ZipFile(file) as archive:
             has_folders = any(part.external_attr for part in archive.infolist())  # torch writes none, and reads no data

@@ -15,17 +15,17 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequest:
-    """While this context is open, the first signal of :data:`SIGNALS` only asks to stop; the second stops at once.
+    """While this context is open, the first signal of :data:`SIGNALS` requests a stop; the second stops at once.
 
-    A terminal that closes may send its signal twice, which still only asks; under ``nohup`` it is not listened to.
+    A terminal that closes may send its signal twice, which is still a request; under ``nohup`` it is ignored.
     """
 
-    requested = False  # whether a signal has asked to stop
+    requested = False  # whether a signal has arrived
     number = 0  # of that signal
 
-    def __init__(self, tell: Callable[[str], None] | None = None) -> None:
-        """Prepare; ``tell`` says that the end has been asked for, on standard error unless given."""
-        self._tell = tell or write_error
+    def __init__(self, notify: Callable[[str], None] | None = None) -> None:
+        """Prepare; ``notify`` shows a line when the stop is requested, by default on standard error."""
+        self._notify = notify or write_error
 
     def __enter__(self) -> StopRequest:
         """Take over the signals; only a process's main thread can do so."""
@@ -52,7 +52,7 @@ class StopRequest:
         if self.requested and number != signal.SIGHUP:
             raise KeyboardInterrupt
         self.requested, self.number = True, self.number or number
-        self._tell("Stopping after this iteration and saving; once more to stop at once.")
+        self._notify("Stopping after this iteration and saving; once more to stop at once.")
 
 
 def write_error(text: str) -> None:
@@ -61,20 +61,8 @@ def write_error(text: str) -> None:
 
 
 def leave_terminal() -> None:
-    """Drop from now on what would be written to a terminal, where every attempt fails once it is closed."""
+    """Drop all further output to a terminal that is closed, where every write would fail."""
     for stream in (1, 2):
         with contextlib.suppress(OSError):
             if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty is false for one that is closed
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-
-
-def end_on_interrupt() -> None:
-    """Let Ctrl-C end the process without a traceback, while a script imports: see :func:`raise_on_interrupt`."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def raise_on_interrupt() -> None:
-    """Let Ctrl-C raise KeyboardInterrupt again, from where there is something to leave in order."""
-    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
-        signal.signal(signal.SIGINT, signal.default_int_handler)

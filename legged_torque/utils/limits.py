@@ -1,11 +1,12 @@
-"""What a setting may be, as a type beside its default: validation, the reference page and ``--help`` follow from it.
+"""Type annotations that bound settings. Validation, the reference page and ``--help`` are derived from them.
 
-A type of Python's own allows what its name says, with numbers of ordinary size only: ``float``, ``list[str]``,
-``Literal["a", "b"]``. ``Annotated[float, Limits(...)]``, or one of the names below, says more.
+A plain type allows all its values, with numbers of ordinary size: ``float``, ``list[str]``, ``Literal["a", "b"]``.
+``Annotated[float, Limits(...)]``, or one of the names below, allows fewer.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import math
@@ -14,47 +15,55 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from legged_torque.utils.config import Section, section_keys
 from legged_torque.utils.errors import UserError, unknown_name
 
 LARGEST = 1e9  # absolute value of a float; squares of larger ones leave float32
 LARGEST_INT = 2**63 - 1  # absolute value of an integer, that of int64
+_NAMES = {float: "a number", int: "an integer", str: "text", bool: "true or false", types.NoneType: "null"}
+_PLURALS = {float: "numbers", int: "integers", str: "texts", list[str]: "lists of texts"}
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What all numbers of a setting may be, whether it is one, a list or a dictionary; they are finite in any case."""
+    """Bounds of all numbers of a setting, whether it is a number, a list or a dictionary."""
 
     lowest: float = -math.inf
     highest: float = math.inf
     above: float = -math.inf  # as lowest, but not allowed itself
-    length: int | None = None  # how many numbers a list has
-    nonempty: bool = False  # whether a list has one number or more
-    ordered: bool = False  # whether a list is a range: [lowest, highest]
+    length: int | None = None  # of a list
+    nonempty: bool = False  # whether a list needs at least one number
+    ordered: bool = False  # whether a list is a range: [minimum, maximum]
 
     def __str__(self) -> str:
-        """Return what is allowed in words."""
-        above, lowest, highest = (_plain(number) for number in (self.above, self.lowest, self.highest))
-        bounds = [f"greater than {above}"] if self.above > -math.inf else []
-        if self.lowest > -math.inf and self.highest < math.inf:
-            bounds += [f"from {lowest} to {highest}"]
-        else:
-            bounds += [f"at least {lowest}"] if self.lowest > -math.inf else []
-            bounds += [f"at most {highest}"] if self.highest < math.inf else []
-        form = [f"{self.length} numbers"] if self.length else ["one number or more"] if self.nonempty else []
-        form = ["[minimum, maximum]"] if self.ordered else form
-        return ", ".join([*form, " and ".join(bounds)] if bounds else form)
+        """Return the bounds in words."""
+        bounds = {"greater than": self.above, "at least": self.lowest, "at most": self.highest}
+        text = " and ".join(f"{word} {number:.10g}" for word, number in bounds.items() if math.isfinite(number))
+        if math.isfinite(self.lowest) and math.isfinite(self.highest):
+            text = f"from {self.lowest:.10g} to {self.highest:.10g}"
+        form = "[minimum, maximum]" if self.ordered else "one number or more" if self.nonempty else ""
+        form = f"{self.length} numbers" if self.length else form
+        return ", ".join(filter(None, (form, text)))
 
     def allow(self, value: Any) -> bool:
-        """Return whether a value of the right type is allowed."""
-        numbers = list(_numbers(value))
+        """Return whether a value of the right type is within the bounds."""
         if isinstance(value, list):
-            length = 2 if self.ordered else self.length
-            if (length and len(numbers) != length) or (self.nonempty and not numbers):
+            length = 2 if self.ordered else self.length or len(value)
+            if len(value) != length or (self.nonempty and not value) or (self.ordered and value[0] > value[1]):
                 return False
-            if self.ordered and numbers[0] > numbers[1]:
-                return False
-        return all(self.lowest <= number <= self.highest and number > self.above for number in numbers)
+        return all(self.lowest <= number <= self.highest and number > self.above for number in _numbers(value))
+
+
+class DrawLimits(Limits):
+    """Bounds of a random parameter's ranges by operation."""
+
+    def __str__(self) -> str:
+        """Return the bounds in words."""
+        return "ranges by operation: set, or add, scale and scale_per_joint; only those of add may be negative"
+
+    def allow(self, value: Any) -> bool:
+        """Return whether "set" is alone, and only added numbers are negative."""
+        is_alone = "set" not in value or len(value) == 1
+        return is_alone and all(limits[0] >= 0.0 for operation, limits in value.items() if operation != "add")
 
 
 Positive = Annotated[float, Limits(above=0)]
@@ -68,58 +77,66 @@ Sizes = Annotated[list[int], Limits(lowest=1, highest=1e6, nonempty=True)]
 Interval = Annotated[list[float], Limits(ordered=True)]
 PositiveInterval = Annotated[list[float], Limits(above=0, ordered=True)]
 NotNegativeInterval = Annotated[list[float], Limits(lowest=0, ordered=True)]
+Draw = dict[Literal["set", "add", "scale", "scale_per_joint"], Interval]
+Ranges = Annotated[Draw, DrawLimits()]
 
 
-def check_section(section: Section, path: str = "") -> None:
-    """Raise a UserError that names the first setting of a section, or below it, whose value is not allowed."""
-    hints = types_of(type(section))
-    for key in section_keys(section):
-        value, dotted = getattr(section, key), f"{path}.{key}" if path else key
-        if isinstance(value, Section):
-            check_section(value, dotted)
-        else:
-            check_value(dotted, value, hints.get(key, object))
+def check_value(name: str, value: Any, hint: Any) -> Any:
+    """Return a value in its type ``hint``, in which 2 may be 2.0, and 1e6 an integer.
 
-
-def check_value(name: str, value: Any, hint: Any) -> None:
-    """Raise a UserError, in which the setting is called ``name``, if a value is not of the type ``hint``."""
-    for number in _numbers(value):
-        if not abs(number) <= (LARGEST if isinstance(number, float) else LARGEST_INT):
-            size = "an integer of 64 bits" if isinstance(number, int) else f"finite, at most {LARGEST:g} either way"
+    A UserError, in which the setting is called ``name``, if the type does not allow the value.
+    """
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        value = check_value(name, value, parts[0])
+        for limits in parts[1:]:
+            if isinstance(limits, Limits) and not limits.allow(value):
+                raise UserError(f"{name} must be {limits}, not {value}")
+        return value
+    if origin in (Union, types.UnionType):
+        for part in parts:
+            with contextlib.suppress(UserError):
+                return check_value(name, value, part)
+        return check_value(name, value, parts[0])  # its error is the user's
+    if origin is Literal and isinstance(value, str) and value not in parts:
+        raise unknown_name(name, value, map(str, parts))
+    if origin is list and isinstance(value, list):
+        return [check_value(f"{name}[{i}]", item, parts[0]) for i, item in enumerate(value)]
+    if origin is dict and isinstance(value, dict):
+        keys = (check_value(f"{name}.{key}", key, parts[0]) for key in value)
+        return {key: check_value(f"{name}.{key}", value[key], parts[1]) for key in keys}
+    if hint in (int, float) and isinstance(value, (int, float)) and not isinstance(value, bool):
+        if not abs(value) <= (LARGEST if hint is float else LARGEST_INT):
+            size = f"finite, at most {LARGEST:g} either way" if hint is float else "an integer of 64 bits"
             raise UserError(f"{name} must be {size}, not {value}")
-    if _fits(value, hint):
-        return
-    if get_origin(hint) is Literal and isinstance(value, str):
-        raise unknown_name(name, value, get_args(hint))
-    hint = without_null(hint)
-    parts = get_args(hint) if get_origin(hint) is Annotated else ()
-    is_type_right = parts and _fits(value, parts[0])
-    raise UserError(f"{name} must be {parts[1] if is_type_right else describe(hint)}, not {value!r}")
+        if hint(value) == value:
+            return hint(value)
+    elif value in parts if origin is Literal else hint not in (int, float) and _is_a(value, origin or hint):
+        return value
+    raise UserError(f"{name} must be {describe(hint) or hint}, not {value!r}")
 
 
-def without_null(hint: Any) -> Any:
-    """Return a type that may be null as what it is otherwise."""
-    is_union = get_origin(hint) in (Union, types.UnionType)
-    return next(part for part in get_args(hint) if part is not types.NoneType) if is_union else hint
+def _is_a(value: Any, kind: Any) -> bool:
+    """Return whether a value is of a kind; of one that is not a type, ``Any`` for instance, everything is."""
+    return isinstance(value, kind) if isinstance(kind, type) else True
 
 
 def describe(hint: Any) -> str:
-    """Return what a type allows, in a few words."""
+    """Return the allowed values of a type in words."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
         limits = ", ".join(str(part) for part in parts[1:] if isinstance(part, Limits))
         whole = " (integer)" if parts[0] is int else " (integers)" if parts[0] == list[int] else ""
         return f"{limits}{whole}" if limits else describe(parts[0])
     if origin in (Union, types.UnionType):
-        return " or ".join(dict.fromkeys(describe(part) for part in parts))
+        return " or ".join(dict.fromkeys(map(describe, parts)))
     if origin is Literal:
-        return " or ".join(str(part) for part in parts)
+        return " or ".join(map(str, parts))
     if origin is list:
-        return f"list of {describe(parts[0])}"
+        return f"a list of {_PLURALS.get(parts[0]) or describe(parts[0])}"
     if origin is dict:
-        return f"{describe(parts[1])} by name"
-    names = {float: "number", int: "integer", str: "text", bool: "true or false", types.NoneType: "null"}
-    return names.get(hint, "")
+        return f"{_PLURALS.get(parts[1]) or describe(parts[1])} by name"
+    return _NAMES.get(hint, "")
 
 
 def types_of(section: type) -> dict[str, Any]:
@@ -136,34 +153,10 @@ def _own_types(owner: type) -> dict[str, Any]:
         raise UserError(f"a type in {owner.__module__}.{owner.__qualname__} is not known: {error}") from None
 
 
-def _plain(number: float) -> str:
-    """Return a number without an exponent."""
-    return str(int(number)) if math.isfinite(number) and number == int(number) else f"{number:g}"
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a value is of a type, and within its limits."""
-    origin, parts = get_origin(hint), get_args(hint)
-    if origin is Annotated:
-        limits = [part for part in parts[1:] if isinstance(part, Limits)]
-        return _fits(value, parts[0]) and (value is None or all(limit.allow(value) for limit in limits))
-    if origin in (Union, types.UnionType):
-        return any(_fits(value, part) for part in parts)
-    if origin is Literal:
-        return value in parts
-    if origin is list:
-        return isinstance(value, list) and all(_fits(item, parts[0]) for item in value)
-    if origin is dict:
-        return isinstance(value, dict) and all(_fits(item, parts[1]) for item in value.values())
-    if hint in (int, float):
-        return isinstance(value, (int, hint)) and not isinstance(value, bool)
-    return isinstance(value, hint) if isinstance(hint, type) else True
-
-
 def _numbers(value: Any) -> Iterator[float]:
     """Yield all numbers of a setting."""
     if isinstance(value, (list, dict)):
-        for item in value.values() if isinstance(value, dict) else value:
-            yield from _numbers(item)
-    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _numbers(part)
+    elif value is not None:
         yield value

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from legged_torque.utils.heading import heading
+
 
 def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     """Turn world vectors (..., 3) into the frames of bodies with unit quaternions (..., 4).
@@ -23,14 +25,13 @@ def quat_rotate_yaw(quat: Tensor, vec: Tensor) -> Tensor:
 
 
 def rotate_yaw(quat: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Do the same with x and y that are not in one tensor (...,)."""
-    w, z = quat[..., 0], quat[..., 3]
-    norm = (w.square() + z.square()).clamp(min=1e-12)  # 0 upside down, where there is no heading
-    cos, sin = (w.square() - z.square()) / norm, 2.0 * w * z / norm
+    """Turn vectors like :func:`quat_rotate_yaw`, with x and y in tensors of their own (...,)."""
+    x_ahead, y_ahead, length = heading(quat)
+    cos, sin = x_ahead / length, y_ahead / length
     return cos * x - sin * y, sin * x + cos * y
 
 
 def yaw(quat: Tensor) -> Tensor:
     """Return by which angle unit quaternions (..., 4) turn about the world's z axis [rad], -pi to pi. Shape: (...,)."""
-    w, z = quat[..., 0], quat[..., 3]
-    return torch.atan2(2.0 * w * z, w.square() - z.square())
+    x_ahead, y_ahead, _ = heading(quat)
+    return torch.atan2(y_ahead, x_ahead)

@@ -29,7 +29,7 @@ Array: TypeAlias = Any  # a numpy array or a torch tensor
 
 @dataclass(frozen=True)
 class Metric:
-    """How a metric is named and shown."""
+    """Name and presentation of a metric."""
 
     name: str  # in files and on the terminal
     unit: str  # empty if it has none
@@ -100,12 +100,12 @@ def step_sums(
     *,
     tracked: int = 3,
 ) -> Array:
-    """Return what one control step of each world adds to the sums.
+    """Return the contribution of one control step of each world to the sums.
 
     Args:
         xp: ``numpy`` or ``torch``, whichever the arrays are of.
         commands: Those that held during the step: v_x, v_y [m/s], yaw rate [rad/s]. Shape: (worlds, 3).
-        velocity: Of the trunk in its own frame after the step, likewise. Shape: (worlds, 3).
+        velocity: Of the trunk in its own frame after the step: v_x, v_y [m/s], yaw rate [rad/s]. Shape: (worlds, 3).
         speed: Horizontal speed of the trunk [m/s]. Shape: (worlds,).
         force: Sum over geoms of the norm of the ground's force [N]. Shape: (worlds,).
         power: Sum over joints of |torque times velocity| [W]. Shape: (worlds,).

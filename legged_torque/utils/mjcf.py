@@ -1,4 +1,4 @@
-"""Reading robots from MJCF files: what MuJoCo does not like is told in one line; joints and motors by transmission."""
+"""Robots in MJCF files: MuJoCo's complaints in one line, chains of bodies, motors by transmission, colliding parts."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ def loading(file: str | Path) -> Iterator[None]:
     """Turn MuJoCo's errors and warnings inside into a UserError that names the MJCF file."""
     if not Path(file).is_file():
         raise UserError(f"cannot load the robot '{file}': there is no such file")
-    with kept_warnings() as told, warnings.catch_warnings():
+    with kept_warnings() as messages, warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
             yield
         except (ValueError, mujoco.FatalError, UserWarning) as error:
-            told.append(str(error))
-    if told:
-        raise UserError(f"cannot load the robot '{file}': {' '.join(told[0].split())}")
+            messages.append(str(error))
+    if messages:
+        raise UserError(f"cannot load the robot '{file}': {' '.join(messages[0].split())}")
 
 
 @contextlib.contextmanager
 def kept_warnings() -> Iterator[list[str]]:
-    """Collect MuJoCo's warnings inside, which it would print, and write to a file in the current folder."""
-    told: list[str] = []
+    """Collect MuJoCo's warnings inside instead of printing them and logging them to a file in the current folder."""
+    messages: list[str] = []
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(told.append)
+    mujoco.set_mju_user_warning(messages.append)
     try:
-        yield told
+        yield messages
     finally:
         mujoco.set_mju_user_warning(before)
 
 
 def read_spec(file: Path, joints: Sequence[str] = ()) -> mujoco.MjSpec:
-    """Read a MJCF file, with its joints in the order of ``joints`` if moving whole limbs leads there; else as it is.
+    """Read a MJCF file and put its joints in the order of ``joints`` if moving whole limbs does it; else keep theirs.
 
-    Keyframes are left out where limbs are moved, since they are in the file's order. A UserError if the file is missing
-    or cannot be read.
+    Keyframes are in the file's order, so they are dropped where limbs are moved. A UserError if the file is missing or
+    cannot be read.
     """
     with loading(file):
         spec = mujoco.MjSpec.from_file(str(file))
@@ -72,14 +72,26 @@ def read_spec(file: Path, joints: Sequence[str] = ()) -> mujoco.MjSpec:
         return spec
 
 
+def body_chains(model: mujoco.MjModel) -> list[list[int]]:
+    """Return the bodies from the trunk's children, the trunk being body 1, to each end of the tree, in their order."""
+    parents, chains = model.body_parentid.tolist(), []
+    for end in sorted(set(range(2, model.nbody)) - set(parents)):
+        chain = [end]
+        while parents[chain[0]] > 1:
+            chain.insert(0, parents[chain[0]])
+        if parents[chain[0]] == 1:
+            chains.append(chain)
+    return chains
+
+
 def motors_of(model: mujoco.MjModel, joint: int) -> list[int]:
-    """Return the actuators that act on a joint, found by their transmission."""
+    """Return the actuators that act on a joint, by their transmission."""
     on_joint = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
     return np.flatnonzero(on_joint).tolist()
 
 
 def why_no_motor(model: mujoco.MjModel, actuator: int) -> str:
-    """Return why an actuator's control is no torque of a joint, up to a factor; empty if it is."""
+    """Return why an actuator's control is not proportional to the torque of a joint; empty if it is."""
     if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
         return "does not act on a joint"
     if model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED:
@@ -101,9 +113,9 @@ def torque_per_control(model: mujoco.MjModel, motor: int) -> float:
 
 
 def torque_range(model: mujoco.MjModel, motor: int) -> tuple[float, float]:
-    """Return the lowest and highest torque that a motor can apply to its joint [N m]: the tightest of all limits.
+    """Return the lowest and highest torque of a motor on its joint [N m]: the tightest of all limits.
 
-    They are its forcerange times gear, its ctrlrange times gear and gain, and its joint's actuatorfrcrange.
+    These are its forcerange times gear, its ctrlrange times gear and gain, and its joint's actuatorfrcrange.
     """
     joint, gear = model.actuator_trnid[motor, 0], model.actuator_gear[motor, 0]
     ranges = (
@@ -116,7 +128,7 @@ def torque_range(model: mujoco.MjModel, motor: int) -> tuple[float, float]:
 
 
 def joint_axes(model: mujoco.MjModel) -> np.ndarray:
-    """Return the axes of all joints in the level trunk's frame, where all angles are 0. Shape: (njnt, 3)."""
+    """Return the axes of all joints in the frame of a level trunk, all angles being 0. Shape: (njnt, 3)."""
     data = mujoco.MjData(model)
     data.qpos[:] = 0.0
     data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE] + 3] = 1.0
@@ -125,7 +137,7 @@ def joint_axes(model: mujoco.MjModel) -> np.ndarray:
 
 
 def robot_notes(file: Path, trained: Path) -> Iterator[str]:
-    """Yield what of a robot in a MJCF is otherwise than of that with which a policy was trained: axes and mass."""
+    """Yield differences of axes and mass between the robot of a MJCF and the robot that a policy was trained on."""
     if not trained.is_file():
         yield f"asset.file is not compared with that of the training, '{trained}', which is gone"
         return
@@ -149,7 +161,7 @@ def joint_limits(model: mujoco.MjModel) -> np.ndarray:
 
 
 def drawing_notes(spec: mujoco.MjSpec) -> Iterator[str]:
-    """Yield what to do if no view would draw the robot, since all its geoms are in other groups."""
+    """Yield advice if views draw nothing of the robot, because all its geoms are in hidden groups."""
     robot = [geom for geom in spec.geoms if geom.parent.name != "world"]
     if robot and not any(geom.group in DRAWN_GROUPS for geom in robot):
         groups = ", ".join(sorted({str(geom.group) for geom in robot}))
@@ -159,12 +171,12 @@ def drawing_notes(spec: mujoco.MjSpec) -> Iterator[str]:
 def colliding_pairs(model: mujoco.MjModel) -> np.ndarray:
     """Return the pairs of geoms that may touch, as MuJoCo filters them. Shape: (pairs, 2).
 
-    They meet by ``contype`` and ``conaffinity`` and are neither of one body, nor of parent and child, nor of bodies
-    that are excluded; or they are a ``<pair>``.
+    Their ``contype`` and ``conaffinity`` match, and their bodies are neither the same, nor parent and child, nor
+    excluded; or they are a ``<pair>``.
     """
     first, second = np.triu_indices(model.ngeom, k=1)
     bodies = model.geom_bodyid[[first, second]]
-    welds = model.body_weldid[bodies]  # bodies without joints are parts of those that they hang on
+    welds = model.body_weldid[bodies]  # bodies without joints are parts of their parents
     parents = model.body_weldid[model.body_parentid[welds]]
     family = (welds[0] == welds[1]) | ((welds > 0).all(axis=0) & (welds == parents[::-1]).any(axis=0))
     excluded = np.isin((bodies[0] << 16) + bodies[1], model.exclude_signature)
@@ -184,9 +196,9 @@ def self_pairs(model: mujoco.MjModel) -> np.ndarray:
 
 
 def exclude_self_collisions(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
-    """Let no parts of a robot collide with each other, whatever its file says.
+    """Exclude all contacts between parts of a robot.
 
-    Returns whether anything has changed, so that ``model``, compiled from ``spec``, is out of date.
+    Returns whether this changes ``spec``, so that ``model``, compiled from it, is out of date.
     """
     pairs = self_pairs(model)
     bodies = {body.id: body for body in spec.bodies}

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,7 +28,9 @@ def load_pyplot() -> ModuleType:
 
 
 def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
-    """Return the JSON object with these keys, or more, that ``script`` has written; UserError if it is none."""
+    """Return the JSON object with at least these keys that ``script`` has written; a UserError if it is none."""
+    if not file.is_file():  # a device might never end
+        raise UserError(f"cannot read '{file}': there is no such file")
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:  # nested too deeply
@@ -38,10 +42,11 @@ def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
 
 def save_figure(figure: Figure, file: Path) -> None:
     """Write a figure in the format that the file's ending names; UserError if that is unknown or cannot be written."""
-    if not file.suffix:  # matplotlib would add one, and write beside a folder of the name
+    if not file.suffix:
         raise UserError(f"cannot write '{file}': a figure needs a name that ends in .png, .svg or .pdf")
+    content = io.BytesIO()
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(file, dpi=130)
-    except (OSError, ValueError) as error:  # ValueError: unknown format
+        figure.savefig(content, dpi=130, format=file.suffix[1:])
+    except ValueError as error:
         raise UserError(f"cannot write '{file}': {error}") from None
+    write_whole(file, content.getvalue())

@@ -10,16 +10,16 @@ INSTALL_HINT = "on Debian: apt-get install libosmesa6, then MUJOCO_GL=osmesa"
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 
 
-def without_renderer() -> None:
-    """Tell MuJoCo to import without a renderer, which scripts that draw nothing must not depend on."""
+def disable_renderer() -> None:
+    """Let MuJoCo import without a renderer, on which scripts that draw nothing must not depend."""
     os.environ["MUJOCO_GL"] = "disable"
 
 
 def choose_offscreen_renderer() -> str | None:
     """Set ``MUJOCO_GL`` to a renderer that needs no screen; return why there is none, or None if there is one.
 
-    What the user has set is taken if its library is installed; otherwise EGL where there is a GPU, then Mesa's software
-    renderer. If there is none, MuJoCo is told to import without one, so that everything else works.
+    The user's choice is taken if its library is installed; otherwise EGL where there is a GPU, then Mesa's software
+    renderer. If there is none, MuJoCo imports without one, so that everything else works.
     """
     asked = os.environ.get("MUJOCO_GL", "").lower()
     if asked in _LIBRARIES:
@@ -31,5 +31,5 @@ def choose_offscreen_renderer() -> str | None:
         if ctypes.util.find_library(_LIBRARIES[name]):
             os.environ["MUJOCO_GL"] = name
             return None
-    without_renderer()
+    disable_renderer()
     return f"the library of {' or '.join(candidates)} is not installed ({INSTALL_HINT})"

@@ -13,12 +13,14 @@ from typing import Any
 
 import yaml
 
-from legged_torque.utils.config import Dumper, parse_yaml
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.files import is_whole_archive, part_of, remove_stale_parts, told_by_name, write_whole
+from legged_torque.utils.files import is_whole_archive, part_of, remove_stale_parts, write_errors, write_whole
+from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 
 CONFIG_FILE = "config.yaml"
 EVALUATIONS_FILE = "evaluations.csv"  # a row per evaluation during training
+MOVED = {"legged_torque.control.gravity_pretraining:pretrain": "legged_torque.paper.gravity.pretraining:pretrain"}
+"""Present names of functions that the settings of older runs name by their former modules."""
 _CHECKPOINT = "model_"
 _PACKAGES = ("legged_torque", "torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib", "numpy")
 
@@ -34,7 +36,7 @@ def claim_run_dir(run_dir: Path, config: dict[str, Any]) -> Path:
 
     A number is added if another run that started just now has taken the name. No folder is ever without its settings.
     """
-    with told_by_name(run_dir):
+    with write_errors(run_dir):
         remove_stale_parts(run_dir.parent)
         part, candidate = part_of(run_dir), run_dir
         save_config(part, config)
@@ -120,7 +122,7 @@ def save_config(run_dir: str | Path, config: dict[str, Any]) -> None:
 
 
 def load_config(run_dir: Path) -> dict[str, Any]:
-    """Return what :func:`save_config` has written; a UserError if the file is missing, broken or not whole."""
+    """Return the content of a file of :func:`save_config`; a UserError if it is missing, broken or not whole."""
     file = run_dir / CONFIG_FILE
     if not file.is_file():
         raise UserError(f"the run '{run_dir}' has no {CONFIG_FILE}")
@@ -128,10 +130,16 @@ def load_config(run_dir: Path) -> dict[str, Any]:
     config = parse_yaml(text, f"'{file}'")
     if not isinstance(config, dict) or not {"task", "env", "train"} <= config.keys():
         raise UserError(f"'{file}' lacks the entries task, env and train")
-    # files of older versions have no marks; their last entry is that of the versions
-    if not text.endswith("\n...\n") if text.startswith("---") else not isinstance(config.get("versions"), dict):
+    if text.startswith("---") and not text.endswith("\n...\n"):
         raise UserError(f"'{file}' is not whole: its end is missing")
-    return config
+    return with_present_names(config)
+
+
+def with_present_names(settings: Any) -> Any:
+    """Return settings in which functions that have :data:`MOVED` have their present names."""
+    if isinstance(settings, dict):
+        return {key: with_present_names(value) for key, value in settings.items()}
+    return MOVED.get(settings, settings) if isinstance(settings, str) else settings
 
 
 def steps_per_iteration(config: dict[str, Any]) -> int | None:

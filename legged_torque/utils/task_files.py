@@ -24,8 +24,8 @@ ENTRY_POINTS = "legged_torque.tasks"
 def import_task_files(tasks: dict[str, Any], files: Iterable[str | Path]) -> None:
     """Import Python files that register tasks, each once; ``tasks`` are those of the registry, by name.
 
-    A file is imported by the name that it has, with its folder as a place to import from: it may use files beside it,
-    and settings may name its classes, ``"my_task:MyRobot"``. A UserError says why a file is of no use.
+    A file is imported by its name, and its folder becomes the last place to import from: it may use files next to it,
+    and settings may name its classes, ``"my_task:MyRobot"``. A UserError says why a file cannot be used.
     """
     for file in map(Path, files):
         name, path = file.stem, file.absolute()
@@ -35,15 +35,15 @@ def import_task_files(tasks: dict[str, Any], files: Iterable[str | Path]) -> Non
         if other and Path(other).resolve() != path.resolve():
             raise UserError(f"'{file}' cannot be imported: there is another module '{name}'; rename the file")
         if name not in sys.modules:
-            sys.path.insert(0, str(path.parent))
+            sys.path.append(str(path.parent))
             with _adding_tasks(tasks, f"'{file}'"):
                 importlib.import_module(name)
 
 
 def import_installed_tasks(tasks: dict[str, Any]) -> None:
-    """Import what installed packages offer as :data:`ENTRY_POINTS`; ``tasks`` are those of the registry, by name.
+    """Import the :data:`ENTRY_POINTS` of installed packages; ``tasks`` are those of the registry, by name.
 
-    One that is broken does not take the others with it: what is wrong is told, and its tasks are missing.
+    A broken one does not affect the others: a line on standard error says what is wrong, and its tasks are missing.
     """
     for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
         if point.module not in sys.modules:
@@ -55,7 +55,7 @@ def import_installed_tasks(tasks: dict[str, Any]) -> None:
 
 
 def _file_of_module(name: str) -> str | None:
-    """Return the file that an import of a name has given or would give; None if there is none, or just a folder."""
+    """Return the file of a module that is imported or can be; None if there is none, or just a folder."""
     if name in sys.modules:
         return getattr(sys.modules[name], "__file__", None) or name  # Python's own have none
     spec = importlib.util.find_spec(name)
@@ -64,9 +64,9 @@ def _file_of_module(name: str) -> str | None:
 
 @contextlib.contextmanager
 def _adding_tasks(tasks: dict[str, Any], source: str) -> Iterator[None]:
-    """Import inside what adds tasks; a UserError says what went wrong, and in which line, and the tasks are as before.
+    """Context for an import that registers tasks; a UserError says in which line it fails, or that it registers none.
 
-    What registers no task is refused.
+    After an error, the tasks are as before.
     """
     before = dict(tasks)
     try:

@@ -1,13 +1,9 @@
-"""The registry of tasks, in legged_gym's manner."""
+"""The registry of tasks, as in legged_gym."""
 
 from __future__ import annotations
 
-import contextlib
 import copy
-import importlib.util
-import io
 import math
-import os
 import pkgutil
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,12 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from legged_torque import resource_path
 from legged_torque.utils import distributed
-from legged_torque.utils.config import BaseConfig, to_dict
+from legged_torque.utils.config import BaseConfig
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.files import remove_stale_parts
-from legged_torque.utils.known_names import check_names, import_names
-from legged_torque.utils.limits import check_section
 from legged_torque.utils.options import Options, apply_options
 from legged_torque.utils.runs import (
     checkpoint_number,
@@ -32,7 +26,6 @@ from legged_torque.utils.runs import (
     new_run_dir,
 )
 from legged_torque.utils.task_files import import_installed_tasks, import_task_files
-from legged_torque.utils.train_validation import check_train_cfg
 
 if TYPE_CHECKING:
     from rsl_rl.env import VecEnv
@@ -66,11 +59,19 @@ class TaskRegistry:
     def register(self, name: str, task_class: type[VecEnv] | str, env_cfg: BaseConfig, train_cfg: BaseConfig) -> None:
         """Make a task known that is created as ``task_class(env_cfg, device)``.
 
-        The class may be named instead, ``"module:Class"``: it is imported when the task is built. A UserError if
-        another task has the name.
+        A UserError if another task has the name, or the settings are not instances of configurations.
+
+        Args:
+            name: Name of the task.
+            task_class: Its class, or ``"module:Class"``, which is imported when the task is built.
+            env_cfg: Settings of the task.
+            train_cfg: Settings of its training, of a :class:`~legged_torque.learning.settings.TrainingCfg`.
         """
         if name in self._tasks:
             raise UserError(f"'{name}' is a task already; choose another name")
+        for cfg in (env_cfg, train_cfg):
+            if not isinstance(cfg, BaseConfig):
+                raise UserError(f"the settings of task '{name}' must be instances of configurations, not {cfg!r}")
         self._tasks[name] = (task_class, env_cfg, train_cfg)
 
     def import_files(self, files: Iterable[str | Path]) -> None:
@@ -90,25 +91,29 @@ class TaskRegistry:
     def get_cfgs(
         self, name: str, args: Options | None = None, run_config: dict[str, Any] | None = None
     ) -> tuple[Any, Any]:
-        """Return copies of the settings of a task and its training, or of a loaded run's, as ``args`` change them."""
+        """Return copies of the settings of a task and its training, or of a loaded run's, as ``args`` change them.
+
+        With ``args``, a UserError names the first value that is not allowed, before torch and the classes that the
+        settings name are imported.
+        """
+        env_cfg, train_cfg = self._copies(name)
         if args is None:
-            return self._copies(name)
-        of_device = {}
-        for on_cpu in (True, False):  # mistakes are told before torch is imported, which knows the devices
-            env_cfg, train_cfg = of_device[on_cpu] = self._copies(name)
-            apply_options(env_cfg, train_cfg, args, run_config, on_cpu)
-            check_section(env_cfg)
-            check_names(train_cfg, [registered for _, _, registered in self._tasks.values()])
-            check_train_cfg(train_cfg)
-        env_cfg, train_cfg = of_device[resolve_device(args.device) == "cpu"]
-        import_names(train_cfg)
+            return env_cfg, train_cfg
+        apply_options(env_cfg, train_cfg, args, run_config)
+        env_cfg.check()
+        train_cfg.check()
+        train_cfg.check_code_names([registered for _, _, registered in self._tasks.values()])
+        on_cpu = resolve_device(args.device) == "cpu"  # imports torch
+        train_cfg.import_code()
+        if on_cpu and run_config is None and not args.gives_num_envs():
+            env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
         return env_cfg, train_cfg
 
     def make_env(self, name: str, args: Options | None = None, env_cfg: Any | None = None) -> tuple[VecEnv, Any]:
         """Create a task on the device of ``args``; return it and its settings.
 
-        ``env_cfg`` are settings to use as they are; None takes the registered ones with ``args`` applied. What the task
-        notes of its robot is printed.
+        ``env_cfg`` are settings to use as they are; None takes the registered ones with ``args`` applied. Notes of the
+        task on its robot are printed.
         """
         task_class = self.get_task_class(name)
         if env_cfg is None:
@@ -140,15 +145,8 @@ class TaskRegistry:
             _, train_cfg = self.get_cfgs(name, args)
         default = experiment_dir(train_cfg, args.log_root if args else None)
         root = default if log_root == "default" else log_root and Path(log_root)
-        if root and train_cfg.runner.logger == "wandb" and importlib.util.find_spec("wandb") is None:
-            raise UserError("--logger wandb needs the extra: pip install 'legged_torque[wandb]'")
         log_dir = str(new_run_dir(root, train_cfg.runner.run_name)) if root else None
-        from rsl_rl.utils import resolve_callable
-
-        runner_class = resolve_callable(train_cfg.runner.class_name)
-        os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"  # checkpoints run no code, whoever's runner loads them
-        with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints its networks at length
-            runner = runner_class(env, to_rsl_rl(train_cfg) | {"task": name}, log_dir, env.device)
+        runner = train_cfg.make_runner(env, name, log_dir)
         if args is not None and args.resume:
             folder = find_run(root or default, args.load_run)
             remove_stale_parts(folder)
@@ -165,7 +163,7 @@ class TaskRegistry:
         if config["task"] != options.task:
             raise UserError(f"the run '{folder}' is of task '{config['task']}', not '{options.task}'")
         cfgs = self.get_cfgs(options.task, options, config)
-        robot, trained = cfgs[0].asset.file, config["env"]["asset"]["file"]
+        robot, trained = cfgs[0].asset.file, config["env"].get("asset", {}).get("file", cfgs[0].asset.file)
         if robot != trained:
             from legged_torque.utils.mjcf import robot_notes  # which imports mujoco
 
@@ -194,7 +192,7 @@ class TaskRegistry:
         return env_cfg, train_cfg
 
     def _get(self, name: str) -> tuple[type[VecEnv] | str, Any, Any]:
-        """Return what was registered under a name."""
+        """Return class and settings of a task; an unknown name is a UserError."""
         if name not in self._tasks:
             self._import_installed()
         if name not in self._tasks:
@@ -209,7 +207,7 @@ class TaskRegistry:
 
 
 def print_notes(notes: Iterable[str]) -> None:
-    """Print what a user should know of a task's robot, once for all processes."""
+    """Print notes for the user, once for all processes."""
     for note in notes if distributed.rank() == 0 else ():
         print(f"Note: {note}", flush=True)
 
@@ -230,19 +228,6 @@ def num_iterations(env: VecEnv, train_cfg: Any) -> int:
     """Return how many iterations a whole training takes, with the steps of all processes counted."""
     steps_per_iteration = distributed.world_size() * env.num_envs * train_cfg.runner.num_steps_per_env
     return math.ceil(train_cfg.runner.total_steps / steps_per_iteration)
-
-
-def to_rsl_rl(train_cfg: Any) -> dict[str, Any]:
-    """Return training settings in the layout that rsl_rl's runner takes."""
-    settings, runner = to_dict(train_cfg), train_cfg.runner
-    loggers = {
-        "tensorboard": {"class_name": "tensorboard"},
-        "wandb": {"class_name": "legged_torque.learning.log_writer:WandbWriter", "project_name": runner.wandb_project},
-        "none": {"class_name": "legged_torque.learning.log_writer:NoLogWriter"},
-    }
-    if runner.logger not in loggers:
-        raise unknown_name("logger", runner.logger, loggers)
-    return {**settings.pop("runner"), **settings, "logger": loggers[runner.logger]}
 
 
 def set_seed(seed: int) -> None:

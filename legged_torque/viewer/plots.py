@@ -34,7 +34,7 @@ class Plots:
         self._feet = [name.removesuffix("_foot") for name in task.foot_names]
         self._terms = task.reward_names
         parts = [name.replace("_", " ") for name in session.state.mixing]
-        self._has_targets = any(term.name == "position_residual" for term in task.action_terms())
+        self._has_targets = any(term.name == "position_residual" for term in task.control_law.terms)
         self._parts = [(name, PARTS[i % len(PARTS)]) for i, name in enumerate(parts)]
         panel = gui.add_panel()
         with panel.add_tab("Walking", viser.Icon.ACTIVITY):

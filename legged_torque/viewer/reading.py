@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legged_torque.envs.base.height_scan import HeightScan
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.sensors.height_scan import HeightScan
 from legged_torque.terrain.rough import RoughGround
 
 
@@ -61,7 +61,7 @@ def watched(task_class: type[LeggedRobot]) -> type[WatchedRobot]:
 
 def weighted_terms(task: LeggedRobot) -> dict[str, Tensor]:
     """Return the weights of the action terms that have one, by the terms' names. Writing to them changes the task."""
-    return {term.name: term.weight for term in task.action_terms() if term.weight is not None}
+    return {term.name: term.weight for term in task.control_law.terms if term.weight is not None}
 
 
 class TaskReader:
@@ -93,7 +93,7 @@ class TaskReader:
         parts = [
             task.sim.qpos,
             self._commands,
-            task.planar_velocity(),
+            task.state.planar_velocity(),
             task.torques[world],
             task.torque_parts[:, world],
             rewards,
@@ -113,7 +113,7 @@ class TaskReader:
     def _targets(self, world: int) -> Tensor:
         """Return where PD control wants the joints of a world, see :class:`Reading`."""
         task = self._task
-        for place, term in enumerate(task.action_terms()):
+        for place, term in enumerate(task.control_law.terms):
             if term.name == "position_residual":
                 actions = task.actions[world, place * task.num_dof :][: task.num_dof]
                 return task.default_dof_pos + task.joint_offset[world] + term.scale[world] * actions

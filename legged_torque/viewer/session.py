@@ -261,7 +261,7 @@ class Session:
     @request
     def load_checkpoint(self, number: int) -> None:
         """Let another checkpoint of the run act while the robots walk on; if it is broken, the old one goes on."""
-        actor = self._runner.alg.actor
+        actor = self._runner.alg.policy()
         weights, counters = copy.deepcopy(actor.state_dict()), self.task.state_dict()
         try:
             self._load(number)

@@ -104,7 +104,7 @@ class TaskRecorder(VideoRecorder):
         """Keep the state after a control step."""
         task = self._task
         self._worlds = self._worlds or [int(task.commands[:, :2].norm(dim=1).argmax())]
-        tensors = (task.sim.qpos, task.commands, task.planar_velocity())
+        tensors = (task.sim.qpos, task.commands, task.state.planar_velocity())
         parts = [tensor[self._worlds].double().cpu().numpy() for tensor in tensors]
         self._steps.append([Moment(*moment) for moment in zip(*parts, strict=True)])
 

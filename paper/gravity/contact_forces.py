@@ -17,14 +17,14 @@ from torch import Tensor
 from legged_torque.utils.errors import UserError
 
 ITERATIONS = 12
-"""Enough for single precision, where forces were seen to be up to 3 N off; in double each more gains about a digit."""
-CENTERING = 0.1  # factor by which each iteration is to reduce the complementarity
+"""Enough for single precision, with forces at most 3 N off; in double precision, each more gains about a digit."""
+CENTERING = 0.1  # factor by which each iteration should reduce the complementarity
 TO_BOUNDARY = 0.99  # share of the way to the nearest limit that a step may go
 
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """What a contact can bear, on level ground."""
+    """Forces that a contact can bear, on level ground."""
 
     friction: float  # mu of the pyramid |f_x| + |f_y| <= mu f_z, which lies inside the cone
     lowest: float  # normal force [N], at least 0
@@ -39,8 +39,8 @@ class ForceDistribution:
     ) -> None:
         """Keep the settings and the constants on the device; a UserError if no force is inside the limits.
 
-        ``arm`` makes moments comparable with forces [m], ``regularization`` weighs single forces against the wrench,
-        small against 1.
+        ``arm`` [m] makes moments comparable with forces. ``regularization``, small against 1, weighs single forces
+        against the wrench.
         """
         if limits.friction <= 0.0 or not 0.0 <= limits.lowest < limits.highest:
             raise UserError(f"contact forces need friction > 0 and 0 <= lowest < highest, not {limits}")
@@ -56,20 +56,20 @@ class ForceDistribution:
     def __call__(
         self, grasp: Tensor, wrench: Tensor, reference: Tensor, mask: Tensor, iterations: int = ITERATIONS
     ) -> tuple[Tensor, Tensor]:
-        """Return the contact forces f_csd (eq. 10), and what the trunk feels of the limits.
+        """Return the contact forces f_csd (eq. 10), and the error of the wrench on the trunk.
 
         With G the grasp matrix and W weighing moments against forces, f_csd minimizes
 
             |W (G f - wrench)|^2 + regularization |f - reference|^2
 
         inside the friction pyramids and limits. As in eq. 10, forces stay as they are if they give the wrench within
-        all limits; otherwise they change such that the trunk feels as little of it as possible.
+        all limits; otherwise they change such that the wrench on the trunk changes as little as possible.
 
         Args:
             grasp: G, the first six rows of J_c^T. Shape: (n, 6, 3 k).
             wrench: Wanted force [N] and moment [N m] on the trunk. Shape: (n, 6).
-            reference: Forces on the robot, in the world [N], that settle what the wrench leaves open. Shape: (n, k, 3).
-            mask: Which contacts touch the ground. Shape: (n, k), bool.
+            reference: Forces on the robot, in the world [N], to follow where the wrench allows. Shape: (n, k, 3).
+            mask: Contacts that touch the ground. Shape: (n, k), bool.
             iterations: Iterations of the solver.
 
         Returns:
@@ -126,5 +126,5 @@ class ForceDistribution:
 
 
 def _room(values: Tensor, steps: Tensor) -> Tensor:
-    """Return how much of its step each state can go until the first of its values is zero. Shape: (n,)."""
+    """Return the share of its step after which the first value of each state is zero. Shape: (n,)."""
     return torch.where(steps < 0.0, -values / steps, math.inf).amin(dim=(1, 2))

@@ -21,9 +21,9 @@ TRUNK_DOFS = 6
 
 
 class RobotDynamics:
-    """What a controller knows of the robot: its nominal model, evaluated at ``num_states`` states at once.
+    """The robot's nominal model, which is all that the controller knows, at ``num_states`` states at once.
 
-    It has a MuJoCo Warp ``Data`` of its own, because the simulator's fused step does not fill one, and because the
+    It has its own MuJoCo Warp ``Data``, because the simulator's fused step does not fill one, and because the
     controller must not know the randomized parameters of the simulated worlds. Points of contact are the lowest points
     of spheres, as on level ground. Nothing here waits for the host, and all tensors keep their addresses.
 
@@ -41,28 +41,25 @@ class RobotDynamics:
         com: Centre of mass of the whole robot in the world [m]. Shape: (n, 3).
         geom_positions: World positions of all geoms [m]. Shape: (n, ngeom, 3).
         geom_rotations: Turn geom vectors into world vectors. Shape: (n, ngeom, 3, 3).
-        contact_joints: Which joints carry which contact point. Shape: (k, nv - 6), bool.
+        contact_joints: Joints between the trunk and each contact point. Shape: (k, nv - 6), bool.
     """
 
-    def __init__(
-        self, mj_model: mujoco.MjModel, num_states: int, device: str, contact_geoms: Sequence[str] | None = None
-    ) -> None:
-        """Prepare the model and all buffers, on "cpu" or "cuda:N".
+    def __init__(self, mj_model: mujoco.MjModel, num_states: int, device: str, contact_geoms: Sequence[str]) -> None:
+        """Prepare the model and all buffers, on "cpu" or "cuda:N", for contacts of spheres with these names.
 
-        The first body of the nominal model is the free trunk, its other joints are hinges. Points of contact are on
-        spheres, ``contact_geoms``; None takes those with "foot" in their names. A UserError if any of it is otherwise.
+        Raises:
+            UserError: If a contact geom is missing or no sphere, the first body is not free, or a joint is no hinge.
         """
         names = [mj_model.geom(i).name for i in range(mj_model.ngeom)]
-        chosen = [name for name in names if "foot" in name] if contact_geoms is None else list(contact_geoms)
-        _check_model(mj_model, chosen, names)
+        _check_model(mj_model, contact_geoms, names)
         prepare_device(device)
         self.mj_model, self.num_states, self.device = mj_model, num_states, device
         with wp.ScopedDevice(device):
             self._model = mjw.put_model(mj_model)
             self._data = mjw.make_data(mj_model, nworld=num_states, nconmax=1, njmax=1)  # no contacts are sought
-        geoms = [names.index(name) for name in chosen]
+        geoms = [names.index(name) for name in contact_geoms]
         bodies = mj_model.geom_bodyid[geoms]
-        self.contact_joints = torch.tensor(_carrying_joints(mj_model, bodies), device=device)
+        self.contact_joints = wp.to_torch(self._model.body_isdofancestor)[bodies, TRUNK_DOFS : mj_model.nv].bool()
         self._geoms, self._bodies = (torch.tensor(ids, dtype=torch.long, device=device) for ids in (geoms, bodies))
         self._radii = torch.tensor(mj_model.geom_size[geoms, 0], dtype=torch.float32, device=device)
         self._weight_per_mass = torch.tensor(-mj_model.opt.gravity, dtype=torch.float32, device=device)
@@ -92,7 +89,7 @@ class RobotDynamics:
         torch.sub(self._bias, self.gravity, out=self.coriolis)
 
     def _place_contacts(self) -> None:
-        """Compute contact points and what accelerates them at qacc = 0."""
+        """Compute contact points and their accelerations at qacc = 0."""
         points = self.geom_positions[:, self._geoms]
         points[:, :, 2] -= self._radii
         self.contact_points.copy_(points)
@@ -135,8 +132,8 @@ class RobotDynamics:
         return wp.full(self.num_states, int(body), dtype=int, device=self.device)
 
 
-def _check_model(model: mujoco.MjModel, contact_geoms: list[str], names: list[str]) -> None:
-    """Raise a UserError for what the formulas here do not hold for."""
+def _check_model(model: mujoco.MjModel, contact_geoms: Sequence[str], names: list[str]) -> None:
+    """Raise a UserError for robots to which the formulas here do not apply."""
     types = model.jnt_type
     if types[0] != mujoco.mjtJoint.mjJNT_FREE or (types[1:] != mujoco.mjtJoint.mjJNT_HINGE).any():
         raise UserError("whole-body control needs a robot with a free trunk, all other joints being hinges")
@@ -149,22 +146,9 @@ def _check_model(model: mujoco.MjModel, contact_geoms: list[str], names: list[st
             raise UserError(f"the contact geom '{name}' must be a sphere")
 
 
-def _carrying_joints(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
-    """Return which joints lie between the trunk and each body. Shape: (bodies, nv - 6), bool."""
-    carrying = np.zeros((len(bodies), model.nv), dtype=bool)
-    for row, body in zip(carrying, bodies, strict=True):
-        while body != TRUNK:
-            row[model.body_dofadr[body] : model.body_dofadr[body] + model.body_dofnum[body]] = True
-            body = model.body_parentid[body]
-    return carrying[:, TRUNK_DOFS:]
-
-
 def _dense_entries(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return where MuJoCo keeps the entries of the inertia matrix, and which are not always zero. Shapes: (nv, nv)."""
-    place, present = (np.zeros((model.nv, model.nv), dtype=kind) for kind in (np.int64, bool))
-    for row in range(model.nv):
-        places = model.M_rowadr[row] + np.arange(model.M_rownnz[row])
-        columns = model.M_colind[places]
-        place[row, columns] = place[columns, row] = places
-        present[row, columns] = present[columns, row] = True
-    return place, present
+    """Return the places of the inertia matrix's entries in MuJoCo's array, and which are present. Shapes: (nv, nv)."""
+    lower, numbers = np.zeros((model.nv, model.nv)), np.arange(1.0, model.nC + 1.0)
+    mujoco.mju_sparse2dense(lower, numbers, model.M_rownnz, model.M_rowadr, model.M_colind)
+    numbers = (lower + np.tril(lower, -1).T).astype(np.int64)
+    return (numbers - 1).clip(min=0), numbers > 0

@@ -5,12 +5,12 @@ accelerate, J_c qacc + dJ_c/dt qvel = 0, it follows that
 
     qacc = N_c A^-1 (S_k^T Gamma - h) - J_c_bar dJ_c/dt qvel.
 
-Contact forces are those that the ground exerts on the robot; the paper's eq. 11 counts them the other way.
+Contact forces are those of the ground on the robot; the paper's eq. 11 has the opposite sign.
 
-Each state has the same number of candidate contacts, and a mask says which of them touch the ground. The rows of
-J_c of the others are zero, and ones on their part of the diagonal keep J_c A^-1 J_c^T invertible; nothing couples them
-with the rest, so that all results are exactly what matrices of only the touching contacts would give. So the contact
-state may change from step to step and differ from state to state, and no matrix changes its size.
+All states have the same candidate contacts, and a mask of those that touch the ground. The rows of J_c of the others
+are zero, and ones on their part of the diagonal keep J_c A^-1 J_c^T invertible; nothing couples them with the rest, so
+results are exactly those of matrices of the touching contacts alone. Contacts may change from step to step and differ
+from state to state, and no matrix changes its size.
 
 Floating point type and device are those of the arguments; nothing waits for the host.
 """
@@ -27,7 +27,7 @@ TRUNK_DOFS = 6  # virtual joints in front of the actuated ones, which S_k remove
 
 @dataclass
 class ContactSpace:
-    """The space of contacts, and the motions that leave it alone."""
+    """The space of contacts, and the motions that leave all contacts at rest."""
 
     jacobian: Tensor  # J_c (eq. 9) with rows of zeros where nothing touches. Shape: (n, 3 k, nv)
     inertia: Tensor  # Lambda_c = (J_c A^-1 J_c^T)^-1, zero where nothing touches. Shape: (n, 3 k, 3 k)
@@ -49,7 +49,7 @@ class TaskSpace:
 
 def invert(matrix: Tensor) -> Tensor:
     """Return the inverses of symmetric positive definite matrices. Shape: (..., m, m)."""
-    # It is zero for a matrix that rounding made indefinite, as happens in single precision where a leg is stretched.
+    # It is zero for a matrix that rounding made indefinite: in single precision, that of a stretched leg.
     factor, info = torch.linalg.cholesky_ex(matrix)
     inverse = inverse_triangle(factor)
     return torch.where((info > 0)[..., None, None], 0.0, inverse.mT @ inverse)
@@ -61,10 +61,10 @@ def inverse_triangle(factor: Tensor) -> Tensor:
 
 
 def contact_space(inertia: Tensor, jacobians: Tensor, bias: Tensor, mask: Tensor) -> ContactSpace:
-    """Compute what the contacts in ``mask`` demand and leave free (eq. 9).
+    """Compute the space of the contacts in ``mask`` (eq. 9).
 
     Shapes: joint space inertia A (n, nv, nv), J_c of all candidate contacts (n, k, 3, nv), ``bias`` dJ_c/dt qvel
-    [m/s^2] (n, k, 3), which contacts touch the ground (n, k), bool.
+    [m/s^2] (n, k, 3), mask of contacts that touch the ground (n, k), bool.
     """
     rows = mask.repeat_interleave(3, dim=1)
     jacobian = torch.where(rows.unsqueeze(2), jacobians.flatten(1, 2), 0.0)
@@ -92,9 +92,8 @@ def task_space(contacts: ContactSpace, jacobian: Tensor, coriolis: Tensor, gravi
 def torque_map(task: TaskSpace, joints: Tensor, damping: float) -> Tensor:
     """Return J_k^T, which turns task forces F into the least joint torques that exert them (eq. 4) (n, nv - 6, m).
 
-    J_bar^T S_k^T is what torques exert; J_k^T is its pseudo-inverse. Torques that only press contacts against each
-    other exert nothing, and the least torques have no such part: they accelerate the robot as the task demands and as
-    little as possible beyond.
+    J_bar^T S_k^T maps torques to forces F; J_k^T is its pseudo-inverse. Torques that only press contacts against each
+    other exert no F, and the least torques have no such part.
 
     Only ``joints`` (n, nv - 6), bool, serve the task; others have rows of zeros. ``damping`` is Tikhonov's, relative to
     the mean square singular value: with fewer than three contacts some forces F can hardly be exerted.

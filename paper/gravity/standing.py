@@ -1,4 +1,4 @@
-"""Standing up from random states: where such trials start, what counts as standing, and how often it works."""
+"""Trials of standing up from random states."""
 
 from __future__ import annotations
 
@@ -17,21 +17,19 @@ from legged_torque.terrain.selection import select_tiles
 from legged_torque.utils.config import update_from_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import apply_perturbation
+from legged_torque.utils.standing import stands
 
-Act = Callable[[LeggedRobot], Tensor]  # returns the actions for a task's state; (num_envs, num_actions)
+Act = Callable[[TorqueRobot], Tensor]  # returns the actions for a task's state; (num_envs, num_actions)
 START_CLEARANCE = (0.0, 0.02)  # lowest and highest clearance of the lowest foot at the start [m]
-MAX_DRAWS = 20  # how often states are drawn until no other part of the robot is below the ground
-LOWEST_HEIGHT = 0.2  # lowest height of a standing robot's trunk [m]
-HIGHEST_GRAVITY_Z = -0.9
-"""Highest z of the unit gravity vector in a standing robot's trunk frame: tilted by up to 26 degrees."""
-HIGHEST_SPEED = 0.3  # highest speed of a standing robot's trunk [m/s]
+MAX_DRAWS = 20  # draws of a state until no other part of the robot is below the ground
+HIGHEST_SPEED = 0.3  # of a standing robot's trunk [m/s]
 
 
 @dataclass
 class StandingResult:
-    """How a trial went."""
+    """The result of a trial."""
 
-    standing: Tensor  # which worlds stand at the end and have not fallen before. Shape: (num_envs,), bool
+    standing: Tensor  # worlds that stand at the end and have not fallen before. Shape: (num_envs,), bool
     share: float  # of these worlds
     mean_torque: float  # mean absolute torque over joints, time and worlds that have not fallen [N m]
 
@@ -39,8 +37,8 @@ class StandingResult:
 def use_standing_trials(cfg: LeggedRobotCfg, decimation: int = 1) -> None:
     """Change a task's settings such that episodes start from the random states of ``--perturbation low``.
 
-    Parameters are not random, nobody pushes, sensors have no noise, and rough ground is level. A control step has as
-    many physics steps as ``decimation`` says: 1 for a controller at 200 Hz, 4 for a policy at 50 Hz.
+    Parameters are not random, robots are not pushed, sensors have no noise, and rough ground is level. ``decimation``
+    is the number of physics steps per control step: 1 for a controller at 200 Hz, 4 for a policy at 50 Hz.
     """
     apply_perturbation(cfg, "low")
     quiet = {"randomize_parameters": False, "push_robots": False}
@@ -49,24 +47,25 @@ def use_standing_trials(cfg: LeggedRobotCfg, decimation: int = 1) -> None:
         select_tiles(cfg.terrain, ["flat"], [0.0], 1)
 
 
-def place_on_ground(
-    task: LeggedRobot, dynamics: RobotDynamics, clearance: tuple[float, float] = START_CLEARANCE
-) -> None:
+def place_on_ground(task: LeggedRobot, dynamics: RobotDynamics) -> None:
     """Start an episode in every world, the lowest foot just above the ground, which is level at z = 0.
 
     The task draws its initial states; then trunks are moved up or down until the lowest point of the lowest foot has a
-    random clearance [m]. States in which another collision geom would be below the ground are drawn again, at most
-    :data:`MAX_DRAWS` times; what is left then is raised until that geom touches the ground. Waits for the host. A
-    UserError if a collision geom is neither sphere, capsule nor box.
+    random clearance (:data:`START_CLEARANCE`). States in which another collision geom would be below the ground are
+    drawn again, at most :data:`MAX_DRAWS` times; those left over are raised until that geom touches the ground. Waits
+    for the host.
+
+    Raises:
+        UserError: If a collision geom is neither sphere, capsule nor box.
     """
-    geoms = _LowestPoints(task, dynamics)
+    lowest_points = _LowestPoints(task, dynamics)
     qpos, qvel = torch.zeros_like(task.sim.qpos), torch.zeros_like(task.sim.qvel)
     missing = torch.ones(task.num_envs, dtype=torch.bool, device=task.device)
     for draw in range(MAX_DRAWS):
         task.reset()
         dynamics.update(task.sim.qpos, task.sim.qvel)
-        foot, other = geoms()
-        down = foot - torch.empty_like(foot).uniform_(*clearance)
+        foot, other = lowest_points()
+        down = foot - torch.empty_like(foot).uniform_(*START_CLEARANCE)
         if draw == MAX_DRAWS - 1:
             down = torch.minimum(down, other)
         take = missing & (other >= down)
@@ -81,35 +80,29 @@ def place_on_ground(
 
 def is_standing(task: LeggedRobot) -> Tensor:
     """Return which worlds stand at the last physics step: high, level, slow, only on feet. Shape: (num_envs,), bool."""
-    upright = (task.base_height > LOWEST_HEIGHT) & (task.projected_gravity[:, 2] < HIGHEST_GRAVITY_Z)
-    only_feet = task.contacts.sum(dim=1) == task.feet_contact.sum(dim=1)
+    tilt = torch.acos((-task.projected_gravity[:, 2]).clamp(-1.0, 1.0))
+    only_feet = task.contacts.sum(dim=1) == task.contacts[:, task.feet_indices].sum(dim=1)
     slow = torch.linalg.vector_norm(task.base_lin_vel, dim=1) < HIGHEST_SPEED
-    return upright & only_feet & slow  # falls before are not known here, see measure_standing
-
-
-def actions_for(task: LeggedRobot, torques: Tensor) -> Tensor:
-    """Return the actions that lead to torques in the present state of a task, see :class:`TorqueRobot`.
-
-    Shapes: (num_envs, num_dof) [N m] to (num_envs, num_actions). A UserError if the task's actions are not torques.
-    """
-    if not isinstance(task, TorqueRobot):
-        raise UserError(f"the actions of {type(task).__name__} are not torques, as those of TorqueRobot are")
-    return task.actions_for(torques)
+    return stands(task.base_height, task.cfg.rewards.base_height_target, tilt) & only_feet & slow
 
 
 def check_torques(task: LeggedRobot) -> None:
-    """Raise a UserError if a task cannot give any torques that are wanted of it."""
+    """Raise a UserError if a task's actions are not torques, or ``actions_for`` does not lead to the given ones."""
+    if not isinstance(task, TorqueRobot):
+        raise UserError(f"the actions of {type(task).__name__} are not torques, as those of TorqueRobot are")
     wanted = torch.linspace(-5.0, 5.0, task.num_dof, device=task.device).expand_as(task.dof_pos)
-    if not torch.allclose(task._compute_torques(actions_for(task, wanted)), wanted, atol=1e-3):
+    if not torch.allclose(task._compute_torques(task.actions_for(wanted)), wanted, atol=1e-3):
         raise UserError(f"{type(task).__name__} cannot give the torques that its actions_for is asked for")
 
 
-def measure_standing(task: LeggedRobot, act: Act, duration: float) -> StandingResult:
-    """Let a controller or policy act from the present state on, and see who stands in the end.
+def measure_standing(task: TorqueRobot, act: Act, duration: float) -> StandingResult:
+    """Let a controller or policy act from the present state on, and count the worlds that stand at the end.
 
     Call :func:`place_on_ground` before. Worlds that the task resets, because the trunk touched the ground or the state
-    diverged, have fallen. Which feet touch the ground is best told to ``act`` by ``task.feet_contact``. The duration
-    [s] is shorter than an episode. A UserError if it is not.
+    diverged, have fallen. ``act`` finds the feet that touch the ground in ``task.feet_contact``.
+
+    Raises:
+        UserError: If the duration [s] is not shorter than an episode.
     """
     steps = round(duration / task.dt)
     if steps >= task.max_episode_length:
@@ -135,9 +128,8 @@ class _LowestPoints:
         feet = [names.index(name) for name in task.foot_names]
         others = [i for i in range(model.ngeom) if model.geom_bodyid[i] > 0 and i not in feet]
         shapes = [_rounded_box(model, i) for i in feet + others]
-        self._half_sizes, self._radii = (
-            torch.tensor(values, dtype=torch.float32, device=task.device) for values in zip(*shapes, strict=True)
-        )
+        half_sizes, radii = zip(*shapes, strict=True)
+        self._half_sizes, self._radii = (torch.tensor(part, device=task.device) for part in (half_sizes, radii))
         self._geoms = torch.tensor(feet + others, device=task.device)
         self._sizes = [len(feet), len(others)]
         self._dynamics = dynamics

@@ -11,13 +11,13 @@ from torch import Tensor
 from legged_torque.paper.gravity import operational_space as osc
 from legged_torque.paper.gravity.contact_forces import ForceDistribution, ForceLimits
 from legged_torque.paper.gravity.dynamics import TRUNK_DOFS, RobotDynamics
+from legged_torque.paper.gravity.threads import single_threaded
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.threads import single_threaded
 
 
 @dataclass(frozen=True)
 class WholeBodySettings:
-    """What the controller wants and may do; the defaults are for the A1 at 200 Hz."""
+    """Gains and limits of the controller; the defaults are for the A1 at 200 Hz."""
 
     height: float = 0.303  # [m] of the trunk's origin above the ground
     position_stiffness: float = 30.0  # [1/s^2] of the trunk towards its height and the middle of its feet
@@ -39,7 +39,7 @@ class WholeBodySettings:
 
 @dataclass
 class WholeBodyTorques:
-    """What the controller decides: torques in N m; forces by the ground on the robot, in N in the world frame."""
+    """Output of the controller: torques [N m]; forces of the ground on the robot, in the world frame [N]."""
 
     task: Tensor  # Gamma_task (eq. 4). Shape: (n, joints)
     posture: Tensor  # Gamma_posture (eq. 5). Shape: (n, joints)
@@ -54,29 +54,26 @@ class WholeBodyController:
 
     - Task (eq. 4): the six degrees of freedom of the trunk. f* is a spring and damper on height, attitude and the
       horizontal distance of the centre of mass from the middle of the feet; yaw is only damped. Feet in the air count
-      less the higher they are: one held up hardly does, and with two on the ground the trunk leans towards the others.
-      F holds the contact-consistent gravity p, so that at f* = 0 this is gravity compensation. Only legs that touch
-      the ground serve the task: the least torques that exert F on the trunk.
+      less the higher they are. F holds the contact-consistent gravity p, so that at f* = 0 this is gravity
+      compensation. Only legs on the ground serve the task, with the least torques that exert F on the trunk.
     - Posture (eq. 5): Gamma_0 is a PD control of all joints towards the nominal pose, plus springs that draw feet in
-      the air under the hips of the level trunk, and ahead of its velocity, to catch it. The null space takes away
-      what would disturb the trunk. Legs in the air keep it all; of the others, internal forces remain.
+      the air under the hips of the level trunk, and ahead of its velocity, to catch it. The null space removes the
+      part that would disturb the trunk: nothing for legs in the air, all but internal forces for the others.
     - Force (eq. 6): both together would cause the contact forces of eq. 11. Where these leave the friction pyramids or
-      limits, or where the legs on the ground cannot exert F, f_csd are the allowed forces that come nearest to the
-      wrench that the trunk needs (eq. 10), and -J_c^T (f_csd - f_c) makes the joints press with these instead.
+      limits, or where the legs on the ground cannot exert F, f_csd are the allowed forces nearest to the wrench that
+      the trunk needs (eq. 10), and -J_c^T (f_csd - f_c) makes the joints press with these instead.
 
-    The usual recipe, contact forces that carry the trunk fed forward through J_c^T plus a PD control of all joints, is
-    the same thing seen from the other side: task plus force torques are the feed-forward of f_csd, and posture torques
-    are the PD control less what it would do to the trunk, for which the task has gains of its own. Without any contact
-    task and force torques are zero and the PD control is all that remains.
+    Without any contact, task and force torques are zero and the PD control remains.
     """
 
     def __init__(
         self, dynamics: RobotDynamics, nominal_pose: Sequence[float], settings: WholeBodySettings | None = None
     ) -> None:
-        """Prepare the constants; every call of the controller updates ``dynamics``, ``nominal_pose`` is in rad.
+        """Prepare the constants. Every call of the controller updates ``dynamics``; ``nominal_pose`` is in rad.
 
-        A UserError if the pose has another number of joints, a joint lacks a motor with force limits, or a setting
-        makes no sense.
+        Raises:
+            UserError: If the pose has another number of joints, a joint lacks a motor with force limits, or no contact
+                force is inside the limits of the settings.
         """
         self.settings = settings = settings or WholeBodySettings()
         self.dynamics = dynamics
@@ -102,7 +99,7 @@ class WholeBodyController:
     def __call__(self, qpos: Tensor, qvel: Tensor, mask: Tensor) -> WholeBodyTorques:
         """Compute the torques for many states at once, on level ground at z = 0.
 
-        ``qpos`` and ``qvel`` are as in :meth:`RobotDynamics.update`; ``mask`` (n, k), bool, says which contacts touch
+        ``qpos`` and ``qvel`` are as in :meth:`RobotDynamics.update`; ``mask`` (n, k), bool, has the contacts that touch
         the ground.
         """
         robot = self.dynamics

@@ -1,42 +1,55 @@
-"""The figures of a report: the paper's Figures 3, 5, 6 and 7, or the same with other titles."""
+"""The figures of a report: the paper's Figures 3, 5, 6 and 7 or the same with other titles, and rough ground."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from legged_torque.paper.report.curves import LEVEL
-from legged_torque.paper.report.figures_bars import draw_bars
-from legged_torque.paper.report.figures_curves import CurveFigure, draw_curves
-from legged_torque.paper.report.figures_rough import draw_success
-from legged_torque.paper.report.figures_style import SETTINGS, seeds_text
-from legged_torque.paper.report.results import Experiment, Table
-from legged_torque.paper.values import ENVIRONMENTS
+import numpy as np
+import pandas as pd
+
+from legged_torque.paper.report.evaluations import LEVEL
+from legged_torque.paper.report.experiment import Experiment
+from legged_torque.paper.report.figures_curves import SEED_MARK, draw_curves
+from legged_torque.paper.report.style import name_of, style
+from legged_torque.paper.values import ENVIRONMENTS, PAPER_METRICS, task_on_plane
+from legged_torque.utils.metrics import Metric
 from legged_torque.utils.plotting import load_pyplot
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CURVES = {
-    "Tracking": ("Figure 3", CurveFigure("track_percentage")),
-    "Tracking over seconds": ("Figure 3 over seconds", CurveFigure("track_percentage", over="seconds")),
-    "Height": ("Figure 5a", CurveFigure("height")),
-    "Critic": ("Figure 5b", CurveFigure("critic_gradient_norm", scale="log", window=0.03)),
-}
-"""Title in the report on an experiment of your own, that in one like the paper's, and what it shows."""
-BARS: dict[str, tuple[str, ...]] = {
-    "Figure 6": ("low", "high"),
-    "Figure 7": ("high_frequency", "doubled"),
-}  # columns of Table I, by title
-OWN_BARS = "Metrics"  # of all other columns
-LEVELS = "Levels"  # on rough ground
-COLOURS = 96  # of a PNG
-
 Draw = Callable[[str], "Figure | None"]
-"""Draws a figure with a title; None without data."""
+"""Draws a figure with a title; returns None without data."""
+CURVES: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "Tracking": ("Figure 3", "track_percentage", {}),
+    "Tracking over seconds": ("Figure 3 over seconds", "track_percentage", {"over": "seconds"}),
+    "Height": ("Figure 5a", "height", {}),
+    "Critic": ("Figure 5b", "critic_gradient_norm", {"scale": "log", "window": 0.03}),
+}
+"""By title in a report on an experiment of the user's own: the title in one like the paper's, metric, and options."""
+BARS = {"Figure 6": ["low", "high"], "Figure 7": ["high_frequency", "doubled"]}
+"""Columns of Table I by title."""
+SETTINGS = {
+    "font.size": 10,
+    "hatch.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "savefig.dpi": 150,
+    "text.parse_math": False,  # a "$" in a name is a "$"
+}
+COLOURS = 96  # of a PNG, which makes it a third of the usual size
+UNFINISHED_ALPHA = 0.45
+CUT_AT = 3.0  # largest height of a panel of bars, in medians of the values that it shows
+PAPER_MARK: dict[str, Any] = {"marker": "D", "color": "none", "markerfacecolor": "white", "markeredgecolor": "black"}
+SPREAD = 0.09  # distance between the points of two seeds, in distances of bars
+NOTES = {"*": "pale, *: seeds are missing or not finished", "cut": "cut: far beyond others"}
+"""Marks below bars, and their meanings in the legend."""
+MARKERS = ("o", "s", "^", "D", "v", "P")  # of approaches on rough ground
 
 
 def file_name(title: str) -> str:
@@ -44,52 +57,150 @@ def file_name(title: str) -> str:
     return f"{title.lower().replace(' ', '')}.png"
 
 
-def draw_all(experiment: Experiment, table: Table, out: Path) -> list[str]:
-    """Draw every figure that there are data for, as PNG, and return their titles; UserError without matplotlib."""
+def planned_figures(experiment: Experiment, table: pd.DataFrame) -> dict[str, Draw]:
+    """Return the functions that draw the figures of a report, by title: the paper's if the experiment is like it."""
+    like_paper = experiment.is_like_paper()
+    figures: dict[str, Draw] = {}
+    for title, (paper_title, metric, options) in CURVES.items():
+        figures[paper_title if like_paper else title] = partial(draw_curves, experiment, metric, **options)
+    columns = [name for name, (trained, evaluated) in experiment.columns().items() if trained == evaluated]
+    bars = (BARS if like_paper else {}) | {
+        "Metrics": [name for name in columns if not like_paper or name not in ENVIRONMENTS]
+    }
+    return figures | {title: partial(draw_bars, experiment, table, names) for title, names in bars.items() if names}
+
+
+def rough_figures(experiment: Experiment) -> dict[str, Draw]:
+    """Return the functions that draw figures on rough ground: levels, and success by environment of training."""
+    if not experiment.has_rough_ground():
+        return {}
+    figures: dict[str, Draw] = {"Levels": partial(draw_curves, experiment, LEVEL.name)}
+    names = experiment.plan.environments
+    return figures | {f"Success in {name}": partial(draw_success, experiment, name) for name in names}
+
+
+def draw_all(experiment: Experiment, figures: dict[str, Draw], out: Path) -> list[str]:
+    """Draw every figure that there are data for, as PNG, and return their titles."""
+    from PIL import Image  # matplotlib needs it too
+
+    counts = {experiment.num_expected(run.cell.task, run.cell.environment) for run in experiment.runs} or {0}
+    seeds = "–".join(map(str, sorted({min(counts), max(counts)})))
+    conditions = f"{experiment.ranges()} ranges, {seeds} seed{'' if seeds == '1' else 's'}"
     pyplot, drawn = load_pyplot(), []
     with pyplot.rc_context(SETTINGS):
-        for title, draw in (planned_figures(experiment, table) | rough_figures(experiment)).items():
-            figure = draw(f"{title} ({conditions(experiment)})")
+        for title, draw in figures.items():
+            figure = draw(f"{title} ({conditions})")
             if figure is not None:
-                save_small(figure, out / file_name(title))
+                figure.savefig(stream := io.BytesIO(), format="png")
+                Image.open(stream).convert("RGB").quantize(COLOURS).save(out / file_name(title), optimize=True)
                 pyplot.close(figure)
                 drawn.append(title)
     return drawn
 
 
-def conditions(experiment: Experiment) -> str:
-    """Return what holds for a whole figure: the ranges of random parameters, and how many seeds there are."""
-    counts = sorted({experiment.num_expected(run.cell.task, run.cell.environment) for run in experiment.runs})
-    seeds = seeds_text(counts[0]) if len(counts) == 1 else "–".join(map(str, [*counts[:1], *counts[-1:]])) + " seeds"
-    return f"{experiment.ranges()} ranges, {seeds}"
+def draw_bars(experiment: Experiment, table: pd.DataFrame, names: Sequence[str], title: str) -> Figure | None:
+    """Draw the metrics of Table I, a row of panels for each of these columns of the table; return None without data."""
+    present = table["mean"].dropna().index.unique("column")
+    columns = [name for name in names if name in present]
+    if not columns:
+        return None
+    grid = {"figsize": (15.0, 3.4 * len(columns) + 0.9), "squeeze": False, "layout": "constrained"}
+    figure, axes = load_pyplot().subplots(len(columns), len(PAPER_METRICS), **grid)
+    for row, column in zip(axes, columns, strict=True):
+        for axis, metric in zip(row, PAPER_METRICS, strict=True):
+            draw_metric(axis, experiment, table.loc[column].xs(metric.name, level="metric"), column, metric)
+        row[0].set_ylabel(ENVIRONMENTS.get(column, column))
+    draw_legend(figure, experiment.plan.tasks, table.loc[columns]["paper"].notna().any())
+    figure.suptitle(title, fontsize=11)
+    return figure
 
 
-def planned_figures(experiment: Experiment, table: Table) -> dict[str, Draw]:
-    """Return what draws the figures of a report, by title: the paper's, if the experiment is like it."""
-    like_paper = experiment.is_like_paper()
-    curves: dict[str, Draw] = {
-        paper if like_paper else own: partial(draw_curves, experiment, what) for own, (paper, what) in CURVES.items()
-    }
-    columns = [name for name, (trained, evaluated) in experiment.columns().items() if trained == evaluated]
-    bars = dict(BARS) if like_paper else {}
-    own = tuple(name for name in columns if not like_paper or name not in ENVIRONMENTS)
-    bars |= {OWN_BARS: own} if own else {}
-    return curves | {title: partial(draw_bars, experiment, table, names) for title, names in bars.items()}
+def draw_metric(axis: Axes, experiment: Experiment, cells: pd.DataFrame, column: str, metric: Metric) -> None:
+    """Draw a metric, by task, in a column of Table I. Bars far beyond the others are cut off."""
+    tops = [max(cell["values"], default=np.nan) for _, cell in cells.iterrows()]  # of the highest seeds
+    shown = np.array([*tops, *cells["paper"], 1e-9])
+    highest = min(1.12 * np.nanmax(shown), CUT_AT * np.nanmedian(shown[shown > 0.0]))
+    notes = []
+    for place, ((task, cell), top) in enumerate(zip(cells.iterrows(), tops, strict=True)):
+        planned = experiment.num_expected(str(task), experiment.columns()[column][0])
+        note = "" if cell["is_final"] else f"{cell['seeds']} of\n{planned} *" if cell["seeds"] else "no\ndata"
+        notes.append(f"{note}\ncut".strip() if top > highest else note)
+        axis.plot(place + 0.3, cell["paper"], markersize=5.5, markeredgewidth=1.4, zorder=6, **PAPER_MARK)
+        if cell["seeds"]:
+            color, _, hatch = style(experiment.plan.tasks, str(task))
+            draw_bar(axis, cell, place, f"{cell['mean']:.{metric.digits}f}", color, hatch)
+    axis.set_xticks(range(len(notes)), notes, fontsize=8)
+    axis.tick_params(axis="x", length=0)
+    axis.set(title=metric.label, xlim=(-0.6, len(notes) - 0.4), ylim=(0, highest))
+    axis.grid(axis="y", alpha=0.3)
 
 
-def rough_figures(experiment: Experiment) -> dict[str, Draw]:
-    """Return what draws figures on rough ground: levels, and success for each environment of training."""
-    if not experiment.has_grounds():
-        return {}
-    figures: dict[str, Draw] = {LEVELS: partial(draw_curves, experiment, CurveFigure(LEVEL.name))}
-    names = experiment.plan.environments
-    return figures | {f"Success in {name}": partial(draw_success, experiment, name) for name in names}
+def draw_bar(axis: Axes, cell: pd.Series, place: int, label: str, color: str, hatch: str) -> None:
+    """Draw a bar with its error, its number and a point per seed; pale if it is not final."""
+    alpha = 1.0 if cell["is_final"] else UNFINISHED_ALPHA
+    axis.bar(place, cell["mean"], width=0.8, color=color, hatch=hatch, edgecolor="black", linewidth=0.8, alpha=alpha)
+    axis.errorbar(place, cell["mean"], yerr=cell["standard_error"], color="black", capsize=5, linewidth=1.5, zorder=4)
+    places = place + SPREAD * (np.arange(cell["seeds"]) - (cell["seeds"] - 1) / 2)
+    axis.plot(places, cell["values"], color="black", linestyle="none", zorder=5, **SEED_MARK)
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
+    layout: dict[str, Any] = {"rotation": 90, "ha": "center", "va": "bottom", "fontsize": 9, "bbox": box}
+    axis.text(place, 0.04, label, transform=axis.get_xaxis_transform(), **layout)
 
 
-def save_small(figure: Figure, file: Path) -> None:
-    """Write a figure as a PNG of few colours, a third of the usual size."""
-    from PIL import Image  # matplotlib needs it too
+def draw_legend(figure: Figure, tasks: Sequence[str], has_paper: bool) -> None:
+    """Draw the legend of a figure of bars below it."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png")
-    Image.open(stream).convert("RGB").quantize(COLOURS).save(file, optimize=True)
+    handles: list[Any] = []
+    for task in tasks:
+        color, _, hatch = style(tasks, task)
+        handles.append(Patch(facecolor=color, hatch=hatch, edgecolor="black", label=name_of(task)))
+    handles.append(Line2D([], [], color="black", linestyle="none", label="single seeds", **SEED_MARK))
+    handles += [Line2D([], [], label="paper", **PAPER_MARK)] if has_paper else []
+    notes = " ".join(tick.get_text() for axis in figure.axes for tick in axis.get_xticklabels())
+    handles += [Patch(color="none", label=meaning) for mark, meaning in NOTES.items() if mark in notes]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, handlelength=3, frameon=False)
+
+
+def draw_success(experiment: Experiment, environment: str, title: str) -> Figure | None:
+    """Draw the share of robots that cross tiles over difficulty, for each kind and all; return None without data."""
+    tiles = experiment.crossings().query("environment == @environment")
+    if tiles.empty:
+        return None
+    kinds = [*tiles["kind"].unique(), "all"]
+    columns = min(4, len(kinds))
+    rows = math.ceil(len(kinds) / columns)
+    grid = {"figsize": (3.1 * columns, 2.3 * rows + 1.2), "sharex": True, "sharey": True, "squeeze": False}
+    figure, axes = load_pyplot().subplots(rows, columns, layout="constrained", **grid)
+    for axis, kind in zip(axes.flat, kinds, strict=False):
+        draw_tiles(axis, experiment, environment, tiles if kind == "all" else tiles[tiles["kind"] == kind])
+        axis.set_title("mean of all kinds" if kind == "all" else kind.replace("_", " "))
+        axis.set(xlabel="difficulty", ylabel="share that crosses", ylim=(-0.04, 1.04))
+        axis.label_outer()
+        axis.grid(alpha=0.3)
+    for axis in axes.flat[len(kinds) :]:
+        axis.set_axis_off()
+    shown = axes.flat[len(kinds) - 1].get_legend_handles_labels()
+    figure.legend(*shown, loc="outside lower center", ncols=columns, handlelength=4, frameon=False)
+    figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def draw_tiles(axis: Axes, experiment: Experiment, environment: str, tiles: pd.DataFrame) -> None:
+    """Draw the success of all tasks on some tiles, approach by approach: the mean, the range and single seeds."""
+    approaches = list(dict.fromkeys(map(task_on_plane, experiment.plan.tasks)))
+    for task in sorted(experiment.plan.tasks, key=lambda name: approaches.index(task_on_plane(name))):
+        seeds = tiles[tiles["task"] == task].pivot_table(index="level", columns="seed", values="crossed")
+        if seeds.empty:
+            continue
+        planned = experiment.num_expected(task, environment)
+        label = name_of(task) + ("" if seeds.shape[1] == planned else f" ({seeds.shape[1]} of {planned} seeds)")
+        color, line, _ = style(experiment.plan.tasks, task)
+        marker = MARKERS[approaches.index(task_on_plane(task)) % len(MARKERS)]
+        face = "white" if line == "--" else color
+        marks: dict[str, Any] = {"marker": marker, "markersize": 3.5, "markerfacecolor": face}
+        axis.plot(seeds.mean(axis=1), color=color, linestyle=line, linewidth=1.5, label=label, **marks)
+        axis.fill_between(seeds.index, seeds.min(axis=1), seeds.max(axis=1), color=color, alpha=0.12, linewidth=0)
+        if seeds.shape[1] > 1:
+            axis.plot(seeds, ".", color=color, markersize=2.5, alpha=0.7)

@@ -1,6 +1,5 @@
-"""Export: what a robot computes from the files is what the task computes, and what does not fit is refused."""
+"""Export: a robot computes from the files what the task computes, and files that do not fit are refused."""
 
-import copy
 import dataclasses
 import re
 import shutil
@@ -10,19 +9,18 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from support.exports import TRAINING, change, export_random
+from support.exports import TRAINING, export_random
 from support.scripts import SMALL, assert_told_in_one_line, run_here
 from support.settings import TASKS, error_of, torques_in_torch
 
-from legged_torque.deploy import description as description_module
-from legged_torque.envs import ObservationTerm, task_registry
-from legged_torque.envs.base.actions import ActionTerm
-
-for package in ("onnx", "onnxruntime", "jsonschema"):
-    pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
-
+from legged_torque.deploy.description import check
 from legged_torque.deploy.export import export_policy, nominal_cfg
-from legged_torque.deploy.policy import Policy, State
+from legged_torque.deploy.policy import ACTIONS, OBSERVATIONS, Policy, State
+from legged_torque.envs import ObservationTerm, task_registry
+from legged_torque.envs.approaches.torque import TorqueRobot
+from legged_torque.envs.tasks import A1TorqueCfg
+from legged_torque.motors.config import MotorCfg
+from legged_torque.motors.motor import Motor
 
 CHANGED = {
     "env.history_length": 3,
@@ -57,22 +55,13 @@ def measured(task, world):
     return State(*(part[world].numpy().copy() for part in parts), quaternion=task.base_quat[world].numpy().copy())
 
 
+def read_yaml(folder):
+    """The contents of an export's policy.yaml."""
+    return yaml.safe_load((folder / "policy.yaml").read_text())
+
+
 TWO_RATES = "a1_multihead_two_rates"
 PARITY = [(name, settings) for name in [*TASKS, TWO_RATES] for settings in ("default", "changed")]
-
-
-@pytest.fixture(scope="module")
-def exported(make_task, tmp_path_factory):
-    """Folder of an export with two kinds of actions."""
-    folder = tmp_path_factory.mktemp("export") / "out"
-    export_random(make_task, "a1_torque_multihead", folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def description(exported):
-    """What the export has written."""
-    return yaml.safe_load((exported / "policy.yaml").read_text())
 
 
 @pytest.mark.parametrize(("name", "settings"), [*PARITY, ("a1_torque_multihead", "torques_once")])
@@ -120,7 +109,7 @@ def test_parity(make_task, tmp_path, name, settings):
 def test_mixing_weights(make_task, tmp_path, name, end):
     """The description holds the mixing weights of the checkpoint, by hand from eq. 1."""
     export_random(make_task, name, tmp_path / "out")
-    terms = yaml.safe_load((tmp_path / "out" / "policy.yaml").read_text())["actions"]["terms"]
+    terms = read_yaml(tmp_path / "out")["actions"]["terms"]
     theta = 1.0 + (end - 1.0) * (20_000_000 // 64_000 * 64_000) / 50e6
     assert [term["name"] for term in terms] == ["position_residual", "torque"]
     assert [term["mixing_weight"] for term in terms] == pytest.approx([theta, 1.0])
@@ -131,7 +120,7 @@ def test_description(exported, description):
     """The files are complete, the numbers those of the A1, and the schema accepts them."""
     assert sorted(path.name for path in exported.iterdir()) == ["policy.onnx", "policy.pt", "policy.yaml"]
     assert list(exported.parent.iterdir()) == [exported]
-    description_module.check(description)
+    check(description)
     assert description["joint_order"][:3] == ["FR_hip_joint", "FR_thigh_joint", "FR_calf_joint"]
     assert description["nominal_pose"]["RL_thigh_joint"] == 1.0
     assert description["gains"]["stiffness"]["FL_calf_joint"] == 20.0
@@ -144,6 +133,7 @@ def test_description(exported, description):
         "refresh_torques": True,
     }
     assert description["training"] == TRAINING
+    assert description["unsupported"] == [] and description["pushes"] == {"set_factor": 1.1}
     text = (exported / "policy.yaml").read_text()
     assert "&id" not in text and max(map(len, text.splitlines())) <= 120
 
@@ -159,7 +149,7 @@ def test_torchscript_and_batches(exported):
 
 
 def test_actions_that_are_not_finite(exported):
-    """They are refused instead of sent, and arrays of a wrong size as well."""
+    """They are refused instead of sent, like arrays of a wrong size."""
     policy = Policy(exported)
     assert "actions are not finite" in error_of(policy.act, np.full(57, np.nan))
     state = State(np.zeros(3), np.zeros(12), np.zeros(12), projected_gravity=np.array([0.0, 0.0, -1.0]))
@@ -172,7 +162,7 @@ def test_actions_that_are_not_finite(exported):
 
 
 def test_double_precision(exported):
-    """In float64 all that is computed here is in float64, and the same."""
+    """In float64, all results are in float64 and the same."""
     single, double = Policy(exported), Policy(exported, np.float64)
     state = State(np.ones(3), np.full(12, 0.3), np.ones(12), projected_gravity=np.array([0.0, 0.6, -0.8]))
     results = []
@@ -185,57 +175,9 @@ def test_double_precision(exported):
         np.testing.assert_allclose(first, second, rtol=1e-5, atol=1e-5)
 
 
-DAMAGE = [
-    ("format_version", 2, "format_version"),
-    ("task", None, "'task' is a required property"),
-    ("gain", {}, "'gain' was unexpected"),
-    ("nominal_pose.FR_knee_joint", 0.1, "unknown joint in nominal_pose of policy.yaml 'FR_knee_joint'"),
-    ("nominal_pose.FR_hip_joint", None, "nominal_pose lacks the joint 'FR_hip_joint'"),
-    ("nominal_pose.FR_hip_joint", "left", "nominal_pose.FR_hip_joint: 'left' is not of type 'number'"),
-    ("nominal_pose.FR_hip_joint", float("nan"), "nominal_pose.FR_hip_joint is not a finite number"),
-    ("joint_order.0", "FR_thigh_joint", "non-unique"),
-    ("joint_order.0", "FR_knee_joint", "did you mean"),
-    ("gains.stiffness.FR_hip_joint", -1.0, "less than the minimum"),
-    ("gains.damping.FR_hip_joint", None, "gains.damping lacks the joint 'FR_hip_joint'"),
-    ("torque_limits.FR_hip_joint", [33.5], "torque_limits.FR_hip_joint"),
-    ("torque_limits.FR_hip_joint", [33.5, -33.5], "must be [lowest, highest]"),
-    ("observations.terms.3.size", 11, "the term 'joint_position' must have size 12, not 11"),
-    ("observations.terms.2.scale", [2.0, 2.0], "the term 'command' must have one scale or 3, not 2"),
-    ("observations.terms.2.name", "comand", "observations.terms.2.name"),
-    ("observations.terms.4", None, "network.num_observations is 57, but the terms have 45 numbers"),
-    ("observations.history_length", 2, "network.num_observations is 57, but the terms have 114 numbers"),
-    ("actions.terms.1", None, "the term 'last_action' must have size 12, not 24"),
-    ("actions.terms.1.name", "position_residual", "the term 'position_residual' occurs more than once"),
-    ("actions.clip", [1.0, -1.0], "actions.clip must be [lowest, highest]"),
-    ("timing.decimation", 0, "timing.decimation"),
-    ("timing.decimation", 4.0, "timing.decimation: 4.0 is not of type 'integer'"),
-    ("timing.decimation", 5, "timing.physics_frequency is not control_frequency times decimation"),
-    ("timing.refresh_torques", "often", "timing.refresh_torques"),
-    ("commands.resampling_probability", 1.5, "commands.resampling_probability"),
-]
-
-
-@pytest.mark.parametrize(("path", "value", "message"), DAMAGE)
-def test_damaged_descriptions(description, path, value, message):
-    """What does not fit is told in one line that names the entry."""
-    damaged = copy.deepcopy(description)
-    change(path, value)(damaged)
-    assert message in error_of(description_module.check, damaged)
-
-
-@pytest.mark.parametrize("text", ["task: [", "walk", "", "3"])
-def test_no_description(exported, tmp_path, text):
-    """Neither is a file that holds something else."""
-    folder = shutil.copytree(exported, tmp_path / "copy")
-    (folder / "policy.yaml").write_text(text)
-    assert "policy.yaml'" in error_of(Policy, folder)
-
-
-def test_other_tasks_are_refused(make_task, exported, tmp_path, monkeypatch):
-    """A task with torques or observations of its own is not exported, and an earlier export stays as it is."""
-    folder = shutil.copytree(exported, tmp_path / "out")
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    robot = task_registry.get_task_class("a1_position")
+def test_other_laws(make_task, tmp_path, monkeypatch):
+    """A task with torques or observations of its own: the networks are exported, and policy.yaml says what differs."""
+    onnxruntime, robot = pytest.importorskip("onnxruntime"), task_registry.get_task_class("a1_position")
     own_torques, own_terms = robot._compute_torques, robot.observation_terms
 
     def shifted_terms(task):
@@ -246,37 +188,88 @@ def test_other_tasks_are_refused(make_task, exported, tmp_path, monkeypatch):
         "torques": ("_compute_torques", lambda task, actions: 1.1 * own_torques(task, actions)),
         "observations": ("observation_terms", shifted_terms),
     }
-    for message, attribute in changes.items():
+    for name, attribute in changes.items():
         with monkeypatch.context() as patch:
             patch.setattr(robot, *attribute)
-            error = error_of(export_random, make_task, "a1_position", folder)
-        assert re.match(f"the {message} of LeggedRobot are not what policy.yaml can describe: they differ by", error)
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-    assert list(tmp_path.iterdir()) == [folder]
+            _, model = export_random(make_task, "a1_position", tmp_path / name, supported=False)
+        (problem,) = read_yaml(tmp_path / name)["unsupported"]
+        assert re.fullmatch(rf"the {name} of LeggedRobot differ by \S+ from those of the terms in policy.yaml", problem)
+        assert f"can only be run by its task: {problem}" in error_of(Policy, tmp_path / name)
+        obs = torch.randn(3, 45, generator=torch.Generator().manual_seed(1))
+        (actions,) = onnxruntime.InferenceSession(tmp_path / name / "policy.onnx").run(None, {"obs": obs.numpy()})
+        with torch.inference_mode():
+            np.testing.assert_allclose(actions, model.as_jit()(obs).numpy(), atol=1e-5)
 
 
-def test_unknown_terms_are_refused(make_task, tmp_path, monkeypatch):
-    """A term that a robot could not compute is refused by name with those that it could, and nothing is written."""
-    robot = task_registry.get_task_class("a1_position")
-    own_terms = robot.observation_terms
-    depth = ObservationTerm("depth_image", lambda: torch.zeros(3, 7), None)
-    changes = {
-        "observation term 'depth_image'; it has projected_gravity, angular_velocity, command, joint_position, "
-        "joint_velocity, last_action, position_phase, height_scan": (
-            "observation_terms",
-            lambda task: [*own_terms(task), depth],
-        ),
-        "action term 'impedance'; it has position_residual, torque": (
-            "action_terms",
-            lambda task: [ActionTerm("impedance", task.action_scale, "rad", "")],
-        ),
-    }
-    for message, attribute in changes.items():
-        with monkeypatch.context() as patch:
-            patch.setattr(robot, *attribute)
-            error = error_of(export_random, make_task, "a1_position", tmp_path / "out")
-        assert error == f"policy.yaml has no {message}"
-    assert not list(tmp_path.iterdir())
+OWN_TERMS = {
+    "observation term 'depth_image'": (
+        "observation_terms",
+        lambda terms: lambda task: [*terms(task), ObservationTerm("depth_image", lambda: task.dof_pos[:, :7], None)],
+    ),
+    "action term 'impedance'": (
+        "action_terms",
+        lambda terms: lambda task: [dataclasses.replace(terms(task)[0], name="impedance")],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OWN_TERMS)
+def test_terms_of_a_user(make_task, tmp_path, monkeypatch, name):
+    """Without a numpy function, a term is named in policy.yaml and the file is not run; with one, it is supported."""
+    robot, (method, change) = task_registry.get_task_class("a1_position"), OWN_TERMS[name]
+    monkeypatch.setattr(robot, method, change(getattr(robot, method)))
+    export_random(make_task, "a1_position", tmp_path / "out", supported=False)
+    (problem,) = read_yaml(tmp_path / "out")["unsupported"]
+    assert problem.startswith(f"no numpy function for the {name}; there are ")
+    assert problem in error_of(Policy, tmp_path / "out")
+    assert_told_in_one_line(run_here("sim2sim.py", str(tmp_path / "out"), root=tmp_path), problem)
+    monkeypatch.setitem(OBSERVATIONS, "depth_image", lambda policy, state, command: state.joint_positions[:7])
+    monkeypatch.setitem(ACTIONS, "impedance", ACTIONS["position_residual"])
+    export_random(make_task, "a1_position", tmp_path / "out")
+    assert Policy(tmp_path / "out").act(np.zeros(45 + 7 * (method == "observation_terms"))).shape == (12,)
+    monkeypatch.undo()
+    assert error_of(Policy, tmp_path / "out") == f"'{tmp_path / 'out'}': {problem}"
+
+
+def test_motors_of_a_user(tmp_path):
+    """A motor of a user's is named in policy.yaml, by its constants if it describes itself."""
+
+    class WeakMotor(Motor):
+        def apply(self, wanted, pos, vel, substep):
+            return 0.5 * wanted
+
+    class WeakMotorWithWords(WeakMotor):
+        def describe(self):
+            return {"share": 0.5}
+
+    class WeakCfg(MotorCfg):
+        def build(self, joints):
+            return WeakMotor(self, joints)
+
+    class WeakCfgWithWords(MotorCfg):
+        def build(self, joints):
+            return WeakMotorWithWords(self, joints)
+
+    class OwnMotorsCfg(A1TorqueCfg):
+        class motors:
+            chain = ["ideal", "weak", "half"]
+
+            class weak(WeakCfg):
+                pass
+
+            class half(WeakCfgWithWords):
+                pass
+
+    cfg = OwnMotorsCfg()
+    cfg.env.num_envs = 3
+    export_random(lambda *args, **kwargs: TorqueRobot(cfg), "a1_torque", tmp_path / "out", supported=False)
+    description = read_yaml(tmp_path / "out")
+    assert description["motors"] == {"half": {"share": 0.5}}
+    assert description["unsupported"] == [
+        "no numpy function for the motor 'half'",
+        "the motor 'weak' has no describe()",
+    ]
+    assert "no numpy function for the motor 'half'" in error_of(Policy, tmp_path / "out")
 
 
 def test_replaces_an_export(make_task, exported, tmp_path):
@@ -288,43 +281,26 @@ def test_replaces_an_export(make_task, exported, tmp_path):
     assert (folder / "notes.txt").read_text() == "mine" and list(tmp_path.iterdir()) == [folder]
 
 
-def test_exports_of_older_versions(exported, tmp_path):
-    """Their networks do not say what their inputs and outputs mean, and are used as ``policy.yaml`` says."""
-    onnx = pytest.importorskip("onnx")
-    folder = shutil.copytree(exported, tmp_path / "out")
-    network = onnx.load(folder / "policy.onnx")
-    assert {entry.key for entry in network.metadata_props} == {"joint_order", "nominal_pose", "observations", "actions"}
-    del network.metadata_props[:]
-    onnx.save(network, folder / "policy.onnx")
-    text = (folder / "policy.yaml").read_text()
-    (folder / "policy.yaml").write_text(
-        re.sub(r", sha256: \w+|\n  sha256: \w+", "", text.replace("scale: 4.0", "scale: 5.0"))
-    )
-    obs = np.full(57, 0.1, np.float32)
-    np.testing.assert_array_equal(Policy(folder).act(obs), Policy(exported).act(obs))
-    assert Policy(folder).description["actions"]["terms"][1]["scale"] == 5.0
-
-
 def test_nominal_settings():
     """A run with randomization is exported with the gains and scales of its settings."""
     cfg, _ = task_registry.get_cfgs("a1_position")
     cfg.domain_rand.randomize_parameters = cfg.domain_rand.push_robots = cfg.noise.add_noise = True
-    cfg.domain_rand.action_delay = [1, 2]
+    cfg.motors.delay.range = [1, 2]
     cfg = nominal_cfg(cfg)
     assert not (cfg.domain_rand.randomize_parameters or cfg.domain_rand.push_robots or cfg.noise.add_noise)
-    assert cfg.domain_rand.action_delay == [0, 0]
+    assert cfg.motors.delay.range == [0, 0]
 
 
 @pytest.mark.parametrize("package", ["onnx", "onnxruntime", "jsonschema"])
 def test_missing_extras(make_task, exported, tmp_path, monkeypatch, package):
-    """A package that is not installed is told with the extra's name, by the export and by what it has written."""
+    """A package that is not installed is named with its extra, on export and when the policy is run."""
     task = make_task("a1_torque", num_envs=3)
     monkeypatch.setitem(sys.modules, package, None)
-    told = f"{package} is not installed; exported policies need the extra: pip install 'legged_torque[export]'"
-    assert error_of(export_policy, task, None, tmp_path / "out", "a1_torque", TRAINING) == told
+    message = f"{package} is not installed; exported policies need the extra: pip install 'legged_torque[export]'"
+    assert error_of(export_policy, task, None, tmp_path / "out", "a1_torque", TRAINING) == message
     assert not list(tmp_path.iterdir())
     if package != "onnx":
-        assert error_of(Policy, exported) == told
+        assert error_of(Policy, exported) == message
 
 
 def test_script(tmp_path):

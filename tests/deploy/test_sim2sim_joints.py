@@ -1,4 +1,4 @@
-"""Sim2sim with files of other conventions: axes are turned around, differences told, all problems at once."""
+"""Sim2sim with files of other conventions: axes are turned around, differences and all problems reported."""
 
 import numpy as np
 import pytest
@@ -14,24 +14,10 @@ from support.robot_files import (
 )
 from support.settings import error_of
 
-for package in ("onnx", "onnxruntime", "jsonschema"):
-    pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
-
-from support.exports import export_random
-
-from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 
 __all__ = ["changed"]
 STATE = np.array([0.0, 0.0, 0.31]), np.array([1.0, 0.0, 0.0, 0.0])
-
-
-@pytest.fixture(scope="module")
-def policy(make_task, tmp_path_factory):
-    """An exported policy of the A1."""
-    folder = tmp_path_factory.mktemp("export") / "out"
-    export_random(make_task, "a1_torque_multihead", folder)
-    return Policy(folder)
 
 
 def walk(robot, policy, steps=10):
@@ -48,9 +34,9 @@ def walk(robot, policy, steps=10):
 
 
 def test_mirrored_axes_are_turned_around(policy, changed):
-    """A file whose left hips turn the other way, as the authors' A1's do, moves as ours does, and a line says so.
+    """A file whose left hips turn the other way, as in the authors' A1, moves as ours does, and a line says so.
 
-    Its joints and motors are in Unitree's orders, of which nothing needs to be said.
+    Its joints and motors are in Unitree's orders, which needs no line.
     """
     expected = walk(MujocoRobot(changed(EVEN_TRUNK), policy.description), policy)
     weak = [setting(f".//joint[@name='{leg}_hip_joint']", range="-0.7 0.8") for leg in ("FL", "RL")]
@@ -66,7 +52,7 @@ def test_mirrored_axes_are_turned_around(policy, changed):
     np.testing.assert_allclose(robot.applied_torques(), 0.0)
 
 
-def test_differences_of_joints_are_told(policy, changed):
+def test_differences_of_joints(policy, changed):
     """Mass, damping, armature, tilted axes, and a nominal pose beyond limits."""
     passive = setting(".//default[@class='a1']/joint", damping="2", frictionloss="0.2", armature="0.01")
     edits = [
@@ -79,13 +65,13 @@ def test_differences_of_joints_are_told(policy, changed):
     assert robot.notes == [
         "mass: the MJCF has 13.453 kg, the robot of the training 12.453 kg",
         "axes: those of the MJCF are not the policy's (FR_hip_joint)",
-        "nominal pose: beyond the joint limits of the MJCF, where episodes start instead (RL_calf_joint)",
         "damping of joints: the MJCF has 2, the robot of the training 0 (all joints)",
         "armature of joints: the MJCF has 0.02, the robot of the training 0.01 (RR_calf_joint)",
+        "nominal pose: beyond the joint limits of the MJCF, where episodes start instead (RL_calf_joint)",
     ]
 
 
-def test_geoms_are_told(policy, changed):
+def test_geoms(policy, changed):
     """Geoms that should end episodes and are missing, and a robot that no view would draw."""
     hidden = setting(".//default[@class='visual']/geom", group="5")
     description = policy.description | {"episode": {"length": 20.0, "ends_on_contact_of": ["trunk", "head"]}}
@@ -95,41 +81,30 @@ def test_geoms_are_told(policy, changed):
     ]
 
 
-def test_older_exports(policy, changed):
-    """Descriptions that do not tell the joints' axes are run as they were, and a line says what is not compared."""
-    older = {key: value for key, value in policy.description.items() if key != "joints"}
-    (note,) = MujocoRobot(changed(), older).notes
-    assert note == "axes, damping, armature and friction of joints are not compared: policy.yaml lacks them"
-
-
-def test_all_problems_are_told(policy, changed):
-    """Actuators that are no motors are told together, and so are missing joints."""
-    told = error_of(MujocoRobot, changed(servo(3, 7)), policy.description)
-    assert (
-        told.count("must be a motor, ctrl its torque; it is a servo") == 2
-        and "'FL_hip_joint'" in told
-        and "'RR_thigh_joint'" in told
-    )
+def test_all_problems_are_reported(policy, changed):
+    """Actuators that are not motors are reported together, and so are missing joints."""
+    message = error_of(MujocoRobot, changed(servo(3, 7)), policy.description)
+    assert "must be a motor, ctrl its torque; one is a servo" in message and "(FL_hip_joint, RR_thigh_joint)" in message
     renamed = [setting(f".//joint[@name='{leg}_calf_joint']", name=f"{leg}_knee") for leg in ("RR", "RL")]
     motors = [setting(f".//motor[@joint='{leg}_calf_joint']", joint=f"{leg}_knee") for leg in ("RR", "RL")]
-    told = error_of(MujocoRobot, changed(*renamed, *motors), policy.description)
-    assert "'RR_calf_joint'" in told and "'RL_calf_joint'" in told
+    message = error_of(MujocoRobot, changed(*renamed, *motors), policy.description)
+    assert "'RR_calf_joint'" in message and "'RL_calf_joint'" in message
 
 
 def test_self_collision(policy, changed):
     """Parts of the robot collide if they did in training, whatever the file says, and then end episodes as well."""
     file = changed(setting(".//default[@class='collision']/geom", contype="2", conaffinity="3"))
-    pose, said, fallen, forces = policy.nominal_pose.copy(), [], [], []
+    pose, notes, fallen, forces = policy.nominal_pose.copy(), [], [], []
     pose[:3] = 0.7, 1.4, -1.3  # the thigh in the trunk
     for trained in (False, True):
         with_option = policy.description["robot"] | {"self_collisions": trained}
         robot = MujocoRobot(file, policy.description | {"robot": with_option})
         robot.reset(np.array([0.0, 0.0, 1.0]), STATE[1], pose, (np.zeros(3), np.zeros(3), np.zeros(12)))
         robot.step(np.zeros(12))
-        said.append(robot.notes)
+        notes.append(robot.notes)
         fallen.append(robot.has_fallen())
         forces.append(robot.contact_force())
-    assert said == [["116 pairs of parts that the MJCF lets collide do not, as in training"], []]
+    assert notes == [["116 pairs of parts that the MJCF lets collide do not, as in training"], []]
     assert fallen == [False, True] and forces[0] == 0.0 and forces[1] > 10.0
     (note,) = MujocoRobot(changed(), policy.description | {"robot": with_option}).notes
     assert note == "parts of the robot collided with each other in training, those of the MJCF do not"

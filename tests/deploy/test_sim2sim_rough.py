@@ -2,20 +2,17 @@
 
 import copy
 import dataclasses
+import json
 import math
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+from support.exports import XML, change, changed_xml, export_random
 from support.ground import ground_cfg
 from support.scripts import assert_told_in_one_line, run_here
 from support.settings import error_of, flatten
-
-for package in ("onnx", "onnxruntime", "jsonschema"):
-    pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
-
-from support.exports import XML, change, changed_xml, export_random
 
 from legged_torque.deploy import hfield_contacts
 from legged_torque.deploy.description import check
@@ -68,7 +65,7 @@ def surface(policy):
 def test_ground_is_the_task_s(exported, policy, robot, surface):
     """``policy.yaml`` has the settings of the map; robots start where the task's do, on the task's surface."""
     task = exported[1]
-    assert robot.notes == [] and Layout(**policy.description["terrain"]) == task.terrain.layout
+    assert Layout(**policy.description["terrain"]) == task.terrain.layout
     np.testing.assert_array_equal(task.terrain.map.heights, surface.heights)
     np.testing.assert_array_equal(robot.origins, task.terrain._origins.flatten(0, 1))
     robot.reset(np.zeros(3), quaternion(0, 0, 0), policy.nominal_pose, STILL)
@@ -117,7 +114,7 @@ def test_motion_is_the_task_s(exported, policy, robot):
         task.reset()
         task.base_pos[:, 0] += 1.4  # half on the first step
         task.reset_buf.fill_(True)  # scans start anew, too
-        task.compute_observations()
+        task.set_state(task.sim.qpos.clone(), task.sim.qvel.clone())
         q, v = task.sim.qpos[world].numpy(), task.sim.qvel[world].numpy()
         robot.reset(q[:3], q[3:7], q[7:], (v[:3], v[3:6], v[6:]))
         policy.reset()
@@ -144,10 +141,12 @@ def test_motion_is_the_task_s(exported, policy, robot):
 
 
 def test_level_map_is_a_plane(policy):
-    """A robot that falls onto a level map, feet sinking in deep, moves as on a plane; MuJoCo alone differs."""
+    """A robot that falls onto a level map, feet sinking in deep, moves as on a plane; with MuJoCo's contacts not."""
     description = copy.deepcopy(policy.description)
     select_ground(description, A1Cfg().terrain, ["flat"], [0.0])
-    on_map, untouched = MujocoRobot(XML, description), MujocoRobot(XML, description)
+    on_map, untouched = MujocoRobot(XML, description), MujocoRobot(XML, description, contacts="mujoco")
+    assert [len(robot.notes) for robot in (on_map, untouched)] == [1, 1]
+    assert "not tested independently" in on_map.notes[0] and "MuJoCo's own" in untouched.notes[0]
     del description["terrain"]
     on_plane, depths = MujocoRobot(XML, description), [0.0]
     pose = policy.nominal_pose + np.random.default_rng(0).uniform(-0.2, 0.2, 12)
@@ -156,9 +155,7 @@ def test_level_map_is_a_plane(policy):
         robot.reset([0.013, 0.021, 0.35], quaternion(0.1, -0.1, 0.7), pose, (np.array([0.5, 0.2, -3.0]), *STILL[1:]))
     for _ in range(60):
         for robot in robots:
-            torques = 60.0 * (policy.nominal_pose - robot.joint_positions()) - 2.0 * robot.joint_velocities()
-            robot.data.ctrl[:] = torques
-            mujoco.mj_step(robot.model, robot.data) if robot is untouched else robot.step(torques)
+            robot.step(60.0 * (policy.nominal_pose - robot.joint_positions()) - 2.0 * robot.joint_velocities())
         depths += on_plane.data.contact.dist.tolist()
     np.testing.assert_allclose(on_map.data.qpos, on_plane.data.qpos, atol=1e-9)
     assert np.abs(untouched.data.qpos - on_plane.data.qpos).max() > 0.1
@@ -289,14 +286,14 @@ def test_ground_of_the_mjcf(policy, tmp_path):
     ],
 )
 def test_damaged_descriptions(policy, path, value, message):
-    """What does not fit is told in one line that names the entry."""
+    """A description that does not fit is refused in one line that names the entry."""
     damaged = copy.deepcopy(policy.description)
     change(path, value)(damaged)
     assert message in error_of(check, damaged)
 
 
 def test_impossible_ground(policy):
-    """Maps that cannot be are told when they are made."""
+    """Maps that cannot exist are refused when they are made."""
     for path, value, message in (
         ("terrain.terrain_proportions.pits", 0.5, "terrain.terrain_proportions must sum to 1, not 1.5"),
         ("terrain.terrain_proportions.lava", 0.0, "unknown kind in terrain.terrain_proportions 'lava'"),
@@ -307,10 +304,17 @@ def test_impossible_ground(policy):
 
 
 def test_script(exported, tmp_path):
-    """``sim2sim.py`` takes kinds and a difficulty, and tells mistakes in one line."""
+    """``sim2sim.py`` takes kinds and a difficulty, says whose contacts act, and reports mistakes in one line."""
     words = [str(exported[0]), "--robots=1", "--steps=3"]
-    status, output, error = run_here("sim2sim.py", *words, "--terrain", "pits", "--level=0.5", root=tmp_path)
-    assert (status, error) == (0, "") and "note" not in output and "height" in output
+    file = tmp_path / "result.json"
+    for contacts, note in (("training", "are corrected to those of training"), ("mujoco", "are MuJoCo's own")):
+        options = ["--terrain", "pits", "--level=0.5", f"--contacts={contacts}", f"--json={file}"]
+        status, output, error = run_here("sim2sim.py", *words, *options, root=tmp_path)
+        assert (status, error) == (0, "") and "height" in output
+        assert f"note: contacts with height fields {note}" in output
+        assert note in json.loads(file.read_text())["notes"][0]
+    result = run_here("sim2sim.py", *words, "--contacts=none", root=tmp_path)
+    assert_told_in_one_line(result, "argument --contacts: invalid choice: 'none'")
     result = run_here("sim2sim.py", *words, "--terrain", "stair_up", root=tmp_path)
     assert_told_in_one_line(result, "unknown kind of terrain 'stair_up'; did you mean 'stairs_up'?")
     result = run_here("sim2sim.py", *words, "--terrain", "pits", "--level", "0.5", "1.5", root=tmp_path)

@@ -1,5 +1,6 @@
 """The code in the how-to pages and in the README, run as it stands there."""
 
+import math
 import re
 import runpy
 import shlex
@@ -123,6 +124,21 @@ def test_parameter(run_page):
     train(make("a1_thigh_mass", "domain_rand.randomize_parameters=true"), "a1_thigh_mass")
 
 
+def test_learner(tmp_path, monkeypatch):
+    """The page's learner trains, resumes and is evaluated by the scripts."""
+    file = tmp_path / "random_search.py"
+    file.write_text("\n".join(blocks("docs/howto/learner.md", "python")))
+    monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
+    words = ["--task=a1_search", f"--task_file={file}", "--device=cpu"]
+    settings = [*TINY, "--logger=none", "--set=actor.hidden_dims=[8]", "--set=evaluation.interval=8"]
+    for more in ([*settings, "--set=evaluation.num_samples=4"], ["--resume", "--max_iterations=3"]):
+        status, output, error = run_here("train.py", *words, *more, root=tmp_path)
+        assert (status, error) == (0, "") and "anew" not in output
+    (file,) = tmp_path.glob("logs/a1_search/*/model_3.pt")
+    assert torch.load(file, weights_only=True)["best_reward"] > -math.inf
+    assert run_here("evaluate.py", *words, "--num_envs=2", "--steps=2", root=tmp_path)[0] == 0
+
+
 def test_combination(run_page):
     """Actions are those of the multi-head task, the curriculum is that of the torque curriculum."""
     run_page("docs/howto/approach.md")
@@ -160,6 +176,29 @@ def test_approach_in_kernel(run_page):
             task.step(actions)
     assert tasks[0].torques.abs().max() > 5.0
     torch.testing.assert_close(tasks[1].torques, tasks[0].torques, rtol=1e-3, atol=1e-3)
+
+
+def test_motor(run_page):
+    """The rate limit acts inside the kernel: 1.5 N m per physics step."""
+    run_page("docs/howto/motor.md")
+    task = make("a1_slew", "init_state.pos=[0, 0, 50]")
+    assert not task.notes
+    task.step(torch.full((4, 12), 2.0))
+    torch.testing.assert_close(task.torques, torch.full((4, 12), 6.0))
+    train(task, "a1_slew")
+
+
+def test_sensor(run_page):
+    """Rays are as long as the trunk is high, two control steps late."""
+    run_page("docs/howto/observation.md")
+    task = make("a1_ray")
+    heights = []
+    for _ in range(6):
+        heights.append(task.base_pos[:, 2].clone())
+        obs = task.step(torch.zeros(4, 12))[0]
+    seen = obs["policy"][:, -2:]
+    assert (seen == seen[:, :1]).all() and not torch.equal(seen[:, 0], task.base_pos[:, 2])
+    assert any(torch.allclose(seen[:, 0], height) for height in heights)
 
 
 def test_robot(run_page):

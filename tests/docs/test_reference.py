@@ -24,6 +24,7 @@ def flat(values, path=""):
     """Dotted paths of nested settings; dictionaries of joints are one setting."""
     for key, value in values.items():
         is_section = isinstance(value, dict) and key not in ("default_joint_angles", "stiffness", "damping")
+        is_section = is_section and path != "domain_rand."
         yield from flat(value, f"{path}{key}.") if is_section else [f"{path}{key}"]
 
 

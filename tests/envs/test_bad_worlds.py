@@ -21,12 +21,12 @@ from legged_torque.utils.errors import TrainingError
 from legged_torque.utils.mirroring import SCALAR
 
 RANDOM = {"domain_rand.randomize_parameters": True}
-HISTORY = {"env.history_length": 3, "domain_rand.action_delay": [1, 6]}
+HISTORY = {"env.history_length": 3, "motors.delay.range": [1, 6]}
 FIXED = {"domain_rand.randomize_parameters": False}
 
 BUFFERS = {
-    "p_gains": lambda task: task.p_gains,
-    "d_gains": lambda task: task.d_gains,
+    "stiffness": lambda task: task.p_gains,
+    "damping": lambda task: task.d_gains,
     "motor_strength": lambda task: task.motor_strength,
     "joint_offset": lambda task: task.joint_offset,
     "torque_scale": lambda task: task.torque_scale,
@@ -39,8 +39,8 @@ BUFFERS = {
     "episode_sums": lambda task: task.episode_sums.T,
 }
 DELAYED_BUFFERS = {
-    "action_delay": lambda task: task.action_delay.drawn,
-    "delayed_actions": lambda task: task.action_delay.before[:, 0],
+    "delay.drawn": lambda task: task.motors.links["delay"].drawn,
+    "delay.before": lambda task: task.motors.links["delay"].before[:, 0],
     "observation_history": lambda task: task.obs_buf["policy"][:, -1:],
 }
 MODEL_FIELDS = ["body_mass", "body_ipos", "geom_friction", "geom_solref", "dof_armature", "gravity"]

@@ -104,7 +104,7 @@ def test_a_torque_head_is_pretrained(monkeypatch):
             seen.append(torch.stack([task._compute_torques(actions), 4.0 * actions[:, 12:]]))
             return actions
 
-        wanted = 4.0 * follow(task, controller, noting, 16, 8).actions[..., 12:]
+        wanted = 4.0 * follow(task, controller, noting, 16, 8)["actions"][..., 12:]
         wrong.append((torch.stack(seen, dim=1) - wanted).square().mean(dim=(1, 2, 3)).sqrt())
     assert wrong[1][0] < wrong[0][0] and wrong[1][1] < 0.7 * wrong[0][1]
 
@@ -236,7 +236,7 @@ def test_what_is_observed_of_two_rates(make_task):
 @pytest.mark.parametrize("delay", [3, 6])
 def test_two_rates_behind_a_delay(make_task, delay):
     """What is delayed is what acts: held positions and torques arrive together."""
-    task = make_task(TWO_RATES, 2, **HIGH_UP, **{"domain_rand.action_delay": [delay, delay]})
+    task = make_task(TWO_RATES, 2, **HIGH_UP, **{"motors.delay.range": [delay, delay]})
     torques_in_torch(task)
     states, step = [], task.sim.step
 

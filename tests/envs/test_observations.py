@@ -23,7 +23,7 @@ def test_observation_layout(make_task, name, num_actions):
     task.actions.copy_(torch.tensor(action))
     task.sim.contact_found.zero_()
     task.sim.contact_found[:, [0, 1, 2, FEET[0], FEET[3]]] = torch.tensor([1.0, 1.0, 2.0, 1.0, 1.0])
-    task._update_state()
+    task.state.update()
     assert task.contacts[0].nonzero().flatten().tolist() == [0, 1, 2, FEET[0], FEET[3]] and task.contacts.max() == 1
     task.compute_observations()
     obs = task.get_observations()
@@ -60,7 +60,7 @@ def test_observation_scales(make_task):
     task.sim.qvel.fill_(0.5)
     task.commands.fill_(0.25)
     task.dof_pos.copy_(task.default_dof_pos.unsqueeze(0) + 0.1)
-    task._update_state()
+    task.state.update()
     task.compute_observations()
     policy = [0, 0, -1, *[2.5] * 3, 0.75, 0.75, 1.25, *[0.7] * 12, *[5.5] * 12, *[0] * 12]
     np.testing.assert_allclose(task.get_observations()["policy"][0], policy, atol=1e-5)

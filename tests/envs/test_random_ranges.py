@@ -7,15 +7,12 @@ import pytest
 from support.settings import error_of, get_cfgs
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.utils.config import set_by_path, to_dict
 from legged_torque.utils.errors import UserError
 
-FACTORS = ("motor_strength", "stiffness_scale", "damping_scale")
 ON = {"domain_rand.randomize_parameters": True}
-JOINT_RANGES = ("dof_damping", "dof_armature", "dof_stiffness", "dof_frictionloss")
-SHARES = tuple(f"{name}_share" for name in ("foot_radius", *JOINT_RANGES))
-NEW_SETTINGS = ("motor_strength_per_joint", "stiffness_scale_per_joint", "damping_scale_per_joint", *SHARES)
 
 
 @pytest.mark.parametrize(
@@ -39,46 +36,42 @@ def test_perturbations(name, velocity, probability):
 
 
 DEFAULT = {
-    "motor_strength": [0.9, 1.1],
-    "stiffness_scale": [0.9, 1.1],
-    "damping_scale": [0.9, 1.1],
-    **{f"{name}_per_joint": [0.98, 1.02] for name in FACTORS},
-    "joint_offset": [-0.01, 0.01],
-    "ground_friction": [0.8, 1.2],
-    "contact_stiffness": [900.0, 1100.0],
-    "contact_damping": [72.0, 88.0],
-    "gravity": [9.51, 10.11],
-    "trunk_mass_offset": [-1.0, 1.0],
-    "trunk_com_offset": [-0.003, 0.003],
-    "foot_radius": [0.019, 0.021],
-    "dof_damping": [0.0, 0.2],
-    "dof_armature": [0.008, 0.02],
-    "dof_stiffness": [0.0, 0.2],
-    "dof_frictionloss": [0.0, 0.4],
+    "motor_strength": {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]},
+    "stiffness": {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]},
+    "damping": {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]},
+    "joint_offset": {"add": [-0.01, 0.01]},
+    "ground_friction": {"set": [0.8, 1.2]},
+    "contact_stiffness": {"set": [900.0, 1100.0]},
+    "contact_damping": {"set": [72.0, 88.0]},
+    "gravity": {"set": [9.51, 10.11]},
+    "trunk_mass": {"add": [-1.0, 1.0]},
+    "trunk_com": {"add": [-0.003, 0.003]},
+    "foot_radius": {"set": [0.019, 0.021]},
+    "dof_damping": {"set": [0.0, 0.2]},
+    "dof_armature": {"set": [0.008, 0.02]},
+    "dof_stiffness": {"set": [0.0, 0.2]},
+    "dof_frictionloss": {"set": [0.0, 0.4]},
     "push_set_factor": 1.1,
     "keep_probability": 0.0,
-    "trunk_mass_scale": [1.0, 1.0],
 }
 HARD = {
-    "motor_strength": [0.5, 1.5],
-    "stiffness_scale": [0.5, 1.5],
-    "damping_scale": [0.5, 1.5],
-    **{f"{name}_per_joint": [0.95, 1.05] for name in FACTORS},
-    "joint_offset": [-0.05, 0.05],
-    "ground_friction": [0.001, 2.0],
-    "contact_stiffness": [500.0, 1500.0],
-    "contact_damping": [30.0, 130.0],
-    "gravity": [8.81, 10.81],
-    "trunk_mass_offset": [-2.0, 2.0],
-    "trunk_com_offset": [-0.01, 0.01],
-    "foot_radius": [0.019, 0.021],
-    "dof_damping": [0.0, 2.0],
-    "dof_armature": [0.008, 0.05],
-    "dof_stiffness": [0.0, 0.5],
-    "dof_frictionloss": [0.0, 1.0],
+    "motor_strength": {"scale": [0.5, 1.5], "scale_per_joint": [0.95, 1.05]},
+    "stiffness": {"scale": [0.5, 1.5], "scale_per_joint": [0.95, 1.05]},
+    "damping": {"scale": [0.5, 1.5], "scale_per_joint": [0.95, 1.05]},
+    "joint_offset": {"add": [-0.05, 0.05]},
+    "ground_friction": {"set": [0.001, 2.0]},
+    "contact_stiffness": {"set": [500.0, 1500.0]},
+    "contact_damping": {"set": [30.0, 130.0]},
+    "gravity": {"set": [8.81, 10.81]},
+    "trunk_mass": {"add": [-2.0, 2.0]},
+    "trunk_com": {"add": [-0.01, 0.01]},
+    "foot_radius": {"set": [0.019, 0.021]},
+    "dof_damping": {"set": [0.0, 2.0]},
+    "dof_armature": {"set": [0.008, 0.05]},
+    "dof_stiffness": {"set": [0.0, 0.5]},
+    "dof_frictionloss": {"set": [0.0, 1.0]},
     "push_set_factor": 1.5,
     "keep_probability": 0.0,
-    "trunk_mass_scale": [1.0, 1.0],
 }
 """The two published sets (spec, randomization_sets.md)."""
 
@@ -94,33 +87,23 @@ HARD = {
 def test_ranges(words, ranges, errors):
     """They are the published ones, whole, over what a loaded run has, and go with any perturbation."""
     old = get_cfgs("--perturbation=high")[0]
-    old.domain_rand.foot_radius, old.domain_rand.keep_probability = [0.0195, 0.0205], 0.3
-    old.domain_rand.stiffness_offset, old.noise.noise_scales.dof_pos = [-3.0, 3.0], 0.5
+    old.domain_rand.foot_radius, old.domain_rand.keep_probability = {"set": [0.0195, 0.0205]}, 0.3
+    old.domain_rand.action_scale, old.noise.noise_scales.dof_pos = {"add": [-0.1, 0.1]}, 0.5
     cfgs = [get_cfgs(*words, "--perturbation=low")[0]]
     if words:
         cfgs.append(get_cfgs(*words, run_config={"env": to_dict(old), "train": {}})[0])
     for cfg in cfgs:
         assert {name: getattr(cfg.domain_rand, name) for name in ranges} == ranges
-        assert cfg.domain_rand.stiffness_offset == [0.0, 0.0]
+        assert cfg.domain_rand.action_scale == {}
         noise = cfg.noise.noise_scales
         assert (noise.dof_pos, noise.dof_vel, noise.ang_vel, noise.gravity) == errors
     assert cfgs[-1].domain_rand.push_velocity == ([-1.0, 1.0] if words else [-0.3, 0.3])
 
 
-def test_older_runs_keep_their_ranges():
-    """A run from before factors per joint and on pushes has none of them."""
-    env = to_dict(get_cfgs("--perturbation=low")[0])
-    for name in (*NEW_SETTINGS, "push_set_factor"):
-        del env["domain_rand"][name]
-    env["domain_rand"]["ground_friction"] = [0.001, 2.0]
-    rand = get_cfgs(run_config={"env": env, "train": {}})[0].domain_rand
-    assert {getattr(rand, name) for name in NEW_SETTINGS} == {None} and rand.push_set_factor == 1.0
-    assert rand.ground_friction == [0.001, 2.0]
-
-
-def test_shares_of_the_robot(make_task):
-    """Where a robot has no ranges of its own, they follow from its radii, armatures, gains and torque limits."""
-    without = {f"domain_rand.{name}": None for name in ("foot_radius", *JOINT_RANGES)}
+def test_units_of_the_robot(make_task):
+    """Ranges of any robot are in units of its radii, armatures, gains and torque limits."""
+    names = ("foot_radius", "dof_damping", "dof_armature", "dof_stiffness", "dof_frictionloss")
+    without = {f"domain_rand.{name}": getattr(LeggedRobotCfg.domain_rand, name) for name in names}
     cfg = A1Cfg()
     for path, value in {**ON, **without, "env.num_envs": 300}.items():
         set_by_path(cfg, path, value)
@@ -142,8 +125,8 @@ def test_shares_of_the_robot(make_task):
         assert (np.abs(values.min(axis=0) - low) < slack).all() and (np.abs(values.max(axis=0) - high) < slack).all()
     radii = sim.field("geom_size")[:, model.geom(task.foot_names[0]).id, 0]
     assert 0.019 <= radii.min() < 0.0191 and 0.0209 < radii.max() <= 0.021001
-    fixed = {"domain_rand.keep_fixed": ["dof_damping", "foot_radius", "dof_armature_share"]}
-    kept = make_task("a1_position", 2, **ON, **without, **fixed, **{"domain_rand.dof_stiffness_share": None}).sim
+    fixed = {"domain_rand.keep_fixed": ["dof_damping", "foot_radius", "dof_armature"]}
+    kept = make_task("a1_position", 2, **{**ON, **without, **fixed, "domain_rand.dof_stiffness": {}}).sim
     for field in ("dof_damping", "geom_size", "dof_armature", "jnt_stiffness"):
         assert (kept.field(field).numpy() == np.float32(getattr(model, field))).all(), field
     assert (kept.field("dof_frictionloss").numpy() != model.dof_frictionloss).any()
@@ -152,9 +135,9 @@ def test_shares_of_the_robot(make_task):
 @pytest.mark.parametrize(
     ("name", "limits", "note"),
     [
-        ("trunk_mass_offset", [-1.0, 2.4], "trunk_mass changes a mass of 4.713 kg by 2.4 kg"),
-        ("dof_frictionloss", [0.0, 3.5], "dof_frictionloss draws up to 3.5 N m, but a motor has 33.5 N m"),
-        ("dof_armature", [0.1, 0.2], "dof_armature draws 0.1 to 0.2, but the robot's own value is 0.01"),
+        ("trunk_mass", {"add": [-1.0, 2.4]}, "trunk_mass changes a mass of 4.713 kg by 2.4 kg"),
+        ("dof_frictionloss", {"set": [0.0, 3.5]}, "dof_frictionloss draws up to 3.5 N m, but a motor has 33.5 N m"),
+        ("dof_armature", {"set": [0.1, 0.2]}, "dof_armature draws 0.1 to 0.2, but the robot's own value is 0.01"),
     ],
 )
 def test_ranges_of_another_robot(make_task, name, limits, note):
@@ -175,10 +158,10 @@ def test_unknown_names(option):
 @pytest.mark.parametrize(
     ("name", "limits", "message"),
     [
-        ("trunk_mass_offset", [-5.0, 1.0], "'trunk_mass' can be -0.287 with the ranges given"),
-        ("stiffness_offset", [-21.0, 0.0], "'p_gains' can be -1.1"),
-        ("damping_offset", [-0.6, 0.0], "'d_gains' can be -0.1"),
-        ("action_scale_offset", [-0.3, 0.0], "'action_scale' can be -0.05"),
+        ("trunk_mass", {"add": [-5.0, 1.0]}, "'trunk_mass' can be -0.287 with the ranges given"),
+        ("stiffness", {"add": [-21.0, 0.0]}, "'stiffness' can be -1"),
+        ("damping", {"add": [-0.6, 0.0]}, "'damping' can be -0.1"),
+        ("action_scale", {"add": [-0.3, 0.0]}, "'action_scale' can be -0.05"),
     ],
 )
 def test_sums_that_make_no_sense(make_task, name, limits, message):
@@ -190,13 +173,16 @@ def test_sums_that_make_no_sense(make_task, name, limits, message):
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("domain_rand.gravity", [10.0, 9.0]),
-        ("domain_rand.dof_damping", [-0.1, 0.2]),
-        ("domain_rand.trunk_mass_scale", [-0.5, 1.0]),
-        ("domain_rand.gravity", [9.0, math.nan]),
-        ("domain_rand.joint_offset", [-math.inf, 0.1]),
-        ("domain_rand.motor_strength_per_joint", []),
-        ("domain_rand.foot_radius", [0.02]),
+        ("domain_rand.gravity", {"set": [10.0, 9.0]}),
+        ("domain_rand.gravity", [9.0, 10.0]),
+        ("domain_rand.gravity", {"sett": [9.0, 10.0]}),
+        ("domain_rand.gravity", {"set": [9.0, 10.0], "add": [0.0, 1.0]}),
+        ("domain_rand.dof_damping", {"set": [-0.1, 0.2]}),
+        ("domain_rand.trunk_mass", {"scale": [-0.5, 1.0]}),
+        ("domain_rand.gravity", {"set": [9.0, math.nan]}),
+        ("domain_rand.joint_offset", {"add": [-math.inf, 0.1]}),
+        ("domain_rand.motor_strength", {"scale_per_joint": []}),
+        ("domain_rand.foot_radius", {"set": [0.02]}),
         ("domain_rand.push_probability", 1.1),
         ("domain_rand.resampling_probability", -0.1),
         ("domain_rand.keep_probability", 2.0),

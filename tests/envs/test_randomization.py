@@ -9,18 +9,17 @@ import pytest
 import torch
 from support.settings import error_of, get_cfgs
 
-from legged_torque.envs.base.domain_rand import of_model
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.sim.randomization import Parameter, Randomization, changes_legs
+from legged_torque.sim.randomization import Randomization, RandomParameter, changes_legs
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
 from tools import distributions
 
 RANGES = {
-    "trunk_mass_offset": ("body_mass", (-1.0, 1.0)),
-    "trunk_com_offset": ("body_ipos", (-0.003, 0.003)),
+    "trunk_mass": ("body_mass", (-1.0, 1.0)),
+    "trunk_com": ("body_ipos", (-0.003, 0.003)),
     "foot_radius": ("geom_size", (0.019, 0.021)),
-    "foot_offset": ("geom_pos", (-0.0025, 0.0025)),
+    "foot_pos": ("geom_pos", (-0.0025, 0.0025)),
     "dof_damping": ("dof_damping", (0.0, 0.2)),
     "dof_armature": ("dof_armature", (0.008, 0.02)),
     "dof_stiffness": ("jnt_stiffness", (0.0, 0.2)),
@@ -31,11 +30,12 @@ RANGES = {
     "gravity": ("gravity", (9.51, 10.11)),
 }
 """Field and range of the published set ``default``, for each parameter of robot and ground."""
-FACTORS = ("motor_strength", "stiffness_scale", "damping_scale")
-CONTROL = (*FACTORS, *(f"{name}_per_joint" for name in FACTORS), "joint_offset", "action_scale_offset")
-CONTROL += ("stiffness_offset", "damping_offset")
-WIDE = {"trunk_mass_scale": [0.75, 1.25], "action_scale_offset": [-0.03, 0.03], "stiffness_offset": [-3.0, 3.0]}
-WIDE = {f"domain_rand.{name}": limits for name, limits in WIDE.items()}
+CONTROL = ("motor_strength", "stiffness", "damping", "joint_offset", "action_scale")
+WIDE = {
+    "domain_rand.trunk_mass": {"add": [-1.0, 1.0], "scale": [0.75, 1.25]},
+    "domain_rand.action_scale": {"add": [-0.03, 0.03]},
+    "domain_rand.stiffness": {"add": [-3.0, 3.0], "scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]},
+}
 FIELDS = sorted({field for field, _ in RANGES.values()} | {"body_inertia"})
 ON = {"domain_rand.randomize_parameters": True}
 
@@ -87,7 +87,8 @@ def move_about(task):
 @pytest.mark.parametrize("name", [*RANGES, "all of them"])
 def test_worlds_move_as_their_models(make_task, name):
     """A world with drawn parameters moves as MuJoCo's model with these numbers, and otherwise than without them."""
-    wide = WIDE | {"domain_rand.ground_friction": [0.3, 2.0], "domain_rand.contact_damping": [30.0, 130.0]}
+    ground = {"ground_friction": {"set": [0.3, 2.0]}, "contact_damping": {"set": [30.0, 130.0]}}
+    wide = WIDE | {f"domain_rand.{key}": value for key, value in ground.items()}
     settings = ON | wide if name == "all of them" else only(name)
     task = make_task("a1_torque", 12, **settings, **{"sim.solver_iterations": 50, "sim.ls_iterations": 50})
     move_about(task)
@@ -132,14 +133,14 @@ def test_picture_of_places(make_task):
 
 def test_distributions(make_task):
     """Draws are uniform in their ranges (Kolmogorov-Smirnov), and no two parameters or worlds go together."""
-    task = make_task("a1_position", 1500, **ON, **{"domain_rand.action_scale_offset": [-0.03, 0.03]})
+    task = make_task("a1_position", 1500, **ON, **{"domain_rand.action_scale": {"add": [-0.03, 0.03]}})
     sim, model = task.sim, task.sim.mj_model
     feet = [model.geom(name).id for name in task.foot_names]
     samples = {
-        "trunk_mass_offset": sim.field("body_mass")[:, 1] - model.body_mass[1],
-        "trunk_com_offset": sim.field("body_ipos")[:, 1, 0] - model.body_ipos[1, 0],
+        "trunk_mass": sim.field("body_mass")[:, 1] - model.body_mass[1],
+        "trunk_com": sim.field("body_ipos")[:, 1, 0] - model.body_ipos[1, 0],
         "foot_radius": sim.field("geom_size")[:, feet[0], 0],
-        "foot_offset": sim.field("geom_pos")[:, feet] - torch.tensor(model.geom_pos[feet]),
+        "foot_pos": sim.field("geom_pos")[:, feet] - torch.tensor(model.geom_pos[feet]),
         "dof_damping": sim.field("dof_damping")[:, 6:],
         "dof_armature": sim.field("dof_armature")[:, 6:],
         "dof_stiffness": sim.field("jnt_stiffness")[:, 1:],
@@ -151,7 +152,7 @@ def test_distributions(make_task):
     }
     ranges = {name: RANGES[name][1] for name in samples}
     samples["joint_offset"], ranges["joint_offset"] = task.joint_offset, (-0.01, 0.01)
-    samples["action_scale_offset"], ranges["action_scale_offset"] = task.action_scale - 0.25, (-0.03, 0.03)
+    samples["action_scale"], ranges["action_scale"] = task.action_scale - 0.25, (-0.03, 0.03)
     for name, values in samples.items():
         assert uniformity(values, *ranges[name]) < 1.0, name
     torch.testing.assert_close(samples["contact_damping"], 72.0 + (samples["contact_stiffness"] - 900.0) * 0.08)
@@ -169,8 +170,8 @@ def test_what_goes_together(make_task):
     The radius is the same for all feet, and the trunk's centre of mass moves alike on all axes. Without their factors
     per joint, motor strength and gains are the same for all joints.
     """
-    without = {"domain_rand.keep_fixed": [f"{name}_per_joint" for name in FACTORS]}
-    task = make_task("a1_torque", 50, **ON, **WIDE, **without)
+    without = {f"domain_rand.{name}": {"scale": [0.9, 1.1]} for name in ("motor_strength", "stiffness", "damping")}
+    task = make_task("a1_torque", 50, **{**ON, **WIDE, **without})
     model = task.sim.mj_model
     ratio = task.sim.field("body_mass")[:, 1] / model.body_mass[1]
     inertia = task.sim.field("body_inertia")[:, 1] / torch.tensor(model.body_inertia[1], dtype=torch.float32)
@@ -214,7 +215,7 @@ def test_critic_knows_what_was_drawn(make_task):
         ("trunk_mass", task.sim.field("body_mass")[:, 1:2], lowest, highest),
         ("ground_friction", task.sim.field("geom_friction")[:, 0, :1], 0.8, 1.2),
         ("dof_armature", task.sim.field("dof_armature")[:, 6:], 0.008, 0.02),
-        ("p_gains", task.p_gains, 17.0 * 0.9 * 0.98, 23.0 * 1.1 * 1.02),
+        ("stiffness", task.p_gains, 17.0 * 0.9 * 0.98, 23.0 * 1.1 * 1.02),
         ("trunk_com", task.sim.field("body_ipos")[:, 1] - torch.tensor(trunk, dtype=torch.float32), -0.003, 0.003),
         ("joint_offset", task.joint_offset, -0.01, 0.01),
     ):
@@ -260,7 +261,7 @@ def test_torques_by_hand(make_task):
 
 def test_factors_per_joint(make_task):
     """Strength and gains have a factor for the world times one for each joint, both uniform, no two together."""
-    task = make_task("a1_position", 1500, **ON, **{"domain_rand.motor_strength": [1.0, 1.0]})
+    task = make_task("a1_position", 1500, **ON, **{"domain_rand.motor_strength": {"scale_per_joint": [0.98, 1.02]}})
     assert uniformity(task.motor_strength, 0.98, 1.02) < 1.0
     assert (torch.corrcoef(task.motor_strength.T) - torch.eye(12)).abs().max() < 0.15
     ratio = (task.p_gains / task.p_gains[:, :1]).log()  # of two factors per joint
@@ -314,7 +315,7 @@ class ThighMassRobot(LeggedRobot):
     def random_parameters(self):
         """The masses of the thighs as well."""
         thighs = [body for body in range(2, 14) if "thigh" in self.sim.mj_model.body(body).name]
-        more = of_model(self, "thigh_mass", "body_mass", thighs, shared=self.shared, scale=(0.5, 0.9))
+        more = RandomParameter("thigh_mass", "body_mass", thighs, {"scale": [0.5, 0.9]}, shared=self.shared)
         return [*super().random_parameters(), more]
 
 
@@ -350,8 +351,8 @@ def test_everything_at_once(make_task, task):
 def test_what_the_kernel_cannot_write_is_refused():
     """Numbers of another type are refused at once, and worlds that share numbers when they are to be drawn."""
     with pytest.raises(UserError, match="'wide' must be float32"):
-        Randomization([Parameter("wide", torch.zeros(3, 2, dtype=torch.float64), [0])], 3, "cpu")
-    shared = Randomization([Parameter("shared", torch.ones(1, 2), [0])], 3, "cpu")
+        Randomization([RandomParameter("wide", torch.zeros(3, 2, dtype=torch.float64), [0], {})], {}.get, 3, "cpu")
+    shared = Randomization([RandomParameter("shared", torch.ones(1, 2), [0], {})], {}.get, 3, "cpu")
     with pytest.raises(UserError, match="without a row per world: shared"):
         shared.draw(torch.ones(3, dtype=torch.bool))
 
@@ -364,9 +365,9 @@ def test_what_the_kernel_cannot_write_is_refused():
         ("body_ipos", [3, 4, 5], False),
         ("body_ipos", [6], True),
         ("dof_armature", [7], False),
-        (None, [7], False),
+        (torch.ones(1, 9), [7], False),
     ],
 )
 def test_changes_of_legs(field, columns, changes):
     """Masses and places of bodies tell whether legs vary, those of the trunk aside."""
-    assert changes_legs([Parameter("drawn", torch.ones(1, 9), columns, model_field=field)]) == changes
+    assert changes_legs([RandomParameter("drawn", field, columns, {})]) == changes

@@ -296,7 +296,7 @@ def test_ranges_of_another_robot(changed, make_task, capsys):
     (note,) = make_task("a1_torque", 1, **drawn).notes
     assert note.startswith("domain_rand.foot_radius draws 0.019 to 0.021, but the robot's own value is 0.022")
     assert f"Note: {note}\n" in capsys.readouterr().out
-    heavy = {"domain_rand.trunk_mass_offset": [-6.0, 6.0]}
+    heavy = {"domain_rand.trunk_mass": {"add": [-6.0, 6.0]}}
     assert "random parameter 'trunk_mass' can be -1.287" in error_of(make_task, "a1_torque", 1, **drawn, **heavy)
 
 

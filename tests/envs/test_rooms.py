@@ -1,16 +1,15 @@
-"""Rooms for other robots, motors and grounds: refusals by name, and new ones that need no change of tasks."""
+"""Other robots, terms, parameters and grounds: refusals by name, and new ones that need no change of tasks."""
 
 import pytest
 import torch
 from support.settings import error_of
 
-from legged_torque.envs.base.asset import by_joint, nominal_pose
+from legged_torque.envs.base.asset import nominal_pose
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.observations import ObservationTerm
 from legged_torque.envs.robots.a1 import A1Cfg
-from legged_torque.motors import MOTORS
-from legged_torque.motors.motors import Motors
-from legged_torque.sim.randomization import Parameter
+from legged_torque.motors.joints import by_joint
+from legged_torque.sim.randomization import RandomParameter
 from legged_torque.terrain import TERRAINS
 from legged_torque.terrain.plane import Plane
 from legged_torque.utils.mirroring import SCALAR
@@ -76,8 +75,11 @@ def test_observation_terms_that_do_not_fit(term, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda task: Parameter("mass", task.sim.field("body_mass"), [2]), "'mass' is kept in the model's 'body_mass'"),
-        (lambda task: Parameter("gain", task.p_gains, [0, 1], mirror=SCALAR), "'gain' must have 2 numbers"),
+        (
+            lambda task: RandomParameter("mass", task.sim.field("body_mass"), [2], {}),
+            "'mass' is the model's 'body_mass'",
+        ),
+        (lambda task: RandomParameter("gain", task.p_gains, [0, 1], {}, mirror=SCALAR), "'gain' must have 2 numbers"),
     ],
 )
 def test_parameters_that_do_not_fit(make, message):
@@ -92,31 +94,7 @@ def test_parameters_that_do_not_fit(make, message):
     assert message in error_of(Robot, cfg)
 
 
-# ------------------------------------------------------------------------------------------------ motors and ground
-
-
-class CurvedMotors(Motors):
-    """Motors whose limits fall linearly to 0 at 20 rad/s."""
-
-    def apply(self, wanted, dof_vel, out):
-        """Write the torque inside the limits of this speed."""
-        share = (1.0 - dof_vel.abs() / 20.0).clamp(min=0.0)
-        out.copy_(wanted.clamp(self.limits[0] * share, self.limits[1] * share))
-
-
-@pytest.mark.parametrize("name", ["a1_position", "a1_torque", "a1_torque_multihead"])
-def test_a_motor_model_comes_without_touching_tasks(make_task, monkeypatch, name):
-    """Registered under a name, it acts in every approach."""
-    monkeypatch.setitem(MOTORS, "curved", CurvedMotors)
-    task = make_task(name, 8, **{"motors.model": "curved", "control.decimation": 1})
-    for _ in range(5):
-        speeds = task.dof_vel.clone()
-        actions = 20.0 * torch.randn(8, task.num_actions)
-        wanted = task._compute_torques(actions)
-        task.step(actions)
-        alive = ~task.reset_buf
-        limits = 33.5 * (1.0 - speeds.abs() / 20.0).clamp(min=0.0)
-        torch.testing.assert_close(task.torques[alive], torch.clamp(wanted, -limits, limits)[alive])
+# ------------------------------------------------------------------------------------------------ ground
 
 
 class Raised(Plane):
@@ -150,9 +128,11 @@ def test_plane():
 
 
 @pytest.mark.parametrize(
-    ("setting", "value", "nearest"), [("motors.model", "idael", "ideal"), ("terrain.mesh_type", "plan", "plane")]
+    ("setting", "value", "nearest"),
+    [("motors.chain", ["idael"], "ideal"), ("terrain.mesh_type", "plan", "plane")],
 )
 def test_unknown_rooms(make_task, setting, value, nearest):
     """A name that does not exist is refused with the nearest one."""
     line = error_of(make_task, "a1_torque", 1, **{setting: value})
-    assert f"unknown {setting} '{value}'; did you mean '{nearest}'?" in line
+    given = value if isinstance(value, str) else value[0]
+    assert f"unknown {setting} '{given}'; did you mean '{nearest}'?" in line

@@ -104,7 +104,7 @@ def test_late_scan(make_task):
 
     def seen():
         now = task.obs_buf["critic"][:, start : start + 187]
-        scan = (task.terrain.height_above(task.observations.terms[-1].value.points()) - 0.5).clamp(-1.0, 1.0)
+        scan = (task.terrain.height_above(task.sensors["height_scan"].points()) - 0.5).clamp(-1.0, 1.0)
         torch.testing.assert_close(now, scale * scan)
         return task.obs_buf["policy"][:, columns].clone(), now.clone()
 

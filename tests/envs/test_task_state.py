@@ -7,7 +7,7 @@ import torch
 from support.rewards import TABLE_III
 from support.settings import error_of
 
-from legged_torque.learning.worlds import check_identity, identity
+from legged_torque.learning.worlds import check_identity
 from legged_torque.terrain.tiles import TILES
 
 
@@ -26,7 +26,7 @@ def test_velocities_and_gravity_in_the_trunk_frame(make_task):
     task.base_quat.copy_(torch.tensor(np.array([quat for quat, _ in rotations])))
     task.sim.qvel[:, :3] = torch.tensor(velocity)
     task.sim.qvel[:, 3:6] = torch.tensor(rate)
-    task._update_state()
+    task.state.update()
     for world, (quat, matrix) in enumerate(rotations):
         np.testing.assert_allclose(task.base_lin_vel[world], matrix.T @ velocity[world], atol=2e-6)
         np.testing.assert_allclose(task.projected_gravity[world], matrix.T @ (0, 0, -1), atol=1e-6)
@@ -57,7 +57,7 @@ def test_air_time_ends_with_a_touch(make_task):
     for touches in (0.0, 0.0, 0.0, 1.0, 1.0, 0.0):
         task.feet_contact.fill_(touches)
         seen.append(task._reward_feet_air_time().item())
-        task.update_feet_air_time()
+        task.state.update_feet_air_time()
     np.testing.assert_allclose(seen, [0.0, 0.0, 0.0, 4 * (0.06 - 0.5), 4 * -0.5, 0.0], rtol=1e-5)
     np.testing.assert_allclose(task.feet_air_time, 0.02, rtol=1e-5)
 
@@ -120,7 +120,7 @@ def test_worlds_know_their_map(make_task, monkeypatch):
     changes = {f"terrain.{name}": value for name, value in ground.items()}
 
     def now():
-        return identity(make_task("a1_rough_position", 2, **changes), {"num_envs": 1, "perturbation": ""})
+        return make_task("a1_rough_position", 2, **changes).identity()
 
     was = now()
     check_identity(was, now())

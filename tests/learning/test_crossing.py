@@ -92,7 +92,7 @@ def test_who_stands_does_not_cross():
 
 
 def test_headings_are_kept():
-    """Who has turned by an angle is told to turn back by half of it per second, at most 1 rad/s; speeds stay."""
+    """Robots that have turned are commanded to turn back by half the angle per second, at most 1 rad/s."""
     grounds = Grounds.of(["flat"], [0.0], FAST)
     task = make_crossing(grounds, 4)
     turned, told = torch.tensor([0.0, 0.3, -0.8, 2.5]), []

@@ -1,15 +1,16 @@
 """The multi-head actor: its architecture counted by hand, its gradients, what it exports and what it saves."""
 
 import math
+from functools import partial
 
 import numpy as np
 import onnx
 import pytest
 import torch
 from onnx.reference import ReferenceEvaluator
+from support.runners import build_runner
 from tensordict import TensorDict
 
-from legged_torque.envs import task_registry
 from legged_torque.learning.multi_head import MultiHeadMLP, MultiHeadModel
 from legged_torque.utils.errors import UserError
 
@@ -30,21 +31,13 @@ SHAPES = {
 @pytest.fixture(scope="module")
 def make_runner(make_task):
     """Factory of runners of small tasks, with weights that depend on the seed."""
-
-    def make(name, seed=0):
-        _, train_cfg = task_registry.get_cfgs(name)
-        train_cfg.runner.num_steps_per_env = 4
-        task = make_task(name, num_envs=2)
-        torch.manual_seed(seed)
-        return task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=None)[0]
-
-    return make
+    return partial(build_runner, make_task, num_envs=2)
 
 
 @pytest.fixture(scope="module")
 def runner(make_runner):
     """The runner of ``a1_torque_multihead``, for tests that only read."""
-    return make_runner("a1_torque_multihead")
+    return make_runner(name="a1_torque_multihead")
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +80,7 @@ def forward_by_hand(actor, obs):
 @pytest.mark.parametrize("name", TASKS)
 def test_layers_of_the_paper(make_runner, name):
     """Trunk 512-256, heads of 128, the torque head on 256 + 12 inputs; every parameter is accounted for."""
-    runner = make_runner(name)
+    runner = make_runner(name=name)
     state = runner.alg.get_policy().state_dict()
     for part, shapes in SHAPES.items():
         weights = [tuple(v.shape) for k, v in state.items() if k.startswith(f"mlp.{part}.") and k.endswith("weight")]
@@ -104,7 +97,7 @@ def test_layers_of_the_paper(make_runner, name):
 @pytest.mark.parametrize("name", ["a1_position", "a1_torque", "a1_torque_curriculum"])
 def test_the_other_approaches_have_one_head(make_runner, name):
     """Their actor is 512-256-128-12, the same for all of them."""
-    state = make_runner(name).alg.get_policy().state_dict()
+    state = make_runner(name=name).alg.get_policy().state_dict()
     shapes = [tuple(value.shape) for key, value in state.items() if key.endswith("weight")]
     assert shapes == [(512, NUM_OBS - NUM_DOF), (256, 512), (128, 256), (12, 128)]
 
@@ -230,7 +223,7 @@ def test_exported_to_onnx(runner, actor, tmp_path):
 
 def test_checkpoint_round_trip(make_runner, tmp_path):
     """A saved policy is plain tensors, and a runner that has loaded it acts as the one that has saved it."""
-    saved, loaded = make_runner("a1_torque_multihead", seed=1), make_runner("a1_torque_multihead", seed=2)
+    saved, loaded = (make_runner(name="a1_torque_multihead", seed=seed) for seed in (1, 2))
     with torch.no_grad():
         saved.alg.actor.distribution.log_std_param.copy_(torch.linspace(-1.0, 1.0, NUM_ACTIONS))
     path, obs = str(tmp_path / "model_0.pt"), make_obs()

@@ -8,8 +8,8 @@ from support.random_stream import upcoming
 from support.settings import error_of, parse
 
 from legged_torque.envs import task_registry
-from legged_torque.learning import runner as runner_module
-from legged_torque.utils.random_state import random_state, restore_random_state
+from legged_torque.learning.random_state import random_state, restore_random_state
+from legged_torque.utils import distributed
 from legged_torque.utils.task_registry import set_seed
 
 WORDS = ["--task=a1_torque", "--num_envs=2", "--seed=3", "--set=runner.num_steps_per_env=3", "--logger=none"]
@@ -48,7 +48,7 @@ def trained(tmp_path_factory):
 
 
 def states_of(run, iteration):
-    """What a checkpoint says of the random numbers."""
+    """The random states in a checkpoint."""
     return torch.load(run.folder / f"model_{iteration}.pt", weights_only=True)["infos"]["random_states"]
 
 
@@ -81,18 +81,13 @@ def test_a_gpu_has_a_stream_of_its_own(monkeypatch):
     assert given == [("cuda:2", (kept + 1).tolist())]
 
 
-@pytest.mark.parametrize("iteration", [1, 2])
-def test_a_resumed_run_goes_on(trained, iteration):
-    """Resumed as by train.py, the next numbers are those that came after the checkpoint was saved."""
-    runner = start(trained.root, "--resume", f"--load_run={trained.folder.name}", f"--checkpoint={iteration}")
-    assert runner.current_learning_iteration == iteration
-    assert torch.equal(torch.rand(5), trained.numbers[iteration])
-
-
-def test_the_last_checkpoint_is_the_default(trained):
-    """What the process drew after training is what a resumed run draws first."""
-    start(trained.root, "--resume")
-    assert torch.equal(torch.rand(5), trained.next)
+def test_resumed_runs_go_on_and_never_repeat_the_start(trained):
+    """Numbers are those that came after the checkpoint was saved; the seed alone leads back to the run's start."""
+    start(trained.root)
+    assert torch.equal(upcoming(), trained.start)
+    for words, expected in (([], trained.next), (["--checkpoint=1"], trained.numbers[1])):
+        start(trained.root, "--resume", f"--load_run={trained.folder.name}", *words)
+        assert torch.equal(upcoming(), expected) and not torch.isclose(upcoming(), trained.start).any()
 
 
 def test_saving_draws_nothing(trained):
@@ -100,27 +95,8 @@ def test_saving_draws_nothing(trained):
     assert trained.saving_draws == [False] * 3
 
 
-def random_actions(runner):
-    """The actions of a rollout in which the policy says 0, so that they are the random numbers alone."""
-    for parameter in runner.alg.actor.parameters():
-        parameter.data.zero_()
-    runner.collect_rollout()
-    return runner.alg.storage.actions
-
-
-def test_a_resumed_run_does_not_repeat_the_start(trained):
-    """The seed alone leads back to the start of the run; resumed, numbers and actions are others."""
-    again = start(trained.root)
-    assert torch.equal(upcoming(), trained.start)
-    first = random_actions(again)
-    resumed = start(trained.root, "--resume")
-    assert not torch.isclose(upcoming(), trained.start).any()
-    assert not torch.isclose(random_actions(resumed), first).any()
-    assert torch.equal(random_actions(start(trained.root)), first)
-
-
 def test_loading_alone_leaves_the_stream(trained):
-    """play.py and the like draw as their own seed says; a state of the checkpoint is only for who asks for it."""
+    """play.py and others keep the numbers of their own seed; only resuming takes those of the checkpoint."""
     runner = start(trained.root)
     torch.manual_seed(9)
     infos = runner.load(str(trained.folder / "model_2.pt"))
@@ -140,7 +116,7 @@ def test_checkpoints_hold_one_state_per_process(trained, iteration):
     assert torch.equal(torch.rand(5), trained.numbers[iteration])
 
 
-def test_every_process_takes_its_own(trained):
+def test_every_process_takes_its_own(trained, monkeypatch):
     """A process takes the state of its number; one that the run did not have keeps its own numbers."""
     runner = trained.runner
     states = []
@@ -154,16 +130,16 @@ def test_every_process_takes_its_own(trained):
         expected[rank] = torch.rand(5)
     for rank in (0, 1, 2):
         torch.manual_seed(22)
-        runner.gpu_global_rank = rank
+        monkeypatch.setenv("WORLD_SIZE", "3")
+        monkeypatch.setenv("RANK", str(rank))
         runner.continue_random_numbers({"random_states": states})
         assert torch.equal(torch.rand(5), expected[rank])
-    runner.gpu_global_rank = 0
 
 
 def test_states_of_all_processes_are_kept(trained, tmp_path, monkeypatch):
-    """What is saved is the list that all processes have gathered, in their order."""
+    """The states of all processes are saved, in their order."""
     others = [{"cpu": torch.full((3,), rank, dtype=torch.uint8)} for rank in range(3)]
-    monkeypatch.setattr(runner_module.distributed, "gather", lambda mine: [mine, *others])
+    monkeypatch.setattr(distributed, "gather", lambda mine: [mine, *others])
     trained.runner.save(str(tmp_path / "model_0.pt"))
     states = torch.load(tmp_path / "model_0.pt", weights_only=True)["infos"]["random_states"]
     assert len(states) == 4 and torch.equal(states[0]["cpu"], torch.get_rng_state())

@@ -10,12 +10,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from support.settings import COMBINATIONS, TASKS
+from support.runners import build_runner, networks
+from support.settings import COMBINATIONS, TASKS, error_of, get_cfgs
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.envs import task_registry
-from legged_torque.learning.log_writer import WandbWriter
-from legged_torque.utils.config import set_by_path
+from legged_torque.learning.training_log import WandbWriter
 from legged_torque.utils.errors import UserError
 
 WORLDS, STEPS = 4, 4
@@ -32,15 +32,10 @@ MOVING = {
 
 @pytest.fixture(scope="module")
 def make_runner(make_task):
-    """Factory of runners with short rollouts of small tasks; settings of the training go by dotted path."""
+    """Factory of small runners, see :func:`support.runners.build_runner`."""
 
-    def make(name="a1_torque_multihead", log_root=None, seed=0, env=None, **overrides):
-        _, train_cfg = task_registry.get_cfgs(name)
-        for path, value in {"runner.num_steps_per_env": STEPS, "algorithm.num_mini_batches": 2, **overrides}.items():
-            set_by_path(train_cfg, path, value)
-        task = make_task(name, num_envs=WORLDS, seed=seed, **(env or {}))
-        torch.manual_seed(seed)
-        return task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=log_root)[0]
+    def make(name="a1_torque_multihead", **settings):
+        return build_runner(make_task, name, WORLDS, **settings)
 
     return make
 
@@ -61,20 +56,6 @@ def folder(runner):
 def copies(tensors):
     """A dictionary of tensors, copied."""
     return {name: value.detach().clone() for name, value in tensors.items()}
-
-
-def networks(runner):
-    """All parameters of actor and critic."""
-    alg = runner.alg
-    return {**alg.actor.state_dict(prefix="actor."), **alg.critic.state_dict(prefix="critic.")}
-
-
-def error_of(function, *args):
-    """The line that a mistake is told with."""
-    with pytest.raises(UserError) as error:
-        function(*args)
-    assert "\n" not in str(error.value)
-    return str(error.value)
 
 
 @pytest.mark.parametrize("name", [*TASKS, *COMBINATIONS, "a1_rough_position_scan"])
@@ -110,53 +91,59 @@ def test_two_iterations_of_every_task(make_runner, tmp_path, name, capsys):
     assert first.startswith("iteration 1 of 2, ") and last.startswith("iteration 2 of 2, ") and "; KL 0.0" in last
 
 
-def test_logs_are_written_while_the_next_rollout_is_collected(make_runner, tmp_path, monkeypatch):
-    """The numbers are those of the iteration before; a checkpoint has all that came before it."""
-    runner, order = make_runner(log_root=tmp_path, **{"runner.save_interval": 2, "runner.logger": "none"}), []
-    collect, save = runner.collect_rollout, runner.save
+def test_logs_and_checkpoints_are_of_their_iterations(make_runner, tmp_path):
+    """Curves have the numbers of each update at its iteration, though written later; checkpoints count all steps."""
+    runner = make_runner(log_root=tmp_path, **{"runner.save_interval": 2})
+    update, updates = runner.alg.update, []
 
-    def told_collect():
-        order.append("collect")
-        collect()
+    def noted_update():
+        updates.append(update())
+        return updates[-1]
 
-    def told_save(path, infos):
-        order.append(f"save {runner.logger.tot_timesteps}")
-        save(path, infos)
-
-    def told_log(it, learning_rate, action_std, **_):
-        order.append(f"log {it}")
-        assert learning_rate == rates[it] and torch.equal(action_std, stds[it])
-        runner.logger.tot_timesteps += BATCH
-
-    rates, stds, update = [], [], runner.alg.update
-
-    def told_update():
-        losses = update()
-        rates.append(float(runner.alg.learning_rate))
-        stds.append(runner.alg.actor.output_std.clone())
-        return losses
-
-    for owner, name, told in (
-        (runner, "collect_rollout", told_collect),
-        (runner, "save", told_save),
-        (runner.logger, "log", told_log),
-        (runner.alg, "update", told_update),
-    ):
-        monkeypatch.setattr(owner, name, told)
+    runner.alg.update = noted_update
     runner.learn(3)
-    middle = ["collect", "log 0", "log 1", f"save {2 * BATCH}", "collect", "log 2", f"save {3 * BATCH}"]
-    assert order == ["save 0", "collect", *middle]
+    runner.logger.writer.flush()
+    events = EventAccumulator(str(folder(runner))).Reload()
+    names = {"learning_rate": "Loss/learning_rate", "action_std": "Policy/mean_std", "kl": "Loss/kl"}
+    for name, tag in names.items():
+        curve = [(event.step, event.value) for event in events.Scalars(tag)]
+        assert curve == [(i, pytest.approx(numbers[name], rel=1e-6)) for i, numbers in enumerate(updates)]
+        assert len({value for _, value in curve}) == 3
+    for count in (0, 2, 3):
+        infos = torch.load(folder(runner) / f"model_{count}.pt", weights_only=True)["infos"]
+        assert infos["total_timesteps"] == count * BATCH
 
 
-def test_two_trainings_with_one_seed_are_equal(make_runner):
-    """A seed fixes every random number, so that on a CPU a training repeats bit by bit."""
-    runners = [make_runner(seed=7), make_runner(seed=7), make_runner(seed=8)]
+@pytest.mark.parametrize(
+    ("capture", "steps", "enabled"), [(True, 4, [True] * 3), (False, 4, [False] * 3), (True, 65, [False, True, True])]
+)
+def test_capture_is_a_setting(make_runner, tmp_path, capture, steps, enabled):
+    """It holds for rollouts, steps and updates, and after loading; rollouts too long for a graph go step by step."""
+    runner = make_runner(**{"runner.capture": capture, "runner.num_steps_per_env": steps})
+    path = str(tmp_path / "model_0.pt")
+    runner.save(path)
+    runner.load(path)
+    assert [
+        graph.enabled for graph in (runner.rollout_graph, runner.env.step_graph, runner.alg.update_graph)
+    ] == enabled
+
+
+def test_trainings_are_equal_if_their_seeds_are(make_runner):
+    """A seed fixes every number, to the bit, with and without ``runner.capture``."""
+    runners = [make_runner(seed=7), make_runner(seed=7, **{"runner.capture": False}), make_runner(seed=8)]
     for runner, seed in zip(runners, (7, 7, 8), strict=True):
         torch.manual_seed(seed)
         runner.learn(2)
     first, again, other = (networks(runner) for runner in runners)
     assert all(torch.equal(again[key], value) for key, value in first.items())
     assert not any(torch.equal(other[key], value) for key, value in first.items())
+
+
+def test_capture_on_the_command_line():
+    """``--set`` switches it off; it is on or off, nothing else."""
+    assert get_cfgs()[1].runner.capture is True
+    assert get_cfgs("--set=runner.capture=False")[1].runner.capture is False
+    assert "runner.capture" in error_of(get_cfgs, "--set=runner.capture=2")
 
 
 def test_rollout_is_stored(make_runner):
@@ -275,30 +262,6 @@ def test_load_brings_everything_back(make_runner, saved):
     )
 
 
-def test_training_continues_as_if_it_had_not_stopped(make_runner, saved, tmp_path):
-    """From the same rollout, a loaded runner takes the very same next update, and counts on from where it was."""
-    _, path = saved
-    runners = [make_runner(seed=seed, log_root=tmp_path, env=MOVING, **{"runner.logger": "none"}) for seed in (5, 6)]
-    for runner in runners:
-        runner.load(str(path))
-    torch.manual_seed(0)
-    runners[0].collect_rollout()
-    source, target = (runner.alg.storage for runner in runners)
-    for name in ("observations", "actions", "values", "actions_log_prob", "returns", "advantages"):
-        getattr(target, name).copy_(getattr(source, name))
-    target.distribution_params = source.distribution_params
-    for runner in runners:
-        torch.manual_seed(1)
-        runner.alg.update()
-    first, second = (networks(runner) for runner in runners)
-    assert all(torch.equal(first[key], value) for key, value in second.items())
-    assert float(runners[0].alg.learning_rate) == float(runners[1].alg.learning_rate)
-    runners[1].learn(1)
-    assert runners[1].current_learning_iteration == 3 and int(runners[1].env.total_steps) == 3 * BATCH
-    state = torch.load(folder(runners[1]) / "model_3.pt", weights_only=True)
-    assert (state["iter"], state["infos"]["total_timesteps"]) == (3, 3 * BATCH)
-
-
 def test_time_of_training_goes_on(make_runner, saved, tmp_path):
     """The seconds that a checkpoint reports are those of all the training so far."""
     _, path = saved
@@ -384,7 +347,7 @@ def test_signal_during_an_iteration(make_runner, tmp_path):
 
 
 def test_wandb(monkeypatch, tmp_path):
-    """It gets the settings as plain values; what it refuses is told in one line."""
+    """It gets the settings as plain values; its errors become one line."""
     uploaded = {}
     wandb = SimpleNamespace(
         Error=ArithmeticError, config=SimpleNamespace(update=uploaded.update), init=lambda **_: None

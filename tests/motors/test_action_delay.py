@@ -16,7 +16,7 @@ EXCEEDED = {1: 10.83, 3: 16.27, 5: 20.52, 15: 37.70, 35: 66.62}
 
 def delayed(low, high, unit="physics_steps", decimation=4, **more):
     """Settings of a task with a delay."""
-    settings = {"domain_rand.action_delay": [low, high], "domain_rand.action_delay_unit": unit}
+    settings = {"motors.delay.range": [low, high], "motors.delay.unit": unit}
     return HIGH_UP | settings | {"control.decimation": decimation} | more
 
 
@@ -56,13 +56,13 @@ def arrived(sent, decimation, delay):
 
 def test_off_by_default(make_task):
     """Without a setting, every physics step has the newest action, bit by bit as with a delay of 0."""
-    cases = ({}, {"domain_rand.action_delay": [0, 0]}, {"domain_rand.action_delay_unit": "control_steps"})
+    cases = ({}, {"motors.delay.range": [0, 0]}, {"motors.delay.unit": "control_steps"})
     seen = []
     for settings in cases:
         task = make_task("a1_torque", 3, **HIGH_UP, **settings)
         notes = watch(task)
         sent = send(task, 5)
-        assert task.cfg.domain_rand.action_delay == [0, 0]
+        assert task.cfg.motors.delay.range == [0, 0]
         assert np.array_equal(torques_of(notes), 8.0 * np.repeat(sent, 4, axis=0))
         seen.append(np.concatenate([*map(np.ravel, notes[-1]), task.get_observations()["critic"].numpy().ravel()]))
     assert np.array_equal(seen[0], seen[1]) and np.array_equal(seen[0], seen[2])
@@ -196,40 +196,40 @@ def test_draws(make_task, low, high, unit):
 @pytest.mark.parametrize(
     ("key", "changes"),
     [
-        ("action_delay", {"action_delay": [-1, 2]}),
-        ("action_delay", {"action_delay": [2, 1]}),
-        ("action_delay", {"action_delay": [0.5, 1]}),
-        ("action_delay", {"action_delay": [0, 1.5]}),
-        ("action_delay", {"action_delay": [1]}),
-        ("action_delay", {"action_delay": []}),
-        ("action_delay", {"action_delay": [0, 1, 2]}),
-        ("action_delay_unit", {"action_delay_unit": "steps"}),
-        ("action_delay_unit", {"action_delay_unit": "", "action_delay": [0, 0]}),
+        ("range", {"range": [-1, 2]}),
+        ("range", {"range": [2, 1]}),
+        ("range", {"range": [0.5, 1]}),
+        ("range", {"range": [0, 1.5]}),
+        ("range", {"range": [1]}),
+        ("range", {"range": []}),
+        ("range", {"range": [0, 1, 2]}),
+        ("unit", {"unit": "steps"}),
+        ("unit", {"unit": "", "range": [0, 0]}),
     ],
 )
 def test_settings_that_make_no_sense(make_task, key, changes):
     """They are refused by their names, whether set by path or in a configuration class."""
-    changes = {f"domain_rand.{name}": value for name, value in changes.items()}
-    assert f"domain_rand.{key}" in error_of(make_task, "a1_torque", 1, **changes)
+    changes = {f"motors.delay.{name}": value for name, value in changes.items()}
+    assert f"motors.delay.{key}" in error_of(make_task, "a1_torque", 1, **changes)
     cfg, _ = get_cfgs("--num_envs=1", task="a1_torque")
     for name, value in changes.items():
-        setattr(cfg.domain_rand, name.removeprefix("domain_rand."), value)
-    assert f"domain_rand.{key}" in error_of(check_env_cfg, cfg)
+        setattr(cfg.motors.delay, name.removeprefix("motors.delay."), value)
+    assert f"motors.delay.{key}" in error_of(check_env_cfg, cfg)
 
 
 def test_torques_that_cannot_follow(make_task):
     """Physics steps cannot be counted where torques are computed once per control step, unless there is no delay."""
     once = {"control.refresh_torques": False}
     line = error_of(make_task, "a1_torque", 1, **delayed(0, 3, **once))
-    assert "domain_rand.action_delay_unit" in line and "control.refresh_torques" in line
+    assert "motors.delay.unit" in line and "control.refresh_torques" in line
     make_task("a1_torque", 1, **delayed(0, 0, **once))
 
 
 def test_command_line():
     """A range is given as a list of physics steps; whole numbers may have a point."""
     for text in ("[1, 3]", "[1.0, 3.0]"):
-        cfg, _ = get_cfgs(f"--set=domain_rand.action_delay={text}")
-        assert cfg.domain_rand.action_delay_unit == "physics_steps"
-        assert cfg.domain_rand.action_delay == [1, 3] and type(cfg.domain_rand.action_delay[0]) is int
-    line = error_of(set_by_path, get_cfgs()[0], "domain_rand.action_delay", "[a, b]")
-    assert "domain_rand.action_delay" in line
+        cfg, _ = get_cfgs(f"--set=motors.delay.range={text}")
+        assert cfg.motors.delay.unit == "physics_steps"
+        assert cfg.motors.delay.range == [1, 3] and type(cfg.motors.delay.range[0]) is int
+    line = error_of(set_by_path, get_cfgs()[0], "motors.delay.range", "[a, b]")
+    assert "motors.delay.range" in line

@@ -1,42 +1,27 @@
-"""The scripts that look at gravity pre-training: how often controller and policy stand, and pictures of a report."""
+"""``pretrain_gravity.py --check_standing``, and ``plot.py``."""
 
 import json
 import re
 import sys
 
+import matplotlib.image
 import pytest
 import torch
+from support.command import command
+from support.gravity import TASK
+from support.gravity import made as made  # a fixture
+from support.reports import line, write_run
 from support.scripts import ROOT, assert_told_in_one_line, contents, run_here
 
-from legged_torque.paper.gravity import pretraining as gravity_pretraining
-
-TASK = "a1_torque_gravity"
-SMALL = ["--device=cpu", "--num_envs=6"]
-FEW = {"num_configurations": 12, "num_steps": 3, "num_rounds": 2, "num_epochs": 1, "held_out": 0.3}
+CHECK = ["--device=cpu", "--num_envs=6", "--check_standing"]
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A folder in which pretrain_gravity.py has made a small policy: the folder, its file, the report's file."""
-    root = tmp_path_factory.mktemp("pretrained")
-    words = [*SMALL, *(f"--set=pretraining.{name}={value}" for name, value in FEW.items())]
-    report = root / "new" / "report.json"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gravity_pretraining, "STANDING_SECONDS", 0.1)  # not looked at here
-        status, output, error = run_here("pretrain_gravity.py", *words, f"--json={report}", root=root)
-    assert (status, error) == (0, ""), output + error
-    return root, root / "logs" / "pretrained" / f"{TASK}.pt", report
-
-
-# ------------------------------------------------------------------------------------------------- check_standing.py
-
-
-def test_who_stands(made, tmp_path):
+def test_standing(made, tmp_path):
     """The controller stands nearly always, acting at 200 Hz or at 50 Hz; a policy of constant torques never does.
 
-    The mean torque of a policy that says 0.5 for every joint is 2 N m.
+    The mean torque of a policy that says 0.5 for every joint is 4 N m.
     """
-    root, file, _ = made
+    root, file, *_ = made
     content = torch.load(file, weights_only=True)
     *_, weight, bias = (name for name in content["actor_state_dict"] if name.startswith("mlp."))
     content["actor_state_dict"][weight][:] = 0.0
@@ -44,7 +29,7 @@ def test_who_stands(made, tmp_path):
     changed = tmp_path / "changed.pt"
     torch.save(content, changed)
     before = contents(root)
-    status, output, error = run_here("check_standing.py", *SMALL, f"--set=pretraining.file={changed}", root=root)
+    status, output, error = run_here("pretrain_gravity.py", *CHECK, f"--set=pretraining.file={changed}", root=root)
     assert (status, error) == (0, "") and contents(root) == before
     head, *rows = output.splitlines()
     assert head.split() == ["frequency", "after", "standing", "mean", "torque"]
@@ -56,90 +41,103 @@ def test_who_stands(made, tmp_path):
     assert rows[2][3:] == ("0.0", "4.00")
 
 
-def test_standing_of_a_missing_policy(tmp_path):
-    """It is told in one line where the policy should be; nothing is made."""
-    result = run_here("check_standing.py", *SMALL, root=tmp_path)
-    told = (
-        f"no pre-trained policy 'logs/pretrained/{TASK}.pt'; make it first: python {ROOT}/scripts/pretrain_gravity.py"
+def test_standing_refuses(made, tmp_path):
+    """A policy that is missing or does not fit is named, and so is an option that makes one; nothing is written."""
+    result = run_here("pretrain_gravity.py", *CHECK, root=tmp_path)
+    message = (
+        f"no pre-trained policy 'logs/pretrained/{TASK}.pt'; make it first: python {ROOT}/scripts/pretrain_gravity"
     )
-    assert_told_in_one_line(result, told)
+    assert_told_in_one_line(result, message)
     assert result[1] == "" and not list(tmp_path.iterdir())
-
-
-def test_standing_of_a_policy_that_does_not_fit(made):
-    """It is refused, as in training."""
-    result = run_here("check_standing.py", *SMALL, "--set=control.torque_scale=5", root=made[0])
+    result = run_here("pretrain_gravity.py", *CHECK, "--set=control.torque_scale=5", root=made[0])
     assert_told_in_one_line(result, "its control.torque_scale is 8.0, here it is 5.0")
+    result = run_here("pretrain_gravity.py", *CHECK, "--num_steps=5", root=made[0])
+    assert_told_in_one_line(result, "--num_steps is for making a policy, which --check_standing does not do")
 
 
-# ---------------------------------------------------------------------------------------------- plot_pretraining.py
+# -------------------------------------------------------------------------------------------------------- plot.py
 
 
-def plot(file, folder, *words):
-    """Draw a report; return the result and the picture's path, in a folder that is not there yet."""
-    picture = folder / "new" / "picture.png"
-    return run_here("plot_pretraining.py", str(file), f"--out={picture}", *words, root=folder), picture
+def plot(figure, file, folder, name="picture.png"):
+    """Draw a figure of a file; return the result and the picture's path, in a folder that is not there yet."""
+    picture = folder / "new" / name
+    return run_here("plot.py", figure, str(file), f"--out={picture}", root=folder), picture
 
 
-def test_picture(made, tmp_path):
+def test_pretraining(made, tmp_path):
     """It is an image of four panels in a row, and shows the report: another one gives another picture."""
-    matplotlib_image = pytest.importorskip("matplotlib.image", reason="needs the extra: pip install -e .[plots]")
-    result, picture = plot(made[2], tmp_path)
+    result, picture = plot("pretraining", made[0] / "report.json", tmp_path)
     assert result == (0, "", "")
-    image = matplotlib_image.imread(picture)
+    image = matplotlib.image.imread(picture)
     height, width, _ = image.shape
     assert 1500 < width < 3000 and 3.0 < width / height < 6.0
-    assert 20_000 < picture.stat().st_size < 400_000
-    report = json.loads(made[2].read_text())
-    report["standing"]["policy"] = 0.25  # of 6 worlds, never so
     changed = tmp_path / "changed.json"
-    changed.write_text(json.dumps(report))
-    result, picture = plot(changed, tmp_path)
-    assert result == (0, "", "")
-    differs = (matplotlib_image.imread(picture) != image).any(axis=2).any(axis=0).nonzero()[0]
+    changed.write_text(
+        json.dumps(made[2] | {"standing": {"controller": made[2]["standing"]["controller"], "policy": 0.3}})
+    )
+    assert plot("pretraining", changed, tmp_path)[0] == (0, "", "")
+    differs = (matplotlib.image.imread(picture) != image).any(axis=2).any(axis=0).nonzero()[0]
     assert len(differs) and differs.min() > 0.7 * width  # in the last panel alone
+
+
+def test_curves(tmp_path):
+    """Several files go into one figure; a wrong file is refused."""
+    for seed in (3, 4):
+        config = {"task": "a1_torque", "env": {}, "train": {"seed": seed}, "versions": {}}
+        write_run(tmp_path / str(seed), [line(1, 0.1), line(2, 0.2)], config)
+    files = [str(tmp_path / seed / "evaluations.csv") for seed in ("3", "4")]
+    picture = tmp_path / "new" / "curves.svg"
+    assert run_here("plot.py", "curves", *files, f"--out={picture}", root=tmp_path) == (0, "", "")
+    text = picture.read_text()
+    assert all(f"<!-- {name} -->" in text for name in ("Default torque, seed 3", "Default torque, seed 4"))
+    assert "<!-- Cost of transport -->" in text
+    assert_told_in_one_line(plot("curves", "none.json", tmp_path)[0], "cannot read")
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         (None, "cannot read"),
-        ("this is no report\n", "cannot read"),
         ("\xff\xfe", "cannot read"),
         ("[1, 2]", "is not a file that pretrain_gravity.py has written"),
-        ('{"settings": {}, "standing": {}, "rms_error": {}}', "is not a file that pretrain_gravity.py has written"),
         ('{"settings": {}, "standing": {}, "rms_error": {}, "histograms": {}}', "is not a whole report"),
         ('{"settings": {}, "standing": {}, "rms_error": {}, "histograms": 3}', "is not a whole report"),
     ],
-    ids=["missing", "text", "bytes", "list", "parts", "empty parts", "other parts"],
+    ids=["missing", "bytes", "list", "empty parts", "other parts"],
 )
 def test_no_report(tmp_path, content, message):
     """A file that is missing or no report is refused by its name, and nothing is drawn."""
-    pytest.importorskip("matplotlib", reason="needs the extra: pip install -e .[plots]")
     file = tmp_path / "report.json"
     if content is not None:
         file.write_bytes(content.encode("latin1"))
     before = contents(tmp_path)
-    result, _ = plot(file, tmp_path)
+    result, _ = plot("pretraining", file, tmp_path)
     assert_told_in_one_line(result, message)
     assert f"'{file}'" in result[2] and contents(tmp_path) == before
 
 
-def test_without_matplotlib(made, tmp_path, monkeypatch):
-    """The extra that is missing is named."""
+def test_mistakes(made, tmp_path, monkeypatch):
+    """A figure that does not exist, a missing option, an unknown format, and a missing extra are named."""
+    report = made[0] / "report.json"
+    result = run_here("plot.py", "curve", root=tmp_path)
+    assert_told_in_one_line(result, "unknown figure 'curve'; did you mean 'curves'?")
+    assert_told_in_one_line(run_here("plot.py", "pretraining", str(report), root=tmp_path), "--out")
+    assert_told_in_one_line(plot("pretraining", report, tmp_path, "picture.xyz")[0], "cannot write")
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    result, picture = plot(made[2], tmp_path)
-    assert_told_in_one_line(result, "pip install 'legged_torque[plots]'")
-    assert not picture.exists()
+    for figure in ("pretraining", "curves"):
+        result, picture = plot(figure, report, tmp_path)
+        assert_told_in_one_line(result, "pip install 'legged_torque[plots]'")
+        assert not picture.exists()
 
 
-def test_out_is_needed(made, tmp_path):
-    """A picture without a name is a mistake."""
-    assert_told_in_one_line(run_here("plot_pretraining.py", str(made[2]), root=tmp_path), "--out")
-
-
-def test_unknown_format(made, tmp_path):
-    """A picture of a format that nobody knows is refused in one line."""
-    pytest.importorskip("matplotlib", reason="needs the extra: pip install -e .[plots]")
-    words = [str(made[2]), f"--out={tmp_path / 'picture.xyz'}"]
-    assert_told_in_one_line(run_here("plot_pretraining.py", *words, root=tmp_path), "cannot write")
+def test_command(tmp_path):
+    """The console command has the figures' own help, and completes their names and options."""
+    status, output, error = command("plot", "curves", "--help")
+    assert (status, error) == (0, "") and output.startswith("usage: legged-torque plot curves ")
+    for words, expected in {"plot cur": ["curves"], "plot curves --o": ["--out"]}.items():
+        offered = tmp_path / expected[0]
+        line = f"legged-torque {words}"
+        variables = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
+        variables |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(offered), "_ARGCOMPLETE_SHELL": "bash"}
+        assert command(env=variables)[0] == 0
+        assert offered.read_text().split() == expected

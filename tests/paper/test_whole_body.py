@@ -15,6 +15,7 @@ from legged_torque.paper.gravity.standing import is_standing, measure_standing, 
 from legged_torque.paper.gravity.whole_body import WholeBodyController, WholeBodySettings
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import Options
+from legged_torque.utils.standing import stands
 
 TORQUE_LIMIT = 33.5
 WEIGHT = 12.453 * 9.81
@@ -118,7 +119,7 @@ def test_without_contact_only_posture_remains(task, state):
 def test_refuses_another_pose(task):
     """The nominal pose must have as many joints as the robot."""
     with pytest.raises(UserError, match="3 joints, the robot 12"):
-        WholeBodyController(RobotDynamics(task.sim.mj_model, 1, "cpu"), [0.0, 0.8, -1.5])
+        WholeBodyController(RobotDynamics(task.sim.mj_model, 1, "cpu", FEET), [0.0, 0.8, -1.5])
 
 
 def test_refuses_a_robot_without_torque_limits(task):
@@ -126,7 +127,7 @@ def test_refuses_a_robot_without_torque_limits(task):
     model = copy.copy(task.sim.mj_model)
     model.actuator_forcelimited[:] = 0
     with pytest.raises(UserError, match="one motor with a force range per joint"):
-        WholeBodyController(RobotDynamics(model, 1, "cpu"), task.default_dof_pos.tolist())
+        WholeBodyController(RobotDynamics(model, 1, "cpu", FEET), task.default_dof_pos.tolist())
 
 
 # --------------------------------------------------------------------------------------------------- standing
@@ -135,7 +136,7 @@ def test_refuses_a_robot_without_torque_limits(task):
 def test_place_on_ground():
     """Nothing is below the ground, and some foot is at most 2 cm above it, according to MuJoCo's contacts."""
     task = make_trial(64)
-    place_on_ground(task, RobotDynamics(task.sim.mj_model, 64, "cpu"))
+    place_on_ground(task, RobotDynamics(task.sim.mj_model, 64, "cpu", FEET))
     model = task.sim.mj_model
     data = mujoco.MjData(model)
     clearance_used = []
@@ -169,27 +170,31 @@ def test_controller_stands_up():
     assert 1.0 < result.mean_torque < 8.0
 
 
-def test_limp_robots_do_not_stand():
-    """Without torques all of them collapse, though those that were reset are in the air again."""
-    task = make_trial(8)
-    place_on_ground(task, RobotDynamics(task.sim.mj_model, 8, "cpu"))
-    result = measure_standing(task, lambda t: torch.zeros(8, 12), 1.5)
-    assert result.share == 0.0 and result.mean_torque == 0.0
-
-
-def test_is_standing(task):
-    """Each of the conditions is needed."""
-    task.base_pos[:, 2] = 0.3
+@pytest.mark.parametrize("name", ["a1_torque", "anymal_c_torque", "g1_torque"])
+def test_is_standing(name, make_task):
+    """Each of the conditions is needed; the height is a share of the robot's own: 0.25 m is high for the A1 alone."""
+    task = make_task(name, 7)
+    nominal = {"a1_torque": 0.303, "anymal_c_torque": 0.549, "g1_torque": 0.785}[name]
+    task.base_pos[:, 2] = nominal
     task.projected_gravity[:] = torch.tensor([0.0, 0.0, -1.0])
     task.base_lin_vel[:] = 0.0
     task.contacts[:] = 0.0
     task.contacts[:, task.feet_indices] = 1.0
-    task.feet_contact[:] = 1.0
-    task.base_pos[1, 2] = 0.19
-    task.projected_gravity[2, 2] = -0.89
+    task.base_pos[1, 2] = 0.49 * nominal
+    task.projected_gravity[2, 2] = -0.87  # 0.52 rad
     task.base_lin_vel[3, 1] = 0.31
     task.contacts[4, task.penalized_contact_indices[1]] = 1.0
-    assert is_standing(task).tolist() == [True] + 4 * [False] + 11 * [True]
+    task.base_pos[5, 2] = 0.25
+    task.projected_gravity[6, 2] = -0.88  # 0.49 rad
+    assert is_standing(task).tolist() == [True, False, False, False, False, name == "a1_torque", True]
+
+
+@pytest.mark.parametrize("as_array", [float, np.float64, lambda value: torch.tensor([value])])
+def test_law_of_standing(as_array):
+    """Numbers, arrays and tensors follow the same law; a state that is not a number does not stand."""
+    states = {(0.51, 0.49): True, (0.49, 0.0): False, (1.0, 0.51): False, (np.nan, 0.0): False, (1.0, np.nan): False}
+    for (height, tilt), expected in states.items():
+        assert bool(stands(as_array(2.0 * height), 2.0, as_array(tilt))) == expected
 
 
 def test_measuring_refuses_what_it_cannot_do():

@@ -9,14 +9,14 @@ from support.settings import error_of
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.tasks import A1TorqueCfg
-from legged_torque.sim.randomization import Parameter, Randomization
-from legged_torque.utils import compiled as module
-from legged_torque.utils.compiled import Compiled, compiled
+from legged_torque.sim import compiled as module
+from legged_torque.sim.compiled import compiled
+from legged_torque.sim.randomization import Randomization, RandomParameter
 from legged_torque.utils.progress import TORCH_COMPILES
 
 SETTINGS = {"domain_rand.randomize_parameters": True, "domain_rand.push_robots": True, "noise.add_noise": True}
 SETTINGS |= {"domain_rand.push_probability": 0.2, "domain_rand.resampling_probability": 0.2}
-HISTORY = {"env.history_length": 3, "domain_rand.action_delay": [1, 6]}
+HISTORY = {"env.history_length": 3, "motors.delay.range": [1, 6]}
 
 
 @pytest.fixture
@@ -31,12 +31,13 @@ def graphs(monkeypatch):
 
     torch._dynamo.reset()
     monkeypatch.setattr(module, "SETTINGS", {"backend": backend, "fullgraph": True, "dynamic": False})
+    monkeypatch.setattr(module, "can_compile", lambda device: True)
     return made
 
 
-def compile_parts(task):
-    """Let a task on the CPU do as on a GPU."""
-    task._parts = [Compiled(part) for part in task._parts]
+def compiled_task(task):
+    """The task, which compiles as it would on a GPU."""
+    task.compile()
     return task
 
 
@@ -49,26 +50,21 @@ def results(task, num=5):
             task.sim.qvel[1, 7] = math.nan
             task.episode_length_buf[2] = task.max_episode_length - 1
         obs, rewards, dones, extras = task.step(torch.randn(task.num_envs, task.num_actions))
-        counted = (
-            task.rewards.terms,
-            task.episode_sums,
-            task.episode_return,
-            task.log._of_terms,
-            task.log._of_steps,
-            task.num_diverged,
-        )
+        counted = (task.rewards.terms, task.episode_sums, task.episode_return, task.num_diverged)
         state = (task.base_lin_vel, task.feet_air_time, task.actions, task.last_actions, task.last_dof_vel)
         ends = (dones, extras["time_outs"], task.episode_length_buf, task.total_steps)
         rows.append([value.clone() for value in (obs["policy"], obs["critic"], rewards, *counted, *state, *ends)])
+    logged = task.log.read(1.0)
+    rows.append([torch.tensor([logged[name] for name in sorted(logged)])])
     return rows
 
 
 @pytest.mark.parametrize(("name", "more"), [("a1_torque_multihead", {}), ("a1_torque_curriculum", HISTORY)])
-def test_a_compiled_step_is_the_same(make_task, graphs, name, more):
-    """Four graphs do all of it, to the bit, also in worlds that end and beside one that diverges."""
+def test_a_compiled_step_is_the_same(make_task, graphs, capsys, name, more):
+    """All parts are compiled, and give the same bits, also in worlds that end and beside one that diverges."""
     expected = results(make_task(name, 5, **SETTINGS, **more))
-    found = results(compile_parts(make_task(name, 5, **SETTINGS, **more)))
-    assert len(graphs) == 4
+    found = results(compiled_task(make_task(name, 5, **SETTINGS, **more)))
+    assert graphs and "uncompiled" not in capsys.readouterr().err
     assert expected[2][-4][1] and expected[2][-4][2] and not expected[2][-4][0]
     for values, others in zip(found, expected, strict=True):
         assert all(torch.equal(*pair) for pair in zip(values, others, strict=True))
@@ -76,16 +72,17 @@ def test_a_compiled_step_is_the_same(make_task, graphs, name, more):
 
 def test_compiled_once(make_task, graphs):
     """One compilation serves steps in every mode of autograd, and resets between them."""
-    task = compile_parts(make_task("a1_torque", 3))
+    task = compiled_task(make_task("a1_torque", 3))
     actions = torch.zeros(3, 12)
     task.step(actions)
+    made = len(graphs)
     with torch.inference_mode():
         task.step(actions)
     with torch.no_grad():
         task.step(actions)
     task.reset()
     task.step(actions)
-    assert len(graphs) == 4 and not task.rew_buf.is_inference() and not TORCH_COMPILES.is_set()
+    assert len(graphs) == made > 0 and not task.rew_buf.is_inference() and not TORCH_COMPILES.is_set()
 
 
 class RoughRobot(TorqueRobot):
@@ -107,34 +104,45 @@ class RoughCfg(A1TorqueCfg):
             rough: float = 1.0
 
 
-def make_rough(num_envs=3):
+def make_rough(num_envs=3, kind=RoughRobot):
     """Build it."""
     cfg: LeggedRobotCfg = RoughCfg()
     cfg.env.num_envs = num_envs
     torch.manual_seed(1)
-    return RoughRobot(cfg)
+    return kind(cfg)
 
 
 def test_what_cannot_be_compiled_runs_as_it_is(graphs, capsys):
     """The step is the same, nothing is counted twice, and one line names the term; the other parts are compiled."""
     expected = results(make_rough())
     capsys.readouterr()
-    found = results(compile_parts(make_rough()))
+    found = results(compiled_task(make_rough()))
     output, error = capsys.readouterr()
-    assert output == "rough\n" * 5 and len(graphs) == 3
-    assert error.count("\n") == 1 and "_judge runs uncompiled" in error and "_reward_rough" in error
+    assert output == "rough\n" * 5 and graphs
+    assert error.count("\n") == 1 and "runs uncompiled" in error and "_reward_rough" in error
     for values, others in zip(found, expected, strict=True):
         assert all(torch.equal(*pair) for pair in zip(values, others, strict=True))
 
 
+class WrongRobot(TorqueRobot):
+    """A robot with a reward of a wrong shape."""
+
+    shape = ()
+
+    def _reward_rough(self):
+        """A tensor of zeros."""
+        return torch.zeros(self.shape)
+
+
 @pytest.mark.parametrize("shape", [(), (1,), (2,), (3, 1)])
-def test_mistakes_of_a_user_stay_theirs(graphs, make_task, capsys, shape):
-    """A term of a wrong shape is told by its name, with and without compilation."""
-    task = make_task("a1_torque", 3)
-    task.rewards._functions[0] = lambda: torch.zeros(shape)
-    told = error_of(task.step, torch.zeros(3, 12))
-    assert told == f"reward term 'tracking_lin_vel' has the shape {shape}, not (3,)"
-    assert error_of(compile_parts(task).step, torch.zeros(3, 12)) == told and "_judge" in capsys.readouterr().err
+def test_mistakes_of_a_user_stay_theirs(graphs, capsys, monkeypatch, shape):
+    """A term of a wrong shape is named, with and without compilation."""
+    monkeypatch.setattr(WrongRobot, "shape", shape)
+    task = make_rough(kind=WrongRobot)
+    line = error_of(task.step, torch.zeros(3, 12))
+    assert line == f"reward term 'rough' has the shape {shape}, not (3,)"
+    assert error_of(compiled_task(task).step, torch.zeros(3, 12)) == line
+    assert "runs uncompiled" in capsys.readouterr().err
 
 
 def test_a_cpu_compiles_nothing():
@@ -152,7 +160,7 @@ def test_draws_of_a_step_are_independent(make_task):
     settings |= {"domain_rand.push_robots": True, "domain_rand.push_probability": 1.0}
     task = make_task("a1_torque", 3000, **settings, **{"domain_rand.randomize_parameters": True})
     task.reset()
-    columns = [task.commands, task.init_angles[:, :1], task.sim.qvel[:, :3], task.motor_strength[:, :1]]
+    columns = [task.commands, task.events.init_angles[:, :1], task.sim.qvel[:, :3], task.motor_strength[:, :1]]
     columns += [task.p_gains[:, :1]]
     correlation = torch.corrcoef(torch.cat(columns, dim=1).T) - torch.eye(9)
     assert torch.isfinite(correlation).all() and correlation.abs().max() < 4.5 / math.sqrt(3000)
@@ -161,7 +169,7 @@ def test_draws_of_a_step_are_independent(make_task):
 def test_a_draw_follows_from_its_seeds():
     """The same seeds give the same numbers, world by world, and others give others."""
     field = torch.zeros(6, 2)
-    drawn = Randomization([Parameter("number", field, [0, 1], base=0.0, offset=(0.0, 1.0))], 6, "cpu")
+    drawn = Randomization([RandomParameter("number", field, [0, 1], {"set": [0.0, 1.0]})], {}.get, 6, "cpu")
     everywhere = torch.ones(6, dtype=torch.bool)
     drawn.seeds.copy_(torch.tensor([1, 2, 3, 1, 2, 4]))
     drawn.draw(everywhere)

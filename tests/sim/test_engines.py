@@ -35,10 +35,10 @@ class TestFused(EngineSuite):
     def test_the_free_joint_is_not_read(self, name):
         """Parameters of the trunk's free joint would not act and are refused; MuJoCo Warp's own step reads them."""
         sim, last_of_trunk = self.make(2), 0 if name == "jnt_stiffness" else 5
-        sim.check_columns(name, [last_of_trunk + 1])
+        sim.field(name, [last_of_trunk + 1])
         with pytest.raises(UserError, match=f"does not read '{name}' of the trunk's free joint"):
-            sim.check_columns(name, [last_of_trunk + 1, last_of_trunk])
-        make_engine("mujoco_warp", compiled(make_a1()), 2).check_columns(name, [last_of_trunk])
+            sim.field(name, [last_of_trunk + 1, last_of_trunk])
+        make_engine("mujoco_warp", compiled(make_a1()), 2).field(name, [last_of_trunk])
 
 
 def put_deep_into_the_floor(sim):

@@ -127,7 +127,6 @@ def test_derived_constants_of_unlike_legs():
     """Inverse weights of a robot whose branches have unlike numbers of joints are those of mj_setConst."""
     model = compiled(make_crab())
     sim = make_engine("fused", model, 2, "cpu")
-    sim.vary_legs()
     sim.field("body_mass")[1, 1:] *= torch.tensor(random(model.nbody - 1, 0.5, 2.0))
     sim.field("dof_armature")[1, 6:] += torch.tensor(random(model.nv - 6, 0.0, 0.1))
     sim.update_constants(torch.tensor([True, True]))

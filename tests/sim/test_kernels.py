@@ -23,11 +23,11 @@ def test_orientation(make_task):
     ranges = {f"domain_rand.init_{name}": [-math.pi, math.pi] for name in ("roll", "pitch", "yaw")}
     task = make_task("a1_torque", 50, **ranges)
     mask = torch.arange(50) % 2 == 0
-    before, angles = task.sim.qpos.clone(), task.init_angles.clone()
+    before, angles = task.sim.qpos.clone(), task.events.init_angles.clone()
     task.events.happen(mask)
-    assert torch.equal(task.sim.qpos[~mask], before[~mask]) and torch.equal(task.init_angles[~mask], angles[~mask])
-    assert not torch.isclose(task.init_angles[mask], angles[mask]).all(dim=1).any()
-    angles = task.init_angles[mask].double().numpy()
+    assert torch.equal(task.sim.qpos[~mask], before[~mask]) and torch.equal(task.events.init_angles[~mask], angles[~mask])
+    assert not torch.isclose(task.events.init_angles[mask], angles[mask]).all(dim=1).any()
+    angles = task.events.init_angles[mask].double().numpy()
     for quat, expected in zip(task.sim.qpos[mask, 3:7].double(), rotation_matrices(*angles.T), strict=True):
         matrix = np.zeros(9)
         mujoco.mju_quat2Mat(matrix, quat.numpy())

@@ -157,9 +157,9 @@ def test_refused():
     with pytest.raises(UserError, match="'mujoco_warp' lacks the capability 'height_map'"):
         make_engine("mujoco_warp", compiled(spec), 1, "cpu", height_map=height_map)
     sim = make_engine("fused", compiled(spec), 2, "cpu", height_map=height_map)
-    sim.check_columns("geom_pos", [2 + 3 * sim.mj_model.geom("FR_foot").id])
+    sim.field("geom_pos", [2 + 3 * sim.mj_model.geom("FR_foot").id])
     with pytest.raises(UserError, match="does not read 'geom_pos' of the floor"):
-        sim.check_columns("geom_pos", [2 + 3 * sim.mj_model.geom("floor").id])
+        sim.field("geom_pos", [2 + 3 * sim.mj_model.geom("floor").id])
     spec.geom("floor").pos = [0.0, 0.0, 0.1]
     with pytest.raises(UserError, match="its floor is not at the origin"):
         make_engine("fused", compiled(spec), 1, "cpu", height_map=height_map)

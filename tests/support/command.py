@@ -7,8 +7,6 @@ import sys
 from support.scripts import ROOT
 
 CODE = "import sys; sys.argv[0] = '/bin/legged-torque'; from legged_torque.utils.command import main; "
-
-
 HEAVY = "{'torch', 'warp', 'mujoco', 'rsl_rl', 'matplotlib', 'argcomplete'} & set(sys.modules)"
 
 

@@ -1,9 +1,13 @@
-"""Shared by tests: exports."""
+"""Exports of random policies, for tests; importing this skips a module where the extra is not installed."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import pytest
 import torch
+
+for package in ("onnx", "onnxruntime", "jsonschema"):
+    pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
 
 from legged_torque.deploy.export import export_policy
 from legged_torque.envs import task_registry
@@ -11,8 +15,11 @@ from legged_torque.envs import task_registry
 TRAINING = {"run": "run", "checkpoint": "model_7.pt", "iterations": 7, "total_steps": 20_000_000}
 
 
-def export_random(make_task, name, folder, normalization=False, **overrides):
-    """Export a small random network of a task after 20 million steps; return the task and the model."""
+def export_random(make_task, name, folder, normalization=False, supported=True, **overrides):
+    """Export a small random network of a task after 20 million steps; return the task and the model.
+
+    ``supported`` says whether ``policy.yaml`` can describe all of the task.
+    """
     task = make_task(name, num_envs=3, **overrides)
     task.load_state_dict({"total_steps": torch.tensor(TRAINING["total_steps"]), "num_diverged": torch.tensor(0)})
     _, train_cfg = task_registry.get_cfgs(name)
@@ -20,12 +27,14 @@ def export_random(make_task, name, folder, normalization=False, **overrides):
     train_cfg.actor.obs_normalization = normalization
     torch.manual_seed(3)
     runner, _ = task_registry.make_alg_runner(task, name, train_cfg=train_cfg, log_root=None)
-    model = runner.alg.get_policy()
+    model = runner.alg.policy()
     if normalization:
         model.obs_normalizer._mean.normal_()
         model.obs_normalizer._std.uniform_(0.5, 2.0)
     model.eval()
-    assert export_policy(task, model, folder, name, TRAINING) < 1e-5
+    difference, unsupported = export_policy(task, model, folder, name, TRAINING)
+    assert difference < 1e-5
+    assert supported == (not unsupported)
     return task, model
 
 

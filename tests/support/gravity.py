@@ -1,4 +1,4 @@
-"""Shared by tests: gravity."""
+"""A small gravity pre-training, made by its script."""
 
 import json
 
@@ -6,17 +6,9 @@ import pytest
 from support.scripts import run_here
 
 TASK = "a1_torque_gravity"
-
-
 SMALL = ["--device=cpu", "--num_envs=16"]
-
-
 FEW = {"num_rounds": 2, "num_epochs": 3, "batch_size": 16}
-
-
 CONFIGURATIONS, STEPS = 41, 6
-
-
 STD = "distribution.log_std_param"
 
 

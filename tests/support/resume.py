@@ -28,7 +28,7 @@ WORDS += ["--set=evaluation.interval=24", "--set=evaluation.num_samples=60", "--
 WORDS += ["--set=evaluation.also=[high]", "--set=evaluation.also_from=48"]
 
 
-WORDS += ["--set=env.history_length=2", "--set=domain_rand.action_delay=[0, 3]"]
+WORDS += ["--set=env.history_length=2", "--set=motors.delay.range=[0, 3]"]
 
 
 def start(root, *words):

@@ -55,7 +55,7 @@ def make_ppo(kind=OnDevicePPO, steps=STEPS, worlds=WORLDS, seed=0, obs_normaliza
 
 
 def record_rollout(alg, seed=1, poison=None):
-    """Let the algorithm act for one rollout of random numbers, as a runner does; return what the task has told it."""
+    """Let the algorithm act for one rollout of random numbers, as a runner does; return what it got from the task."""
     torch.manual_seed(seed)
     told = {"rewards": [], "dones": [], "time_outs": []}
     for step in range(alg.storage.num_transitions_per_env):

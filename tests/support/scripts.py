@@ -12,8 +12,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
 SMALL = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--set=runner.num_steps_per_env=4", "--max_iterations=2"]
 
 
@@ -21,7 +19,7 @@ def run_here(script, *words, root):
     """Run a script in this process, in the folder ``root``, whose ``logs/`` it writes.
 
     Returns:
-        Exit status, standard output, standard error without what tells that kernels are being compiled.
+        Exit status, standard output, standard error without the lines about kernels that are being compiled.
     """
     output, error, status = io.StringIO(), io.StringIO(), 0
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(output), contextlib.redirect_stderr(error):
@@ -33,12 +31,12 @@ def run_here(script, *words, root):
         except SystemExit as stop:
             status = stop.code or 0
     lines = error.getvalue().splitlines(keepends=True)
-    told = [line for line in lines if not line.startswith(("compiling kernels", "compiled kernels"))]
-    return status, output.getvalue(), "".join(told)
+    others = [line for line in lines if not line.startswith("compiling kernels")]
+    return status, output.getvalue(), "".join(others)
 
 
 def contents(folder):
-    """Every file and folder below a folder, with what would give away a change."""
+    """Every file and folder below a folder, with its time and size."""
     return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in folder.rglob("*")}
 
 
@@ -50,7 +48,7 @@ def assert_told_in_one_line(result, message):
     assert status == 2
 
 
-LIGHT = """import json, runpy, sys
+_LIGHT = """import json, runpy, sys
 for path, *words in json.loads(sys.argv[1]):
     sys.argv, status = [path, *words], 0
     try:
@@ -62,15 +60,13 @@ for path, *words in json.loads(sys.argv[1]):
 
 
 HEAVY = {"torch", "warp", "mujoco", "mujoco_warp", "rsl_rl", "tensordict", "matplotlib"}
-
-
 """Packages that take long to import."""
 
 
 def assert_light(answers, root):
     """Scripts with words, one after the other in a process, end with the status of each and import nothing heavy."""
     commands = json.dumps([[str(ROOT / "scripts" / script), *words] for script, *words in answers])
-    command, environment = [sys.executable, "-c", LIGHT, commands], {**os.environ, "PYTHONPATH": str(ROOT)}
+    command, environment = [sys.executable, "-c", _LIGHT, commands], {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
     results = [json.loads(line[8:]) for line in done.stdout.splitlines() if line.startswith("result: ")]
     for (words, expected), (status, *imported) in zip(answers.items(), results, strict=True):

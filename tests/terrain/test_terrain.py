@@ -3,7 +3,6 @@
 import math
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -12,10 +11,9 @@ import torch
 from support.ground import ground_cfg, make_ground, rays
 from support.settings import error_of, flatten
 
+from legged_torque.envs.base.evaluation import evaluation_cfg
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.envs.robots.a1 import A1Cfg
-from legged_torque.learning.evaluator import evaluation_cfg
-from legged_torque.learning.worlds import world_tensors
 from legged_torque.terrain import make_terrain
 from legged_torque.terrain.height_map import HeightMap
 from legged_torque.terrain.hfield import add_hfield
@@ -272,10 +270,9 @@ def test_levels_stay_in_evaluations():
 
 
 def test_levels_are_kept_for_a_resume():
-    """The file of the worlds finds them; the map, which settings give, is not among them."""
+    """They are the state of the ground; columns and map follow from the settings."""
     ground = make_ground(7)
-    found = world_tensors(SimpleNamespace(num_envs=7, terrain=ground))
-    assert set(found) == {"terrain.levels", "terrain.columns"} and found["terrain.levels"] is ground.levels
+    assert ground.state_dict() == {"levels": ground.levels}
 
 
 # ---- in a task ------------------------------------------------------------------------------------------------------
@@ -299,7 +296,7 @@ def test_height_scan(make_rough_task):
         yaw, roll = torch.tensor([0.4, -1.1]), torch.tensor([0.3, 0.0])
         turns = [yaw.cos() * roll.cos(), yaw.cos() * roll.sin(), yaw.sin() * roll.sin(), yaw.sin() * roll.cos()]
         robots.base_quat.copy_(torch.stack(turns, dim=1))  # half the angles: first about x, then about z
-        robots.compute_observations()
+        robots.set_state(robots.sim.qpos.clone(), robots.sim.qvel.clone())
     expected = torch.empty(2, 17, 11)
     for world, heading in enumerate((0.8, -2.2)):
         for i in range(17):
@@ -371,4 +368,4 @@ def test_robots_stand_on_their_tiles(make_rough_task):
 )
 def test_mistakes_are_told(settings, line):
     """One line says what cannot be, before anything is built."""
-    assert line in error_of(check_env_cfg, ground_cfg(**settings))
+    assert line in error_of(lambda: check_env_cfg(ground_cfg(**settings)))

@@ -19,7 +19,7 @@ def plot(tmp_path, *words):
     [
         ("--perturbation=none",),
         ("--task=a1_torque_multihead", "--perturbation=doubled", "--set=env.history_length=3"),
-        ("--set=domain_rand.action_delay=[1, 4]", "--set=domain_rand.keep_fixed=[gravity, trunk_mass_offset]"),
+        ("--set=motors.delay.range=[1, 4]", "--set=domain_rand.keep_fixed=[gravity, trunk_mass_offset]"),
     ],
 )
 def test_picture(tmp_path, words):

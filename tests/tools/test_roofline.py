@@ -1,6 +1,7 @@
 """FLOP and bytes of update and physics: as PyTorch counts them, and as counted by hand."""
 
 import pytest
+import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from legged_torque.benchmark import roofline
@@ -61,7 +62,7 @@ def test_update_by_hand(tmp_path):
     weights = (actor_inputs + 1) * 8 + 9 * 6 + 7 * 12 + 12 + (critic_inputs + 1) * 7 + 8 * 5 + 6
     expected = 12 * (stored + 2 * 2 * activations) + 4 * 2 * 3 * weights
     assert roofline.update_bytes(alg) == 4 * expected
-    alg.use_mixed_precision = True  # halves the activations, nothing else
+    alg.product_dtype = torch.bfloat16  # halves the activations, nothing else
     assert roofline.update_bytes(alg) == 4 * expected - 12 * 2 * 2 * activations * 2
 
 

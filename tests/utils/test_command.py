@@ -15,9 +15,10 @@ from support.settings import error_of, get_cfgs, parse
 
 from legged_torque.benchmark.installation import extras, gpus, size_of
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.commands import UniformCommands, fix_command
+from legged_torque.envs.base.commands import fix_command
 from legged_torque.utils.args import Parser, add_task_args, task_file_words
 from legged_torque.utils.cli import run_script, script_command
+from legged_torque.utils.options import Options
 
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("[!_]*.py"))
 
@@ -147,9 +148,10 @@ def test_fixed_command():
     env_cfg, _ = task_registry.get_cfgs("a1_position")
     env_cfg.env.num_envs = 3
     fix_command(env_cfg, (0.5, -0.25, 0.125))
-    generator = UniformCommands(env_cfg, "cpu")
-    generator.resample(generator.values[:, 0] == 0)
-    assert generator.values.tolist() == [[0.5, -0.25, 0.125]] * 3
+    task, _ = task_registry.make_env("a1_position", Options(device="cpu"), env_cfg)
+    task.commands.zero_()
+    task.command_generator.resample(torch.ones(3, dtype=torch.bool))
+    assert task.commands.tolist() == [[0.5, -0.25, 0.125]] * 3
 
 
 def test_words_for_task_files():

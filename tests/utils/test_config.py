@@ -9,9 +9,10 @@ from support.settings import TASKS, error_of, flatten, get, get_cfgs, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.cli import run_script
-from legged_torque.utils.config import Dumper, parse_yaml, section_keys, set_by_path, to_dict
+from legged_torque.utils.config import section_keys, set_by_path, to_dict
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 from legged_torque.utils.task_registry import num_iterations
 
 
@@ -74,15 +75,15 @@ def test_last_override_wins():
         ("rewards.scales.torques.x=1", "config key 'rewards.scales.torques' is a value, it has no entry 'x'"),
         ("rewards.scales=1", "config key 'rewards.scales' is a section with entries"),
         ("env.num_envs", "--set takes KEY=VALUE, not 'env.num_envs'"),
-        ("env.num_envs=2.5", "config key 'env.num_envs' takes a value like 64, not 2.5"),
-        ("env.num_envs=many", "config key 'env.num_envs' takes a value like 64, not 'many'"),
-        ("env.num_envs=true", "config key 'env.num_envs' takes a value like 64, not True"),
-        ("env.num_envs=[4]", "config key 'env.num_envs' takes a value like 64, not [4]"),
-        ("control.refresh_torques=1", "config key 'control.refresh_torques' takes a value like True, not 1"),
-        ("control.refresh_torques=maybe", "config key 'control.refresh_torques' takes a value like True, not 'maybe'"),
-        ("rewards.scales.torques=false", "config key 'rewards.scales.torques' takes a value like -0.0002, not False"),
-        ("commands.ranges.lin_vel_x=1", "config key 'commands.ranges.lin_vel_x' takes a value like [-1.0, 1.0], not 1"),
-        ("commands.ranges.lin_vel_x=[a, 1]", "'commands.ranges.lin_vel_x[0]' takes a value like -1.0, not 'a'"),
+        ("env.num_envs=2.5", "env.num_envs must be an integer, not 2.5"),
+        ("env.num_envs=many", "env.num_envs must be an integer, not 'many'"),
+        ("env.num_envs=true", "env.num_envs must be an integer, not True"),
+        ("env.num_envs=[4]", "env.num_envs must be an integer, not [4]"),
+        ("control.refresh_torques=1", "control.refresh_torques must be true or false, not 1"),
+        ("control.refresh_torques=maybe", "control.refresh_torques must be true or false, not 'maybe'"),
+        ("rewards.scales.torques=false", "rewards.scales.torques must be a number, not False"),
+        ("commands.ranges.lin_vel_x=1", "commands.ranges.lin_vel_x must be a list of numbers, not 1"),
+        ("commands.ranges.lin_vel_x=[a, 1]", "commands.ranges.lin_vel_x[0] must be a number, not 'a'"),
         ("env.num_envs=[4", "the value '[4' is not valid YAML"),
     ],
 )
@@ -99,7 +100,7 @@ def test_set_by_path():
     assert cfg.commands.ranges.lin_vel_x == [0.0, 2.0]
     assert (cfg.rewards.scales.torques, cfg.rewards.scales.collision) == (-1.0, -2.0)
     assert cfg.rewards.scales.base_height == -30.0
-    assert "'env.num_envs' takes a value like" in error_of(set_by_path, cfg, "env.num_envs", 2.5)
+    assert "env.num_envs must be an integer, not 2.5" in error_of(set_by_path, cfg, "env.num_envs", 2.5)
     assert "did you mean 'rewards.scales.torques'" in error_of(set_by_path, cfg, "rewards.scales", {"torque": 1})
 
 

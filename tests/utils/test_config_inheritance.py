@@ -140,7 +140,7 @@ def test_instances_do_not_share():
 
     class Listed(Base):
         class rewards:
-            names: list[str] = ["a"]  # noqa: RUF012
+            names: list[str] = ["a"]
 
     first, second = Listed(), Listed()
     first.rewards.names.append("b")

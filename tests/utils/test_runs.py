@@ -14,7 +14,6 @@ from support.settings import COMBINATIONS, TASKS, error_of, flatten, get_cfgs
 from legged_torque.envs import task_registry
 from legged_torque.utils import runs
 from legged_torque.utils.config import to_dict, update_from_dict
-from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_whole
 
 
@@ -121,7 +120,7 @@ def test_broken_config_file(text, message, tmp_path):
     ("values", "message"),
     [
         ({"env": {"num_env": 3}}, "unknown config key 'env.num_env'; did you mean 'env.num_envs'?"),
-        ({"rewards": {"scales": {"torques": "x"}}}, "config key 'rewards.scales.torques' takes a value like -0.0002"),
+        ({"rewards": {"scales": {"torques": "x"}}}, "rewards.scales.torques must be a number, not 'x'"),
         ({"rewards": {"scales": 3}}, "config key 'rewards.scales' is a section with entries"),
         ({"rewards": None}, "config key 'rewards' is a section with entries"),
         ({3: 4}, "unknown config key '3'"),
@@ -188,21 +187,13 @@ def test_a_device_is_not_replaced(tmp_path):
     assert link.is_symlink() and link.read_bytes() == b"" and Path("/dev/null").is_char_device()
 
 
-@pytest.mark.parametrize("marks", [True, False])
-def test_a_config_file_that_was_cut_off(tmp_path, marks):
-    """None of its beginnings gives other settings than the whole file, that of an older version neither."""
+def test_a_config_file_that_was_cut_off(tmp_path):
+    """None of its beginnings is taken for the whole file."""
     env_cfg, train_cfg = get_cfgs()
     runs.save_config(tmp_path, {"task": "a1_position", "env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     file = tmp_path / "config.yaml"
     text = file.read_text()
-    text = text if marks else text.removeprefix("---\n").removesuffix("...\n")
-    file.write_text(text)
-    whole = runs.load_config(tmp_path)
+    assert runs.load_config(tmp_path)["task"] == "a1_position"
     for end in [*range(0, len(text), 97), *range(text.index("\nversions"), len(text))]:
         file.write_text(text[:end])
-        try:
-            config = runs.load_config(tmp_path)
-        except UserError as error:
-            assert str(file) in str(error)
-        else:
-            assert not marks and {**config, "versions": 0} == {**whole, "versions": 0}
+        assert str(file) in error_of(runs.load_config, tmp_path)

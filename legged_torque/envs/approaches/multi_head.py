@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from legged_torque.envs.approaches.multi_head_config import CurriculumMultiHeadCfg as CurriculumMultiHeadCfg
@@ -17,29 +16,9 @@ from legged_torque.envs.approaches.multi_head_config import TorqueMultiHeadCfg a
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.approaches.torque_curriculum import TorqueCurriculumRobot
 from legged_torque.envs.base.actions import ActionTerm, position_residual, torque
-from legged_torque.envs.base.control_laws import PdControl, of_joint, pd_torque, pd_torques
 from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.envs.base.observations import ObservationTerm
-from legged_torque.motors.drive import in_kernel
 from legged_torque.utils.mirroring import SCALAR
-
-
-@wp.struct
-class MultiHeadControl:
-    """What :func:`mixed_torque` reads of a task."""
-
-    pd: PdControl
-    torque_scale: wp.array2d[float]
-    mixing: wp.array[float]
-
-
-@wp.func
-def mixed_torque(
-    task: MultiHeadControl, actions: wp.array[float], world: int, joint: int, pos: float, vel: float
-) -> float:
-    """Return the torque of one joint."""
-    torque = of_joint(task.torque_scale, world, joint) * actions[task.pd.default_dof_pos.shape[0] + joint]
-    return task.mixing[0] * pd_torque(task.pd, actions, world, joint, pos, vel) + task.mixing[1] * torque
 
 
 class MultiHeadRobot(TorqueRobot):
@@ -60,21 +39,17 @@ class MultiHeadRobot(TorqueRobot):
         self.update_curriculum()
 
     def action_terms(self) -> list[ActionTerm]:
-        """Return a position residual and a torque per joint, mixed by their weights."""
+        """Return a position residual and a torque per joint, mixed by their weights.
+
+        tau = theta_pd tau_pd(a[:n]) + theta_torque torque_scale a[n:] (eq. 7) [N m].
+        """
         theta_pd, theta_torque = self.mixing
-        return [position_residual(self.action_scale, theta_pd), torque(self.torque_scale, theta_torque)]
+        return [position_residual(self.control, theta_pd), torque(self.control, theta_torque)]
 
     def update_curriculum(self) -> None:
         """Set the mixing weights by eq. 1, at the last multiple of the update interval."""
         interval = self.cfg.control.mixing.update_interval
         self.mixing.copy_(self._mixing_curriculum(self.total_steps // interval * interval))
-
-    @in_kernel(mixed_torque)
-    def _compute_torques(self, actions: Tensor) -> Tensor:
-        """tau = theta_pd tau_pd(a[:n]) + theta_torque torque_scale a[n:] (eq. 7) [N m]. Shape: (num_envs, n)."""
-        theta_pd, theta_torque = self.mixing
-        positions, torques = actions.split(self.num_dof, dim=1)
-        return theta_pd * pd_torques(self, positions) + theta_torque * (self.torque_scale * torques)
 
     def actions_for(self, torques: Tensor) -> Tensor:
         """Return the actions that lead to torques [N m]: all of them by the torque part. Shape: (num_envs, 2 num_dof).
@@ -82,8 +57,10 @@ class MultiHeadRobot(TorqueRobot):
         PD targets are where the PD part is 0, so that whoever has learned these actions gives the same torques at every
         weight of the PD part, and loses nothing while it fades.
         """
-        rest = pd_torques(self, torch.zeros_like(torques)) / (self.p_gains * self.action_scale)
-        return torch.cat([-rest, torques / (self.mixing[1] * self.torque_scale)], dim=1)
+        control, (positions, _) = self.control, self.control_law.terms
+        rest = positions.torques(torch.zeros_like(torques), self.dof_pos, self.dof_vel)
+        rest = rest / (control.p_gains * control.action_scale)
+        return torch.cat([-rest, torques / (self.mixing[1] * control.torque_scale)], dim=1)
 
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the mixing weights too."""

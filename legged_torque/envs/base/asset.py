@@ -1,4 +1,4 @@
-"""From the settings of a robot to its model, its parts by name, and its numbers by joint."""
+"""A robot's model, its parts by name, and its numbers by joint, from its settings."""
 
 from __future__ import annotations
 
@@ -12,14 +12,9 @@ from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.robot_checks import floor_problems, foot_notes, pose_problems
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching
-from legged_torque.sim.robot_file import (
-    model_problems,
-    refuse,
-    spec_problems,
-    use_plain_motors,
-)
+from legged_torque.sim.robot_file import model_problems, spec_problems, use_plain_motors
 from legged_torque.terrain.terrain import Terrain
-from legged_torque.utils.errors import UserError, told_in, unknown_name
+from legged_torque.utils.errors import UserError, collect_errors, unknown_name
 from legged_torque.utils.mjcf import (
     drawing_notes,
     exclude_self_collisions,
@@ -28,15 +23,16 @@ from legged_torque.utils.mjcf import (
     read_spec,
     self_pairs,
 )
+from legged_torque.utils.problems import refuse
 
 
 @dataclass
 class Asset:
-    """A robot's model and which of its parts mean what."""
+    """A robot's model and the roles of its parts."""
 
     mj_model: mujoco.MjModel
-    dof_names: list[str]  # of the joints, in the order of the settings, whatever that of the MJCF
-    geom_names: list[str]  # of the collision geoms; the lists below are places in this one
+    dof_names: list[str]  # of the joints, in the order of the settings, not of the MJCF
+    geom_names: list[str]  # of the collision geoms; the lists below index this one
     feet: list[int]  # geoms of the feet, in the order of ``foot_names``
     penalized: list[int]  # geoms of the collision term
     terminating: list[int]  # geoms that end an episode
@@ -49,12 +45,12 @@ class Asset:
 
     @property
     def foot_of(self) -> list[int]:
-        """To which foot each geom of the feet belongs: those of one body are one foot."""
+        """Number of the foot that each geom of the feet belongs to; geoms of one body are one foot."""
         bodies = [int(self.mj_model.geom(name).bodyid[0]) for name in self.foot_names]
         return [list(dict.fromkeys(bodies)).index(body) for body in bodies]
 
     def dof_axes(self) -> np.ndarray:
-        """Return the axes of the joints in the trunk's frame, where all angles are 0. Shape: (num_dof, 3)."""
+        """Return the axes of the joints in the trunk's frame, all angles being 0. Shape: (num_dof, 3)."""
         return joint_axes(self.mj_model)[1:]
 
 
@@ -62,22 +58,22 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     """Load the robot of ``cfg.asset``, to be simulated in steps of ``cfg.sim.dt``, on the file's plane or a terrain.
 
     Its motors are plain ones in the order of its joints, see :func:`~legged_torque.sim.robot_file.use_plain_motors`. A
-    UserError, which tells all that is wrong at once, if the file cannot be read, names in the settings match nothing,
-    or tasks cannot simulate the robot.
+    UserError, which lists all problems, if the file cannot be read, names in the settings match nothing, or tasks
+    cannot simulate the robot.
     """
     settings, file = cfg.asset, resource_path(cfg.asset.file)
     spec = read_spec(file, list(cfg.init_state.default_joint_angles))
     problems, notes, geoms = list(spec_problems(spec)), list(drawing_notes(spec)), collision_geoms(spec)
     chosen: list[list[int]] = []
     for parts in ([settings.foot_name], settings.penalize_contacts_on, settings.terminate_after_contacts_on):
-        with told_in(problems):
+        with collect_errors(problems):
             chosen.append(indices_matching(geoms, parts))
     with loading(file):
         if terrain and not problems:
             terrain.add_to(spec, FLOOR)
         model = spec.compile() if problems else build_model(spec, geoms)
     dof_names = [model.joint(i).name for i in range(1, model.njnt)]
-    with told_in(problems):
+    with collect_errors(problems):
         problems += model_problems(model)
         problems += pose_problems(nominal_pose(cfg.init_state.default_joint_angles, dof_names), model)
     if not problems:
@@ -98,11 +94,11 @@ def _choose_self_collisions(
 ) -> bool:
     """Exclude the robot's contacts with itself unless ``asset.self_collisions`` asks for them, and note that.
 
-    Returns whether ``model`` is out of date. A UserError if the file has none that were asked for.
+    Returns whether ``model`` is out of date. A UserError if contacts were asked for and the file has none.
     """
     pairs = len(self_pairs(model))
     if settings.self_collisions and not pairs:
-        why = "no two geoms of its moving parts have contype and conaffinity that meet, or are a <pair>"
+        why = "no two geoms of its moving parts have contype and conaffinity that match, or are a <pair>"
         raise UserError(f"asset.self_collisions is on, but in '{settings.file}' {why}")
     if settings.self_collisions or not pairs:
         return False
@@ -110,32 +106,10 @@ def _choose_self_collisions(
     return exclude_self_collisions(spec, model)
 
 
-def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:
-    """Return a number for each joint: one for all, or by a part of their names, of which the first that matches counts.
-
-    A UserError, which names the setting, if a joint has no number or a name matches no joint.
-    """
-    if not isinstance(values, dict):
-        return [values] * len(dof_names)
-    for part in values:
-        if not any(part in name for name in dof_names):
-            raise unknown_name(f"joint (part of its name) in {setting}", part, dof_names)
-    taken = []
-    for name in dof_names:
-        matching = [part for part in values if part in name]
-        if not matching:
-            raise UserError(f"{setting} lacks the joint '{name}'; it has {', '.join(values) or 'no entries'}")
-        taken.append(matching[0])
-    for part in values:
-        if part not in taken:
-            raise UserError(f"'{part}' in {setting} has no effect: its joints take a name before it")
-    return [values[part] for part in taken]
-
-
 def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[float]:
     """Return the angles [rad] of ``init_state.default_joint_angles``, in the order of the model.
 
-    A UserError if a joint is missing or unknown, or the order is another one.
+    A UserError if a joint is missing or unknown, or the order differs.
     """
     key = "init_state.default_joint_angles"
     for name in angles:

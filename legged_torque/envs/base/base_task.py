@@ -1,51 +1,63 @@
-"""What rsl_rl asks of every task: steps, observations, episodes, counters."""
+"""The interface of tasks to rsl_rl and to trainers: steps, observations, episodes, counters, checkpoints."""
 
 from __future__ import annotations
 
+import hashlib
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from typing import Any
 
+import mujoco
+import numpy as np
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.envs.base.evaluation import WalkingEvaluation
+from legged_torque.envs.base.state import RobotState
+from legged_torque.sim.compiled import compiled
+from legged_torque.sim.engine import Engine
 from legged_torque.sim.graph import CudaGraph
-from legged_torque.utils.compiled import compiled
+from legged_torque.terrain.terrain import Terrain
+from legged_torque.utils.buffers import copy_state
+from legged_torque.utils.config import flat, to_dict
 
 
 class BaseTask(VecEnv):
-    """A batch of worlds whose control step replays as one CUDA graph on a GPU.
+    """The half of :class:`~legged_torque.envs.base.legged_robot.LeggedRobot` that faces a learner.
 
-    Hence the rules for everything that runs inside :meth:`_step`: fixed shapes, masks instead of lists of ids, nothing
-    read back to the host, and what is kept from step to step is written in place (``copy_``, ``masked_fill_``), never
-    bound to a new tensor.
+    A control step replays as one CUDA graph on a GPU. Hence the rules for everything that runs inside :meth:`_step`:
+    fixed shapes, masks instead of lists of ids, nothing read back to the host, and what is kept from step to step is
+    written in place (``copy_``, ``masked_fill_``), never bound to a new tensor.
 
     Attributes:
-        obs_buf: Groups "policy" and "critic" of the observations, each (num_envs, size).
+        state: The state of the robots.
+        obs_buf: Groups of observations: "policy" and "critic", each (num_envs, size), and others of a task's own.
         rew_buf: Rewards of the last step. Shape: (num_envs,).
-        reset_buf: Worlds whose episode has ended with the last step. Shape: (num_envs,), bool.
-        time_out_buf: Those of them whose time was over. Shape: (num_envs,), bool.
-        episode_return: Sum of the rewards of the episode so far. Shape: (num_envs,).
         total_steps: Environment steps so far over all worlds of all processes: t of eq. 1. Scalar, int64.
         num_diverged: Worlds that were reset since something in them was not finite. Scalar, int64.
+        num_processes: Processes that train together, each with as many worlds; the trainer sets it.
+        keep_final_observations: Whether "final_observations" of the extras are computed, see :meth:`step`.
     """
 
+    sim: Engine
+    terrain: Terrain
+    state: RobotState
     obs_buf: TensorDict
+    num_processes = 1
     _parts: Sequence[Callable[[], None]] = ()
     """What a step does with torch, in the order of the step, between what Warp's kernels do."""
     _is_compiled = False
-    num_processes = 1
-    """Processes that train together, each with as many worlds; the runner sets it."""
 
     def __init__(self, num_envs: int, device: str) -> None:
-        """Allocate rewards, ends and counters of ``num_envs`` worlds on the device, "cpu" or "cuda:N"."""
+        """Allocate rewards and counters of ``num_envs`` worlds on the device, "cpu" or "cuda:N"."""
         self.num_envs, self.device = num_envs, device
-        self.rew_buf, self.episode_return = (torch.zeros(num_envs, device=device) for _ in range(2))
-        self.reset_buf, self.time_out_buf = (torch.zeros_like(self.rew_buf, dtype=torch.bool) for _ in range(2))
-        self._episode_length_buf = torch.zeros(num_envs, dtype=torch.long, device=device)
+        self.rew_buf = torch.zeros(num_envs, device=device)
         self.total_steps, self.num_diverged = (torch.zeros((), dtype=torch.long, device=device) for _ in range(2))
-        self.extras = {"time_outs": self.time_out_buf}
+        self._final: dict[str, Tensor] = {}
+        self._keeps_final = False
+        self._world_state: dict[str, Tensor] = {}
         self.step_graph = CudaGraph(self._step, device)
 
     def compile(self) -> None:
@@ -58,45 +70,62 @@ class BaseTask(VecEnv):
             self._parts = [compiled(part, self.device) for part in self._parts]
             self.step_graph.reset()
 
-    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """Apply actions for one control step. Shape: (num_envs, num_actions); one that is not finite resets its world.
 
-        Returns observations (a copy); rewards (num_envs,); dones (num_envs,), bool; extras with "time_outs"
-        (num_envs,), bool. Rewards, dones and extras are buffers that the next step overwrites.
+        Returns observations (a copy), after the resets of worlds whose episode has ended; rewards (num_envs,); dones
+        (num_envs,), bool; extras with "time_outs" (num_envs,), bool, and with ``keep_final_observations`` also
+        "final_observations": those of all worlds before any reset. Rewards, dones and extras are buffers that the next
+        step overwrites.
         """
         self._given_actions.copy_(actions)
         self.step_graph()
-        return self.get_observations(), self.rew_buf, self.reset_buf, self.extras
+        extras: dict[str, Any] = {"time_outs": self.state.time_out_buf}
+        if self._final:
+            extras["final_observations"] = self._finite(self._final)
+        return self.get_observations(), self.rew_buf, self.state.reset_buf, extras
 
     def get_observations(self) -> TensorDict:
-        """Return a copy of the current observations: groups "policy" and "critic", each (num_envs, size).
+        """Return a copy of the current observations, see :attr:`obs_buf`.
 
         Numbers that are not finite are 0 in it; their worlds are reset in the next step.
         """
-        groups = {name: self.obs_buf[name].nan_to_num() for name in map(str, self.obs_buf.keys())}
-        return TensorDict(groups, [self.num_envs], device=self.device)
+        return self._finite({str(name): self.obs_buf[name] for name in self.obs_buf.keys()})  # noqa: SIM118
 
     def reset(self, world: int | None = None) -> TensorDict:
         """Start a new episode in every world, or in a single one, and return the observations.
 
-        A single one is for viewers: the others are observed once more, and what happens at random may happen there.
+        A single one is for viewers: the others are observed once more, and random events may happen there.
         """
-        self.reset_buf.fill_(world is None)
+        self.state.reset_buf.fill_(world is None)
         if world is not None:
-            self.reset_buf[world] = True
+            self.state.reset_buf[world] = True
         self._reset_worlds()
         self._finish_step()
         return self.get_observations()
 
     @property
+    def keep_final_observations(self) -> bool:
+        """Whether steps keep the observations of all worlds before any reset."""
+        return self._keeps_final
+
+    @keep_final_observations.setter
+    def keep_final_observations(self, value: bool) -> None:
+        """Say whether they do; the step is captured anew."""
+        self._keeps_final, self._final = value, {}
+        self.step_graph.reset()
+
+    @property
     def episode_length_buf(self) -> Tensor:
         """Control steps since the start of each world's episode. Shape: (num_envs,), int64."""
-        return self._episode_length_buf
+        return self.state.episode_length
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: Tensor) -> None:
         """Write the counters in place: rsl_rl sets them to random values when training starts."""
-        self._episode_length_buf.copy_(value)
+        self.state.episode_length.copy_(value)
+
+    # ---- checkpoints -------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what a checkpoint must keep of the task: its counters, on which all curricula depend."""
@@ -108,8 +137,44 @@ class BaseTask(VecEnv):
         self.num_diverged.copy_(state["num_diverged"])
         self.update_curriculum()
 
+    def keep(self, name: str, tensor: Tensor) -> Tensor:
+        """Make a tensor of a task of your own a part of :meth:`world_state_dict`, and return it.
+
+        It has a row per world, and steps write it in place. Shape: (num_envs, any).
+        """
+        self._world_state[name] = tensor
+        return tensor
+
+    @abstractmethod
+    def world_state_dict(self) -> dict[str, Any]:
+        """Return all that worlds keep from step to step, in nested dictionaries: the tensors in use, not copies."""
+
+    def load_world_state_dict(self, state: Any) -> None:
+        """Go on with the worlds of a :meth:`world_state_dict`; a UserError, and nothing changed, if it does not fit."""
+        copy_state(self.world_state_dict(), state)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what must be the same for worlds to go on after a stop: settings, and hashes of robot and map."""
+        robot = np.zeros(mujoco.mj_sizeModel(self.sim.mj_model), np.uint8)
+        mujoco.mj_saveModel(self.sim.mj_model, None, robot)
+        parts = {"robot's model or the version of MuJoCo": robot}
+        if self.terrain.map:  # a user's own kinds of tiles are no settings
+            parts["map of the ground"] = self.terrain.map.heights
+        hashes = {name: hashlib.sha256(part.data).hexdigest() for name, part in parts.items()}
+        return {"settings": flat(to_dict(self.cfg)), **hashes}
+
+    def check_buffers(self) -> str | None:
+        """Return a warning if the simulator has dropped contacts; waits for the device."""
+        return self.sim.check_buffers()
+
+    def make_evaluation(self, num_envs: int, perturbation: str) -> WalkingEvaluation:
+        """Return worlds of their own in which to measure a policy; an empty name is the environment of these worlds."""
+        return WalkingEvaluation(self, num_envs, perturbation)
+
+    # ---- what a task does --------------------------------------------------------------------------------------------
+
     def update_curriculum(self) -> None:
-        """Curriculum hook for what may only change between rollouts; the runner calls it before each of them."""
+        """Curriculum hook for what may only change between rollouts; the trainer calls it before each of them."""
 
     @abstractmethod
     def _step(self) -> None:
@@ -122,3 +187,8 @@ class BaseTask(VecEnv):
     @abstractmethod
     def _finish_step(self) -> None:
         """Begin the episodes of ``reset_buf``, compute the observations, and keep what the next step compares with."""
+
+    def _finite(self, groups: dict[str, Tensor]) -> TensorDict:
+        """Return a copy of observations with 0 for what is not finite."""
+        copies = {name: group.nan_to_num() for name, group in groups.items()}
+        return TensorDict(copies, [self.num_envs], device=self.device)

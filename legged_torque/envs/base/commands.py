@@ -10,6 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.envs.base.state import RobotState
 from legged_torque.sim import kernels
 from legged_torque.utils.math import yaw
 
@@ -32,12 +33,12 @@ class UniformCommands:
         low, span: Lowest command, and what is from there to the highest; likewise of headings. Shapes: (4,).
     """
 
-    def __init__(self, cfg: LeggedRobotCfg, device: str) -> None:
-        """Start with commands of 0; they will be drawn from ``cfg.commands.ranges``."""
-        ranges = cfg.commands.ranges
-        self.values = torch.zeros(cfg.env.num_envs, 3, device=device)
-        self.headings = torch.zeros(cfg.env.num_envs, device=device)
-        self._has_headings = cfg.commands.heading_command
+    def __init__(self, settings: type[LeggedRobotCfg.commands], state: RobotState) -> None:
+        """Start with commands of 0; they will be drawn from ``commands.ranges`` into those of the state."""
+        ranges, device = settings.ranges, state.device
+        self.values, self._base_quat = state.commands, state.base_quat
+        self.headings = torch.zeros(state.num_envs, device=device)
+        self._has_headings = settings.heading_command
         limits = [ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw, ranges.heading]
         low, high = torch.tensor(limits, dtype=torch.float32, device=device).unbind(dim=1)
         self.low, self.span = low.clone(), high - low
@@ -55,11 +56,15 @@ class UniformCommands:
         arrays = [wp.from_torch(array) for array in (mask, seeds, self.low, self.span, self.values, self.headings)]
         wp.launch(kernels.draw_commands, len(mask), arrays, device=arrays[0].device)
 
-    def follow_headings(self, base_quat: Tensor) -> None:
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the headings; the commands are a part of the state."""
+        return {"headings": self.headings}
+
+    def follow_headings(self) -> None:
         """With ``commands.heading_command``, command the yaw rates that turn trunks to their headings.
 
-        A rate is proportional to the angle that is left, within the range of yaw rates. Shape: (num_envs, 4).
+        A rate is proportional to the angle that is left, within the range of yaw rates.
         """
         if self._has_headings:
-            left = torch.remainder(self.headings - yaw(base_quat) + math.pi, 2.0 * math.pi) - math.pi
+            left = torch.remainder(self.headings - yaw(self._base_quat) + math.pi, 2.0 * math.pi) - math.pi
             self.values[:, 2].copy_((HEADING_GAIN * left).clamp(self.low[2], self.low[2] + self.span[2]))

@@ -1,4 +1,4 @@
-"""Whether a robot stands in its nominal pose, tried in plain MuJoCo before a training."""
+"""A robot held in its nominal pose in plain MuJoCo, before a training."""
 
 from __future__ import annotations
 
@@ -7,40 +7,31 @@ import numpy as np
 
 from legged_torque.envs.base.asset import Asset, load_asset
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.sim.model import CONTACT_DATA, FLOOR
-from legged_torque.utils.errors import UserError
+from legged_torque.sim.model import FLOOR
+from legged_torque.utils.standing import hold_pose
 
 STANDING_TIME = 3.0  # for which the nominal pose is held [s]
-LEAST_HEIGHT = 0.5  # of a standing robot's trunk, times that in the nominal pose
-MOST_TILT = 0.5  # of a standing robot's trunk [rad]
 _FAR = 10.0  # farther than any part is from the floor [m]
 
 
 def standing_note(task: LeggedRobot) -> str:
-    """Return how the robot falls that is put on a plane in its nominal pose, held by PD control; empty if it stands.
+    """Describe how a robot held in its nominal pose by PD control falls on a plane; empty if it stands.
 
-    One robot is simulated for :data:`STANDING_TIME`, with the task's gains and limits. Nothing is
-    told of a task without gains. A UserError if the simulation diverges.
+    One robot is simulated for :data:`STANDING_TIME`, with the task's gains and limits. Tasks without gains are skipped.
+    A UserError if the simulation diverges.
     """
-    asset = load_asset(task.cfg)
-    numbers = (task.default_dof_pos, task.p_gains[0], task.d_gains[0], *task.torque_limits)
-    pose, stiffness, damping, lowest, highest = (tensor.double().cpu().numpy() for tensor in numbers)
+    asset, control = load_asset(task.cfg), task.cfg.control
+    numbers = (task.default_dof_pos, task.p_gains[0], task.d_gains[0], task.torque_limits)
+    pose, stiffness, damping, limits = (tensor.double().cpu().numpy() for tensor in numbers)
     if not stiffness.any():
         return ""
-    model, data = asset.mj_model, _placed(asset, pose)
-    height = float(data.qpos[2])
-    for step in range(round(STANDING_TIME / model.opt.timestep)):
-        if step % task.cfg.control.decimation == 0 or task.cfg.control.refresh_torques:
-            wanted = stiffness * (pose - data.qpos[7:]) - damping * data.qvel[6:]
-            data.ctrl[:] = np.clip(wanted, lowest, highest)
-        mujoco.mj_step(model, data)
-        if any(warning.number for warning in data.warning):
-            raise UserError(f"'{task.cfg.asset.file}' diverges under PD control: check masses, gains and sim.dt")
-        fate = _fall(asset, data, height)
-        if fate:
-            after = f"after {(step + 1) * model.opt.timestep:.2f} s {fate}"
-            return f"the nominal pose does not stand under PD control, {after}; see init_state, control.stiffness"
-    return ""
+    every = 1 if control.refresh_torques else control.decimation
+    ending = [asset.mj_model.geom(asset.geom_names[place]).id for place in asset.terminating]
+    gains = (stiffness, damping, limits)
+    result = hold_pose(_placed(asset, pose), *gains, STANDING_TIME, every=every, may_not_touch=ending)
+    if not result.fall:
+        return ""
+    return f"the nominal pose does not stand under PD control, {result.fall}; see init_state, control.stiffness"
 
 
 def _placed(asset: Asset, pose: np.ndarray) -> mujoco.MjData:
@@ -51,18 +42,3 @@ def _placed(asset: Asset, pose: np.ndarray) -> mujoco.MjData:
     floor, parts = model.geom(FLOOR).id, [model.geom(name).id for name in asset.geom_names]
     data.qpos[2] -= min(mujoco.mj_geomDistance(model, data, floor, part, _FAR, None) for part in parts)
     return data
-
-
-def _fall(asset: Asset, data: mujoco.MjData, height: float) -> str:
-    """Return why a robot does not stand: a part that ends episodes touches the ground, the trunk is tilted or has sunk.
-
-    ``height`` is that at which the trunk started [m].
-    """
-    touching = data.sensordata.reshape(-1, CONTACT_DATA)[:, 0] > 0
-    ending = [asset.geom_names[geom] for geom in asset.terminating if touching[geom]]
-    if ending:
-        return f"'{ending[0]}' touches the ground"
-    tilt = np.arccos(np.clip(1.0 - 2.0 * (data.qpos[4] ** 2 + data.qpos[5] ** 2), -1.0, 1.0))
-    if data.qpos[2] < LEAST_HEIGHT * height:
-        return f"the trunk has sunk from {height:.2f} to {data.qpos[2]:.2f} m"
-    return f"the trunk is tilted by {tilt:.2f} rad" if tilt > MOST_TILT else ""

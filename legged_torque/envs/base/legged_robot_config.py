@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
+from legged_torque.envs.base.older_runs import RENAMED, converted, is_older
+from legged_torque.learning.settings import Activation, TrainingCfg
+from legged_torque.motors.config import DelayCfg, IdealCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
 from legged_torque.utils.limits import (
     Count,
@@ -14,10 +17,9 @@ from legged_torque.utils.limits import (
     Interval,
     Limits,
     NotNegative,
-    NotNegativeInterval,
     Number,
     Positive,
-    PositiveInterval,
+    Ranges,
     Share,
     Sizes,
     Worlds,
@@ -92,18 +94,28 @@ class LeggedRobotCfg(BaseConfig):
             gaps: Share = 0.0  # of up to 1 m
             pits: Share = 0.0  # up to 1 m deep
 
-    class motors:  # what joints get of the torques that actions ask for
-        model: str = "ideal"  # any torque within the limits, at once
+    class motors:  # from actions to the torques that joints get: a link is a section with a method ``build``
+        chain: list[str] = ["delay", "ideal"]  # links in order: those of actions, then those of torques
+
+        class delay(DelayCfg):  # time from the policy to the motors
+            range = [0, 0]  # in ``unit``, drawn at every reset
+            unit = "physics_steps"  # or "control_steps"
+
+        class ideal(IdealCfg):  # any torque within the limits, at once
+            pass
+
+    class sensors:  # sensors by name: a sensor is a section with a method ``build``
+        pass
 
     class init_state:  # where episodes start, and the nominal pose
         pos: Place = [0.0, 0.0, 1.0]  # [m] of the trunk at a reset: high enough for stretched legs
         default_joint_angles: dict[str, float] = {}  # [rad] q_nominal, by joint name, in the order that policies see
 
     class domain_rand:
-        """What is drawn at random: uniform ranges [lowest, highest]. See ``perturbations`` and ``parameter_ranges``.
+        """Uniform ranges [lowest, highest] of all that is drawn at random. See ``perturbations``, ``parameter_ranges``.
 
-        Of a parameter without a range, every world has the robot's own value. Ranges that end in ``_share`` are in
-        units of the robot itself, and count where the same range without that ending is None.
+        A parameter has ranges by operation: "set" replaces the robot's own value, "add" is added to it, "scale" and
+        "scale_per_joint" multiply it; {} leaves it alone. Of several operations, they follow in this order.
         """
 
         # initial state, at every reset
@@ -116,43 +128,28 @@ class LeggedRobotCfg(BaseConfig):
         init_lin_vel: Interval = [0.0, 0.0]  # [m/s] of the trunk, per axis
         init_ang_vel: Interval = [0.0, 0.0]  # [rad/s] of the trunk, per axis
 
-        # time from the policy to the motors, at every reset
-        action_delay: Annotated[list[int], Limits(0, 1000, ordered=True)] = [0, 0]  # in action_delay_unit
-        action_delay_unit: Literal["physics_steps", "control_steps"] = "physics_steps"  # or "control_steps"
-
         # parameters, resampled at resets and at random; one value per world unless noted
         randomize_parameters: bool = False  # whether parameters are drawn at all
-        keep_fixed: list[str] = []  # names of ranges below that are not drawn after all
+        keep_fixed: list[str] = []  # names of parameters below that are not drawn after all
+        keep_probability: Share = 0.0  # of draws in which the joints keep their own values of dof_*
         resampling_probability: Share = 0.002  # per control step and world
-        trunk_mass_offset: Interval = [0.0, 0.0]  # [kg], then
-        trunk_mass_scale: PositiveInterval = [0.8, 1.2]  # times the mass; inertia in proportion
-        trunk_com_offset: Interval = [-0.003, 0.003]  # [m] the same on all three axes
-        foot_radius: PositiveInterval | None = None  # [m]
-        foot_radius_share: PositiveInterval | None = [0.95, 1.05]  # times the robot's own, of round feet
-        foot_offset: Interval = [-0.0025, 0.0025]  # [m] per foot and axis
-        keep_probability: Share = 0.0  # of draws in which the joints keep their own values of the next four
-        dof_damping: NotNegativeInterval | None = None  # [N m s/rad] per joint
-        dof_damping_share: NotNegativeInterval | None = [0.0, 0.4]  # of Kd, added to the robot's own
-        dof_armature: NotNegativeInterval | None = None  # [kg m^2] per joint
-        dof_armature_share: NotNegativeInterval | None = [0.8, 2.0]  # times the robot's own
-        dof_stiffness: NotNegativeInterval | None = None  # [N m/rad] per joint, of a spring towards angle 0
-        dof_stiffness_share: NotNegativeInterval | None = [0.0, 0.01]  # of Kp, added to the robot's own
-        dof_frictionloss: NotNegativeInterval | None = None  # [N m] per joint
-        dof_frictionloss_share: NotNegativeInterval | None = [0.0, 0.012]  # of the torque limit, added likewise
-        ground_friction: PositiveInterval = [0.8, 1.2]  # tangential; torsional and rolling in proportion
-        contact_stiffness: PositiveInterval = [900.0, 1100.0]  # of MuJoCo's direct solref
-        contact_damping: PositiveInterval = [72.0, 88.0]  # low where the stiffness is low
-        gravity: NotNegativeInterval = [9.51, 10.11]  # [m/s^2]
-        motor_strength: NotNegativeInterval = [0.9, 1.1]  # times the torques
-        motor_strength_per_joint: NotNegativeInterval | None = [0.98, 1.02]  # then times this, per joint
-        joint_offset: Interval = [-0.01, 0.01]  # [rad] on the target angle, per joint
-        action_scale_offset: Interval = [0.0, 0.0]  # [rad] per unit of a position action; torques in proportion
-        stiffness_offset: Interval = [0.0, 0.0]  # [N m/rad] on Kp, then
-        stiffness_scale: NotNegativeInterval = [0.9, 1.1]  # times Kp,
-        stiffness_scale_per_joint: NotNegativeInterval | None = [0.98, 1.02]  # then times this, per joint
-        damping_offset: Interval = [0.0, 0.0]  # [N m s/rad] on Kd, then
-        damping_scale: NotNegativeInterval = [0.9, 1.1]  # times Kd,
-        damping_scale_per_joint: NotNegativeInterval | None = [0.98, 1.02]  # then times this, per joint
+        trunk_mass: Ranges = {"scale": [0.8, 1.2]}  # [kg]; inertia in proportion
+        trunk_com: Ranges = {"add": [-0.003, 0.003]}  # [m] the same on all three axes
+        foot_radius: Ranges = {"scale": [0.95, 1.05]}  # [m]; a scale is for round feet only
+        foot_pos: Ranges = {"add": [-0.0025, 0.0025]}  # [m] per foot and axis
+        dof_damping: Ranges = {"add": [0.0, 0.4]}  # [N m s/rad] per joint; add: in units of Kd
+        dof_armature: Ranges = {"scale": [0.8, 2.0]}  # [kg m^2] per joint
+        dof_stiffness: Ranges = {"add": [0.0, 0.01]}  # [N m/rad] per joint, of a spring; add: in units of Kp
+        dof_frictionloss: Ranges = {"add": [0.0, 0.012]}  # [N m] per joint; add: in units of the torque limit
+        ground_friction: Ranges = {"set": [0.8, 1.2]}  # tangential; torsional and rolling in proportion
+        contact_stiffness: Ranges = {"set": [900.0, 1100.0]}  # of MuJoCo's direct solref
+        contact_damping: Ranges = {"set": [72.0, 88.0]}  # low where the stiffness is low
+        gravity: Ranges = {"set": [9.51, 10.11]}  # [m/s^2]
+        motor_strength: Ranges = {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]}  # times the torques
+        joint_offset: Ranges = {"add": [-0.01, 0.01]}  # [rad] on the target angle, per joint
+        action_scale: Ranges = {}  # [rad] per unit of a position action; torques in proportion
+        stiffness: Ranges = {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]}  # [N m/rad] Kp
+        damping: Ranges = {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]}  # [N m s/rad] Kd
 
         # pushes: half of them add to the trunk's velocity, half set it
         push_robots: bool = False  # whether robots are pushed
@@ -254,52 +251,59 @@ class LeggedRobotCfg(BaseConfig):
         }
 
     def hard_ranges(self) -> dict[str, dict[str, Any]]:
-        """Return where the published set ``hard`` differs from this class, for :meth:`parameter_ranges`."""
-        ground = {"ground_friction": [0.001, 2.0], "contact_stiffness": [500.0, 1500.0]}
-        ground |= {"contact_damping": [30.0, 130.0], "gravity": [8.81, 10.81]}
-        factors = ("motor_strength", "stiffness_scale", "damping_scale")
-        control = {name: [0.5, 1.5] for name in factors} | {f"{name}_per_joint": [0.95, 1.05] for name in factors}
-        control |= {"joint_offset": [-0.05, 0.05], "trunk_com_offset": [-0.01, 0.01]}
-        shares = {
-            "dof_damping_share": [0.0, 4.0],
-            "dof_armature_share": [0.8, 5.0],
-            "dof_stiffness_share": [0.0, 0.025],
+        """Return the published set ``hard`` where it differs from this class, for :meth:`parameter_ranges`."""
+        control = {"scale": [0.5, 1.5], "scale_per_joint": [0.95, 1.05]}
+        draws = {
+            "trunk_mass": {"scale": [0.6, 1.4]},
+            "trunk_com": {"add": [-0.01, 0.01]},
+            "dof_damping": {"add": [0.0, 4.0]},
+            "dof_armature": {"scale": [0.8, 5.0]},
+            "dof_stiffness": {"add": [0.0, 0.025]},
+            "dof_frictionloss": {"add": [0.0, 0.03]},
+            "ground_friction": {"set": [0.001, 2.0]},
+            "contact_stiffness": {"set": [500.0, 1500.0]},
+            "contact_damping": {"set": [30.0, 130.0]},
+            "gravity": {"set": [8.81, 10.81]},
+            "motor_strength": control,
+            "joint_offset": {"add": [-0.05, 0.05]},
+            "stiffness": control,
+            "damping": control,
         }
-        shares |= {"dof_frictionloss_share": [0.0, 0.03], "trunk_mass_scale": [0.6, 1.4]}
         errors = {"dof_vel": 1.5, "ang_vel": 0.2, "gravity": 0.1}
-        return {"domain_rand": {**ground, **control, **shares, "push_set_factor": 1.5}, "noise_scales": errors}
+        return {"domain_rand": {**draws, "push_set_factor": 1.5}, "noise_scales": errors}
 
     def parameter_ranges(self) -> dict[str, dict]:
         """Return the named sets that ``--ranges`` chooses from: that of this class, and the hard one."""
         own, hard = type(self)(), self.hard_ranges()
         rand, errors = to_dict(own.domain_rand), to_dict(own.noise.noise_scales)
-        default = {name: rand[name] for name in (*own.random_ranges(), "keep_probability", "push_set_factor")}
+        default = {name: rand[name] for name in (*own.random_parameters(), "keep_probability", "push_set_factor")}
+        harder = {name: _replaced(rand[name], value) for name, value in hard["domain_rand"].items()}
         return {
             "default": {"domain_rand": default, "noise": {"noise_scales": errors}},
-            "hard": {
-                "domain_rand": default | hard["domain_rand"],
-                "noise": {"noise_scales": errors | hard["noise_scales"]},
-            },
+            "hard": {"domain_rand": default | harder, "noise": {"noise_scales": errors | hard["noise_scales"]}},
         }
 
-    def random_ranges(self) -> list[str]:
-        """Return the names in ``domain_rand`` from which parameters of robot, ground and control are drawn."""
-        others = ("keep_fixed", "push_velocity", "action_delay")
-        names = [name for name, value in to_dict(self.domain_rand).items() if value is None or isinstance(value, list)]
-        return [name for name in names if name not in others and not name.startswith("init_")]
+    def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Return the settings of a run of commit d8439d6 in today's layout."""
+        return converted(values) if is_older(values) else values
 
-    @staticmethod
-    def of_older_runs() -> dict[str, dict]:
-        """Return what runs were trained with whose ``config.yaml`` has no entry for these settings yet."""
-        per_joint = ("motor_strength_per_joint", "stiffness_scale_per_joint", "damping_scale_per_joint")
-        shares = (
-            "foot_radius_share",
-            *(f"dof_{of}_share" for of in ("damping", "armature", "stiffness", "frictionloss")),
-        )
-        return {"domain_rand": {**dict.fromkeys((*per_joint, *shares)), "push_set_factor": 1.0}}
+    def renamed(self) -> dict[str, str]:
+        """Return the new names of settings of commit d8439d6."""
+        return RENAMED
+
+    def random_parameters(self) -> dict[str, dict[str, list[float]]]:
+        """Return the ranges of all parameters of ``domain_rand``, by name."""
+        return {name: value for name, value in to_dict(self.domain_rand).items() if isinstance(value, dict)}
 
 
-class LeggedRobotCfgPPO(BaseConfig):
+def _replaced(own: Any, hard: Any) -> Any:
+    """Return a parameter's ranges with harder ones; numbers of a robot are not replaced by units of any robot."""
+    if not isinstance(own, dict):
+        return hard
+    return own if "set" in own and "set" not in hard else own | hard
+
+
+class LeggedRobotCfgPPO(TrainingCfg):
     """Settings of the training: the ``parallel`` preset, made for thousands of worlds."""
 
     seed: Annotated[int, Limits(lowest=0)] = 1  # of all random numbers of a training
@@ -335,7 +339,7 @@ class LeggedRobotCfgPPO(BaseConfig):
     class actor:  # the policy's network, an rsl_rl model
         class_name: str = "MLPModel"  # an rsl_rl model
         hidden_dims: Sizes = [512, 256, 128]  # sizes of the hidden layers
-        activation: str = "elu"  # after every hidden layer
+        activation: Activation = "elu"  # after every hidden layer
 
         class distribution_cfg:  # the distribution of its actions
             class_name: str = "legged_torque.learning.distribution:GaussianDistribution"  # rsl_rl's, made for graphs
@@ -345,7 +349,7 @@ class LeggedRobotCfgPPO(BaseConfig):
     class critic:  # the value function's network
         class_name: str = "MLPModel"  # an rsl_rl model
         hidden_dims: Sizes = [512, 256, 128]  # sizes of the hidden layers
-        activation: str = "elu"  # after every hidden layer
+        activation: Activation = "elu"  # after every hidden layer
 
     class algorithm:  # PPO, with rsl_rl's names
         class_name: str = "legged_torque.learning.ppo:OnDevicePPO"  # rsl_rl's PPO without waiting for the host
@@ -380,8 +384,3 @@ class LeggedRobotCfgPPO(BaseConfig):
         fixed |= {"symmetry_cfg": {"use_data_augmentation": False}}
         table_ii = {**rollouts, "algorithm": {**ppo, **fixed}}  # to the letter
         return {"parallel": {}, "thorough": {"runner": {"total_steps": 330_000_000}}, "paper": table_ii}
-
-    @staticmethod
-    def of_older_runs() -> dict[str, dict]:
-        """Return what runs were trained with whose ``config.yaml`` has no entry for these settings yet."""
-        return {"algorithm": {"use_mixed_precision": False, "annealing_start": 1.0}}

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.base.state import RobotState
+from legged_torque.sim.engine import Engine
 from legged_torque.utils import metrics
 from legged_torque.utils.display import Counter
 
@@ -17,10 +19,27 @@ COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")
 NUM_BINS = 4  # into how many equal parts the range of each command is split
 
 
+class WalkingTask(Protocol):
+    """What is measured of a task; see :class:`~legged_torque.envs.base.legged_robot.LeggedRobot`."""
+
+    cfg: Any
+    sim: Engine
+    state: RobotState
+    num_envs: int
+    device: str
+    dt: float
+
+    def reset(self) -> TensorDict:
+        """Start a new episode in every world, and return the observations."""
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+        """Make a control step, and return the observations first."""
+
+
 class WalkingMetrics:
     """Sums of :mod:`legged_torque.utils.metrics` over the steps of a task, per world and kept on the device."""
 
-    def __init__(self, task: LeggedRobot) -> None:
+    def __init__(self, task: WalkingTask) -> None:
         """Start with empty sums."""
         self._task = task
         model = task.sim.mj_model
@@ -36,19 +55,19 @@ class WalkingMetrics:
 
         Only in the worlds that are ``counted``, if it is given. Shape: (num_envs,), bool.
         """
-        task = self._task
-        velocity = task.planar_velocity()
+        state = self._task.state
+        velocity = state.planar_velocity()
         sums = metrics.step_sums(
             torch,
             commands,
             velocity,
             speed=velocity[:, :2].norm(dim=1),
-            force=task.sim.contact_force.norm(dim=2).sum(dim=1),
-            power=(task.torques * task.dof_vel).abs().sum(dim=1),
-            height=task.base_height,
-            fell=task.reset_buf & ~task.time_out_buf,
-            ended=task.reset_buf,
-            tracked=num_tracked(task),
+            force=state.contact_force.norm(dim=2).sum(dim=1),
+            power=(state.torques * state.dof_vel).abs().sum(dim=1),
+            height=state.base_height,
+            fell=state.reset_buf & ~state.time_out_buf,
+            ended=state.reset_buf,
+            tracked=num_tracked(self._task),
         )
         self._sums += sums if counted is None else sums * counted
 
@@ -71,7 +90,7 @@ class WalkingMetrics:
 class CommandBreakdown:
     """Tracking by commanded velocity: each command's range is split into :data:`NUM_BINS` equal parts."""
 
-    def __init__(self, task: LeggedRobot) -> None:
+    def __init__(self, task: WalkingTask) -> None:
         """Start with empty sums."""
         self._task = task
         ranges = task.cfg.commands.ranges
@@ -81,13 +100,13 @@ class CommandBreakdown:
     def add_step(self, commands: Tensor) -> None:
         """Add the step that the task has just made; arguments as for :meth:`WalkingMetrics.add_step`."""
         task = self._task
-        velocity = task.planar_velocity()
+        velocity = task.state.planar_velocity()
         error = (commands - velocity).abs()
         tracked = num_tracked(task)
         tracking = torch.stack(metrics.tracking_percentage(torch, error[:, :tracked], commands[:, :tracked]))
         low, high = self._ranges.T
         place = ((commands - low) / (high - low).clamp(min=1e-6) * NUM_BINS).long().clamp(0, NUM_BINS - 1)
-        member = torch.nn.functional.one_hot(place, NUM_BINS) * ~task.reset_buf.view(-1, 1, 1)
+        member = torch.nn.functional.one_hot(place, NUM_BINS) * ~task.state.reset_buf.view(-1, 1, 1)
         rows = torch.stack([torch.ones_like(error), error, *tracking.unsqueeze(2).expand(-1, *error.shape)])
         self._sums += (rows.unsqueeze(3) * member).sum(dim=1)
 
@@ -116,13 +135,13 @@ class CommandBreakdown:
         return result
 
 
-def num_tracked(task: LeggedRobot) -> int:
+def num_tracked(task: WalkingTask) -> int:
     """Return how many of a task's commands count for the tracking percentage, the yaw rate being the last."""
     return 2 if task.cfg.commands.heading_command else 3
 
 
 def measure(
-    task: LeggedRobot,
+    task: WalkingTask,
     policy: Callable[[TensorDict], Tensor],
     num_steps: int,
     on_step: Callable[[Tensor], None] = lambda commands: None,
@@ -136,7 +155,7 @@ def measure(
     obs = task.reset()
     with torch.inference_mode(), Counter("evaluating, step", num_steps) as counter:
         for _ in range(num_steps):
-            commands = task.commands.clone()
+            commands = task.state.commands.clone()
             obs = task.step(policy(obs))[0]
             walking.add_step(commands)
             on_step(commands)

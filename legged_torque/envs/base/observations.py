@@ -1,23 +1,24 @@
-"""What policy and critic see: one list of terms, from which sizes, noise, history and mirror images follow."""
+"""Observations: one list of terms, from which groups, sizes, noise, history and mirror images follow."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque.envs.base.height_scan import CLIP, OFFSET, HeightScan, LateScan
+from legged_torque.envs.base.actions import ControlParameters
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.envs.base.state import RobotState
+from legged_torque.envs.base.symmetry import RobotSymmetry
+from legged_torque.sensors.height_scan import CLIP, OFFSET, HeightScan
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import AXIAL_VECTOR, PLANAR_VELOCITY, SCALAR, VECTOR, Mirroring
-
-if TYPE_CHECKING:
-    from legged_torque.envs.base.legged_robot import LeggedRobot
 
 
 @dataclass
@@ -25,7 +26,7 @@ class ObservationTerm:
     """One part of the observations."""
 
     name: str  # also in ``policy.yaml``
-    value: Callable[[], Tensor]  # returns the unscaled values. Shape: (num_envs, size)
+    value: Callable[[], Tensor]  # returns the unscaled values. Shape: (num_envs, size), of a group of its own any
     mirror: Mirroring | None  # left-right mirror image; None: not known, learning from mirror images is refused
     scale: float | Sequence[float] = 1.0  # factor on all values, or on each
     noise: float = 0.0  # largest error of the policy's sensor, uniform, before scaling
@@ -33,6 +34,7 @@ class ObservationTerm:
     unit: str = ""  # of the values
     frame: str = "none"  # in which they are given: "trunk", "joint" or "none"
     meaning: str = ""  # what they are
+    group: str = ""  # a group of its own, which ``obs_groups`` can give to a network; empty: "policy" and "critic"
 
 
 _DESCRIPTIONS = {
@@ -49,17 +51,34 @@ _DESCRIPTIONS = {
 """Unit, frame and meaning of the standard terms."""
 
 
-def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
+def standard_terms(
+    cfg: LeggedRobotCfg,
+    state: RobotState,
+    control: ControlParameters,
+    parameters: Tensor,
+    parameter_mirrors: Mapping[str, Mirroring | None],
+    symmetry: RobotSymmetry,
+    scan: HeightScan | None,
+) -> list[ObservationTerm]:
     """Return the terms of all tasks: what a real robot can measure (paper, App. I-B), then what only a simulator knows.
 
     Scales are those of ``normalization.obs_scales``, errors those of ``noise.noise_scales``.
+
+    Args:
+        cfg: Settings of the task.
+        state: The robots.
+        control: Their nominal pose.
+        parameters: The drawn parameters, see ``Randomization.values``. Shape: (num_envs, any).
+        parameter_mirrors: Their mirror images, by name.
+        symmetry: Which joints and feet are mirror images of each other.
+        scan: The height scan, on rough ground.
     """
-    scales, noise, symmetry = task.cfg.normalization.obs_scales, task.cfg.noise.noise_scales, task.symmetry
+    scales, noise = cfg.normalization.obs_scales, cfg.noise.noise_scales
     command_scales = (scales.lin_vel, scales.lin_vel, scales.ang_vel)
     joints, feet = symmetry.joints, symmetry.feet
-    actions = joints and Mirroring.joined([joints] * len(task.action_terms()))
-    parameters = [mirror for mirror in task.parameter_mirrors.values() if mirror]
-    parameter_mirror = Mirroring.joined(parameters) if len(parameters) == len(task.parameter_mirrors) else None
+    actions = joints and Mirroring.joined([joints] * (state.actions.shape[1] // state.dof_pos.shape[1]))
+    images = [mirror for mirror in parameter_mirrors.values() if mirror]
+    parameter_mirror = Mirroring.joined(images) if len(images) == len(parameter_mirrors) else None
 
     def term(
         name: str, value: Any, mirror: Mirroring | None, scale: Any = 1.0, error: float = 0.0, privileged: bool = False
@@ -67,26 +86,23 @@ def standard_terms(task: LeggedRobot) -> list[ObservationTerm]:
         return ObservationTerm(name, value, mirror, scale, error, privileged, *_DESCRIPTIONS.get(name, ()))
 
     terms = [
-        term("projected_gravity", lambda: task.projected_gravity, VECTOR, error=noise.gravity),
-        term("angular_velocity", lambda: task.base_ang_vel, AXIAL_VECTOR, scales.ang_vel, noise.ang_vel),
-        term("command", lambda: task.commands, PLANAR_VELOCITY, command_scales),
-        term("joint_position", lambda: task.dof_pos - task.default_dof_pos, joints, scales.dof_pos, noise.dof_pos),
-        term("joint_velocity", lambda: task.dof_vel, joints, scales.dof_vel, noise.dof_vel),
-        term("last_action", lambda: task.actions, actions),
-        term("linear_velocity", lambda: task.base_lin_vel, VECTOR, scales.lin_vel, privileged=True),
-        term("height", lambda: task.base_height.unsqueeze(1), SCALAR, privileged=True),
-        term("feet_contact", lambda: task.feet_contact, feet, privileged=True),
-        term("random_parameters", lambda: task.randomization.values, parameter_mirror, privileged=True),
+        term("projected_gravity", lambda: state.projected_gravity, VECTOR, error=noise.gravity),
+        term("angular_velocity", lambda: state.base_ang_vel, AXIAL_VECTOR, scales.ang_vel, noise.ang_vel),
+        term("command", lambda: state.commands, PLANAR_VELOCITY, command_scales),
+        term("joint_position", lambda: state.dof_pos - control.default_dof_pos, joints, scales.dof_pos, noise.dof_pos),
+        term("joint_velocity", lambda: state.dof_vel, joints, scales.dof_vel, noise.dof_vel),
+        term("last_action", lambda: state.actions, actions),
+        term("linear_velocity", lambda: state.base_lin_vel, VECTOR, scales.lin_vel, privileged=True),
+        term("height", lambda: state.base_height.unsqueeze(1), SCALAR, privileged=True),
+        term("feet_contact", lambda: state.feet_contact, feet, privileged=True),
+        term("random_parameters", lambda: parameters, parameter_mirror, privileged=True),
     ]
-    ground = task.cfg.terrain
-    if ground.mesh_type == "heightfield":
-        scan = HeightScan(task)
-        seen: HeightScan | LateScan = scan
-        factors = (scales.height_measurements, noise.height_measurements)
-        if ground.measure_heights and ground.measure_delay:
-            seen = LateScan(task, scan, ground.measure_delay)
-            terms.append(term("height_scan_now", scan, scan.mirror, *factors, privileged=True))
-        terms.append(term("height_scan", seen, scan.mirror, *factors, privileged=not ground.measure_heights))
+    if scan:
+        factors, is_seen = (scales.height_measurements, noise.height_measurements), cfg.terrain.measure_heights
+        if is_seen and scan.delay:
+            terms.append(term("height_scan_now", lambda: scan.newest, scan.mirror, *factors, privileged=True))
+        seen = (lambda: scan.values) if is_seen else (lambda: scan.newest)
+        terms.append(term("height_scan", seen, scan.mirror, *factors, privileged=not is_seen))
     return terms
 
 
@@ -94,18 +110,19 @@ class Observations:
     """Computes the observations of a list of terms.
 
     Attributes:
-        terms: The terms: those of the policy, then those of the critic alone.
-        sizes: Numbers of each term, by name.
+        terms: The terms of "policy" and "critic": those of the policy, then those of the critic alone.
+        sizes: Numbers of each of them, by name.
         policy_size: Numbers that the policy sees of one step.
-        buffers: Groups "policy", with noise and history, and "critic", without; NaN where a term was not finite.
-            Shapes: (num_envs, size).
+        groups: Terms with groups of their own, by name of the group.
+        buffers: Groups "policy", with noise and history, "critic", without, and others, with noise; NaN where a term
+            was not finite. Shapes: (num_envs, size), of others any.
     """
 
     def __init__(
         self, terms: Sequence[ObservationTerm], history_length: int, clip: float, add_noise: bool, num_envs: int
     ) -> None:
-        """Allocate the buffers. Observations are clipped to +-``clip``; ``add_noise`` is for the policy alone."""
-        self.terms = sorted(terms, key=lambda term: term.privileged)
+        """Allocate the buffers. Observations are clipped to +-``clip``; ``add_noise`` is not for the critic."""
+        self.terms = sorted((term for term in terms if not term.group), key=lambda term: term.privileged)
         values = [term.value() for term in self.terms]
         device = values[0].device
         self.sizes: dict[str, int] = {}
@@ -118,10 +135,20 @@ class Observations:
         self._scales = torch.tensor([*chain(*scales)], dtype=torch.float32, device=device)
         self.policy_size = sum(self.sizes[term.name] for term in self.policy_terms())
         self._noise = torch.tensor([*chain(*errors)][: self.policy_size], dtype=torch.float32, device=device)
-        sizes = {"policy": self.policy_size * history_length, "critic": len(self._scales)}
-        groups = {name: torch.zeros(num_envs, size, device=device) for name, size in sizes.items()}
-        self.buffers = TensorDict(groups, batch_size=[num_envs], device=device)
-        self._policy, self._critic = groups["policy"], groups["critic"]
+        shapes: dict[str, tuple[int, ...]] = {
+            "policy": (self.policy_size * history_length,),
+            "critic": (len(self._scales),),
+        }
+        self.groups: dict[str, ObservationTerm] = {}
+        for term in (term for term in terms if term.group):
+            if term.group in shapes:
+                raise UserError(f"the observation group '{term.group}' of '{term.name}' exists already")
+            if not isinstance(term.scale, (int, float)):
+                raise UserError(f"the observation '{term.name}' of a group of its own takes a single scale")
+            self.groups[term.group], shapes[term.group] = term, tuple(term.value().shape[1:])
+        self._groups = {name: torch.zeros(num_envs, *shape, device=device) for name, shape in shapes.items()}
+        self.buffers = TensorDict(self._groups, batch_size=[num_envs], device=device)
+        self._policy, self._critic = self._groups["policy"], self._groups["critic"]
 
     def policy_terms(self) -> list[ObservationTerm]:
         """Return the terms that the policy sees."""
@@ -134,33 +161,68 @@ class Observations:
         columns = range(start, start + self.sizes[name])
         return [step * self.policy_size + column for step in range(self._history_length) for column in columns]
 
+    @property
+    def history(self) -> Tensor:
+        """The policy's observations of the steps before. Shape: (num_envs, policy_size x further steps)."""
+        return self._policy[:, self.policy_size :]
+
+    def by_term(self) -> dict[str, Tensor]:
+        """Return what the critic sees of each term, and groups of single terms. Shapes: (num_envs, any)."""
+        parts = dict(zip(self.sizes, self._critic.split(list(self.sizes.values()), dim=1), strict=True))
+        return parts | {term.name: self._groups[group].flatten(1) for group, term in self.groups.items()}
+
     def compute(self, is_new: Tensor) -> None:
         """Compute the observations of this moment.
 
         Where an episode has just started, as ``is_new`` says, the history starts with copies. Shape: (num_envs,), bool.
         """
+        for name, values in self.look(is_new).items():
+            self._groups[name].copy_(values)
+
+    def look(self, is_new: Tensor | None = None) -> dict[str, Tensor]:
+        """Return the observations of this moment, by group; the history goes on everywhere without ``is_new``."""
         critic = torch.cat([term.value() for term in self.terms], dim=1) * self._scales
-        critic = critic.nan_to_num(nan=math.nan, posinf=math.nan, neginf=math.nan)  # not clipped: it must be noticed
+        critic = _marked(critic)  # not clipped: it must be noticed
         policy = critic[:, : self.policy_size]
         if self._add_noise:
             policy = torch.addcmul(policy, self._noise, 2.0 * torch.rand(policy.shape, device=policy.device) - 1.0)
         policy = policy.clamp(-self._clip, self._clip)
-        self._policy.copy_(self._with_history(policy, is_new))
-        self._critic.copy_(critic.clamp(-self._clip, self._clip))
+        seen = {"policy": self._with_history(policy, is_new), "critic": critic.clamp(-self._clip, self._clip)}
+        return seen | {name: self._of_group(term) for name, term in self.groups.items()}
 
-    def _with_history(self, policy: Tensor, is_new: Tensor) -> Tensor:
-        """Return the policy's observations followed by those of the steps before."""
-        if self._history_length == 1:
-            return policy
-        before = self._policy[:, : -policy.shape[1]]
-        copies = policy.repeat(1, self._history_length - 1)
-        return torch.cat([policy, torch.where(is_new.unsqueeze(1), copies, before)], dim=1)
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the groups."""
+        return dict(self._groups)
 
     def mirrors(self) -> dict[str, list[tuple[str, Mirroring | None]]]:
         """Return the mirror images of the groups, term by term with their names."""
         policy = [(term.name, term.mirror) for term in self.policy_terms()]
         critic = [(term.name, term.mirror) for term in self.terms]
-        return {"policy": policy * self._history_length, "critic": critic}
+        others = {name: [(term.name, term.mirror)] for name, term in self.groups.items()}
+        return {"policy": policy * self._history_length, "critic": critic, **others}
+
+    def _of_group(self, term: ObservationTerm) -> Tensor:
+        """Return the scaled values of a term with a group of its own."""
+        scale: Any = term.scale  # a number
+        values = _marked(term.value() * scale)
+        if self._add_noise and term.noise and not term.privileged:
+            values = values + term.noise * scale * (2.0 * torch.rand_like(values) - 1.0)
+        return values.clamp(-self._clip, self._clip)
+
+    def _with_history(self, policy: Tensor, is_new: Tensor | None) -> Tensor:
+        """Return the policy's observations followed by those of the steps before."""
+        if self._history_length == 1:
+            return policy
+        before = self._policy[:, : -policy.shape[1]]
+        if is_new is not None:
+            copies = policy.repeat(1, self._history_length - 1)
+            before = torch.where(is_new.unsqueeze(1), copies, before)
+        return torch.cat([policy, before], dim=1)
+
+
+def _marked(values: Tensor) -> Tensor:
+    """Return values with NaN for all that is not finite."""
+    return values.nan_to_num(nan=math.nan, posinf=math.nan, neginf=math.nan)
 
 
 def _check(term: ObservationTerm, size: int, before: dict[str, int]) -> None:

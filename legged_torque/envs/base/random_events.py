@@ -1,8 +1,10 @@
-"""What happens at random in the worlds of a task: resets, new commands, new parameters, pushes."""
+"""Random events in the worlds of a task: resets, new commands, new parameters, pushes."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import warp as wp
@@ -11,8 +13,8 @@ from torch import Tensor
 from legged_torque.envs.base.commands import UniformCommands
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim import kernels
-from legged_torque.sim.engine import Engine
-from legged_torque.sim.randomization import Parameter, Randomization
+from legged_torque.sim.engine import Engine, shared_field
+from legged_torque.sim.randomization import Randomization, RandomParameter
 
 PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one, times ``push_set_factor``
 
@@ -32,16 +34,17 @@ class RandomEvents:
         sim: Engine,
         commands: UniformCommands,
         init_angles: Tensor,
-        initial_state: Sequence[Parameter],
-        parameters: Sequence[Parameter],
+        initial_state: Sequence[RandomParameter],
+        parameters: Sequence[RandomParameter],
     ) -> None:
         """Prepare; nothing is drawn yet. ``init_angles`` are among the fields of ``initial_state``."""
         settings = self._settings = cfg.domain_rand
         self._sim, self._commands, self.init_angles = sim, commands, init_angles
         device, n = sim.device, sim.num_envs
         self._new_parameters = torch.zeros(n, dtype=torch.bool, device=device)
-        self.initial_state = Randomization(initial_state, n, device)
-        self.parameters = Randomization(parameters, n, device, settings.keep_probability)
+        model_field = sim.field if settings.randomize_parameters else functools.partial(shared_field, sim)
+        self.initial_state = Randomization(initial_state, model_field, n, device)
+        self.parameters = Randomization(parameters, model_field, n, device, settings.keep_probability)
         self._seeds = torch.zeros(3, n, dtype=torch.int32, device=device)
         self.initial_state.seeds, self.parameters.seeds = self._seeds[1:]
         chances = [cfg.commands.resampling_probability, settings.resampling_probability]
@@ -66,3 +69,7 @@ class RandomEvents:
         if settings.randomize_parameters:
             self.parameters.draw(self._new_parameters)
             sim.update_constants(self._new_parameters)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the drawn parameters, and the tensors in which they are kept; those of the model the simulator has."""
+        return {"values": self.parameters.values, "fields": self.parameters.own_fields()}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from legged_torque.envs.base.curriculum import LinearCurriculum
-from legged_torque.envs.base.legged_robot_config import LinearChange
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.config import section_keys, to_dict
+from legged_torque.utils.errors import UserError, unknown_name
 
 
 class Rewards:
@@ -23,24 +24,23 @@ class Rewards:
     """
 
     def __init__(
-        self,
-        functions: Mapping[str, Callable[[], Tensor]],
-        scales: Mapping[str, float],
-        curricula: Mapping[str, LinearChange],
-        only_positive: bool,
-        dt: float,
-        num_envs: int,
-        device: str,
+        self, functions: Mapping[str, Callable[[], Tensor]], settings: Any, dt: float, num_envs: int, device: str
     ) -> None:
-        """Prepare the weights: each term's scale per second, times its factor of the curricula, if it has one.
+        """Prepare the terms with a scale that is not zero.
 
-        ``functions`` return each term's values, one per world.
+        Their weights are the scales per second of the section ``rewards``, times a factor of its curricula, if they
+        have one. ``functions`` return the values of all known terms, one per world. A UserError for an unknown term.
         """
-        self.names = list(functions)
+        scales = {name: scale for name, scale in to_dict(settings.scales).items() if scale != 0.0}
+        curricula = {name: getattr(settings.curriculum, name) for name in section_keys(settings.curriculum)}
+        for name in [*scales, *curricula]:
+            if name not in functions:
+                raise unknown_name("reward term", name, functions)
+        self.names = list(scales)
         self.terms, self.episode_sums = (torch.zeros(len(self.names), num_envs, device=device) for _ in range(2))
-        self._functions, self._rows = list(functions.values()), self.terms.unbind()
-        self.only_positive = only_positive
-        self._scales = torch.tensor([scales[name] for name in self.names], dtype=torch.float32, device=device) * dt
+        self._functions, self._rows = [functions[name] for name in self.names], self.terms.unbind()
+        self.only_positive = settings.only_positive_rewards
+        self._scales = torch.tensor(list(scales.values()), dtype=torch.float32, device=device) * dt
         self._curriculum = LinearCurriculum([curricula.get(name) for name in self.names], device)
 
     def weights(self, total_steps: Tensor) -> Tensor:
@@ -66,3 +66,7 @@ class Rewards:
         """Add the terms to the sums of the episode, as 0 in worlds that have diverged. Shape: (num_envs,), bool."""
         self.terms.masked_fill_(diverged, 0.0)
         self.episode_sums += self.terms
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the terms and their sums."""
+        return {"terms": self.terms, "episode_sums": self.episode_sums}

@@ -1,23 +1,24 @@
-"""Whether a robot's file and the settings of a task fit together; what does not is told, never silently wrong."""
+"""Checks that a robot's file and the settings of a task fit together."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import mujoco
 import numpy as np
+from torch import Tensor
 
 from legged_torque.sim.model import FLOOR
-from legged_torque.sim.randomization import Parameter
+from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.mirroring import Mirroring
-from legged_torque.utils.mjcf import joint_limits
+from legged_torque.utils.mjcf import body_chains, joint_limits
 
 MIRROR_TOLERANCE = 5e-3  # by which a foot may miss the mirror image of its counterpart [m]
 _POSES = 5  # random ones that are mirrored
 
 
 def pose_problems(pose: Sequence[float], model: mujoco.MjModel) -> Iterator[str]:
-    """Yield which angles of the nominal pose [rad], one per joint of the model but the first, are beyond limits."""
+    """Yield angles of the nominal pose [rad], one per joint of the model but the first, that are beyond limits."""
     for joint, (angle, (low, high)) in enumerate(zip(pose, joint_limits(model)[1:], strict=True), start=1):
         if not low <= angle <= high:
             name = model.joint(joint).name
@@ -25,8 +26,8 @@ def pose_problems(pose: Sequence[float], model: mujoco.MjModel) -> Iterator[str]
 
 
 def foot_notes(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
-    """Yield which legs have no foot, or a foot of other numbers of geoms: a leg ends in a body without children."""
-    ends = set(range(2, model.nbody)) - set(model.body_parentid.tolist())
+    """Yield legs without a foot, or with another number of foot geoms than most; a leg ends in a childless body."""
+    ends = {chain[-1] for chain in body_chains(model)}
     bodies = [int(model.geom(name).bodyid[0]) for name in feet]
     usual = min(bodies.count(body) for body in bodies)
     for body in sorted(ends.union(bodies)):
@@ -36,7 +37,7 @@ def foot_notes(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
 
 
 def floor_problems(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
-    """Yield which feet the ground lets through, whichever engine simulates them."""
+    """Yield feet that fall through the ground with every engine."""
     kinds, floor = (model.geom_contype, model.geom_conaffinity), model.geom(FLOOR).id
     through = [f for f in feet if not any(a[floor] & b[model.geom(f).id] for a, b in (kinds, kinds[::-1]))]
     if through:
@@ -44,7 +45,7 @@ def floor_problems(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
 
 
 def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, foot_names: Sequence[str]) -> str:
-    """Return why mirrored angles of joints do not put feet at mirrored places; empty if they do."""
+    """Return how far mirrored joint angles miss mirrored places of the feet; empty if they do not."""
     rng, data, places = np.random.default_rng(0), mujoco.MjData(model), []
     low, high = np.clip(joint_limits(model)[1:].T, -1.0, 1.0)
     geoms = [model.geom(name).id for name in foot_names]
@@ -62,25 +63,33 @@ def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, fo
     return ""
 
 
-def range_notes(drawn: Sequence[Parameter], torques: np.ndarray) -> Iterator[str]:
-    """Yield which ranges may be another robot's.
+def range_notes(drawn: Sequence[RandomParameter], fields: Mapping[str, Tensor], torques: np.ndarray) -> Iterator[str]:
+    """Yield ranges that seem to be another robot's.
 
-    They leave out the robot's own value, or change a mass by more than half, or draw dry friction of more than a tenth
-    of a joint's highest torque. Those are ``torques`` [N m]. Shape: (num_dof,).
+    Such a range leaves out the robot's own value, changes a mass by more than half, or draws dry friction of more than
+    a tenth of a joint's highest torque.
+
+    Args:
+        drawn: The parameters.
+        fields: Those of the model that they are kept in, by name. Shapes: (num_envs, any).
+        torques: Highest torques [N m]. Shape: (num_dof,).
     """
-    for parameter in (each for each in drawn if each.model_field):
-        columns = list(parameter.columns)
-        own = parameter.field[0, columns].cpu().numpy()
-        weight, (low, high) = np.broadcast_to(parameter.weight, own.shape), parameter.offset
-        most = np.abs(weight) * max(-low, high)
-        told = ""
-        if parameter.model_field == "body_mass" and (most > 0.5 * own).any():
-            told = f"changes a mass of {own[0]:g} kg by {most[0]:g} kg"
-        elif parameter.model_field == "dof_frictionloss" and (most > 0.1 * torques[np.subtract(columns, 6)]).any():
-            told = f"draws up to {most.max():g} N m, but a motor has {torques.min():g} N m"
-        elif parameter.base is not None:
-            scaled = np.divide(own - parameter.base, weight, out=np.zeros_like(own), where=weight != 0.0)
+    for parameter in drawn:
+        (kind, limits), *_ = [*parameter.draw.items(), ("", [0.0, 0.0])]
+        if not isinstance(parameter.field, str) or kind not in ("set", "add"):
+            continue
+        own = fields[parameter.field][0, list(parameter.columns)].cpu().numpy()
+        unit = np.broadcast_to(parameter.set_unit if kind == "set" else parameter.add_unit, own.shape)
+        low, high = limits
+        most = np.abs(unit) * max(-low, high)
+        note = ""
+        if parameter.field == "body_mass" and (most > 0.5 * own).any():
+            note = f"changes a mass of {own[0]:g} kg by {most[0]:g} kg"
+        elif parameter.field == "dof_frictionloss" and (most > 0.1 * torques[np.subtract(parameter.columns, 6)]).any():
+            note = f"draws up to {most.max():g} N m, but a motor has {torques.min():g} N m"
+        elif kind == "set":
+            scaled = np.divide(own, unit, out=np.zeros_like(own), where=unit != 0.0)
             outside = scaled[(scaled < low - 1e-6 * abs(low)) | (scaled > high + 1e-6 * abs(high))]
-            told = f"draws {low:g} to {high:g}, but the robot's own value is {outside[0]:g}" if outside.size else ""
-        if told:
-            yield f"domain_rand.{parameter.name} {told}: is it the range of another robot?"
+            note = f"draws {low:g} to {high:g}, but the robot's own value is {outside[0]:g}" if outside.size else ""
+        if note:
+            yield f"domain_rand.{parameter.name} {note}: is it the range of another robot?"

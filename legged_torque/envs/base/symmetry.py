@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDict
@@ -11,9 +11,6 @@ from torch import Tensor
 
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import AXIAL_VECTOR, Mirroring, counterparts
-
-if TYPE_CHECKING:
-    from legged_torque.envs.base.legged_robot import LeggedRobot
 
 Names = Sequence[str]
 
@@ -113,20 +110,16 @@ class Mirror:
         return values[:, order] * signs
 
 
-def make_mirror(task: LeggedRobot) -> Mirror:
-    """Return what reflects a task's observations and actions.
+class Mirrored(Protocol):
+    """A task that knows mirror images."""
 
-    A UserError if the robot is not symmetric, or the mirror image of a term or of a random parameter is not known.
-    """
-    actions = [(term.name, task.symmetry.joints) for term in task.action_terms()]
-    unknown = [name for name, mirroring in task.parameter_mirrors.items() if mirroring is None]
-    problem = f"the mirror image of the random parameter '{unknown[0]}' is not known" if unknown else ""
-    parts = {**task.observations.mirrors(), "actions": actions}
-    return Mirror(parts, task.symmetry.problem or problem, task.device)
+    @property
+    def mirror(self) -> Mirror:
+        """Reflects its observations and actions."""
 
 
 def with_mirror_images(
-    env: LeggedRobot, obs: TensorDict | None, actions: Tensor | None
+    env: Mirrored, obs: TensorDict | None, actions: Tensor | None
 ) -> tuple[TensorDict | None, Tensor | None]:
     """Return observations and actions followed by their mirror images: rsl_rl's ``data_augmentation_func``.
 

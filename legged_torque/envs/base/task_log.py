@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
+from torch import Tensor
 
-if TYPE_CHECKING:
-    from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.base.state import RobotState
 
 
 class TaskLog:
-    """What happened in a task since the last :meth:`read`."""
+    """Episodes, tracking and diverged worlds since the last :meth:`read`."""
 
     def __init__(self, reward_names: list[str], num_envs: int, device: str) -> None:
-        """Start with empty sums; names of reward terms are in the order of the task's ``episode_sums``."""
+        """Start with empty sums; names of reward terms are in the order of ``episode_sums``."""
         self._names = [*reward_names, "steps", "episodes", "length", "return", "diverged", "error_xy", "error_yaw"]
         self._num_terms = len(reward_names)
         # Of each world, since adding up worlds costs a GPU more than all else here.
@@ -23,24 +21,31 @@ class TaskLog:
             for count in (self._num_terms, len(self._names) - self._num_terms)
         )
 
-    def add_step(self, task: LeggedRobot) -> None:
-        """Add one control step, after its rewards and before its resets."""
-        error_xy = (task.commands[:, :2] - task.base_lin_vel[:, :2]).square().sum(dim=1)
-        error_yaw = (task.commands[:, 2] - task.base_ang_vel[:, 2]).square()
-        finished = task.reset_buf.float()
-        diverged = task.sim.diverged
+    def add_step(self, state: RobotState, episode_sums: Tensor) -> None:
+        """Add one control step, after its rewards and before its resets.
+
+        ``episode_sums`` are those of the reward terms. Shape: (terms, num_envs).
+        """
+        error_xy = (state.commands[:, :2] - state.base_lin_vel[:, :2]).square().sum(dim=1)
+        error_yaw = (state.commands[:, 2] - state.base_ang_vel[:, 2]).square()
+        finished = state.reset_buf.float()
+        diverged = state.diverged
         rows = [
             torch.ones_like(finished),
             finished,
-            finished * task.episode_length_buf,
-            finished * task.episode_return,
+            finished * state.episode_length,
+            finished * state.episode_return,
             diverged.float(),
             torch.where(diverged, 0.0, error_xy),
             torch.where(diverged, 0.0, error_yaw),
         ]
-        self._of_terms.add_(task.episode_sums * finished)
+        self._of_terms.add_(episode_sums * finished)
         for row, number in zip(self._of_steps, rows, strict=True):
             row.add_(number)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the sums."""
+        return {"of_terms": self._of_terms, "of_steps": self._of_steps}
 
     def read(self, max_episode_length_s: float) -> dict[str, float]:
         """Return the means since the last call and start anew. Waits for the device.

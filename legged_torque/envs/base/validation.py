@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LinearChange
-from legged_torque.sim.registry import engine_class
 from legged_torque.terrain.layout import Layout
-from legged_torque.utils.config import Section, section_keys
+from legged_torque.utils.config import Section, check_section, section_keys
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.limits import check_section
 
 
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     """Raise a UserError that names the first setting of a task that makes no sense, alone or with others."""
     check_section(cfg)
-    engine_class(cfg.sim.engine)
+    if cfg.sim.engine not in ("fused", "mujoco_warp"):
+        from legged_torque.sim.registry import engine_class  # takes seconds, which only other engines are worth
+
+        engine_class(cfg.sim.engine)
     _check_changes(cfg)
     for pair in cfg.asset.mirrored_legs:
         if len(pair) != 2:
@@ -24,14 +25,15 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
         raise UserError(f"rewards.base_height_target must be greater than 0, not {cfg.rewards.base_height_target}")
     if cfg.terrain.mesh_type == "heightfield":
         _check_map(cfg)
-    rand = cfg.domain_rand
-    for name in rand.keep_fixed:
-        if name not in cfg.random_ranges():
-            raise unknown_name("range in domain_rand.keep_fixed", name, cfg.random_ranges())
-    if rand.action_delay[1] and rand.action_delay_unit == "physics_steps" and not cfg.control.refresh_torques:
+    parameters = cfg.random_parameters()
+    for name in cfg.domain_rand.keep_fixed:
+        if name not in parameters:
+            raise unknown_name("parameter in domain_rand.keep_fixed", name, parameters)
+    delay = cfg.motors.delay
+    if delay.range[1] and delay.unit == "physics_steps" and not cfg.control.refresh_torques:
         raise UserError(
-            "domain_rand.action_delay_unit must be control_steps, since control.refresh_torques is off: torques are "
-            "computed once per control step"
+            "motors.delay.unit must be control_steps, since control.refresh_torques is off: torques are computed once "
+            "per control step"
         )
 
 

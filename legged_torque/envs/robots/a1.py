@@ -32,13 +32,12 @@ class A1Cfg(LeggedRobotCfg):
         torque_scale = 4.0
 
     class domain_rand:
-        trunk_mass_offset = [-1.0, 1.0]
-        trunk_mass_scale = [1.0, 1.0]
-        foot_radius = [0.019, 0.021]
-        dof_damping = [0.0, 0.2]
-        dof_armature = [0.008, 0.02]
-        dof_stiffness = [0.0, 0.2]
-        dof_frictionloss = [0.0, 0.4]
+        trunk_mass = {"add": [-1.0, 1.0]}
+        foot_radius = {"set": [0.019, 0.021]}
+        dof_damping = {"set": [0.0, 0.2]}
+        dof_armature = {"set": [0.008, 0.02]}
+        dof_stiffness = {"set": [0.0, 0.2]}
+        dof_frictionloss = {"set": [0.0, 0.4]}
 
     class rewards:
         base_height_target = 0.303
@@ -46,10 +45,13 @@ class A1Cfg(LeggedRobotCfg):
     def hard_ranges(self) -> dict[str, dict]:
         """Return the hard ranges, with those of this robot's parts."""
         hard = super().hard_ranges()
-        hard["domain_rand"] |= {"trunk_mass_offset": [-2.0, 2.0], "trunk_mass_scale": [1.0, 1.0]}
-        hard["domain_rand"] |= {"dof_damping": [0.0, 2.0]}
-        hard["domain_rand"] |= {"dof_armature": [0.008, 0.05], "dof_stiffness": [0.0, 0.5]}
-        hard["domain_rand"] |= {"dof_frictionloss": [0.0, 1.0]}
+        hard["domain_rand"] |= {
+            "trunk_mass": {"add": [-2.0, 2.0]},
+            "dof_damping": {"set": [0.0, 2.0]},
+            "dof_armature": {"set": [0.008, 0.05]},
+            "dof_stiffness": {"set": [0.0, 0.5]},
+            "dof_frictionloss": {"set": [0.0, 1.0]},
+        }
         return hard
 
 

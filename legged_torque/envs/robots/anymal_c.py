@@ -32,12 +32,12 @@ class AnymalCCfg(LeggedRobotCfg):
         torque_scale = 15.0
 
     class domain_rand:
-        trunk_mass_offset = [-4.0, 4.0]
-        foot_radius = [0.0285, 0.0315]
-        dof_damping = [0.0, 0.6]
-        dof_armature = [0.05, 0.1]
-        dof_stiffness = [0.0, 0.6]
-        dof_frictionloss = [0.0, 1.2]
+        trunk_mass = {"add": [-4.0, 4.0], "scale": [0.8, 1.2]}
+        foot_radius = {"set": [0.0285, 0.0315]}
+        dof_damping = {"set": [0.0, 0.6]}
+        dof_armature = {"set": [0.05, 0.1]}
+        dof_stiffness = {"set": [0.0, 0.6]}
+        dof_frictionloss = {"set": [0.0, 1.2]}
 
     class rewards:
         base_height_target = 0.549

@@ -34,11 +34,11 @@ class G1Cfg(LeggedRobotCfg):
     class domain_rand:
         init_roll = [-0.1, 0.1]
         init_pitch = [-0.1, 0.1]
-        trunk_mass_offset = [-2.0, 2.0]
-        dof_damping = [0.0, 0.4]
-        dof_armature = [0.008, 0.02]
-        dof_stiffness = [0.0, 0.4]
-        dof_frictionloss = [0.0, 0.8]
+        trunk_mass = {"add": [-2.0, 2.0], "scale": [0.8, 1.2]}
+        dof_damping = {"set": [0.0, 0.4]}
+        dof_armature = {"set": [0.008, 0.02]}
+        dof_stiffness = {"set": [0.0, 0.4]}
+        dof_frictionloss = {"set": [0.0, 0.8]}
 
     class commands:
         class ranges:

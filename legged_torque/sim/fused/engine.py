@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 import warp as wp
+from torch import Tensor
 
 from legged_torque.sim.fused.collision_self import make_self_contacts, pair_kinds
 from legged_torque.sim.fused.constraint import Contact
@@ -93,19 +94,23 @@ class FusedEngine(WarpEngine):
         inputs = [self._struct, self._ground, reads, self._state, self._scratch, steps.start, steps.stop, sense]
         launch_worlds(kernel, dim, inputs, self._wp_device, BLOCK_DIM)
 
-    def applied_forces(self) -> tuple[wp.array, wp.array]:
+    def applied_forces(self) -> tuple[Tensor, Tensor]:
         """Return MuJoCo's ``xfrc_applied`` and ``qfrc_applied``, which act from the first call on."""
         self._has_forces = True
         return super().applied_forces()
 
-    def check_columns(self, name: str, columns: Sequence[int]) -> None:
-        """Refuse the columns of the trunk's free joint, and the place of a floor that is a height map."""
-        width = self.field(name)[0, 0].numel()
-        if any(column < unread_columns(name) * width for column in columns):
+    def field(self, name: str, columns: Sequence[int] | None = None) -> Tensor:
+        """Return a field of the model with a row per world, which it gets at the first request, to change ``columns``.
+
+        A UserError for those of the trunk's free joint, and for the place of a floor that is a height map.
+        """
+        field = super().field(name, columns)
+        entries = [column // field[0, 0].numel() for column in columns or ()]
+        if any(entry < unread_columns(name) for entry in entries):
             raise UserError(f"sim.engine 'fused' does not read '{name}' of the trunk's free joint")
-        is_place = self._on_map and name in ("geom_pos", "geom_quat")
-        if is_place and find_floor(self.mj_model) in [column // width for column in columns]:
+        if self._on_map and name in ("geom_pos", "geom_quat") and find_floor(self.mj_model) in entries:
             raise UserError(f"sim.engine 'fused' does not read '{name}' of the floor: heights of a map are the world's")
+        return field
 
     def _field_names(self) -> list[str]:
         """Return which fields of the model may differ from world to world: those that the kernel reads by world."""

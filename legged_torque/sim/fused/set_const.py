@@ -51,8 +51,9 @@ class DerivedConstants:
 
     def vary_branches(self) -> None:
         """Take differences between the worlds' branches into account, from the next :meth:`update` on."""
-        self._branches_vary = True
-        self._measure_worlds(self._dim[0])
+        if not self._branches_vary:
+            self._branches_vary = True
+            self._measure_worlds(self._dim[0])
 
     def update(self, worlds: Tensor) -> None:
         """Recompute the constants in some worlds. Shape: (num_envs,), bool."""

@@ -8,8 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import self_pairs, why_no_motor
+from legged_torque.utils.mjcf import body_chains, self_pairs, why_no_motor
+from legged_torque.utils.problems import refuse
 
 MAX_BRANCHES = 16  # threads of a world must fit into half a warp
 _SELF_KINDS = [mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX]
@@ -33,6 +33,8 @@ turn into walls: there, points all around the end circles turn with the cylinder
 """
 
 SLOWER = "about 30 times slower"  # on an H200, see docs/performance.md
+REFUSED = "sim.engine 'fused' cannot simulate this robot"
+ADVICE = f"use sim.engine = 'mujoco_warp', {SLOWER}, without randomize_parameters"
 FLOORS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 """Types of floors. The fused step has planes; its height maps are no geoms of the model."""
 
@@ -60,8 +62,8 @@ def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:
 
     A UserError lists everything that the fused step does not simulate.
     """
-    _refuse(reasons_against(model, floors))
-    chains = _chains(model)
+    refuse(reasons_against(model, floors), REFUSED, ADVICE)
+    chains = body_chains(model)
     points: list[list] = [[] for _ in chains]
     depths = {body: (i, j + 1) for i, chain in enumerate(chains) for j, body in enumerate(chain)}
     trunk_geoms = 0
@@ -85,9 +87,9 @@ def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:
 def reasons_against(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS) -> list[str]:
     """Return the reasons why the fused step cannot simulate a robot on a floor of one of some types."""
     reasons = [*_of_bodies(model), *_of_contacts(model, floors), *_of_motors(model), *_of_options(model)]
-    chains = _chains(model)
-    ends = [chain[-1] for chain in chains]
-    reasons += [f"body '{model.body(body).name}' branches" for body in ends if body in model.body_parentid]
+    chains = body_chains(model)
+    branching = np.flatnonzero(np.bincount(model.body_parentid[2:]) > 1)
+    reasons += [f"body '{model.body(body).name}' branches" for body in branching if body > 1]
     if not 0 < len(chains) <= MAX_BRANCHES:
         reasons.append(f"it has {len(chains)} legs, not 1 to {MAX_BRANCHES}")
     return reasons
@@ -110,14 +112,7 @@ def check_map(model: mujoco.MjModel) -> None:
     """Raise a UserError if the floor of an accepted robot is not at the origin, where a height map needs it."""
     floor = find_floor(model)
     posed = model.geom_pos[floor].any() or not np.array_equal(model.geom_quat[floor], (1.0, 0.0, 0.0, 0.0))
-    _refuse(["its floor is not at the origin, where a height map needs it"] if posed else [])
-
-
-def _refuse(reasons: list[str]) -> None:
-    """Raise a UserError with all reasons not to simulate a robot, if there are any."""
-    if reasons:
-        advice = f"use sim.engine = 'mujoco_warp', {SLOWER}, without randomize_parameters"
-        raise UserError(f"sim.engine 'fused' cannot simulate this robot: {'; '.join(reasons)}; {advice}")
+    refuse(["its floor is not at the origin, where a height map needs it"] if posed else [], REFUSED, ADVICE)
 
 
 def _of(part: Any, chosen: np.ndarray) -> str:
@@ -129,16 +124,6 @@ def _of(part: Any, chosen: np.ndarray) -> str:
 def _broken(rules: dict[str, bool]) -> list[str]:
     """Return the reasons of the rules that do not hold."""
     return [reason for reason, holds in rules.items() if not holds]
-
-
-def _chains(model: mujoco.MjModel) -> list[list[int]]:
-    """Return the bodies of each branch, from the trunk to where it ends, or branches itself."""
-    children = [[c for c in range(2, model.nbody) if model.body_parentid[c] == b] for b in range(model.nbody)]
-    chains = [[body] for body in children[1]] if model.nbody > 1 else []
-    for chain in chains:
-        while len(children[chain[-1]]) == 1:
-            chain += children[chain[-1]]
-    return chains
 
 
 _HARMLESS_DISABLED = ("midphase", "nativeccd", "multiccd", "island", "autoreset", "warmstart", "equality")

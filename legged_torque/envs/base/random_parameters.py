@@ -1,0 +1,188 @@
+"""The numbers of the robot, the ground and the controller that are drawn at random (paper, App. I-B)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+from torch import Tensor
+
+from legged_torque.envs.base.actions import ControlParameters
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.envs.base.symmetry import RobotSymmetry
+from legged_torque.sim.randomization import RandomParameter, fixed
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.mirroring import SCALAR, VECTOR, Mirroring
+from legged_torque.utils.mjcf import joint_limits
+
+TRUNK = 1  # the trunk's body
+_ROUND = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)}  # types of feet that have a radius
+LEAST_MASS = 0.01  # [kg] of a trunk
+
+
+def initial_state(
+    cfg: LeggedRobotCfg, model: mujoco.MjModel, qpos: Tensor, qvel: Tensor, angles: Tensor, pose: Sequence[float]
+) -> list[RandomParameter]:
+    """Return the state in which episodes start, without its last entry, the place: see :func:`initial_place`.
+
+    Args:
+        cfg: Settings of the task.
+        model: The robot.
+        qpos: Positions of all worlds. Shape: (num_envs, nq).
+        qvel: Velocities of all worlds. Shape: (num_envs, nv).
+        angles: Roll, pitch and yaw of the trunk [rad]. Shape: (num_envs, 3).
+        pose: The nominal angles of the joints [rad].
+    """
+    rand, dofs = cfg.domain_rand, range(len(pose))
+    limits = joint_limits(model)[1:].T.tolist()
+
+    def drawn(name: str, field: Tensor, columns: Sequence[int], unit: str) -> RandomParameter:
+        return RandomParameter(name, field, columns, {"set": getattr(rand, name)}, unit)
+
+    dof_pos = RandomParameter("dof_pos", qpos, [7 + dof for dof in dofs], {"scale": rand.init_dof_pos_scale}, "rad")
+    return [
+        RandomParameter("base_height", qpos, [2], {}, "m", own=cfg.init_state.pos[2]),
+        *(drawn(f"init_{angle}", angles, [i], "rad") for i, angle in enumerate(("roll", "pitch", "yaw"))),
+        dataclasses.replace(dof_pos, own=pose, limits=(limits[0], limits[1])),
+        drawn("init_lin_vel", qvel, range(3), "m/s"),
+        drawn("init_ang_vel", qvel, range(3, 6), "rad/s"),
+        drawn("init_dof_vel", qvel, [6 + dof for dof in dofs], "rad/s"),
+    ]
+
+
+def initial_place(cfg: LeggedRobotCfg, qpos: Tensor) -> RandomParameter:
+    """Return x and y at which episodes start [m]."""
+    place = {"add": cfg.domain_rand.init_place}
+    return RandomParameter("init_place", qpos, range(2), place, "m", own=cfg.init_state.pos[:2])
+
+
+def robot_parameters(
+    draws: Mapping[str, Any],
+    model: mujoco.MjModel,
+    foot_names: Sequence[str],
+    control: ControlParameters,
+    torque_limits: Tensor,
+    symmetry: RobotSymmetry,
+) -> list[RandomParameter]:
+    """Return the parameters of the robot; its joints may keep their own values, all at once.
+
+    Args:
+        draws: The ranges of ``domain_rand`` by name.
+        model: The robot.
+        foot_names: Names of the feet's geoms.
+        control: Gains, in units of which "add" ranges of damping and stiffness are.
+        torque_limits: Highest torques [N m], in units of which "add" ranges of dry friction are. Shape: (num_dof,).
+        symmetry: Which joints and feet are mirror images of each other.
+    """
+    dofs, joints = range(6, model.nv), range(1, model.njnt)
+    feet = [model.geom(name).id for name in foot_names]
+    inertia_per_mass = list(model.body_inertia[TRUNK] / model.body_mass[TRUNK])
+    joint_values = symmetry.joints and symmetry.joints.unsigned()
+    foot_vectors = symmetry.foot_geoms and symmetry.foot_geoms.of_vectors(VECTOR)
+    are_round = set(model.geom_type[feet]) <= _ROUND
+    foot_radius = draws["foot_radius"] if are_round or "scale" not in draws["foot_radius"] else {}
+
+    def of_joints(name: str, field: str, columns: Sequence[int], unit: str, add_unit: Any = 1.0) -> RandomParameter:
+        return RandomParameter(
+            name, field, columns, draws[name], unit, add_unit=add_unit, may_keep=True, mirror=joint_values
+        )
+
+    mass, inertia = draws["trunk_mass"], entries(3, [TRUNK])
+    trunk: dict[str, Any] = {"shared": True, "add_unit": inertia_per_mass}
+    com: dict[str, Any] = {"shared": True, "listed_by_column": True, "mirror": VECTOR}
+    return [
+        RandomParameter("trunk_mass", "body_mass", [TRUNK], mass, "kg", at_least=LEAST_MASS),
+        RandomParameter("trunk_inertia", "body_inertia", inertia, mass, "kg m^2", same_draw_as="trunk_mass", **trunk),
+        RandomParameter("trunk_com", "body_ipos", entries(3, [TRUNK]), draws["trunk_com"], "m", **com),
+        RandomParameter("foot_radius", "geom_size", [3 * foot for foot in feet], foot_radius, "m", shared=True),
+        RandomParameter("foot_pos", "geom_pos", entries(3, feet), draws["foot_pos"], "m", mirror=foot_vectors),
+        of_joints("dof_damping", "dof_damping", dofs, "N m s/rad", control.d_gains[0].tolist()),
+        of_joints("dof_armature", "dof_armature", dofs, "kg m^2"),
+        of_joints("dof_stiffness", "jnt_stiffness", joints, "N m/rad", control.p_gains[0].tolist()),
+        of_joints("dof_frictionloss", "dof_frictionloss", dofs, "N m", torque_limits.tolist()),
+    ]
+
+
+def ground_parameters(draws: Mapping[str, Any], model: mujoco.MjModel) -> list[RandomParameter]:
+    """Return the parameters of the ground, the same for all geoms of a world; arguments as of robot_parameters."""
+    geoms = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
+    kinds = list(
+        (model.geom_friction[geoms] / model.geom_friction[geoms, :1]).ravel()
+    )  # tangential, torsional, rolling
+    stiffness, damping = [2 * geom for geom in geoms], [2 * geom + 1 for geom in geoms]
+    solref: dict[str, Any] = {"shared": True, "set_unit": -1.0}  # MuJoCo's direct format has negative numbers
+    shared: dict[str, Any] = {"shared": True, "set_unit": kinds}
+    late: dict[str, Any] = {"same_draw_as": "contact_stiffness"}
+    return [
+        RandomParameter("ground_friction", "geom_friction", entries(3, geoms), draws["ground_friction"], **shared),
+        RandomParameter("contact_stiffness", "geom_solref", stiffness, draws["contact_stiffness"], **solref),
+        RandomParameter("contact_damping", "geom_solref", damping, draws["contact_damping"], **late, **solref),
+        RandomParameter("gravity", "gravity", [2], draws["gravity"], "m/s^2", set_unit=-1.0),
+    ]
+
+
+def control_parameters(
+    draws: Mapping[str, Any], control: ControlParameters, strength: Tensor, symmetry: RobotSymmetry
+) -> list[RandomParameter]:
+    """Return the parameters of motors and controller; arguments as of robot_parameters.
+
+    ``strength`` are the factors of all motors. Shape: (num_envs, num_dof).
+    """
+    joints, mirror = range(strength.shape[1]), symmetry.joints
+
+    def of_joints(name: str, field: Tensor, unit: str, least: float) -> RandomParameter:
+        images = mirror.unsigned() if mirror and "scale_per_joint" in draws[name] else None
+        return RandomParameter(name, field, joints, draws[name], unit, shared=True, at_least=least, mirror=images)
+
+    scale = draws["action_scale"]
+    return [
+        of_joints("motor_strength", strength, "", -math.inf),
+        RandomParameter("joint_offset", control.joint_offset, joints, draws["joint_offset"], "rad", mirror=mirror),
+        RandomParameter("action_scale", control.action_scale, [0], scale, "rad", at_least=0.0),
+        RandomParameter(
+            "torque_scale",
+            control.torque_scale,
+            [0],
+            scale,
+            "N m",
+            same_draw_as="action_scale",
+            add_unit=control.torque_per_position,
+        ),
+        of_joints("stiffness", control.p_gains, "N m/rad", 0.0),
+        of_joints("damping", control.d_gains, "N m s/rad", 0.0),
+    ]
+
+
+def with_settings(parameters: Sequence[RandomParameter], rand: Any, draws: Mapping[str, Any]) -> list[RandomParameter]:
+    """Return parameters as ``domain_rand`` asks for: those of ``keep_fixed`` keep their own values.
+
+    Parameters without ranges of their own in ``draws`` go with the one whose draws they take. Bounds hold only where
+    anything is drawn.
+    """
+    kept = []
+    for parameter in parameters:
+        setting = parameter.name if parameter.name in draws else parameter.same_draw_as or parameter.name
+        kept.append(fixed(parameter) if setting in rand.keep_fixed else parameter)
+    if rand.randomize_parameters:
+        return kept
+    return [dataclasses.replace(parameter, at_least=-math.inf) for parameter in kept]
+
+
+def mirrors(drawn: Sequence[RandomParameter], sizes: Mapping[str, int]) -> dict[str, Mirroring | None]:
+    """Return the mirror images of the numbers of :attr:`Randomization.values`, by name; None where it is not known.
+
+    ``sizes`` says how many numbers of its own each of the drawn parameters has.
+    """
+    own = [parameter for parameter in drawn if parameter.name in sizes]
+    for p in own:
+        if p.mirror and len(p.mirror.order) != sizes[p.name]:
+            raise UserError(f"the mirror image of the random parameter '{p.name}' must have {sizes[p.name]} numbers")
+    return {p.name: p.mirror or (SCALAR if sizes[p.name] == 1 else None) for p in own}
+
+
+def entries(width: int, rows: Sequence[int]) -> list[int]:
+    """Return the places of all numbers of some entries that have ``width`` numbers each."""
+    return [row * width + part for row in rows for part in range(width)]

@@ -1,0 +1,47 @@
+"""Proximal policy optimization, with torch's operations or, where they can do it, with Triton's kernels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+
+from legged_torque.envs.base.symmetry import with_mirror_images
+from legged_torque.learning.distribution import GaussianDistribution
+from legged_torque.learning.multi_head import MultiHeadModel
+from legged_torque.learning.ppo.torch_ppo import LOSS_NAMES as LOSS_NAMES
+from legged_torque.learning.ppo.torch_ppo import TorchPPO
+from legged_torque.learning.ppo.triton.networks import read_network
+from legged_torque.sim.compiled import has_triton
+
+
+class OnDevicePPO(TorchPPO):
+    """The PPO that settings name; :meth:`construct_algorithm` chooses Triton's kernels where that is possible."""
+
+    @classmethod
+    def make(cls, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> TorchPPO:
+        """Return the algorithm with Triton's kernels on a GPU that can run them, if they know all of its parts."""
+        alg = cls(actor, critic, storage, **settings)
+        if not has_triton(alg.device) or not has_kernels(alg):
+            return alg
+        from legged_torque.learning.ppo.triton.triton_ppo import TritonPPO, can_multiply  # imports Triton
+
+        dtype = torch.bfloat16 if alg.use_mixed_precision else torch.float32
+        return TritonPPO(actor, critic, storage, **settings) if can_multiply(dtype, alg.device) else alg
+
+
+def has_kernels(alg: TorchPPO) -> bool:
+    """Return whether there are kernels for all parts of an algorithm; there are none for classes of a user's."""
+    models, symmetry = (alg.actor, alg.critic), alg.symmetry
+    return (
+        type(alg) is OnDevicePPO
+        and all(type(model) in (MLPModel, MultiHeadModel) for model in models)
+        and type(alg.actor.distribution) is GaussianDistribution
+        and all(read_network(model.mlp) and not model.obs_normalization for model in models)
+        and all(parameter.requires_grad for model in models for parameter in model.parameters())
+        and not alg.normalize_advantage_per_mini_batch
+        and not (symmetry and symmetry.use_mirror_loss)
+        and not (symmetry and symmetry.data_augmentation_func is not with_mirror_images)
+    )

@@ -1,0 +1,182 @@
+"""The interfaces between the trainer, what learns, and the task in which it learns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from legged_torque.sim.health import Watched
+from legged_torque.utils.errors import UserError
+
+
+@dataclass(frozen=True)
+class Transition:
+    """One control step in every world, in tensors that the next step may overwrite: copy what is kept.
+
+    Attributes:
+        obs: Observations from which the actions were chosen. Shape: (num_envs, size) per group.
+        actions: Shape: (num_envs, num_actions).
+        rewards: Shape: (num_envs,).
+        dones: Worlds whose episode has ended. Shape: (num_envs,), bool.
+        time_outs: Those of them whose time was over, if the task reports them. Shape: (num_envs,), bool.
+        obs_after: Observations from which the next actions are chosen, in ended worlds those of the new episode.
+        next_obs: Observations before any reset, for a learner with ``needs_next_obs``; otherwise None.
+        extras: All else that the task's step has returned.
+    """
+
+    obs: TensorDict
+    actions: Tensor
+    rewards: Tensor
+    dones: Tensor
+    time_outs: Tensor | None
+    obs_after: TensorDict
+    next_obs: TensorDict | None
+    extras: dict[str, Any]
+
+
+class Learner(Protocol):
+    """A reinforcement learning algorithm, built by ``construct_algorithm(obs, env, cfg, device)`` as in rsl_rl.
+
+    Three methods are optional. ``set_progress(iteration, num_iterations)`` is called before each update.
+    ``broadcast_parameters()`` gives all processes the parameters of the first one; a learner without it trains in one
+    process only. ``close()`` is called when training is over.
+
+    Attributes:
+        capturable: Whether :meth:`act` and :meth:`observe` may be captured in a CUDA graph: fixed shapes and addresses,
+            and no wait for the host. Their Python code then runs for the first two rollouts only.
+        needs_next_obs: Whether transitions need observations before resets, which cost the task time.
+    """
+
+    capturable: bool
+    needs_next_obs: bool
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Return the actions of all worlds, with exploration. Shape: (num_envs, num_actions)."""
+
+    def observe(self, transition: Transition) -> None:
+        """Keep what followed the last actions."""
+
+    def due(self) -> bool:
+        """Return whether to update now; asked after each rollout of ``runner.num_steps_per_env`` steps."""
+
+    def update(self) -> dict[str, Any]:
+        """Learn, and return numbers or scalar tensors to be logged as losses.
+
+        Some names have a meaning: "learning_rate"; "action_std", the mean standard deviation of actions;
+        "skipped_updates", gradient steps that were not made since numbers were not finite; "all_skipped", true if
+        none was made.
+        """
+
+    def policy(self) -> nn.Module:
+        """Return the network from observations to mean actions, always the same object."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return tensors and plain values from which learning continues, in memory of their own."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a :meth:`state_dict`, which may have further entries."""
+
+
+class EpisodeLog(Protocol):
+    """Sums over the steps of a task."""
+
+    def read(self, max_episode_length_s: float) -> dict[str, float]:
+        """Return means since the last call, with "return" and "length" [steps] of ended episodes if there are any."""
+
+
+class Health(Protocol):
+    """Counts of numbers that were not finite."""
+
+    def read(self) -> tuple[float, dict[Watched, int]]:
+        """Return the share of worlds that have diverged since the last call, and resets by tensor that caused them."""
+
+
+class Task(Protocol):
+    """A batch of worlds.
+
+    Some methods are optional. ``make_evaluation(num_envs, perturbation)`` returns an :class:`Evaluation`; without it,
+    ``evaluation.interval`` must be 0. Worlds of a task with these three go on in a resumed training, others start anew:
+    ``identity()`` returns "settings" by dotted path and hashes by what they are of, which must not change, as plain
+    values; ``world_state_dict()`` and ``load_world_state_dict(state)`` are for tensors, in nested dictionaries.
+
+    Attributes:
+        device: "cpu" or "cuda:N".
+        dt: Length of a control step [s].
+        max_episode_length: Length of an episode [steps].
+        num_processes: Processes that train together, set by the trainer.
+        total_steps: Steps so far over all worlds of all processes. Scalar, int64.
+        episode_length_buf: Steps since the start of each world's episode. Shape: (num_envs,), int64.
+    """
+
+    num_envs: int
+    num_actions: int
+    device: str
+    dt: float
+    max_episode_length: int
+    num_processes: int
+    total_steps: Tensor
+    episode_length_buf: Tensor
+    log: EpisodeLog
+    health: Health
+
+    def get_observations(self) -> TensorDict:
+        """Return the current observations."""
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+        """Return observations, rewards, dones and extras: "time_outs", and "final_observations" if they are kept."""
+
+    def compile(self) -> None:
+        """Prepare for speed; called before each rollout."""
+
+    def update_curriculum(self) -> None:
+        """Change what may change between rollouts only; called before each of them."""
+
+    def curriculum_values(self) -> dict[str, Tensor]:
+        """Return scalars of curricula to be logged."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the counters that a checkpoint keeps."""
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from the counters of a checkpoint."""
+
+    def check_buffers(self) -> str | None:
+        """Return a warning if the simulation has dropped anything; called with each checkpoint."""
+
+
+class Evaluation(Protocol):
+    """Worlds of their own in which a policy is measured while it trains.
+
+    Attributes:
+        task: The worlds, a :class:`Task` that keeps its worlds.
+    """
+
+    task: Any
+
+    def step(self, actions: Tensor) -> TensorDict:
+        """Make a step, count it, and return the observations; may be captured in a CUDA graph."""
+
+    def clear(self) -> None:
+        """Forget the steps so far."""
+
+    def means(self) -> dict[str, float]:
+        """Return the metrics of the steps so far."""
+
+    def levels(self) -> dict[str, float]:
+        """Return the present levels of the curricula of the training's ground."""
+
+
+def check_learner(alg: Any, env: Any, num_processes: int) -> None:
+    """Raise a UserError if an object is no :class:`Learner`, or needs what the task or several processes lack."""
+    name = type(alg).__name__
+    members = [*Learner.__annotations__, *(name for name in vars(Learner) if not name.startswith("_"))]
+    missing = [member for member in members if not hasattr(alg, member)]
+    if missing:
+        raise UserError(f"algorithm.class_name: {name} is no learner, it lacks {', '.join(missing)}")
+    if alg.needs_next_obs and not hasattr(env, "keep_final_observations"):
+        raise UserError(f"{name} needs observations before resets, which {type(env).__name__} does not keep")
+    if num_processes > 1 and not hasattr(alg, "broadcast_parameters"):
+        raise UserError(f"{name} trains in one process only: it has no broadcast_parameters()")

@@ -1,0 +1,117 @@
+"""Base of the settings of trainings: their checks, and the runner that they describe. Needs no torch."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+from legged_torque.utils.config import BaseConfig, flat, to_dict
+from legged_torque.utils.errors import UserError, unknown_name
+
+if TYPE_CHECKING:
+    from rsl_rl.env import VecEnv
+    from rsl_rl.runners import OnPolicyRunner
+
+CODE_NAMES = ("class_name", "function", "_func")
+"""Ends of the names of settings that name a class or a function, ``"module:Class"`` or a name in rsl_rl."""
+Activation: TypeAlias = Literal[
+    "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish", "identity"
+]
+"""Activation functions that rsl_rl's networks know."""
+
+
+class TrainingCfg(BaseConfig):
+    """Base of the settings of trainings; their sections are those of ``LeggedRobotCfgPPO``."""
+
+    def check(self) -> None:
+        """Raise a UserError that names the first setting with a value that is not allowed, alone or with others."""
+        super().check()
+        cfg: Any = self
+        rate = cfg.algorithm
+        if getattr(rate, "schedule", None) == "adaptive" and rate.learning_rate > rate.max_learning_rate:
+            most = f"at most algorithm.max_learning_rate, {rate.max_learning_rate}"
+            raise UserError(f"algorithm.learning_rate must be {most}, not {rate.learning_rate}")
+        if cfg.pretraining.file and not cfg.pretraining.function:
+            raise UserError(
+                "pretraining.file is set, but nothing starts from it: the task's pretraining.function is empty"
+            )
+        for key in ("run_name", "experiment_name"):
+            value = getattr(cfg.runner, key)
+            if value and (Path(value).name != value or value == ".." or not value.isprintable()):
+                raise UserError(f"runner.{key} must be a name, not the path '{value}'")
+
+    def presets(self) -> dict[str, dict[str, Any]]:
+        """Return the named changes to the settings of task and training that ``--preset`` chooses from."""
+        return {"parallel": {}}
+
+    def check_code_names(self, registered: Iterable[TrainingCfg]) -> None:
+        """Refuse, by UserError, names of code that none of the ``registered`` settings or their presets have.
+
+        Settings may come from a stranger's file: a run's ``config.yaml`` or the description of an experiment. Importing
+        a name would run any code that is installed. The tasks that are registered are the user's own.
+        """
+        unknown, known = code_names(to_dict(self)), dict[str, list[Any]]()
+        for cfg in registered:
+            if not unknown:  # mostly after the first one, of many
+                return
+            for settings in (to_dict(cfg), *cfg.presets().values()):
+                for path, name in code_names(settings).items():
+                    known.setdefault(path, []).append(name)
+            unknown = {path: name for path, name in unknown.items() if name not in known.get(path, [])}
+        for path, name in unknown.items():
+            error = unknown_name(path, str(name), {str(other) for other in known.get(path, []) if other})
+            raise UserError(f"{error}; these are the names that registered tasks have, register a task to add one")
+
+    def import_code(self) -> None:
+        """Import the classes and functions that the settings name, with torch; a UserError if one does not exist."""
+        from rsl_rl.utils import resolve_callable
+
+        for path, name in code_names(to_dict(self)).items():
+            try:
+                if name:
+                    resolve_callable(name)
+            except (ValueError, ImportError, AttributeError) as error:
+                raise UserError(f"{path}: {error}") from None
+
+    def make_runner(self, env: VecEnv, task: str | None, log_dir: str | None) -> OnPolicyRunner:
+        """Create the runner of these settings for a task.
+
+        Args:
+            env: The task.
+            task: Its name, for checkpoints.
+            log_dir: Folder of the run; None keeps nothing.
+        """
+        if log_dir and self.runner.logger == "wandb" and importlib.util.find_spec("wandb") is None:  # type: ignore[attr-defined]
+            raise UserError("--logger wandb needs the extra: pip install 'legged_torque[wandb]'")
+        from rsl_rl.utils import resolve_callable
+
+        settings = self.to_rsl_rl()
+        # A runner of rsl_rl's own, which a user may register, would run code that a checkpoint holds.
+        os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
+        with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints its networks at length
+            runner_class = resolve_callable(settings["class_name"])
+            return runner_class(env, settings | {"task": task}, log_dir, env.device)
+
+    def to_rsl_rl(self) -> dict[str, Any]:
+        """Return the settings in the layout that rsl_rl's runner takes."""
+        settings = to_dict(self)
+        runner = settings.pop("runner")
+        loggers = {
+            "tensorboard": {"class_name": "tensorboard"},
+            "wandb": {
+                "class_name": "legged_torque.learning.training_log:WandbWriter",
+                "project_name": runner["wandb_project"],
+            },
+            "none": {"class_name": "legged_torque.learning.training_log:NoLogWriter"},
+        }
+        return {**runner, **settings, "logger": loggers[runner["logger"]]}
+
+
+def code_names(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return every setting that names a class or a function, by its dotted path."""
+    return {path: name for path, name in flat(settings).items() if path.endswith(CODE_NAMES)}

@@ -1,0 +1,105 @@
+"""The chain of links from the policy's actions to the torques of the joints."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from legged_torque.motors.config import MotorCfg
+from legged_torque.motors.joints import Joints
+from legged_torque.motors.kernel import Part, torque_kernel
+from legged_torque.motors.motor import Motor
+from legged_torque.sim.randomization import RandomParameter
+from legged_torque.utils.errors import UserError, unknown_name
+
+
+class MotorChain:
+    """Links in the order of ``motors.chain``: first those that act on actions, then those that act on torques.
+
+    Between them the control law computes the torques that motors are asked for, and each motor gives its strength times
+    them to the next link.
+
+    Attributes:
+        links: The links by name.
+        strength: Factors on the torques that motors are asked for, drawn at random. Shape: (num_envs, num_dof).
+    """
+
+    def __init__(self, settings: Any, joints: Joints) -> None:
+        """Build the links of a section ``motors`` of settings.
+
+        A UserError names a link without a section, one that occurs twice, or one of actions behind one of torques.
+        """
+        known = [name for name, value in vars(settings).items() if isinstance(value, MotorCfg)]
+        self.links: dict[str, Motor] = {}
+        for name in settings.chain:
+            if name not in known:
+                raise unknown_name("motors.chain", name, known)
+            if name in self.links:
+                raise UserError(f"motors.chain has the link '{name}' twice; give the second one a section of its own")
+            self.links[name] = getattr(settings, name).build(joints)
+        self._of_actions, self._of_torques = (
+            [link for link in self.links.values() if link.acts_on == kind] for kind in ("actions", "torques")
+        )
+        if list(self.links.values()) != [*self._of_actions, *self._of_torques]:
+            raise UserError(f"motors.chain must have links that act on actions first, not {', '.join(self.links)}")
+        self.strength = torch.ones(joints.num_envs, len(joints.names), device=joints.device)
+        self._actions = joints.actions
+
+    def send(self, actions: Tensor) -> None:
+        """Take the actions of a new control step. Shape: (num_envs, num_actions)."""
+        for link in self.links.values():
+            link.send(actions)
+
+    def actions(self, pos: Tensor, vel: Tensor, substep: int) -> Tensor:
+        """Return the actions that have reached the motors by a physics step. Shape: (num_envs, num_actions)."""
+        actions = self._actions
+        for link in self._of_actions:
+            actions = link.apply(actions, pos, vel, substep)
+        return actions
+
+    def apply(self, wanted: Tensor, pos: Tensor, vel: Tensor, substep: int) -> Tensor:
+        """Return the torques that joints get of those that a control law asks for [N m].
+
+        Called once per physics step; arguments as of :meth:`~legged_torque.motors.motor.Motor.apply`.
+        """
+        torques = self.strength * wanted
+        for link in self._of_torques:
+            torques = link.apply(torques, pos, vel, substep)
+        return torques
+
+    def kernel(self, law: Part) -> Part | None:
+        """Return the whole chain behind a control law as one Warp function; None if a link has none.
+
+        The function is as :func:`~legged_torque.motors.kernel.torque_kernel` returns it.
+        """
+        if len(self._of_actions) > 1 or any(link.kernel is None for link in self.links.values()):
+            return None
+        parts = {name: (link.kernel, link.kernel_reads()) for name, link in self.links.items()}
+        of_actions = [parts[name] for name, link in self.links.items() if link.acts_on == "actions"]
+        of_torques = [parts[name] for name, link in self.links.items() if link.acts_on == "torques"]
+        return torque_kernel(law, self.strength, of_actions[0] if of_actions else self._actions, of_torques)
+
+    def reset(self, mask: Tensor) -> None:
+        """Forget what belongs to episodes that have ended. Shape: (num_envs,), bool."""
+        for link in self.links.values():
+            link.reset(mask)
+
+    def random_parameters(self) -> list[RandomParameter]:
+        """Return what is drawn of all links."""
+        return [parameter for link in self.links.values() for parameter in link.random_parameters()]
+
+    def describe(self) -> dict[str, dict[str, Any]]:
+        """Return the constants of all links that do more than limit torques, for ``policy.yaml``."""
+        described = {name: link.describe() for name, link in self.links.items()}
+        return {name: constants for name, constants in described.items() if constants}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what all links keep from step to step, by name of the link."""
+        return {name: link.state_dict() for name, link in self.links.items()} | {"strength": self.strength}
+
+    def watched(self) -> dict[str, Tensor]:
+        """Return the tensors that must be finite in every world. Shapes: (num_envs, any)."""
+        states = ((name, link.state_dict()) for name, link in self.links.items())
+        return {f"{name}.{key}": value.flatten(1) for name, state in states for key, value in state.items()}

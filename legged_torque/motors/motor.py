@@ -1,0 +1,65 @@
+"""The interface of motor models."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from torch import Tensor
+
+from legged_torque.motors.config import MotorCfg
+from legged_torque.motors.joints import Joints
+from legged_torque.sim.randomization import RandomParameter
+from legged_torque.utils.buffers import Buffers
+
+
+class Motor(Buffers):
+    """One link of the chain from the policy to the joints: a model of a motor, a delay, a limit.
+
+    A model is a subclass with :meth:`apply`, and a section of settings whose ``build`` makes it, named in
+    ``motors.chain``. It may name a Warp function, :attr:`kernel`; if all links do, torques are computed inside the
+    physics kernel. What it keeps from step to step is made by :meth:`~legged_torque.utils.buffers.Buffers.buffer`, and
+    then part of checkpoints.
+    """
+
+    acts_on: ClassVar[str] = "torques"
+    """"torques", those that the control law asks for, or "actions", before the control law sees them."""
+    kernel: ClassVar[Any] = None
+    """A Warp function that does the same as :meth:`apply` for one joint of one world, inside the physics kernel.
+
+    Of torques: ``(reads, world, joint, substep, wanted, pos, vel) -> torque [N m]``, where ``reads`` is the struct that
+    :meth:`kernel_reads` returns. Of actions: ``(reads, world, substep) -> row of actions``.
+    """
+
+    def __init__(self, cfg: MotorCfg, joints: Joints) -> None:
+        """Create the motors of all worlds."""
+        super().__init__(joints.num_envs, joints.device)
+        self.cfg, self.joints = cfg, joints
+
+    def send(self, actions: Tensor) -> None:
+        """Take the actions of a new control step, before its physics steps. Shape: (num_envs, num_actions)."""
+
+    def apply(self, wanted: Tensor, pos: Tensor, vel: Tensor, substep: int) -> Tensor:
+        """Return the torques that come out of this link [N m]; runs at every physics step, inside a CUDA graph.
+
+        Args:
+            wanted: Torques that come in [N m]. Of links that act on actions: nothing is read, actions are returned.
+            pos: Joint positions [rad]. Shapes: (num_envs, num_dof).
+            vel: Joint velocities [rad/s].
+            substep: Number of the physics step within the control step.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no apply")
+
+    def kernel_reads(self) -> Any:
+        """Return what :attr:`kernel` reads: an instance of the Warp struct of its first parameter."""
+        raise NotImplementedError(f"{type(self).__name__} names a kernel without kernel_reads")
+
+    def reset(self, mask: Tensor) -> None:
+        """Forget what belongs to episodes that have ended. Shape: (num_envs,), bool."""
+
+    def random_parameters(self) -> list[RandomParameter]:
+        """Return what is drawn of these motors, at resets and at random or at resets alone."""
+        return []
+
+    def describe(self) -> dict[str, Any]:
+        """Return the constants of this link for ``policy.yaml``, plain values; empty if it does nothing."""
+        return {}

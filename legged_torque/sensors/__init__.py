@@ -1,0 +1,1 @@
+"""Sensors: measurements of each world at a rate of their own, late and with errors."""

@@ -1,0 +1,64 @@
+"""The interface of sensors."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from legged_torque.envs.base.state import RobotState
+from legged_torque.sensors.config import SensorCfg
+from legged_torque.utils.buffers import Buffers
+from legged_torque.utils.errors import UserError
+
+
+class Sensor(Buffers):
+    """Measures numbers, vectors or images of all worlds.
+
+    A sensor is a subclass with :meth:`shape` and :meth:`measure`, and a section of ``sensors`` whose ``build`` makes
+    it. Observation terms read :attr:`values` of ``LeggedRobot.sensors[name]``. Measurements are kept, held and delayed
+    here, inside a CUDA graph, and are part of checkpoints.
+
+    Attributes:
+        newest: The last measurement, with errors. Shape: (num_envs, *shape()).
+        values: The same, late. Shape: (num_envs, *shape()).
+    """
+
+    compilable = True
+    """Whether :meth:`measure` has torch's operations only. One that launches kernels of Warp says False."""
+
+    def __init__(self, cfg: SensorCfg, state: RobotState) -> None:
+        """Allocate what is kept. A UserError if the rate does not divide that of the control steps."""
+        super().__init__(state.num_envs, state.device)
+        self.cfg, self.state = cfg, state
+        steps = 1.0 / (cfg.rate * state.dt) if cfg.rate else 1.0
+        self.interval = round(steps)  # control steps from one measurement to the next
+        if abs(steps - self.interval) > 1e-6 * steps:
+            raise UserError(
+                f"a sensor's rate must divide that of the control steps, {1 / state.dt:g} Hz, not {cfg.rate:g}"
+            )
+        self.delay = round(cfg.delay / state.dt)  # control steps
+        self.has_noise = False  # whether errors are added; the task sets it
+        self._kept = self.buffer("kept", self.delay + 1, *self.shape())  # the newest first
+        self.newest, self.values = self._kept[:, 0], self._kept[:, -1]
+
+    def shape(self) -> tuple[int, ...]:
+        """Return the shape of a world's measurement."""
+        raise NotImplementedError(f"{type(self).__name__} has no shape")
+
+    def measure(self) -> Tensor:
+        """Return a measurement of this moment, without delay and errors. Shape: (num_envs, *shape())."""
+        raise NotImplementedError(f"{type(self).__name__} has no measure")
+
+    def update(self, is_new: Tensor) -> None:
+        """Measure, where and when it is time, once per control step.
+
+        Where an episode has just started, as ``is_new`` says, nothing from before is left. Shape: (num_envs,), bool.
+        """
+        now, new = self.measure(), is_new.view(-1, *[1] * len(self.shape()))
+        if self.has_noise and self.cfg.noise:
+            now = now + self.cfg.noise * (2.0 * torch.rand_like(now) - 1.0)
+        if self.interval > 1:
+            is_due = (self.state.episode_length % self.interval == 0).view(new.shape)
+            now = torch.where(is_due | new, now, self.newest)
+        now, new = now.unsqueeze(1), new.unsqueeze(1)
+        self._kept.copy_(torch.cat([now, torch.where(new, now, self._kept[:, :-1])], dim=1) if self.delay else now)

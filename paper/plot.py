@@ -1,0 +1,76 @@
+"""Figures of ``scripts/plot.py`` on the paper's methods: learning curves, and reports on gravity pre-training."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from legged_torque.paper.report import check_extra
+from legged_torque.utils.cli import Parser, check_output, slow_imports
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.plotting import load_pyplot, read_data, save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BLUE, ORANGE = "#0072B2", "#D55E00"  # which colour-blind readers can tell apart
+
+
+def plot_curves() -> None:
+    """Draw a panel per metric and a line per training."""
+    example = "python scripts/plot.py curves CURVES.csv.gz --out curves.png"
+    parser = Parser(f"Draw learning curves (Figure 3): ``{example}``.")
+    help_text = "JSON of learning_curve.py, evaluations.csv of a run, or evaluations.csv.gz of a report"
+    parser.add_argument("files", type=Path, nargs="+", help=help_text)
+    parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
+    args = parser.parse_args()
+    check_output(args.out)
+    with slow_imports():
+        check_extra()
+        from legged_torque.paper.report.figures_curves import draw_single_curves
+    save_figure(draw_single_curves(args.files), args.out)
+
+
+def plot_pretraining() -> None:
+    """Draw torques, residuals, learning and standing of a pre-training in four panels."""
+    example = "python scripts/plot.py pretraining report.json --out pretraining.png"
+    parser = Parser(f"Draw a report on gravity pre-training: ``{example}``.")
+    parser.add_argument("file", type=Path, help="report of pretrain_gravity.py --json")
+    parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
+    args = parser.parse_args()
+    check_output(args.out)
+    figure, axes = load_pyplot().subplots(1, 4, figsize=(17, 4), layout="constrained")
+    report = read_data(args.file, {"histograms", "settings", "rms_error", "standing"}, "pretrain_gravity.py")
+    try:
+        _draw_histogram(axes[0], report, "mean_torque", "torques", "mean absolute torque [N m]")
+        _draw_histogram(axes[1], report, "residual", "contact residuals", "wrench residual [weight]")
+        _draw_learning(axes[2], report["rms_error"])
+        _draw_standing(axes[3], report["standing"])
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(f"'{args.file}' is not a whole report of pretrain_gravity.py: {error!r}") from None
+    save_figure(figure, args.out)
+
+
+def _draw_histogram(axis: Axes, report: dict[str, Any], name: str, title: str, label: str) -> None:
+    """Draw counts on a logarithmic axis, and the limit beyond which pairs are dropped."""
+    histogram, limit = report["histograms"][name], report["settings"][f"max_{name}"]
+    axis.stairs(histogram["counts"], histogram["edges"], fill=True, color=BLUE)
+    axis.axvline(limit, color=ORANGE, linestyle="--", label=f"dropped beyond {limit:g}")
+    axis.set(title=title, xlabel=label, ylabel="pairs", yscale="log")
+    axis.legend()
+
+
+def _draw_learning(axis: Axes, errors: dict[str, Sequence[float]]) -> None:
+    """Draw root mean square errors in training and on held out pairs over epochs."""
+    for (name, values), color, line in zip(errors.items(), (BLUE, ORANGE), ("-", "--"), strict=True):
+        axis.plot(range(1, len(values) + 1), values, line, color=color, label=name.replace("_", " "))
+    axis.set(title="learned torques", xlabel="epoch", ylabel="root mean square error [N m]", ylim=(0, None))
+    axis.legend()
+
+
+def _draw_standing(axis: Axes, shares: dict[str, float]) -> None:
+    """Draw how many worlds of controller and policy stand."""
+    bars = axis.bar(list(shares), [100 * share for share in shares.values()], color=[ORANGE, BLUE], width=0.6)
+    axis.bar_label(bars, fmt="%.1f %%")
+    axis.set(title="standing after 5 s", ylabel="worlds [%]", ylim=(0, 110))

@@ -1,0 +1,205 @@
+"""Control steps that replay as a CUDA graph.
+
+They compute what they do without, wait for nothing, take no memory, keep bad numbers where they are, and draw at random
+what they should.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import kstest
+from support.on_device import make_env, no_waiting, sim_of, use_graphs, used_memory
+
+WORLDS = 1024
+WORDS = ["--task=a1_torque_multihead", f"--num_envs={WORLDS}", "--perturbation=low"]
+
+
+def actions_of(env, step):
+    """Random actions, the same in each step of each test."""
+    generator = torch.Generator(env.device).manual_seed(step)
+    return torch.randn(env.num_envs, env.num_actions, device=env.device, generator=generator)
+
+
+def outcome(env, step):
+    """Take a step from a seed, and return copies of what came of it."""
+    torch.manual_seed(100 + step)
+    obs, rewards, dones, extras = env.step(actions_of(env, step))
+    exact = {"dones": dones, "time outs": extras["time_outs"], "qpos": sim_of(env).qpos, "qvel": sim_of(env).qvel}
+    rounded = {**obs, "rewards": rewards, "episode sums": env.episode_sums, "air time": env.feet_air_time}
+    return tuple({name: value.clone() for name, value in part.items()} for part in (exact, rounded))
+
+
+def test_compiled_as_eager(device, capfd):
+    """What ``torch.compile`` makes of a step is the step but for rounding; no part of it is left uncompiled."""
+    eager, compiled = (make_env(device, *WORDS, "--set=env.episode_length_s=1")[0] for _ in range(2))
+    compiled.compile()
+    for env in (eager, compiled):
+        torch.manual_seed(0)
+        env.reset()
+        env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
+    ended = 0
+    for step in range(12):
+        (exact, rounded), (same, close) = outcome(eager, step), outcome(compiled, step)
+        ended += int(exact["dones"].sum())
+        for name, value in exact.items():
+            assert torch.equal(same[name], value), (step, name)
+        for name, value in rounded.items():
+            torch.testing.assert_close(close[name], value, rtol=1e-4, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
+    assert ended > 100 and "uncompiled" not in capfd.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def walking(device):
+    """A compiled task whose steps are replayed."""
+    env, _ = make_env(device, *WORDS)
+    env.compile()
+    for step in range(4):
+        env.step(actions_of(env, step))
+    return env
+
+
+def test_a_step_waits_for_nothing(device, walking):
+    """Nothing is read back to the host, replayed or not: torch would refuse it here."""
+    actions = actions_of(walking, 0)
+    for is_replayed in (False, True):
+        use_graphs(walking, is_replayed)
+        walking.step(actions)
+        with no_waiting(device):
+            for _ in range(5):
+                walking.step(actions)
+
+
+def test_a_thousand_steps_take_no_memory(device, walking):
+    """What torch and Warp hold of the GPU stays as it is."""
+    actions = actions_of(walking, 0)
+    before = used_memory(device)
+    for _ in range(1000 if device != "cpu" else 10):
+        walking.step(actions)
+    assert used_memory(device) == before
+
+
+def test_bad_numbers_end_their_world(device):
+    """In a replayed step their worlds start anew without a reward; the others do not notice, to the bit."""
+    broken, healthy = (make_env(device, *WORDS)[0] for _ in range(2))
+    worlds = torch.tensor([3, 500, WORLDS - 1], device=device)
+    others = torch.ones(WORLDS, dtype=torch.bool, device=device)
+    others[worlds] = False
+    for env in (broken, healthy):
+        torch.manual_seed(0)
+        env.reset()
+    for step in range(8):
+        actions = actions_of(broken, step)
+        if step == 4:
+            sim_of(broken).qpos[worlds[0], 8] = math.nan
+            sim_of(broken).qvel[worlds[1], 10] = math.inf
+        results = []
+        for env in (broken, healthy):
+            torch.manual_seed(step)
+            given = actions.clone()
+            if step == 4 and env is broken:
+                given[worlds[2], 0] = math.nan
+            obs, rewards, dones, _ = env.step(given)
+            state = (sim_of(env).qpos, sim_of(env).qvel)
+            results.append([tensor.clone() for tensor in (*obs.values(), rewards, dones, *state)])
+        for mine, other in zip(*results, strict=True):
+            assert torch.isfinite(mine).all() and torch.equal(mine[others], other[others]), step
+        if step == 4:
+            assert results[0][3][worlds].all() and not results[0][2][worlds].any()
+    assert int(broken.num_diverged) == 3 and int(healthy.num_diverged) == 0
+
+
+# ------------------------------------------------------------------------------------------------- drawn at random
+
+NUM = 4096
+MANY = [*WORDS, f"--num_envs={NUM}"]
+HIGH_UP = "--set=init_state.pos=[0,0,50]"  # nothing falls
+DRAWN = {  # numbers of a field of the model, and their range of the published set "default"
+    "body_mass": (1, (4.713 - 1.0, 4.713 + 1.0)),
+    "dof_damping": (6, (0.0, 0.2)),
+    "dof_armature": (17, (0.008, 0.02)),
+    "dof_frictionloss": (10, (0.0, 0.4)),
+    "jnt_stiffness": (12, (0.0, 0.2)),
+    "gravity": (2, (-10.11, -9.51)),
+}
+
+
+def take_steps(env, count):
+    """Let robots do nothing for some steps."""
+    for _ in range(count):
+        env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
+
+
+def assert_uniform(values, low, high):
+    """Kolmogorov's test, which 1 in 100,000 samples of a uniform distribution fails."""
+    sample = values.double().cpu().numpy().ravel()
+    assert kstest(sample, "uniform", (low, high - low)).statistic * np.sqrt(len(sample)) < 2.5
+
+
+def numbers(env):
+    """The chosen number of each field in all worlds. Shape: (fields, num_envs)."""
+    fields = {name: sim_of(env).field(name).flatten(1) for name in DRAWN}
+    return torch.stack([field[:, DRAWN[name][0]] for name, field in fields.items()])
+
+
+def test_parameters(device):
+    """Draws are uniform in their ranges, no two of them go together, and each step draws in its share of worlds."""
+    env, _ = make_env(device, *MANY, HIGH_UP, "--set=domain_rand.resampling_probability=0.3")
+    take_steps(env, 3)
+    before = numbers(env).clone()
+    take_steps(env, 1)
+    after = numbers(env)
+    changed = (after != before).any(dim=0)
+    assert abs(float(changed.float().mean()) - 0.3) < 4.0 * math.sqrt(0.21 / NUM)
+    assert (after[:, ~changed] == before[:, ~changed]).all()
+    for values, (_, limits) in zip(after, DRAWN.values(), strict=True):
+        assert_uniform(values, *limits)
+        assert_uniform(values[changed], *limits)
+    correlation = torch.corrcoef(torch.cat([after, before])[:, changed]) - torch.eye(2 * len(DRAWN), device=device)
+    assert correlation.abs().max() < 4.5 / math.sqrt(int(changed.sum()))
+
+
+def test_pushes(device):
+    """Their share, their sizes, and that half of them add to the velocity: next to the same worlds without pushes."""
+    pushes = ["--set=domain_rand.push_probability=0.3", "--set=domain_rand.push_velocity=[-2,2]"]
+    pushes += ["--set=domain_rand.push_set_factor=1.5"]
+    velocities = []
+    for on in (True, False):
+        env, _ = make_env(device, *MANY, HIGH_UP, *pushes, f"--set=domain_rand.push_robots={on}")
+        take_steps(env, 3)
+        torch.manual_seed(0)
+        env.reset()
+        sim_of(env).qvel[:, :3] = 10.0  # whatever pushes the reset has brought
+        take_steps(env, 1)
+        velocities.append(sim_of(env).qvel[:, :3].clone())
+    pushed, undisturbed = velocities
+    mask = (pushed != undisturbed).any(dim=1)
+    assert abs(float(mask.float().mean()) - 0.3) < 4.0 * math.sqrt(0.21 / NUM)
+    added = pushed[mask][:, 0] > 5.0
+    assert abs(float(added.float().mean()) - 0.5) < 4.0 * math.sqrt(0.25 / int(mask.sum()))
+    changes = torch.where(added.unsqueeze(1), pushed[mask] - undisturbed[mask], pushed[mask] / 1.5)
+    for axis in range(3):
+        assert_uniform(changes[:, axis], -2.0, 2.0)
+
+
+def test_new_episodes(device):
+    """Exactly the worlds whose time is over start anew: state, parameters, commands and counters."""
+    chances = ["domain_rand.resampling_probability", "domain_rand.push_probability", "commands.resampling_probability"]
+    env, _ = make_env(
+        device, *MANY, HIGH_UP, *(f"--set={name}=0" for name in chances), "--set=commands.heading_command=False"
+    )
+    take_steps(env, 3)
+    ends = torch.arange(NUM, device=device) % 5 == 0
+    env.episode_length_buf = torch.where(ends, int(env.max_episode_length), env.episode_length_buf)
+    before = {"parameters": numbers(env).T.clone(), "commands": env.commands.clone()}
+    _, _, dones, extras = env.step(torch.zeros(NUM, env.num_actions, device=device))
+    assert torch.equal(dones, ends) and torch.equal(extras["time_outs"], ends)
+    for name, now in {"parameters": numbers(env).T, "commands": env.commands}.items():
+        assert torch.equal(now[~ends], before[name][~ends]), name
+        assert (now[ends] != before[name][ends]).any(dim=1).all(), name
+    assert (env.episode_length_buf[ends] == 0).all() and (env.episode_length_buf[~ends] == 4).all()
+    height, velocity = sim_of(env).qpos[:, 2], sim_of(env).qvel
+    assert (height[ends] == 50.0).all() and (height[~ends] < 50.0).any()
+    assert_uniform(velocity[ends][:, 0], -0.5, 0.5)
+    assert_uniform(velocity[ends][:, 6:], -10.5, 10.5)

@@ -1,0 +1,84 @@
+"""Importing a robot's file never runs code from it, and the script writes both of its files or none."""
+
+import runpy
+import sys
+
+import pytest
+from support.published import as_mjcf, urdf
+from support.scripts import ROOT
+
+from legged_torque.envs import robots, tasks
+from legged_torque.envs.base.asset import load_asset
+from legged_torque.importer.mjcf import mjcf
+from legged_torque.importer.robot import import_robot
+from legged_torque.importer.settings import settings
+from legged_torque.importer.trial import parse
+from legged_torque.utils.errors import UserError
+
+HARMFUL = ["FL_'+str(open('PWNED', 'w'))+'", "FL_&quot;+str(open('PWNED', 'w'))+&quot;", "FL_&#10;x", "FL_\\", "FL_é"]
+
+
+@pytest.mark.parametrize("name", HARMFUL)
+@pytest.mark.parametrize("place", ["FL_calf", "LF_HAA", "LF_hip", "base"])
+def test_names_that_are_code(tmp_path, name, place):
+    """Names of bodies, joints and links are refused before they can become parts of a settings module."""
+    source = as_mjcf("") if place == "FL_calf" else urdf()
+    assert f'"{place}"' in source
+    file = tmp_path / "robot.xml"
+    file.write_text(source.replace(f'"{place}"', f'"{name}"'), encoding="utf-8")
+    with pytest.raises(UserError, match="names may have letters, digits"):
+        import_robot(file)
+
+
+def test_files_whose_names_are_code(tmp_path, monkeypatch):
+    """The name of the file, and that of the folder of its MJCF, are no code either, and its MJCF stays XML."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "a\"+str(open('PWNED', 'w'))+\"\nopen('PWNED', 'w')"
+    folder.mkdir()
+    file = folder / 'dog\nopen("PWNED", "w")#""" --->.urdf'
+    file.write_text(urdf())
+    robot = import_robot(file, "dog")
+    parse(mjcf(robot), file)
+    parts: dict = {"__name__": "dog"}
+    exec(compile(settings(robot, str(folder / "dog.xml")), "dog.py", "exec"), parts)
+    assert parts["DogCfg"]().asset.file == str(folder / "dog.xml")
+    assert not (tmp_path / "PWNED").exists()
+
+
+def test_a_broken_module(tmp_path, monkeypatch, capsys):
+    """It is reported in a line, and the other robots are there."""
+    (tmp_path / "broken.py").write_text("class Cfg(:\n")
+    before = [parts[0] for parts in tasks.further_robots()]
+    monkeypatch.setattr(robots, "__path__", [*robots.__path__, str(tmp_path)])
+    assert [parts[0] for parts in tasks.further_robots()] == before
+    assert "Note: the robot 'broken' is missing: SyntaxError" in capsys.readouterr().err
+
+
+def test_script(tmp_path, monkeypatch, capsys):
+    """The script writes both files once, says what simulates the robot, and writes over nothing."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dog.urdf").write_text(urdf())
+    monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--out", "new"])
+    runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
+    output = capsys.readouterr().out
+    assert "sim.engine 'fused' simulates it" in output
+    assert output.endswith(f"Train it: python {ROOT}/scripts/train.py --task=dog_position\n")
+    helper = "from legged_torque.envs.robots.a1 import A1Cfg\ndef half(number):\n    return number / 2\n"
+    (tmp_path / "new" / "legs_of_many.py").write_text(helper)
+    monkeypatch.setattr(robots, "__path__", [*robots.__path__, str(tmp_path / "new")])
+    (found,) = [parts for parts in tasks.further_robots() if parts[0] in ("dog", "legs_of_many")]
+    assert [name for name, *_ in tasks.tasks_of(*found)][:2] == ["dog_position", "dog_torque"]
+    (tmp_path / "new" / "two.py").write_text((tmp_path / "new" / "dog.py").read_text() + "class B(DogCfg): pass\n")
+    with pytest.raises(UserError, match=r"'two\.py' in envs/robots must have one class of this kind, not DogCfg, B"):
+        list(tasks.further_robots())
+    monkeypatch.chdir("/")
+    assert len(load_asset(found[1]()).feet) == 4
+    monkeypatch.chdir(tmp_path)
+    assert sorted(path.name for path in (tmp_path / "new").glob("dog.*")) == ["dog.py", "dog.xml"]
+    with pytest.raises(SystemExit, match="2"):
+        runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
+    assert "exists" in capsys.readouterr().err
+    monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--name", "go2_torque"])
+    with pytest.raises(SystemExit, match="2"):
+        runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
+    assert "names that are taken, as 'go2_torque_gravity'" in capsys.readouterr().err

@@ -1,0 +1,379 @@
+"""Acting and learning in few kernels against torch's autograd, torch's Adam and rsl_rl, in Triton's interpreter.
+
+The interpreter runs kernels on the CPU with the numbers' own precision: matrix products of float32 are exact there.
+"""
+
+import copy
+import math
+import os
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from support.rollouts import (
+    POISONS,
+    SETTINGS,
+    SIZES,
+    copy_rollout,
+    make_ppo,
+    parameters,
+    poison,
+    random_obs,
+    record_rollout,
+    steps_taken,
+)
+from support.runners import build_runner, networks
+
+from legged_torque.learning.distribution import GaussianDistribution
+from legged_torque.learning.multi_head import MultiHeadModel
+from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, has_kernels
+from tools.capture import KERNEL_TOLERANCE, compare_kernels
+
+pytest.importorskip("triton", reason="Triton is there for Linux only")
+if os.environ.get("TRITON_INTERPRET") != "1":
+    pytest.skip("Triton's interpreter is for machines without a GPU: CUDA_VISIBLE_DEVICES=", allow_module_level=True)
+from legged_torque.learning.ppo.triton.triton_ppo import TritonPPO
+
+STEPS, WORLDS, NUM_ACTIONS = 3, 40, 6
+MIRROR = {  # an order that is its own inverse, and signs
+    "policy": ([1, 0, 2, 4, 3], [1.0, 1.0, -1.0, 1.0, 1.0]),
+    "critic": ([1, 0, 2, 4, 3, 5, 6], [1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0]),
+    "actions": ([3, 4, 5, 0, 1, 2], [-1.0, 1.0, 1.0, -1.0, 1.0, 1.0]),
+}
+
+
+class Mirrored:
+    """As much of a task as learning from mirror images needs."""
+
+    def __init__(self):
+        self.mirror = lambda name, values: values[:, self.maps[name][0]] * self.maps[name][1]
+        self.maps = {name: (torch.tensor(order), torch.tensor(signs)) for name, (order, signs) in MIRROR.items()}
+        self.mirror.maps = self.maps
+
+
+def make(kind=TritonPPO, multi_head=False, symmetric=False, seed=0, std_type="log", **settings):
+    """An algorithm whose layers are wider than a tile, no multiple of one, and no power of two."""
+    torch.manual_seed(seed)
+    distribution = {"class_name": GaussianDistribution, "init_std": 0.7, "std_type": std_type}
+    obs, groups = random_obs(WORLDS), {"actor": ["policy"], "critic": ["critic"]}
+    arguments = (obs, groups, "actor", NUM_ACTIONS, [72, 136], "elu", False, distribution)
+    actor = MultiHeadModel(*arguments, head_hidden_dims=[40]) if multi_head else MLPModel(*arguments)
+    critic = MLPModel(obs, groups, "critic", 1, [200, 24, 16], "elu")
+    storage = RolloutStorage("rl", WORLDS, STEPS, obs, [NUM_ACTIONS])
+    if symmetric:
+        function = "legged_torque.envs.base.symmetry:with_mirror_images"
+        settings["symmetry_cfg"] = {"data_augmentation_func": function, "use_data_augmentation": True}
+        settings["symmetry_cfg"] |= {"use_mirror_loss": False, "env": Mirrored()}
+    assert kind is PPO or has_kernels(OnDevicePPO(actor, critic, storage, **{**SETTINGS, **settings}))
+    return kind(actor, critic, storage, **{**SETTINGS, **settings})
+
+
+def pair(seed=3, **settings):
+    """The same algorithm with torch's operations and with kernels, after the same rollout."""
+    plain, fused = make(OnDevicePPO, **settings), make(**settings)
+    record_rollout(plain, seed)
+    record_rollout(fused, seed)
+    return plain, fused
+
+
+def choose(algorithms, seed):
+    """Let all algorithms learn from the same samples next."""
+    order = torch.randperm(STEPS * WORLDS, generator=torch.Generator().manual_seed(seed))
+    for alg in algorithms:
+        alg.indices.copy_(order[: alg.batch_size])
+
+
+KINDS = [{}, {"multi_head": True, "symmetric": True}]
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+def test_rollout_is_that_of_rsl_rl(kind):
+    """Actions, their probabilities, values, returns and advantages (GAE)."""
+    plain, fused = pair(**kind)
+    for name in ("actions", "actions_log_prob", "values", "rewards", "dones", "returns", "advantages"):
+        actual, expected = getattr(fused.storage, name), getattr(plain.storage, name)
+        torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-4, msg=lambda m, n=name: f"{n}: {m}")
+    for name in SIZES:
+        assert torch.equal(fused.storage.observations[name], plain.storage.observations[name])
+    torch.testing.assert_close(fused.action_std(), plain.action_std()[0])
+
+
+@pytest.mark.parametrize("kind", [*KINDS, {"std_type": "scalar"}, {"use_clipped_value_loss": False}], ids=str)
+def test_gradients_are_those_of_autograd(kind):
+    """Of all parameters, for a policy that has moved since it acted, so that ratios and values are clipped too."""
+    settings = {"max_grad_norm": 1e9, "clip_param": 0.02, "learning_rate": 1e-2, "entropy_coef": 0.1, **kind}
+    algorithms = plain, fused = pair(**settings)
+    for round_number in range(2):
+        choose(algorithms, round_number)
+        plain.losses.zero_()
+        fused.losses.zero_()
+        plain.update_minibatch()
+        fused.update_minibatch()
+        gradients = dict(zip(parameters(fused), fused.gradients(), strict=True))
+        expected = {f"actor.{name}": p.grad for name, p in plain.actor.named_parameters()}
+        expected |= {f"critic.{name}": p.grad for name, p in plain.critic.named_parameters()}
+        for name, gradient in gradients.items():
+            scale = float(expected[name].abs().max())
+            torch.testing.assert_close(
+                gradient, expected[name], rtol=2e-3, atol=2e-4 * scale, msg=lambda m, n=name: f"{n}: {m}"
+            )
+        torch.testing.assert_close(fused.losses, plain.losses, rtol=2e-4, atol=1e-5)
+        with torch.no_grad():  # errors do not add up
+            for own, other in zip(parameters(fused).values(), parameters(plain).values(), strict=True):
+                own.copy_(other)
+        fused.round_weights()
+
+
+def test_share_of_clipped_samples_is_neither_none_nor_all():
+    """In the test above, rollouts do clip: the ratio leaves its range for some samples."""
+    plain, _ = pair(clip_param=0.02, learning_rate=1e-3)
+    choose([plain], 0)
+    plain.update_minibatch()
+    storage, chosen = plain.storage, plain.indices
+    plain.actor(storage.observations.flatten(0, 1)[chosen], stochastic_output=True)
+    log_probs = plain.actor.get_output_log_prob(storage.actions.flatten(0, 1)[chosen])
+    ratio = torch.exp(log_probs - storage.actions_log_prob.flatten()[chosen])
+    share = ((ratio - 1.0).abs() > 0.02).float().mean()
+    assert 0.1 < share < 0.9
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "adamw"])
+def test_steps_are_those_of_torch(optimizer):
+    """Adam and AdamW of torch, in float64 and given the same gradients, which are clipped as torch clips them."""
+    alg = make(optimizer=optimizer, max_grad_norm=0.05)
+    models = (copy.deepcopy(alg.actor).double(), copy.deepcopy(alg.critic).double())
+    theirs = [*models[0].parameters(), *models[1].parameters()]
+    reference = type(alg.optimizer)(theirs, lr=1e-3)
+    record_rollout(alg)
+    for round_number in range(3):
+        choose([alg], round_number)
+        alg.update_minibatch()
+        for parameter, gradient in zip(theirs, alg.gradients(), strict=True):
+            parameter.grad = gradient.double()
+        for model in models:
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 0.05)
+        reference.step()
+    for own, other in zip(parameters(alg).values(), theirs, strict=True):
+        torch.testing.assert_close(own.double(), other, rtol=1e-5, atol=1e-7)
+
+
+def test_whole_updates_are_those_of_rsl_rl():
+    """One epoch of stock rsl_rl on the same rollout, with minibatches that hold the same samples."""
+    plain, fused = pair(num_mini_batches=1)
+    stock = make(PPO, num_mini_batches=1)
+    copy_rollout(plain.storage, stock.storage)
+    expected, actual = stock.update(), fused.update()
+    for name in ("value", "surrogate", "entropy"):
+        assert actual[name] == pytest.approx(expected[name], rel=1e-3, abs=1e-5)
+    for own, other in zip(parameters(fused).values(), parameters(stock).values(), strict=True):
+        far = (own - other).abs() > 2e-4  # where a gradient is all but 0, rounding decides the first step's direction
+        assert far.float().mean() < 0.01
+
+
+def test_learning_rate_follows_the_divergence():
+    """As without fused kernels: after the policy has moved far, it falls by 1.5, annealed too, and its bounds hold."""
+    algorithms = pair(schedule="adaptive", learning_rate=1e-2, desired_kl=0.01, annealing_start=0.5)
+    for round_number in range(3):
+        choose(algorithms, round_number)
+        for alg in algorithms:
+            alg.anneal(0.3 + 0.3 * round_number)
+        algorithms[0].update_minibatch()
+        algorithms[1].update_minibatch()
+        assert float(algorithms[1].learning_rate) == pytest.approx(float(algorithms[0].learning_rate), rel=1e-6)
+    assert float(algorithms[1].learning_rate) < 1e-2
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing():
+    """It is counted; parameters, moments and the count of steps stay as they were to the bit."""
+    alg = make()
+    record_rollout(alg, poison=(2, 3))
+    before = [tensor.clone() for tensor in alg.tensors()]
+    choose([alg], 0)
+    alg.indices[0] = 2 * WORLDS + 3  # the poisoned sample
+    alg.update_minibatch()
+    assert all(torch.equal(old, new) for old, new in zip(before, alg.tensors(), strict=True))
+    losses = dict(zip(LOSS_NAMES, alg.losses.tolist(), strict=True))
+    assert losses.pop("skipped_updates") == 1.0
+    assert set(losses.values()) == {0.0}
+
+
+def learn(alg, firsts):
+    """Learn from minibatches that begin at these samples of a rollout."""
+    for first in firsts:
+        alg.indices.copy_(torch.arange(first, first + alg.batch_size))
+        alg.update_minibatch()
+    return alg
+
+
+@pytest.fixture(scope="module")
+def twin():
+    """An algorithm that has never seen the spoiled minibatch."""
+    alg = make(**KINDS[1])
+    record_rollout(alg)
+    return learn(alg, [60])
+
+
+@pytest.mark.parametrize(("field", "value"), POISONS[1::2])
+def test_a_minibatch_that_is_skipped_leaves_nothing_behind(twin, field, value):
+    """The next one is learned from as if the one before had never been, to the bit."""
+    spoiled = make(**KINDS[1])
+    record_rollout(spoiled)
+    poison(spoiled.storage, field, value, step=0, world=2)
+    learn(spoiled, [0, 60])
+    assert [float(alg.losses[-1]) for alg in (spoiled, twin)] == [1.0, 0.0]
+    assert all(map(torch.equal, spoiled.tensors(), twin.tensors()))
+
+
+def test_gradients_are_finite_whatever_the_learning_rate():
+    """It is no part of them, nor of the samples that fill up the last tile."""
+    alg = make()
+    record_rollout(alg)
+    alg.learning_rate.fill_(math.inf)
+    choose([alg], 0)
+    alg.update_minibatch()
+    assert all(torch.isfinite(gradient).all() for gradient in alg.gradients())
+
+
+def test_the_critic_learns_alone():
+    """While a pre-trained policy stays, only the critic's parameters move."""
+    alg = make()
+    record_rollout(alg)
+    alg.learn_actor(False)
+    before = {name: value.clone() for name, value in parameters(alg).items()}
+    choose([alg], 0)
+    alg.update_minibatch()
+    for name, value in parameters(alg).items():
+        assert torch.equal(value, before[name]) == name.startswith("actor")
+
+
+def test_checkpoints_go_both_ways():
+    """Torch continues from a checkpoint of the kernels, and the other way round; both then agree."""
+    first = make()
+    record_rollout(first)
+    choose([first], 0)
+    first.update_minibatch()
+    plain, fused = make(OnDevicePPO, seed=8), make(seed=9)
+    for alg in (plain, fused):
+        alg.load(copy.deepcopy(first.save()), None, True)
+        record_rollout(alg, 4)
+    assert steps_taken(plain) == steps_taken(fused) == 1
+    choose([plain, fused], 1)
+    plain.update_minibatch()
+    fused.update_minibatch()
+    for own, other in zip(parameters(fused).values(), parameters(plain).values(), strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-3, atol=2e-5)
+    back = make()
+    back.load(copy.deepcopy(plain.save()), None, True)
+    for own, other in zip(parameters(back).values(), parameters(plain).values(), strict=True):
+        assert torch.equal(own, other)
+
+
+def test_the_same_bits_twice():
+    """Rollouts and updates repeat to the bit."""
+    states = []
+    for _ in range(2):
+        alg = make(multi_head=True)
+        record_rollout(alg)
+        choose([alg], 0)
+        alg.update_minibatch()
+        states.append([tensor.numpy().tobytes() for tensor in alg.tensors()])
+    assert states[0] == states[1]
+
+
+def test_padding_does_not_matter():
+    """A minibatch that fills no tile gives the mean over its samples alone, here by hand."""
+    alg = make(num_mini_batches=3)
+    assert alg.batch_size == 40
+    record_rollout(alg)
+    choose([alg], 0)
+    alg.update_minibatch()
+    observations = alg.storage.observations["critic"].flatten(0, 1)[alg.indices]
+    with torch.no_grad():
+        fresh = make(OnDevicePPO, num_mini_batches=3)
+        values = fresh.critic.mlp(observations).squeeze(1).double().numpy()
+    returns = alg.storage.returns.flatten()[alg.indices].double().numpy()
+    old = alg.storage.values.flatten()[alg.indices].double().numpy()
+    clipped = old + np.clip(values - old, -0.2, 0.2)
+    expected = np.maximum((values - returns) ** 2, (clipped - returns) ** 2).mean()
+    assert float(alg.losses[0]) == pytest.approx(expected, rel=1e-4)
+
+
+PARTS = [
+    "normalization",
+    "activation",
+    "advantages",
+    "mirror loss",
+    "fixed deviation",
+    "losses",
+    "model",
+    "distribution",
+]
+
+
+@pytest.mark.parametrize("what", PARTS)
+def test_what_has_no_kernels_is_left_to_torch(what):
+    """Algorithms with other parts are known beforehand."""
+    alg = make_ppo()
+    assert has_kernels(alg)
+    if what == "normalization":
+        alg = make_ppo(obs_normalization=True)
+    elif what == "activation":
+        alg.actor.mlp[1] = torch.nn.Tanh()
+    elif what == "advantages":
+        alg = make_ppo(normalize_advantage_per_mini_batch=True)
+    elif what == "mirror loss":
+        alg = make(OnDevicePPO, symmetric=True)
+        alg.symmetry.use_mirror_loss = True
+    elif what in ("losses", "model", "distribution"):
+        part = {"losses": alg, "model": alg.critic, "distribution": alg.actor.distribution}[what]
+        part.__class__ = type("Own", (type(part),), {})  # of a user, with methods that kernels do not know
+    else:
+        alg.actor.distribution.log_std_param.requires_grad_(False)
+    assert not has_kernels(alg)
+
+
+def test_a_training_with_kernels(make_task, tmp_path, monkeypatch):
+    """Where there are kernels, the same settings train with them, and a checkpoint goes on without."""
+
+    def build(**settings):
+        small = {"actor.hidden_dims": [8, 8], "actor.head_hidden_dims": [8], "critic.hidden_dims": [8]}
+        small |= {"runner.logger": "none", "algorithm.use_mixed_precision": False, "algorithm.num_learning_epochs": 1}
+        return build_runner(make_task, "a1_torque_multihead", 2, log_root=tmp_path, **small, **settings)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("legged_torque.learning.ppo.has_triton", lambda device: True)
+        patch.setattr("legged_torque.learning.ppo.triton.triton_ppo.can_multiply", lambda dtype, device: True)
+        runner = build()
+    before = {name: value.clone() for name, value in networks(runner).items()}
+    runner.learn(2)
+    assert type(runner.alg) is TritonPPO and steps_taken(runner.alg) == 2 * 2
+    assert not any(torch.equal(value, before[name]) for name, value in networks(runner).items())
+    plain = build()
+    plain.load(f"{runner.log_dir}/model_2.pt")
+    assert type(plain.alg) is OnDevicePPO and plain.current_learning_iteration == 2
+    assert all(torch.equal(value, networks(runner)[name]) for name, value in networks(plain).items())
+    plain.learn(1)
+
+
+def test_mixed_precision_is_that_of_the_kernels():
+    """An algorithm that works with torch's operations says that it does without."""
+    assert make(OnDevicePPO, use_mixed_precision=True).product_dtype == torch.float32
+
+
+def test_the_check_on_a_gpu_compares_with_autograd():
+    """Its errors are those of float32 here; a gradient that is off is seen."""
+    alg = make(multi_head=True, symmetric=True)
+    record_rollout(alg)
+    runner = SimpleNamespace(alg=alg)
+    before = [tensor.clone() for tensor in alg.tensors()]
+    errors = compare_kernels(runner)
+    assert set(errors) == {"actor", "critic"}
+    assert max(errors.values()) < 1e-4
+    assert all(torch.equal(old, new) for old, new in zip(before, alg.tensors(), strict=True))
+    alg.gradients = lambda: [1.2 * gradient for gradient in TritonPPO.gradients(alg)]
+    assert min(compare_kernels(runner).values()) > KERNEL_TOLERANCE
+    assert compare_kernels(SimpleNamespace(alg=make(OnDevicePPO))) == {}

@@ -1,0 +1,257 @@
+"""Motors from outside of the package: a torque-speed curve, a limit of the rate with state, a delay of torques."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from support.episodes import HIGH_UP, time_out
+from support.settings import error_of, torques_in_torch
+
+from legged_torque.envs.approaches.torque import TorqueRobot
+from legged_torque.envs.tasks import A1TorqueCfg
+from legged_torque.motors.config import MotorCfg
+from legged_torque.motors.kernel import read
+from legged_torque.motors.motor import Motor
+from legged_torque.sim.randomization import RandomParameter
+
+# ------------------------------------------------------------------------------------------------ a user's own file
+
+
+@wp.struct
+class Curve:
+    """Inputs of :func:`curve_torque`."""
+
+    stall: wp.array[float]
+    no_load: wp.array2d[float]
+
+
+@wp.func
+def curve_torque(motor: Curve, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
+    """Return the torque inside limits that fall linearly with the speed."""
+    most = motor.stall[joint] * wp.max(1.0 - wp.abs(vel) / motor.no_load[world, joint], 0.0)
+    return wp.clamp(wanted, -most, most)
+
+
+class CurveCfg(MotorCfg):
+    """Settings of a torque-speed curve."""
+
+    stall: float | dict[str, float] = 33.5  # [N m]
+    no_load: float = 20.0  # [rad/s]
+
+    def build(self, joints):
+        return CurveMotor(self, joints)
+
+
+class CurveMotor(Motor):
+    """A torque-speed curve with a random no-load speed."""
+
+    kernel = curve_torque
+
+    def __init__(self, cfg, joints):
+        super().__init__(cfg, joints)
+        self.stall = joints.values("motors.curve.stall", cfg.stall)
+        self.no_load = self.buffer("no_load", len(joints.names)).fill_(cfg.no_load)
+
+    def apply(self, wanted, pos, vel, substep):
+        most = self.stall * (1.0 - vel.abs() / self.no_load).clamp(min=0.0)
+        return wanted.clamp(-most, most)
+
+    def kernel_reads(self):
+        return read(Curve, stall=self.stall, no_load=self.no_load)
+
+    def random_parameters(self):
+        columns = range(self.no_load.shape[1])
+        return [RandomParameter("no_load", self.no_load, columns, {"scale": [0.9, 1.1]}, "rad/s", shared=True)]
+
+    def describe(self):
+        return {"stall": self.stall.tolist(), "no_load": self.cfg.no_load}
+
+
+@wp.struct
+class Slew:
+    """Inputs of :func:`slew_torque`."""
+
+    most: float
+    last: wp.array2d[float]
+
+
+@wp.func
+def slew_torque(motor: Slew, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
+    """Return a torque that differs from the last one by at most so much, and keep it."""
+    last = motor.last[world, joint]
+    torque = wp.clamp(wanted, last - motor.most, last + motor.most)
+    motor.last[world, joint] = torque
+    return torque
+
+
+class SlewCfg(MotorCfg):
+    """Settings of a limit of the rate."""
+
+    rate: float = 500.0  # [N m/s]
+
+    def build(self, joints):
+        return SlewMotor(self, joints)
+
+
+class SlewMotor(Motor):
+    """Limits how fast a torque may change."""
+
+    kernel = slew_torque
+
+    def __init__(self, cfg, joints):
+        super().__init__(cfg, joints)
+        self.most, self.last = cfg.rate * joints.dt, self.buffer("last", len(joints.names))
+
+    def apply(self, wanted, pos, vel, substep):
+        self.last.copy_(wanted.clamp(self.last - self.most, self.last + self.most))
+        return self.last.clone()
+
+    def kernel_reads(self):
+        return read(Slew, most=self.most, last=self.last)
+
+    def reset(self, mask):
+        self.last.masked_fill_(mask.unsqueeze(1), 0.0)
+
+
+class LateCfg(MotorCfg):
+    """Settings of a delay of torques."""
+
+    steps: int = 2  # physics steps
+
+    def build(self, joints):
+        return LateMotor(self, joints)
+
+
+class LateMotor(Motor):
+    """Torques that come late, in torch only."""
+
+    def __init__(self, cfg, joints):
+        super().__init__(cfg, joints)
+        self.before = self.buffer("before", cfg.steps, len(joints.names))
+
+    def apply(self, wanted, pos, vel, substep):
+        late = self.before[:, -1].clone()
+        self.before.copy_(torch.cat([wanted.unsqueeze(1), self.before[:, :-1]], dim=1))
+        return late
+
+
+class OwnMotorsCfg(A1TorqueCfg):
+    """An A1 with motors of its own."""
+
+    class motors:
+        chain = ["delay", "curve", "slew"]
+
+        class curve(CurveCfg):
+            stall = {"hip": 20.0, "joint": 33.5}
+
+        class slew(SlewCfg):
+            pass
+
+        class late(LateCfg):
+            pass
+
+        class quick(SlewCfg):
+            rate = 4000.0
+
+
+def make(num_envs=3, chain=("delay", "curve", "slew"), **changes):
+    """A task with these motors, high up in the air."""
+    cfg = OwnMotorsCfg()
+    cfg.env.num_envs, cfg.motors.chain, cfg.init_state.pos = num_envs, list(chain), HIGH_UP["init_state.pos"]
+    for name, value in changes.items():
+        setattr(cfg.domain_rand, name, value)
+    torch.manual_seed(0)
+    return TorqueRobot(cfg)
+
+
+# ------------------------------------------------------------------------------------------------ what it does
+
+
+def by_hand(wanted, vel, last, no_load=20.0):
+    """The torque of the curve and of the rate limit, of 500 N m/s in steps of 5 ms."""
+    stall = np.where(np.arange(12) % 3 == 0, 20.0, 33.5)
+    most = stall * np.maximum(1.0 - np.abs(vel) / no_load, 0.0)
+    return np.clip(np.clip(wanted, -most, most), last - 2.5, last + 2.5)
+
+
+@pytest.mark.parametrize("in_torch", [False, True], ids=["kernel", "torch"])
+def test_curve_and_rate(in_torch):
+    """Torques are those of both formulas in this order, from physics step to physics step, and start anew at resets."""
+    task = make()
+    if in_torch:
+        torques_in_torch(task)
+    last, noted = np.zeros((3, 12)), []
+    sim_step, drive = task.sim.step, task.sim.drive
+
+    def note():
+        noted.append(task.dof_vel.numpy().copy())
+
+    task.sim.step = lambda sense: (note(), sim_step(sense))
+    task.sim.drive = lambda steps, *law: [(note(), drive(1, *law)) for _ in range(steps)]
+    generator = torch.Generator().manual_seed(0)
+    for step in range(5):
+        if step == 3:
+            time_out(task, [1])
+        actions = 3.0 * torch.randn(3, 12, generator=generator)
+        noted.clear()
+        task.step(actions)
+        for vel in noted:
+            last = by_hand(8.0 * actions.numpy(), vel, last)
+        ended = task.reset_buf.numpy()
+        np.testing.assert_allclose(task.torques.numpy()[~ended], last[~ended], atol=1e-3)
+        last[ended] = 0.0
+    assert len(noted) == 4 and np.abs(last).max() > 5.0
+
+
+def test_kernel_and_torch_agree():
+    """The same motors inside the kernel and in torch lead to the same states."""
+    tasks = [make(8), make(8)]
+    torques_in_torch(tasks[1])
+    for step in range(6):
+        actions = 3.0 * torch.randn(8, 12, generator=torch.Generator().manual_seed(step))
+        for task in tasks:
+            task.step(actions)
+        torch.testing.assert_close(tasks[0].sim.qvel, tasks[1].sim.qvel, rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(tasks[0].torques, tasks[1].torques, rtol=1e-3, atol=1e-3)
+
+
+def test_a_link_without_a_kernel():
+    """Torques then leave the kernel, with a note; a delay behind other links, and two links of one model."""
+    task = make(2, ("curve", "quick", "late"), randomize_parameters=False)
+    assert any("outside of the physics kernel" in note for note in task.notes)
+    seen = []
+    run = task.sim.step
+    task.sim.step = lambda sense: (seen.append(task.torques.numpy().copy()), run(sense))
+    task.step(torch.full((2, 12), 1.0))
+    seen = np.stack(seen)
+    assert (seen[:2] == 0.0).all()  # two physics steps late
+    np.testing.assert_allclose(seen[2:], 8.0, atol=4.0)
+    assert (seen[2] > 0.0).all()
+    both = make(2, ("curve", "quick", "slew"))
+    both.step(torch.full((2, 12), 1.0))
+    np.testing.assert_allclose(both.torques, 8.0, atol=1e-3)  # 2.5 N m per step: 8 after four of them
+
+
+def test_own_state_and_parameters():
+    """State is a part of the worlds' state, parameters are drawn, observed by the critic, and mirrored if known."""
+    task = make(50, randomize_parameters=True)
+    for _ in range(3):
+        task.step(torch.randn(50, 12))
+    no_load = task.motors.links["curve"].no_load
+    assert (no_load == no_load[:, :1]).all() and 18.0 <= no_load.min() < 18.5 and 21.5 < no_load.max() <= 22.0
+    assert "no_load" in task.randomization.sizes
+    state = {name: value.clone() for name, value in task.motors.state_dict()["slew"].items()}
+    assert state["last"].abs().max() > 1.0
+    task.motors.links["slew"].last.zero_()
+    kept = task.world_state_dict()
+    kept = {**kept, "motors": {**kept["motors"], "slew": state}}
+    task.load_world_state_dict(kept)
+    assert torch.equal(task.motors.links["slew"].last, state["last"])
+    assert task.motors.describe() == {"curve": {"stall": pytest.approx([20.0, 33.5, 33.5] * 4), "no_load": 20.0}}
+
+
+def test_mistakes():
+    """Links that do not exist, occur twice or in the wrong order are refused by name."""
+    assert "unknown motors.chain 'curv'; did you mean 'curve'?" in error_of(make, 1, ("curv",))
+    assert "has the link 'slew' twice" in error_of(make, 1, ("slew", "slew"))
+    assert "links that act on actions first" in error_of(make, 1, ("curve", "delay"))

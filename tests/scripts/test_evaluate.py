@@ -1,0 +1,137 @@
+"""Evaluation of checkpoints by evaluate.py, and the rows of resumed runs."""
+
+import json
+import re
+
+import pytest
+import torch
+from support.evaluations import note_steps, read_rows
+from support.scripts import assert_told_in_one_line, contents, run_here
+from torch.nn.functional import elu, linear
+
+from legged_torque.envs.base.metrics import WalkingMetrics
+from legged_torque.utils.metrics import UNITS
+
+TASK = ["--task=a1_position", "--device=cpu"]
+SMALL = [*TASK, "--num_envs=2", "--set=runner.num_steps_per_env=4", "--set=runner.save_interval=1", "--logger=none"]
+SMALL += ["--set=actor.hidden_dims=[8]", "--set=critic.hidden_dims=[8]", "--set=algorithm.num_mini_batches=1"]
+SMALL += ["--set=evaluation.interval=8", "--set=evaluation.num_samples=6"]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """A folder whose logs hold a small run of ``a1_position`` without perturbations."""
+    root = tmp_path_factory.mktemp("root")
+    assert run_here("train.py", *SMALL, "--max_iterations=3", "--run_name=first", root=root)[0] == 0
+    return root
+
+
+def evaluate(root, file, *words):
+    """What evaluate.py prints, and its file, which must be JSON to the letter."""
+    status, output, error = run_here("evaluate.py", *TASK, f"--json={file}", *words, root=root)
+    assert (status, error) == (0, "")
+    return output, json.loads(file.read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+
+
+def test_a_resumed_run_writes_its_own_rows(root, tmp_path):
+    """They begin after the checkpoint's steps, and the file of the first run stays as it was; no logger is needed."""
+    first = next(root.glob("logs/*/*_first"))
+    text = (first / "evaluations.csv").read_text()
+    words = [f"--load_run={first}", "--checkpoint=2", "--resume", "--max_iterations=4", "--run_name=second"]
+    assert run_here("train.py", *TASK, *words, root=tmp_path)[0] == 0
+    rows = [read_rows(run / "evaluations.csv") for run in (first, *tmp_path.glob("logs/*/*_second"))]
+    assert (first / "evaluations.csv").read_text() == text
+    assert [[row["steps"] for row in each] for each in rows] == [[8, 16, 24], [24, 32]]
+    assert [row["iteration"] for row in rows[1]] == [3, 4]
+    seconds = torch.load(first / "model_2.pt", weights_only=True)["infos"]["seconds"]
+    assert rows[1][0]["seconds"] >= float(f"{seconds:.6g}") > 0.0
+
+
+def test_a_seed_fixes_every_number(root, tmp_path):
+    """Two evaluations with one seed give the same file; another seed, perturbation or checkpoint, other numbers."""
+    often = "--set=domain_rand.push_probability=0.5"  # or low and high would rarely differ in so few steps
+    words = ["--num_envs=3", "--steps=20", "--seed=3", often]
+    _, result = evaluate(root, tmp_path / "a.json", *words)
+    torch.rand(11)
+    evaluate(root, tmp_path / "b.json", *words)
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+    assert [result[key] for key in ("steps", "checkpoint", "num_envs", "num_steps")] == [24, "model_3.pt", 3, 20]
+    changes = ["--seed=4", "--perturbation=low", "--perturbation=high", "--checkpoint=1", "--perturbation=none"]
+    others = [evaluate(root, tmp_path / f"{i}.json", *words, change)[1] for i, change in enumerate(changes)]
+    numbers = [json.dumps([each["metrics"], each["by_command"]]) for each in (result, *others)]
+    assert len(set(numbers)) == 5 and numbers[0] == numbers[-1]  # the run had no perturbations either
+    assert [each["seed"] for each in others] == [4, 3, 3, 3, 3] and others[3]["steps"] == 8
+    assert [each["perturbation"] for each in others] == ["as in training", "low", "high", "as in training", "none"]
+
+
+def test_fixed_command_with_one_world(root, tmp_path, monkeypatch):
+    """The command holds in all steps, new episodes included; standard errors are null; the folder is created."""
+    told, add_step, noted = [], WalkingMetrics.add_step, note_steps(monkeypatch)
+    monkeypatch.setattr(WalkingMetrics, "add_step", lambda *args: (told.append(args[1]), add_step(*args)))
+    words = ["--num_envs=1", "--steps=9", "--set=env.episode_length_s=0.05", "--set=commands.resampling_probability=1"]
+    output, result = evaluate(root, tmp_path / "new" / "folder" / "x.json", *words, "--command", "0.5", "0", "-0.2")
+    assert len(told) == len(noted) == 9 and any(note.reset.any() for note in noted)
+    for commands in told + [note.commands for note in noted]:
+        torch.testing.assert_close(commands, torch.tensor([[0.5, 0.0, -0.2]]))
+    assert result["command"] == [0.5, 0.0, -0.2]
+    state = torch.load(next(root.glob("logs/*/*_first/model_3.pt")), weights_only=True)["actor_state_dict"]
+    weights = [state[f"mlp.{name}"] for name in ("0.weight", "0.bias", "2.weight", "2.bias")]
+    for note in noted:  # mean actions of a network with one hidden layer
+        mean = linear(elu(linear(note.obs["policy"], *weights[:2])), *weights[2:])
+        torch.testing.assert_close(note.actions, mean)
+    for name, value in {"lin_vel_x": 0.5, "lin_vel_y": 0.0, "ang_vel_yaw": -0.2}.items():
+        (part,) = result["by_command"][name]
+        assert (part["from"], part["to"], part["share"]) == pytest.approx((value, value, 1.0), abs=1e-6)
+        assert re.search(rf"(?m)^  error of {name} +{part['error']:.3f}$", output)
+    heights, metrics = [float(note.height) for note in noted if not note.reset.any()], result["metrics"]
+    assert metrics["height"]["mean"] == pytest.approx(sum(heights) / len(heights), rel=1e-5)
+    assert list(metrics) == list(UNITS) and all(entry["standard_error"] is None for entry in metrics.values())
+    for name, unit in UNITS.items():
+        assert re.search(rf"(?m)^  {name} +{metrics[name]['mean']:.4f} \+- nan {re.escape(unit)}$", output), name
+    assert "model_3.pt, after 24 steps of training, 1 worlds x 9 steps:" in output
+
+
+def test_crossing_tiles_after_training_on_a_plane(root, tmp_path):
+    """The policy sees what it saw; there is a row per kind and level; a seed fixes every number."""
+    words = ["--terrain", "stairs_up", "flat", "--level", "0.5", "0", "--num_envs=2", "--command", "2", "0", "0"]
+    output, result = evaluate(root, tmp_path / "a.json", *words)
+    evaluate(root, tmp_path / "b.json", *words)
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+    tiles = [(row["kind"], row["level"], row["worlds"]) for row in result["grounds"]]
+    assert tiles == [("stairs_up", 0.0, 2), ("stairs_up", 0.5, 2), ("flat", 0.0, 2), ("flat", 0.5, 2)]
+    assert (result["num_envs"], result["time_limit"], result["steps"]) == (8, 4.0, 24) and "num_steps" not in result
+    for row in result["grounds"]:
+        assert row["crossed"] == {"mean": 0.0, "standard_error": 0.0}  # it cannot walk yet
+        assert list(row["metrics"]) == list(UNITS)
+        cost = row["metrics"]["cost_of_transport"]["mean"]
+        place = rf"{row['kind']} +{row['level']:g} +2 +0.000 \+- 0.000 +{row['fell']['mean']:.3f} "
+        assert re.search(rf"(?m)^  {place}.* {cost:.2f}$", output), row
+    assert "8 worlds, told to walk 2 0 m/s for 4.0 s at most:" in output
+
+
+MISTAKES = {
+    "--terrain stairs_pu": "unknown kind of terrain 'stairs_pu'; did you mean 'stairs_up'?",
+    "--terrain flat --level 0.5 1.01": "a level must be from 0 to 1, not 1.01",
+    "--terrain flat --level -0.1": "a level must be from 0 to 1, not -0.1",
+    "--terrain flat --level nan": "argument --level: it must be finite, not nan",
+    "--terrain flat --level": "argument --level: expected at least one argument",
+    "--terrain flat --command 0 0 0": "the command must have a speed of 0.1 m/s or more and a yaw rate of 0, not 0 0 0",
+    "--terrain flat --command 1 0 0.5": "a yaw rate of 0, not 1 0 0.5",
+    "--terrain flat --steps=5": "--steps is not for --terrain",
+    "--level 0.5": "--level needs --terrain",
+    "--terrain flat --level 0 --set terrain.measure_heights=true": "does not fit this task",
+    "--perturbation=hihg": "unknown perturbation 'hihg'; did you mean 'high'?",
+    "--checkpoint=7": "unknown checkpoint '7'; allowed: 0, 1, 2, 3",
+    "--steps=0": "--steps must be at least 1, not 0",
+    "--command 1 0": "argument --command: expected 3 arguments",
+    "--step=5": "unknown option '--step=5'; did you mean '--steps'?",
+}
+
+
+@pytest.mark.parametrize(("words", "message"), MISTAKES.items())
+def test_mistakes(root, words, message):
+    """Exit status 2, one line that names the mistake, and nothing is written."""
+    before = contents(root)
+    result = run_here("evaluate.py", *TASK, f"--json={root / 'x.json'}", *words.split(), root=root)
+    assert_told_in_one_line(result, message)
+    assert contents(root) == before

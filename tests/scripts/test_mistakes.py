@@ -1,0 +1,152 @@
+"""Mistakes on the command lines of scripts: one line, exit status 2, and nothing is written."""
+
+import re
+
+import pytest
+from support.scripts import ROOT, SMALL, assert_light, assert_told_in_one_line, contents, run_here
+
+MISTAKES = [
+    ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
+    ("--set=control.stifness=1", "unknown config key 'control.stifness'; did you mean 'control.stiffness'?"),
+    ("--set=control.stiffness=stiff", "control.stiffness must be a number, not 'stiff'"),
+    ("--set=control.decimation=0", "control.decimation must be from 1 to 1000, not 0"),
+    ("--set=sim.dt=0", "sim.dt must be greater than 0"),
+    ("--set=asset.file=a1.xml", "a1.xml"),
+    ("--set=algorithm.num_mini_batches=9", "algorithm.num_mini_batches is 9, more than the samples of a rollout"),
+    ("--device=gpu", "unknown device 'gpu'; did you mean 'cpu'?"),
+    ("--device=cuda:99", "there is no device 'cuda:99'; available: cpu"),
+    ("--preset=papr", "unknown preset 'papr'; did you mean 'paper'?"),
+    ("--logger=tensorbord", "unknown runner.logger 'tensorbord'; did you mean 'tensorboard'?"),
+    ("--num_env=3", "unknown option '--num_env=3'; did you mean '--num_envs'?"),
+    ("--resum", "unknown option '--resum'; did you mean '--resume'?"),
+    ("resume", "unknown option 'resume'"),
+    ("--num_envs=0", "num_envs must be from 1 to 10000000, not 0"),
+    ("--num_envs=few", "argument --num_envs: invalid int value: 'few'"),
+    ("--max_iterations=0", "--max_iterations must be at least 1, not 0"),
+    ("--resume --load_run=2026", "unknown run '2026'"),
+    ("--resume --checkpoint=7", "unknown checkpoint '7'; allowed: 0, 1, 2"),
+    ("--resume --checkpoint=last", "argument --checkpoint: invalid int value: 'last'"),
+    ("--resume --experiment_name=nothing", "there is no run with a checkpoint in"),
+    ("--resume", "the run has 2 iterations already; raise --max_iterations"),
+    ("--resume --experiment_name=not_yaml", "config.yaml' is not valid YAML"),
+    ("--resume --experiment_name=no_mapping", "config.yaml' lacks the entries task, env and train"),
+    ("--resume --experiment_name=no_entries", "config.yaml' lacks the entries task, env and train"),
+    ("--resume --experiment_name=no_config", "has no config.yaml"),
+    ("--resume --experiment_name=unknown_key", "unknown config key 'env.num_env'; did you mean 'env.num_envs'?"),
+    ("--resume --experiment_name=wrong_type", "rewards.scales.torques must be a number, not 'little'"),
+    ("--resume --experiment_name=no_section", "config key 'env' is a section with entries, not the value 3"),
+    ("--resume --experiment_name=text_checkpoint", "model_2.pt' is not a readable checkpoint"),
+    ("--resume --experiment_name=half_checkpoint", "model_2.pt' is not a readable checkpoint"),
+    ("--resume --experiment_name=a1_position --task=a1_torque", "is of task 'a1_position', not 'a1_torque'"),
+    ("--set=asset.mirrored_legs=[[FR]]", "asset.mirrored_legs must be pairs [right, left], not ['FR']"),
+    ("--num_envs=3000000000", "num_envs must be from 1 to 10000000"),
+    ("--preset=", "the value of --preset is empty"),
+    ("--max_iterations=--", "the value of --max_iterations is empty"),
+    ("--perturbation=", "the value of --perturbation is empty"),
+    ("--log_root=/dev/null", "cannot write '/dev/null/a1_position/"),
+    (f"--run_name={'x' * 300}", "File name too long"),
+    ("--task=a1_torque_gravity --set=pretraining.file=/proc/x/y.pt", "cannot write '/proc/x/y.pt'"),
+    ("--set=actor.distribution_cfg.class_name=Gauss", "actor.distribution_cfg.class_name"),
+    ("--set=obs_groups.actor=[polic]", "did you mean 'policy'?"),
+    ("--set=env.num_actions=24", "env.num_actions must be 12 for LeggedRobot, not 24"),
+    ("--seed=99999999999999999999999", "seed must be an integer of 64 bits"),
+    ("--load_run=2026", "--load_run and --checkpoint need --resume"),
+    ("--resume --preset=paper", "--preset cannot be given with --resume"),
+    ("--set=asset.terminate_after_contacts_on=[trnk]", "did you mean 'trunk'?"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), MISTAKES, ids=[words for words, _ in MISTAKES])
+def test_mistakes_when_training(root, words, message):
+    """Exit status 2, one line that names the mistake and the nearest valid name, and nothing is written."""
+    before = contents(root)
+    result = run_here("train.py", *SMALL, *re.split(r" (?=--)", words), root=root)
+    assert_told_in_one_line(result, message)
+    assert contents(root) == before
+
+
+@pytest.mark.parametrize(
+    ("script", "words", "message"),
+    [
+        ("play.py", "--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
+        ("play.py", "--load_run=2026", "unknown run '2026'"),
+        ("play.py", "--checkpoint=7", "unknown checkpoint '7'; allowed: 0, 1, 2"),
+        ("play.py", "--experiment_name=not_yaml", "config.yaml' is not valid YAML"),
+        ("play.py", "--experiment_name=text_checkpoint", "model_2.pt' is not a readable checkpoint"),
+        (
+            "play.py",
+            "--experiment_name=a1_position --task=a1_multihead",
+            "is of task 'a1_position', not 'a1_multihead'",
+        ),
+        ("play.py", "--num_envs=0", "num_envs must be from 1 to 10000000, not 0"),
+        ("play.py", "--steps=0", "--steps must be at least 1, not 0"),
+        ("play.py", "--terrain=stairs", "unknown kind of terrain 'stairs'; did you mean 'stairs_up'?"),
+        ("play.py", "--level=0.5", "--level needs --terrain: the kinds of rough ground"),
+        ("play.py", "--compare=logs", "--compare needs --viewer web"),
+        ("play.py", "--compare=logs --viewer=web", "the run 'logs' has no config.yaml"),
+        ("play.py", "--grid=5", "--grid must be 1, 4, 9, 16 or 25, not 5"),
+        ("play.py", "--grid=0", "--grid must be 1, 4, 9, 16 or 25, not 0"),
+        ("play.py", "--grid=36", "--grid must be 1, 4, 9, 16 or 25, not 36"),
+        ("play.py", "--grid=-4", "--grid must be 1, 4, 9, 16 or 25, not -4"),
+        ("play.py", "--grid=four", "argument --grid: invalid int value: 'four'"),
+        ("play.py", "--grid=9 --num_envs=4", "--grid 9 needs as many worlds, but --num_envs is 4"),
+        ("play.py", "--grid=4 --viewer=web", "--grid is for videos, which --viewer web does not make"),
+        ("play.py", "--stpes=5", "unknown option '--stpes=5'; did you mean '--steps'?"),
+        ("play.py", "--set=control.stifness=1", "did you mean 'control.stiffness'?"),
+        ("learning_curve.py", "--steps=0", "--steps must be at least 1, not 0"),
+        ("learning_curve.py", "--load_run=2026", "unknown run '2026'"),
+        ("learning_curve.py", "--num_envs=2 --json=/dev/null/a", "cannot write '/dev/null/a': Not a directory"),
+        ("evaluate.py", "--json=/dev", "cannot write '/dev': it is a folder"),
+        ("evaluate.py", "--json=/proc/x", "cannot write '/proc/x'"),
+        ("evaluate.py", "--steps=1 --json=/dev/full", "cannot write '/dev/full': No space left on device"),
+        ("evaluate.py", "--command nan 0 0", "argument --command: it must be finite, not nan"),
+        ("export.py", "--num_envs=0", "num_envs must be from 1"),
+        ("export.py", "--out=/dev/null", "cannot write '/dev/null/policy.yaml'"),
+        ("play.py", "--video=/dev/null/a.mp4", "cannot write '/dev/null/a.mp4'"),
+        ("physics_accuracy.py", "--steps=0", "--steps must be at least 1, not 0"),
+    ],
+)
+def test_mistakes_after_training(root, script, words, message):
+    """The other scripts tell mistakes in the same way."""
+    before = contents(root)
+    result = run_here(script, "--task=a1_position", "--device=cpu", *words.split(), root=root)
+    assert_told_in_one_line(result, message)
+    assert contents(root) == before
+
+
+def test_number_of_processes_that_is_none(tmp_path, monkeypatch):
+    """What torchrun says by the environment is a mistake of the user's if it makes no sense."""
+    monkeypatch.setenv("WORLD_SIZE", "x")
+    assert_told_in_one_line(run_here("train.py", *SMALL, root=tmp_path), "WORLD_SIZE, which torchrun sets, must be")
+    assert not list(tmp_path.iterdir())
+
+
+def test_values_of_several_lines(tmp_path):
+    """The line of a mistake is one even if a name in it has two."""
+    assert_told_in_one_line(run_here("train.py", "--task=a\nb", root=tmp_path), "unknown task 'a")
+
+
+@pytest.mark.parametrize("script", ["train.py", "play.py", "learning_curve.py", "benchmark.py"])
+def test_help(script, tmp_path):
+    """``--help`` describes the options."""
+    status, output, error = run_here(script, "--help", root=tmp_path)
+    assert (status, error) == (0, "")
+    assert "--task" in output and "--num_envs" in output and "--device" in output
+
+
+def test_answers_need_nothing_heavy(tmp_path):
+    """Help of every script, lists, and mistakes that settings show come before anything that takes long to import."""
+    answers = {
+        **{(script.name, "--help"): 0 for script in sorted((ROOT / "scripts").glob("[!_]*.py"))},
+        ("train.py", "--list"): 0,
+        ("train.py", "--task=a1_positon"): 2,
+        ("train.py", "--num_env=3"): 2,
+        ("train.py", "--num_envs=few"): 2,
+        ("train.py", "--num_envs=0"): 2,
+        ("train.py", "--set=control.stifness=1"): 2,
+        ("train.py", "--set=sim.dt=0"): 2,
+        ("train.py", "--set=algorithm.learning_rate=1"): 2,
+        ("train.py", "--set=runner.class_name=Other"): 2,
+        ("train.py", "--resume", "--load_run=2026"): 2,
+    }
+    assert_light(answers, tmp_path)

@@ -1,0 +1,62 @@
+"""What two trainings have done in an iteration, compared to the bit, and gradients of kernels against autograd."""
+
+import torch
+from support.on_device import make_runner
+from torch.nn.utils import parameters_to_vector
+
+from legged_torque.utils.task_registry import set_seed
+
+
+def recorded(runner):
+    """Copies of the last rollout, and of what was learned from it."""
+    alg, storage = runner.alg, runner.alg.storage
+    result = {f"observations {group}": value for group, value in storage.observations.items()}
+    result |= {name: getattr(storage, name) for name in ("actions", "rewards", "returns", "advantages")}
+    result |= {"actor": parameters_to_vector(alg.actor.parameters()), "losses": alg.losses}
+    result |= {"critic": parameters_to_vector(alg.critic.parameters()), "learning rate": alg.learning_rate}
+    return {name: value.detach().clone() for name, value in result.items()}
+
+
+def differences(device, iterations, *words):
+    """Train twice, with CUDA graphs and without; return what differs, and by how much, iteration by iteration.
+
+    The first iteration with graphs runs as it is, the second captures them, the others replay them.
+    """
+    runners = [make_runner(device, *words, f"--set=runner.capture={capture}") for capture in (False, True)]
+    found = {}
+    for iteration in range(iterations):
+        results = []
+        for runner in runners:
+            set_seed(iteration)
+            runner.learn(1, init_at_random_ep_len=iteration == 0)
+            results.append(recorded(runner))
+        for name, plain in results[0].items():
+            if not torch.equal(plain, results[1][name]) or not torch.isfinite(plain).all():
+                found[iteration, name] = float((plain - results[1][name]).abs().max())
+    return found, runners
+
+
+@torch.no_grad()
+def gradient_errors(alg):
+    """How far the kernels' gradients of the chosen samples are from autograd's, in parts of their norm.
+
+    Nothing has changed afterwards.
+    """
+    state, rate, losses = alg.tensors(), alg.learning_rate, alg.losses
+    tensors = [*state, rate, losses]
+    before = [tensor.clone() for tensor in tensors]
+    alg.update_minibatch()
+    found = [gradient.clone() for gradient in alg.gradients()]
+    for tensor, value in zip(tensors, before, strict=True):
+        tensor.copy_(value)
+    alg.round_weights()
+    alg.optimizer.zero_grad()
+    with torch.enable_grad():
+        alg.loss()[0].backward()
+    errors, start = {}, 0
+    for name, network in {"actor": alg.actor, "critic": alg.critic}.items():
+        exact = parameters_to_vector(parameter.grad for parameter in network.parameters())
+        count = len(list(network.parameters()))
+        ours = parameters_to_vector(found[start : start + count])
+        errors[name], start = float((ours - exact).norm() / exact.norm()), start + count
+    return errors

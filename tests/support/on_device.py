@@ -1,0 +1,101 @@
+"""Simulators, tasks and trainings on a device of the test's choice, and what tests read of them."""
+
+import contextlib
+import gc
+
+import torch
+import warp as wp
+from support.fused import assert_alike, compiled, draw_states, put
+from support.settings import parse
+
+from legged_torque import RESOURCES_DIR
+from legged_torque.envs import task_registry
+from legged_torque.sim.registry import make_engine
+from legged_torque.utils.mjcf import read_spec
+from legged_torque.utils.task_registry import set_seed
+
+
+def make_robot(name, edit=None):
+    """The model of a robot that comes with the package, on a plane, changed by a function of its specification."""
+    spec = read_spec(RESOURCES_DIR / f"robots/{name}/{name}.xml")
+    if edit is not None:
+        edit(spec)
+    return compiled(spec)
+
+
+def make_sim(model, num, device, engine="fused", **settings):
+    """An engine whose solver converges."""
+    return make_engine(engine, model, num, device, 100, 50, **settings)
+
+
+def results(sim):
+    """Velocities, positions, contact counts and contact forces after a step, as ``assert_alike`` takes them."""
+    tensors = (sim.qvel, sim.qpos, sim.contact_found, sim.contact_force)
+    return [tensor.double().cpu().numpy() for tensor in tensors]
+
+
+def step(sim, states):
+    """The same after one step from some states."""
+    put(sim, states)
+    sim.step()
+    return results(sim)
+
+
+def thrown(model, num, seed=0):
+    """States of a robot that was thrown on the floor, in proportion to its height."""
+    height = model.key_qpos[0][2]
+    return draw_states(model, num, (0.15 * height, height), seed)
+
+
+def assert_matches(model, states, actual, expected):
+    """Compare results as ``assert_alike`` does, except in worlds where a contact only just touches: 1% at most."""
+    alike = (actual[2] == expected[2]).all(axis=1)
+    assert alike.mean() >= 0.99, alike.mean()
+    chosen = {name: values[alike] for name, values in states.items()}
+    assert_alike(model, chosen, *([values[alike] for values in result] for result in (actual, expected)))
+
+
+def make_env(device, *words):
+    """The task of a command line, and the settings of its training."""
+    options = parse(*words, f"--device={device}")
+    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+    set_seed(train_cfg.seed)
+    return task_registry.make_env(options.task, options, env_cfg)[0], train_cfg
+
+
+def make_runner(device, *words, log_root=None):
+    """The runner of a command line, with the task that it trains."""
+    env, train_cfg = make_env(device, *words)
+    return task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=log_root)[0]
+
+
+def sim_of(env):
+    """The simulator of a task."""
+    return env.sim
+
+
+def use_graphs(env, on):
+    """Choose whether control steps of a task replay as a CUDA graph."""
+    env.step_graph.enabled = on
+
+
+@contextlib.contextmanager
+def no_waiting(device):
+    """Let torch refuse whatever waits for a GPU."""
+    if torch.device(device).type != "cuda":
+        yield
+        return
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+def used_memory(device):
+    """Bytes that torch and Warp hold of a GPU's memory; 0 of a CPU's."""
+    if torch.device(device).type != "cuda":
+        return 0
+    gc.collect()
+    of_warp = wp.get_mempool_used_mem_current(device) if wp.is_mempool_supported(device) else 0
+    return torch.cuda.memory_allocated(device) + of_warp
