@@ -160,7 +160,8 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
     fallen robots here, and they have more contacts. Returned are the medians over the rounds [ms].
     """
     actions = ACTION_SCALE * torch.randn(task.num_envs, task.num_actions, device=task.device)
-    state = (task.sim.qpos, task.sim.qvel, task.sim.qacc_warmstart)
+    carried = task.sim.state_dict()
+    state = [carried[name] for name in ("qpos", "qvel", "qacc_warmstart") if name in carried]
     kept = [tensor.clone() for tensor in state]
 
     def physics() -> None:

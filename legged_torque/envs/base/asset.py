@@ -10,7 +10,7 @@ import numpy as np
 
 from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.envs.base.robot_checks import engine_notes, floor_problems, foot_notes, pose_problems
+from legged_torque.envs.base.robot_checks import floor_problems, foot_notes, pose_problems
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching
 from legged_torque.sim.robot_file import model_problems, spec_problems, use_plain_motors
 from legged_torque.terrain.terrain import Terrain
@@ -84,7 +84,7 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
             model = spec.compile()
     model.opt.timestep = cfg.sim.dt
     feet, penalized, terminating = chosen
-    notes += [*foot_notes(model, [geoms[place] for place in feet]), *engine_notes(model, cfg.sim.engine)]
+    notes += foot_notes(model, [geoms[place] for place in feet])
     return Asset(model, dof_names, geoms, feet, penalized, terminating, notes)
 
 

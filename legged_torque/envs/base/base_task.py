@@ -17,8 +17,8 @@ from torch import Tensor
 from legged_torque.envs.base.evaluation import WalkingEvaluation
 from legged_torque.envs.base.state import RobotState
 from legged_torque.sim.compiled import compiled
+from legged_torque.sim.engine import Engine
 from legged_torque.sim.graph import CudaGraph
-from legged_torque.sim.simulator import Simulator
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.buffers import copy_state
 from legged_torque.utils.config import flat, to_dict
@@ -41,7 +41,7 @@ class BaseTask(VecEnv):
         keep_final_observations: Whether "final_observations" of the extras are computed, see :meth:`step`.
     """
 
-    sim: Simulator
+    sim: Engine
     terrain: Terrain
     state: RobotState
     obs_buf: TensorDict

@@ -36,19 +36,16 @@ from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.motors.chain import MotorChain
 from legged_torque.motors.joints import Joints
 from legged_torque.sensors.sensors import Sensors
+from legged_torque.sim.engine import require
 from legged_torque.sim.health import Health
 from legged_torque.sim.model import indices_matching
-from legged_torque.sim.randomization import RandomParameter, changes_legs
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.randomization import RandomParameter
+from legged_torque.sim.registry import engine_class, make_engine
 from legged_torque.terrain import make_terrain
 from legged_torque.utils.config import section_keys
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import joint_limits
 
-MODEL_FIELDS = (
-    *("body_mass", "body_inertia", "body_ipos", "geom_size", "geom_pos", "geom_friction", "geom_solref", "gravity"),
-    *("dof_damping", "dof_armature", "jnt_stiffness", "dof_frictionloss"),
-)
 OUTSIDE_KERNEL = "torques are computed in torch, outside of the physics kernel, which makes steps slower"
 """What a task says that overrides ``_compute_torques`` or has motors without a Warp function."""
 
@@ -318,12 +315,16 @@ class LeggedRobot(RewardTerms, BaseTask):
         """Load robot and ground, and build the simulator."""
         cfg, sim = self.cfg, self.cfg.sim
         self.terrain = make_terrain(cfg.terrain, self.num_envs, self.device)
-        height_map = self.terrain.map if sim.engine == "fused" else None  # others find it in their model
+        engine = engine_class(sim.engine)
+        if cfg.domain_rand.randomize_parameters:
+            require(engine, "per_world", "domain_rand.randomize_parameters")
+        if cfg.asset.self_collisions:
+            require(engine, "self_collision", "asset.self_collisions")
+        height_map = self.terrain.map if "height_map" in engine.capabilities else None  # others find it in their model
         self.asset = load_asset(cfg, None if height_map else self.terrain)
         model = self.asset.mj_model
-        per_world = MODEL_FIELDS if cfg.domain_rand.randomize_parameters else ()
         limits = (sim.solver_iterations, sim.ls_iterations)
-        self.sim = Simulator(model, self.num_envs, self.device, sim.engine, *limits, per_world, False, height_map)
+        self.sim = make_engine(sim.engine, model, self.num_envs, self.device, *limits, height_map)
         self.dof_names, self.foot_names = self.asset.dof_names, self.asset.foot_names
         self.num_dof = len(self.dof_names)
         axes, names = self.asset.dof_axes().tolist(), (self.foot_names, self.asset.foot_of)
@@ -331,7 +332,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         if self.symmetry.joints and self.symmetry.foot_geoms:
             problem = mirror_problem(model, self.symmetry.joints, self.symmetry.foot_geoms, self.foot_names)
             self.symmetry.refuse(problem)
-        self.notes = list(self.asset.notes)
+        self.notes = [*self.asset.notes, *self.sim.notes]
 
     def _init_buffers(self) -> None:
         """Allocate constants of the controller and of the rewards; approaches add their own."""
@@ -367,7 +368,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.motors = MotorChain(cfg.motors, Joints(self.dof_names, self.torque_limits, armature, self.actions, *clock))
         self.motor_strength = self.motors.strength
         self._torque_kernel = None
-        if self.sim.is_fused and cfg.control.refresh_torques:
+        if "torques_in_kernel" in self.sim.capabilities and cfg.control.refresh_torques:
             law = self.control_law.kernel
             self._torque_kernel = self.motors.kernel(law) if law else None
             if self._is_overridden() or not self._torque_kernel:
@@ -398,8 +399,6 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.parameter_mirrors = mirrors(drawn, self.randomization.sizes)
         if rand.randomize_parameters:
             self.notes += range_notes(drawn, self.randomization.fields, self.torque_limits[1].cpu().numpy())
-            if changes_legs(drawn):
-                self.sim.vary_legs()
 
     def _init_observations(self) -> None:
         """Prepare the observations."""

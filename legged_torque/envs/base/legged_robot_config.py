@@ -67,7 +67,7 @@ class LeggedRobotCfg(BaseConfig):
 
     class sim:  # physics
         dt: Annotated[float, Limits(above=0, highest=0.1)] = 0.005  # [s] physics step
-        engine: Literal["fused", "mujoco_warp"] = "fused"  # fused: legged robots; mujoco_warp: any robot
+        engine: str = "fused"  # for legged robots; mujoco_warp is for any robot
         solver_iterations: Annotated[int, Limits(1, 1000)] = 30  # at most
         ls_iterations: Annotated[int, Limits(1, 1000)] = 20  # line search, at most
 

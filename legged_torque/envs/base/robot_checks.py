@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 from torch import Tensor
 
-from legged_torque.sim.fused.tree import SLOWER, reasons_against
 from legged_torque.sim.model import FLOOR
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.mirroring import Mirroring
@@ -35,14 +34,6 @@ def foot_notes(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
         if bodies.count(body) != usual:
             has = f"the body '{model.body(body).name}' has {bodies.count(body)} feet"
             yield f"{has}; asset.foot_name chooses {', '.join(feet)}"
-
-
-def engine_notes(model: mujoco.MjModel, engine: str) -> Iterator[str]:
-    """Yield how much slower the engine is than the fused step, and why the latter cannot simulate the robot."""
-    if engine == "mujoco_warp":
-        reasons = "; ".join(reasons_against(model))
-        why = f"which cannot simulate this robot: {reasons}" if reasons else "which can simulate this robot"
-        yield f"sim.engine 'mujoco_warp' steps worlds, {SLOWER} than 'fused', {why}"
 
 
 def floor_problems(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:

@@ -10,6 +10,10 @@ from legged_torque.utils.errors import UserError, unknown_name
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     """Raise a UserError that names the first setting of a task that makes no sense, alone or with others."""
     cfg.check()
+    if cfg.sim.engine not in ("fused", "mujoco_warp"):
+        from legged_torque.sim.registry import engine_class  # takes seconds, which only other engines are worth
+
+        engine_class(cfg.sim.engine)
     for pair in cfg.asset.mirrored_legs:
         if len(pair) != 2:
             raise UserError(f"asset.mirrored_legs must be pairs [right, left], not {pair}")
