@@ -25,8 +25,7 @@ from legged_torque import resource_path
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.sim.engine import Engine
-from legged_torque.sim.height_map import HeightMap
+from legged_torque.sim.engine import Engine, HeightMap
 from legged_torque.sim.model import FLOOR, build_model
 from legged_torque.sim.registry import ENGINES, make_engine
 from legged_torque.utils import cli

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from legged_torque.motors.config import MotorCfg
 from legged_torque.motors.joints import Joints
-from legged_torque.motors.kernel import Part, torque_kernel
+from legged_torque.motors.kernel import Part, newest_actions, torque_kernel
 from legged_torque.motors.motor import Motor
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.errors import UserError, unknown_name
@@ -76,10 +76,10 @@ class MotorChain:
         """
         if len(self._of_actions) > 1 or any(link.kernel is None for link in self.links.values()):
             return None
-        parts = {name: (link.kernel, link.kernel_reads()) for name, link in self.links.items()}
-        of_actions = [parts[name] for name, link in self.links.items() if link.acts_on == "actions"]
-        of_torques = [parts[name] for name, link in self.links.items() if link.acts_on == "torques"]
-        return torque_kernel(law, self.strength, of_actions[0] if of_actions else self._actions, of_torques)
+        of_actions, of_torques = (
+            [(link.kernel, link.kernel_reads()) for link in links] for links in (self._of_actions, self._of_torques)
+        )
+        return torque_kernel(law, self.strength, *of_actions or [(newest_actions, self._actions)], of_torques)
 
     def reset(self, mask: Tensor) -> None:
         """Forget what belongs to episodes that have ended. Shape: (num_envs,), bool."""

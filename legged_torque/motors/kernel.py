@@ -28,25 +28,36 @@ def control_law(terms: Sequence[tuple[Part, Tensor | None]], num_dof: int) -> Pa
     ``(reads, actions, world, joint, pos, vel) -> torque [N m]``.
     """
     total: Part | None = None
-    for place, (law, weight) in enumerate(terms):
-        total = _add_law(total, law, weight, place * num_dof)
+    for place, ((law, law_reads), weight) in enumerate(terms):
+        function, struct = _sum_of_laws(total and total[0], law, weight is not None)
+        values = {"others": total[1]} if total else {}
+        values |= {"weight": weight.view(1)} if weight is not None else {}
+        total = function, read(struct, term=law_reads, first=place * num_dof, **values)
     assert total is not None, "a control law needs an action term"
     return total
 
 
-def torque_kernel(law: Part, strength: Tensor, actions: Tensor | Part, links: Sequence[Part]) -> Part:
+def torque_kernel(law: Part, strength: Tensor, actions: Part, links: Sequence[Part]) -> Part:
     """Return the torque of a joint as ``Engine.drive`` takes it, ``(reads, world, joint, substep, pos, vel)`` [N m].
 
     Args:
         law: As of :func:`control_law`.
         strength: Factors on what the law asks for. Shape: (num_envs, num_dof).
-        actions: The actions (num_envs, num_actions), or a link that acts on actions.
+        actions: A link that acts on actions, or :func:`newest_actions` with the actions (num_envs, num_actions).
         links: Further links, see :attr:`~legged_torque.motors.motor.Motor.kernel`.
     """
-    torque = _ask(law, strength, actions)
-    for link in links:
-        torque = _add_link(torque, link)
-    return torque
+    function, struct = _strengthened(law[0], actions[0])
+    reads = read(struct, law=law[1], strength=strength, actions=actions[1])
+    for link, link_reads in links:
+        function, struct = _behind(function, link)
+        reads = read(struct, before=reads, link=link_reads)
+    return function, reads
+
+
+@wp.func
+def newest_actions(actions: wp.array2d(dtype=wp.float32), world: int, substep: int) -> wp.array(dtype=wp.float32):
+    """Return the actions of a world, which reach its motors at once."""
+    return actions[world]
 
 
 def launch_law(law: Part, actions: Tensor, pos: Tensor, vel: Tensor, out: Tensor) -> None:
@@ -64,14 +75,6 @@ def struct_of(function: wp.Function) -> Any:
 def _struct(name: str, **types: Any) -> Any:
     """Return a Warp struct with these members."""
     return wp.struct(type(name, (), {"__annotations__": types, "__module__": __name__, "__qualname__": name}))
-
-
-def _add_law(total: Part | None, law: Part, weight: Tensor | None, first: int) -> Part:
-    """Return a control law with one more term, whose actions begin at ``first``."""
-    function, struct = _sum_of_laws(total and total[0], law[0], weight is not None)
-    values = {"others": total[1]} if total else {}
-    values |= {"weight": weight.view(1)} if weight is not None else {}
-    return function, read(struct, term=law[1], first=first, **values)
 
 
 @functools.cache
@@ -96,35 +99,17 @@ def _sum_of_laws(others: wp.Function | None, law: wp.Function, is_weighted: bool
     return law_torque, Reads
 
 
-def _ask(law: Part, strength: Tensor, actions: Tensor | Part) -> Part:
-    """Return what the control law asks of the motors, times their strength."""
-    link = None if isinstance(actions, Tensor) else actions[0]
-    function, struct = _asked(law[0], link)
-    source = actions if isinstance(actions, Tensor) else actions[1]
-    return function, read(struct, law=law[1], strength=strength, actions=source)
-
-
 @functools.cache
-def _asked(law: wp.Function, link: wp.Function | None) -> tuple[wp.Function, Any]:
-    """Return the function of a control law behind a link that acts on actions, if there is one."""
-    source = struct_of(link) if link else wp.array2d(dtype=wp.float32)
-    Reads = _struct("AskReads", law=struct_of(law), strength=wp.array2d(dtype=wp.float32), actions=source)
+def _strengthened(law: wp.Function, link: wp.Function) -> tuple[wp.Function, Any]:
+    """Return what a control law asks for, behind a link that acts on actions, times the strength."""
+    Reads = _struct("AskReads", law=struct_of(law), strength=wp.array2d(dtype=wp.float32), actions=struct_of(link))
 
     @wp.func
     def asked_torque(reads: Reads, world: int, joint: int, substep: int, pos: float, vel: float) -> float:
-        if wp.static(link is None):
-            wanted = law(reads.law, reads.actions[world], world, joint, pos, vel)
-        else:
-            wanted = law(reads.law, link(reads.actions, world, substep), world, joint, pos, vel)
+        wanted = law(reads.law, link(reads.actions, world, substep), world, joint, pos, vel)
         return reads.strength[world, joint] * wanted
 
     return asked_torque, Reads
-
-
-def _add_link(torque: Part, link: Part) -> Part:
-    """Return torques behind one more link."""
-    function, struct = _behind(torque[0], link[0])
-    return function, read(struct, before=torque[1], link=link[1])
 
 
 @functools.cache

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, Protocol
 
 import mujoco
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -20,6 +21,25 @@ CAPABILITIES = {
     "per_world": "has Engine.field and what belongs to it: parameters of the model that differ from world to world",
 }
 """What an engine may be able to do besides stepping worlds."""
+
+
+class HeightMap(Protocol):
+    """Ground that is not a plane: heights on a square grid in the world frame, with two triangles per cell.
+
+    A cell's diagonal runs from sample (i, j) to (i + 1, j + 1), as in MuJoCo's hfield. All worlds have the same map.
+    """
+
+    @property
+    def heights(self) -> np.ndarray:
+        """Return the heights [m]: rows along x, columns along y, two or more of each. Shape: (rows, cols)."""
+
+    @property
+    def horizontal_scale(self) -> float:
+        """Return the distance between neighbouring samples [m]."""
+
+    @property
+    def corner(self) -> tuple[float, float]:
+        """Return x and y of sample (0, 0) [m]."""
 
 
 class Engine(Protocol):
@@ -47,8 +67,7 @@ class Engine(Protocol):
             start of the last physics step; undefined after a step that did not sense. Shape: (num_envs, geoms).
         contact_force: Net contact force on each sensed geom in the world frame [N], of the same step.
             Shape: (num_envs, geoms, 3).
-        diverged: Worlds whose state was not finite or absurdly large in a :meth:`flag_diverged` since the last
-            :meth:`clear_diverged`. Shape: (num_envs,), bool.
+        diverged: Worlds that :meth:`flag_diverged` has marked. Shape: (num_envs,), bool.
         fields: The fields that :meth:`field` has returned and those that follow from them, by name.
     """
 
@@ -66,20 +85,12 @@ class Engine(Protocol):
     diverged: Tensor
     fields: dict[str, Tensor]
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        num_envs: int,
-        device: str,
-        solver_iterations: int = 30,
-        ls_iterations: int = 20,
-        **options: Any,
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, num_envs: int, device: str, **options: Any) -> None:
         """Build the worlds, all in the reference pose of a model with contact sensors (four numbers each).
 
-        The constraint solver does at most so many iterations per physics step, and its line search per iteration.
-        Engines with the capability "height_map" take ``height_map`` in ``options``, the ground in place of the model's
-        plane. A UserError if the engine cannot simulate this robot.
+        ``model.opt`` has the most iterations of the constraint solver and of its line search. Engines with the
+        capability "height_map" take ``height_map`` in ``options``, the ground in place of the model's plane. A
+        UserError if the engine cannot simulate this robot.
         """
 
     def step(self, sense: bool = True) -> None:
@@ -93,9 +104,6 @@ class Engine(Protocol):
 
         Everything that they carry from step to step is cleared, warm starts and applied forces included.
         """
-
-    def clear_diverged(self) -> None:
-        """Set ``diverged`` to False everywhere."""
 
     def flag_diverged(self) -> None:
         """Mark the worlds whose state is not finite or absurdly large."""

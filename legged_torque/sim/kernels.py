@@ -42,13 +42,6 @@ def turn(qpos: Rows, world: int, roll: float, pitch: float, yaw: float):
         qpos[world, 4 + i] = quat[i]
 
 
-@wp.func
-def push_trunk(qvel: Rows, world: int, velocity: wp.vec3, add: bool):
-    """Set or add the trunk's linear velocity of one world."""
-    for i in range(3):
-        qvel[world, i] = velocity[i] + wp.where(add, qvel[world, i], 0.0)
-
-
 @wp.kernel(enable_backward=False)
 def flag_diverged(qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverged: Mask, overflow_seen: Integers):
     """Check one position, velocity and acceleration of a world; the comparisons are false for NaN."""
@@ -117,7 +110,9 @@ def apply_random_events(
         shares = wp.vec3(wp.randf(random), wp.randf(random), wp.randf(random))
         velocity = wp.vec3(lowest, lowest, lowest) + width * shares
         is_added = drawn[3] < chances[3]
-        push_trunk(qvel, world, wp.where(is_added, 1.0, push_set_factor) * velocity, is_added)
+        velocity *= wp.where(is_added, 1.0, push_set_factor)
+        for i in range(3):
+            qvel[world, i] = velocity[i] + wp.where(is_added, qvel[world, i], 0.0)
 
 
 @wp.struct

@@ -19,18 +19,10 @@ class MuJoCoWarpEngine(WarpEngine):
     name = "mujoco_warp"
     capabilities = frozenset({"self_collision", "applied_forces", "per_world"})
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        num_envs: int,
-        device: str,
-        solver_iterations: int = 30,
-        ls_iterations: int = 20,
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, num_envs: int, device: str) -> None:
         """Build the worlds; a UserError if MuJoCo Warp cannot simulate this robot."""
         contacts = max_contacts(model)
-        rows = max_constraints(model, contacts)
-        super().__init__(model, num_envs, device, solver_iterations, ls_iterations, contacts, rows)
+        super().__init__(model, num_envs, device, contacts, max_constraints(model, contacts))
         reasons = "; ".join(reasons_against(model))
         why = f"which cannot simulate this robot: {reasons}" if reasons else "which can simulate this robot"
         self.notes = [f"sim.engine 'mujoco_warp' steps worlds, {SLOWER} than 'fused', {why}"]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -87,19 +88,12 @@ class Randomization:
         first_draw: dict[str, int] = {}
         num_draws = 1  # number 0 decides what is kept
         for parameter in parameters:
-            is_of_model = isinstance(parameter.field, str)
-            field = parameter.field
-            if isinstance(field, str):
-                field = model_field(field, parameter.columns).flatten(1)
-            check_value(f"random parameter '{parameter.name}'", parameter.draw, Draw)
-            check_field(parameter, field)
-            self.fields[str(parameter.field) if is_of_model else parameter.name] = field
-            count = 1 if parameter.shared else len(parameter.columns)
+            field = self._field(parameter, model_field)
             start = first_draw.setdefault(parameter.same_draw_as or parameter.name, num_draws)
             is_new = start == num_draws
             if is_new:
                 self.sizes[parameter.name] = parameter.num_listed
-                num_draws += count
+                num_draws += 1 if parameter.shared else len(parameter.columns)
             column_draw = num_draws if "scale_per_joint" in parameter.draw else None
             num_draws += len(parameter.columns) if column_draw is not None else 0
             table_rows = table(parameter, field, keep_probability)
@@ -113,7 +107,7 @@ class Randomization:
                     row.place = len(at_start)
                     at_start.append((row.own_value - row.middle) * row.per_half_range)
                 rows.append(row)
-        self._refuse_views(parameters)
+        self._refuse_views()
         self._without_rows = [name for name, field in self.fields.items() if len(field) != num_envs]
         self._device = device
         self.values = torch.tensor(at_start, device=device).repeat(num_envs, 1)
@@ -125,15 +119,26 @@ class Randomization:
         names = [parameter.name for parameter in self.parameters if isinstance(parameter.field, Tensor)]
         return {name: self.fields[name] for name in names}
 
-    def _refuse_views(self, parameters: Sequence[RandomParameter]) -> None:
+    def _field(self, parameter: RandomParameter, model_field: Callable[[str, Sequence[int]], Tensor]) -> Tensor:
+        """Return and keep the tensor of a parameter; a UserError unless the kernel can write to its addresses."""
+        name, field = parameter.name, parameter.field
+        check_value(f"random parameter '{name}'", parameter.draw, Draw)
+        if isinstance(field, str):
+            name, field = field, model_field(field, parameter.columns).flatten(1)
+        kind, shape = field.dtype, tuple(field.shape)
+        if kind != torch.float32 or len(shape) != 2:
+            raise UserError(f"random parameter '{parameter.name}' must be float32 with two axes, not {kind} {shape}")
+        self.fields[name] = field
+        return field
+
+    def _refuse_views(self) -> None:
         """Raise a UserError for a tensor that is a field of the model: what follows from it would stay as it was."""
-        names = [str(parameter.field) for parameter in parameters if isinstance(parameter.field, str)]
-        storages = {self.fields[name].untyped_storage().data_ptr(): name for name in names}
-        for parameter in parameters:
-            field = parameter.field
-            name = None if isinstance(field, str) else storages.get(field.untyped_storage().data_ptr())
+        own = self.own_fields()
+        storages = {self.fields[name].untyped_storage().data_ptr(): name for name in self.fields.keys() - own.keys()}
+        for parameter, field in own.items():
+            name = storages.get(field.untyped_storage().data_ptr())
             if name:
-                raise UserError(f"the random parameter '{parameter.name}' is the model's '{name}': give its name")
+                raise UserError(f"the random parameter '{parameter}' is the model's '{name}': give its name")
 
     def draw(self, mask: Tensor) -> None:
         """Draw all parameters anew in the worlds of ``mask`` (num_envs,), bool; a UserError if worlds share one."""
@@ -141,13 +146,6 @@ class Randomization:
             raise UserError(f"random parameters without a row per world: {', '.join(self._without_rows)}")
         arrays = [wp.from_torch(mask), wp.from_torch(self.seeds), self._rows, wp.from_torch(self.values)]
         wp.launch(kernels.draw, (len(self.values), len(self._rows)), arrays, device=self._device)
-
-
-def check_field(parameter: RandomParameter, field: Tensor) -> None:
-    """Raise a UserError unless a parameter's numbers are of the kind that the kernel writes to their addresses."""
-    kind, shape = field.dtype, tuple(field.shape)
-    if kind != torch.float32 or len(shape) != 2:
-        raise UserError(f"random parameter '{parameter.name}' must be float32 with two axes, not {kind} {shape}")
 
 
 def fixed(parameter: RandomParameter) -> RandomParameter:
@@ -159,15 +157,13 @@ def fixed(parameter: RandomParameter) -> RandomParameter:
 def table(parameter: RandomParameter, field: Tensor, keep_probability: float) -> list[Any]:
     """Return how each column of a parameter is drawn; a UserError if it can fall below what it may be."""
     at_start = field[0, list(parameter.columns)].tolist()
-    own, unit, offset = at_start if parameter.own is None else parameter.own, parameter.add_unit, (0.0, 0.0)
+    own, unit = at_start if parameter.own is None else parameter.own, parameter.add_unit
     if "set" in parameter.draw:
-        own, unit, offset = 0.0, parameter.set_unit, pair(parameter.draw["set"])
-    elif "add" in parameter.draw:
-        offset = pair(parameter.draw["add"])
-    scale = pair(parameter.draw.get("scale", [1.0, 1.0]))
-    column_scale = pair(parameter.draw.get("scale_per_joint", [1.0, 1.0]))
+        own, unit = 0.0, parameter.set_unit
+    draw = {"scale": (1.0, 1.0), "scale_per_joint": (1.0, 1.0), **parameter.draw}
+    offset, scale = draw.get("set", draw.get("add", (0.0, 0.0))), draw["scale"]
     lowest, highest = parameter.limits or (-math.inf, math.inf)
-    columns = [per_column(numbers, len(at_start)) for numbers in (own, unit, lowest, highest)]
+    columns = [np.broadcast_to(numbers, len(at_start)).tolist() for numbers in (own, unit, lowest, highest)]
     rows = []
     for default, base, weight, low, high in zip(at_start, *columns, strict=True):
         row: Any = kernels.Row()
@@ -175,12 +171,10 @@ def table(parameter: RandomParameter, field: Tensor, keep_probability: float) ->
         row.base, row.weight, row.own_value = base, weight, default
         row.offset_low, row.offset_span = offset[0], offset[1] - offset[0]
         row.scale_low, row.scale_span = scale[0], scale[1] - scale[0]
-        row.column_low, row.column_span = column_scale[0], column_scale[1] - column_scale[0]
+        of_column = draw["scale_per_joint"]
+        row.column_low, row.column_span = of_column[0], of_column[1] - of_column[0]
         row.keep_probability = keep_probability if parameter.may_keep else 0.0
-        scales = product(scale, column_scale)
-        corners = [
-            (base + weight * added) * factor * of_column for added, (factor, of_column) in product(offset, scales)
-        ]
+        corners = [(base + weight * add) * factor * other for add, factor, other in product(offset, scale, of_column)]
         if min(corners) < parameter.at_least:
             raise UserError(
                 f"random parameter '{parameter.name}' can be {min(corners):g} with the ranges given; it must be at "
@@ -191,14 +185,3 @@ def table(parameter: RandomParameter, field: Tensor, keep_probability: float) ->
         row.per_half_range = 1.0 / half_range if half_range > 0.0 else 0.0
         rows.append(row)
     return rows
-
-
-def pair(limits: Sequence[float]) -> tuple[float, float]:
-    """Return a range of the settings as lowest and highest value."""
-    low, high = limits
-    return float(low), float(high)
-
-
-def per_column(value: Sequence[float] | float, count: int) -> list[float]:
-    """Return one number per column."""
-    return [float(value)] * count if isinstance(value, (int, float)) else [float(v) for v in value]

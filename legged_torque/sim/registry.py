@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mujoco
 
-from legged_torque.sim.engine import Engine, require
+from legged_torque.sim.engine import Engine, HeightMap, require
 from legged_torque.sim.fused.engine import FusedEngine
-from legged_torque.sim.height_map import HeightMap
 from legged_torque.sim.mjwarp import MuJoCoWarpEngine
 from legged_torque.sim.robot_file import actuator_problems
 from legged_torque.utils.errors import refuse, unknown_name
@@ -35,12 +32,13 @@ def make_engine(
 ) -> Engine:
     """Build the worlds of an engine on "cpu" or "cuda:N", see :class:`Engine`.
 
-    A UserError if the engine is unknown, lacks what is needed, or cannot simulate this robot.
+    The constraint solver does at most so many iterations per physics step, and its line search per iteration. A
+    UserError if the engine is unknown, lacks what is needed, or cannot simulate this robot.
     """
     engine = engine_class(name)
     refuse(list(actuator_problems(model)), f"sim.engine '{name}' needs motors")
-    options: dict[str, Any] = {}
-    if height_map is not None:
-        require(engine, "height_map", "a height map")
-        options["height_map"] = height_map
-    return engine(model, num_envs, device, solver_iterations, ls_iterations, **options)
+    model.opt.iterations, model.opt.ls_iterations = solver_iterations, ls_iterations
+    if height_map is None:
+        return engine(model, num_envs, device)
+    require(engine, "height_map", "a height map")
+    return engine(model, num_envs, device, height_map=height_map)

@@ -34,22 +34,12 @@ class WarpEngine(Engine):
         solver_niter: Iterations of the solver in the last physics step. Shape: (num_envs,), int32.
     """
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        num_envs: int,
-        device: str,
-        solver_iterations: int = 30,
-        ls_iterations: int = 20,
-        contacts: int = 1,
-        rows: int = 1,
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, num_envs: int, device: str, contacts: int = 1, rows: int = 1) -> None:
         """Build the worlds, with room for so many contacts and constraint rows of MuJoCo Warp's own in each."""
         use_known_options(model)
         self.mj_model, self.num_envs, self.device = model, num_envs, device
         prepare_device(device)
         self._wp_device = wp.get_device(device)
-        model.opt.iterations, model.opt.ls_iterations = solver_iterations, ls_iterations
         with wp.ScopedDevice(self._wp_device):
             try:
                 self._model = mjw.put_model(model)
@@ -77,10 +67,6 @@ class WarpEngine(Engine):
         wp.launch(kernels.reset_worlds, self.num_envs, inputs, device=self._wp_device)
         for tensor in self._carried.values():
             tensor.view(self.num_envs, -1).masked_fill_(mask.unsqueeze(1), 0.0)
-
-    def clear_diverged(self) -> None:
-        """Set ``diverged`` to False everywhere."""
-        self.diverged.zero_()
 
     def flag_diverged(self) -> None:
         """Mark the worlds whose state is not finite or absurdly large; MuJoCo Warp has no such check."""

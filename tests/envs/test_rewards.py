@@ -38,7 +38,7 @@ def neutral(task):
     task.base_pos.copy_(torch.tensor([7.0, 8.0, 0.303]).expand_as(task.base_pos))
     task.feet_contact.fill_(1.0)
     task.feet_air_time.fill_(0.5)
-    task.sim.clear_diverged()
+    task.sim.diverged.zero_()
 
 
 def set_tracking_lin_vel(task, world):

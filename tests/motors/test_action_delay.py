@@ -8,7 +8,6 @@ from support.episodes import HIGH_UP, time_out
 from support.settings import error_of, get_cfgs, torques_in_torch
 
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.config import set_by_path
 
 EXCEEDED = {1: 10.83, 3: 16.27, 5: 20.52, 15: 37.70, 35: 66.62}
 """What 1 in 1000 chi-square numbers exceeds, by degrees of freedom."""
@@ -105,18 +104,6 @@ def test_position_control(make_task, delay, unit, refresh):
         expected = np.clip(pd_by_hand(actions[t], q, qd), -33.5, 33.5)
         np.testing.assert_allclose(torques, expected, rtol=1e-4, atol=1e-4)
     assert np.abs(notes[0][1] - notes[3][1]).max() > 0.01  # the joints do move within a control step
-
-
-@pytest.mark.parametrize("delay", [2, 6])
-def test_both_heads(make_task, delay):
-    """Position and torque actions arrive together; both parts weigh 1 when training starts."""
-    task = make_task("a1_torque_multihead", 3, **delayed(delay, delay))
-    notes = watch(task)
-    actions = arrived(send(task, 6), 4, delay)
-    assert actions.shape == (24, 3, 24)
-    for action, (torques, q, qd) in zip(actions, notes, strict=True):
-        expected = np.clip(pd_by_hand(action[:, :12], q, qd) + 4.0 * action[:, 12:], -33.5, 33.5)
-        np.testing.assert_allclose(torques, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_policy_knows_what_it_has_sent(make_task):
@@ -223,13 +210,3 @@ def test_torques_that_cannot_follow(make_task):
     line = error_of(make_task, "a1_torque", 1, **delayed(0, 3, **once))
     assert "motors.delay.unit" in line and "control.refresh_torques" in line
     make_task("a1_torque", 1, **delayed(0, 0, **once))
-
-
-def test_command_line():
-    """A range is given as a list of physics steps; whole numbers may have a point."""
-    for text in ("[1, 3]", "[1.0, 3.0]"):
-        cfg, _ = get_cfgs(f"--set=motors.delay.range={text}")
-        assert cfg.motors.delay.unit == "physics_steps"
-        assert cfg.motors.delay.range == [1, 3] and type(cfg.motors.delay.range[0]) is int
-    line = error_of(set_by_path, get_cfgs()[0], "motors.delay.range", "[a, b]")
-    assert "motors.delay.range" in line

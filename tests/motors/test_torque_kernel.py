@@ -16,8 +16,7 @@ from support.settings import torques_in_torch
 from legged_torque.envs.base.actions import PdControl, pd_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.robots.a1 import A1Cfg
-from legged_torque.sim.registry import ENGINES, make_engine
-from legged_torque.utils.errors import UserError
+from legged_torque.sim.registry import make_engine
 
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "contact_found", "contact_force")
 
@@ -82,13 +81,6 @@ def test_simulator_drives():
         assert sim.contact_found[world].sum() == data.ncon
 
 
-def test_only_the_fused_engine_drives():
-    """The other one says so."""
-    sim = make_engine("mujoco_warp", compiled(make_walker()), 1)
-    with pytest.raises(UserError, match="'mujoco_warp' lacks the capability 'torques_in_kernel'"):
-        sim.drive(1, spring, Springs())
-
-
 # ------------------------------------------------------------------------------------------------ tasks
 
 
@@ -122,16 +114,6 @@ def test_as_in_torch(make_task, name, settings):
             getattr(tasks[1].sim, field).copy_(getattr(tasks[0].sim, field))  # rounding errors do not add up
     assert tasks[0].contacts.any()
     assert notes == [["drive"] * 12, ["step"] * 12 * tasks[0].cfg.control.decimation]
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("refresh", [True, False])
-def test_when_torch_computes(make_task, engine, refresh):
-    """MuJoCo Warp's own step, and torques that are held, take a launch per physics step."""
-    task = make_task("a1_position", 1, **{"sim.engine": engine, "control.refresh_torques": refresh})
-    notes = launches(task)
-    task.step(torch.zeros(1, 12))
-    assert notes == (["drive"] if engine == "fused" and refresh else ["step"] * 4)
 
 
 class Uneven(LeggedRobot):
@@ -171,10 +153,6 @@ class Wrapped(LeggedRobot):
         return 2.0 * LeggedRobot._compute_torques(self, actions)
 
 
-class Heir(Doubled):
-    """Inherits the override."""
-
-
 @wp.func
 def doubled(pd: PdControl, action: float, world: int, joint: int, pos: float, vel: float) -> float:
     """Return twice the torque of position control."""
@@ -188,9 +166,7 @@ class DoubledInKernel(LeggedRobot):
         return [dataclasses.replace(super().action_terms()[0], law=doubled)]
 
 
-@pytest.mark.parametrize(
-    ("robot", "launch"), [(Doubled, "step"), (Wrapped, "step"), (Heir, "step"), (DoubledInKernel, "drive")]
-)
+@pytest.mark.parametrize(("robot", "launch"), [(Doubled, "step"), (Wrapped, "step"), (DoubledInKernel, "drive")])
 def test_overrides_count(robot, launch):
     """A class that overrides the method gets its own torques, and a note says that they leave the kernel."""
     cfg = A1Cfg()

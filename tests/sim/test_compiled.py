@@ -61,7 +61,7 @@ def results(task, num=5):
 
 @pytest.mark.parametrize(("name", "more"), [("a1_torque_multihead", {}), ("a1_torque_curriculum", HISTORY)])
 def test_a_compiled_step_is_the_same(make_task, graphs, capsys, name, more):
-    """All parts are compiled, and give the same bits, also in worlds that end and beside one that diverges."""
+    """All parts are compiled, and give the same bits, also in worlds that end, next to one that diverges."""
     expected = results(make_task(name, 5, **SETTINGS, **more))
     found = results(compiled_task(make_task(name, 5, **SETTINGS, **more)))
     assert graphs and "uncompiled" not in capsys.readouterr().err

@@ -16,7 +16,7 @@ from legged_torque.sim.registry import make_engine
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import read_spec
 
-GEOM, JOINT, TRN = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtTrn
+GEOM, JOINT, TRN, DISABLE = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtTrn, mujoco.mjtDisableBit
 A1 = RESOURCES_DIR / "robots/a1/a1.xml"
 MOTOR = {"gear": [1, 0, 0, 0, 0, 0], "ctrlrange": (-9, 9), "forcerange": (-9, 9), "trntype": TRN.mjTRN_JOINT}
 HINGES = "each body but the trunk must have one hinge joint, unlike '"
@@ -32,10 +32,7 @@ REFUSED = [
     (f"spec.body('FL_hip').add_body(name='b').add_geom({SPHERE})", HINGES),
     ("spec.geom('floor').contype = 0", "it needs one plane and no other obstacle"),
     (f"spec.worldbody.add_geom({SPHERE}, pos=(0, 0, -1), condim=3)", "it needs one plane and no other obstacle"),
-    (
-        "spec.worldbody.add_geom(type=GEOM.mjGEOM_PLANE, size=(1, 1, 1), pos=(0, 0, -9))",
-        "it needs one plane and no other obstacle",
-    ),
+    ("spec.worldbody.add_geom(type=GEOM.mjGEOM_PLANE, size=(1, 1, 1), pos=(0, 0, -9))", "it needs one plane"),
     (
         "spec.geom('FR_hip').type = GEOM.mjGEOM_ELLIPSOID; spec.geom('FR_hip').size = (0.1, 0.1, 0.2)",
         "only spheres, capsules, cylinders and boxes may collide, unlike 'FR_hip'",
@@ -51,11 +48,7 @@ REFUSED = [
     ("spec.joint('FR_calf_joint').margin = 0.01", "joint limits have margins"),
     ("spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC", "the friction cone must be pyramidal"),
     ("spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4", "the integrator must be implicitfast or Euler"),
-    ("spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT", "the integrator must be implicitfast or Euler"),
-    (
-        "spec.option.integrator, spec.option.disableflags = 0, mujoco.mjtDisableBit.mjDSBL_EULERDAMP | 4",
-        "it disables frictionloss, eulerdamp",
-    ),
+    ("o = spec.option; o.integrator, o.disableflags = 0, DISABLE.mjDSBL_EULERDAMP | 4", "frictionloss, eulerdamp"),
     ("spec.option.enableflags = mujoco.mjtEnableBit.mjENBL_OVERRIDE", "it enables override"),
     ("spec.add_equality(type=2, name1='FR_hip_joint', name2='FL_hip_joint')", "equalities, tendons or mocap"),
     ("spec.add_tendon(name='t').wrap_joint('FR_hip_joint', 1.0)", "equalities, tendons or mocap"),
@@ -63,11 +56,9 @@ REFUSED = [
     ("spec.add_pair(geomname1='FL_foot', geomname2='FR_foot', condim=1)", "other than condim 3"),
     ("spec.option.density = 1.2", "it moves through a fluid"),
     ("spec.option.viscosity = 1.2", "it moves through a fluid"),
-    ("spec.option.wind = (1, 0, 0); spec.option.density = 1.2", "it moves through a fluid"),
     ("spec.body('FR_calf').gravcomp = 0.5", "bodies are compensated for gravity"),
     (SITE, "actuators must be motors"),
     ("spec.actuator('FR_hip').set_to_position(kp=10.0)", "actuators must be motors"),
-    ("a = spec.actuator('FR_hip'); a.ctrlrange = (0, 1); a.set_to_damper(kv=1.0)", "actuators must be motors"),
     ("spec.actuator('FR_hip').dyntype = mujoco.mjtDyn.mjDYN_INTEGRATOR", "actuators must be motors"),
     ("spec.actuator('FR_hip').gainprm[0] = 2.0", "actuators must be motors"),
     ("branch(spec.body('FL_thigh'))", "body 'FL_thigh' branches"),
@@ -115,10 +106,7 @@ def remove_legs(spec):
         spec.delete(spec.body(f"{leg}_hip"))
 
 
-@pytest.mark.parametrize(
-    ("edit", "reason"),
-    [pytest.param(*case, id=case[0][:60]) for case in REFUSED],
-)
+@pytest.mark.parametrize(("edit", "reason"), [pytest.param(*case, id=case[0][:60]) for case in REFUSED])
 def test_refused(edit, reason):
     """A robot with anything that the step does not simulate is refused, by its reason."""
     spec = read_spec(A1)
@@ -167,7 +155,7 @@ def test_solver_of_the_file():
 
 
 def test_engine_that_is_slower():
-    """Who takes MuJoCo Warp's own step is told how much slower it is, and whether it had to be."""
+    """A note of MuJoCo Warp's own step says how much slower it is, and why the fused step is no choice."""
     assert not make_engine("fused", compiled(make_a1()), 1).notes
     assert "which can simulate this robot" in make_engine("mujoco_warp", compiled(make_a1()), 1).notes[0]
     spec = make_a1()

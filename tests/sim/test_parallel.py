@@ -13,7 +13,7 @@ STEPS = 12
 
 @pytest.fixture
 def set_threads():
-    """Function that tells torch how many threads to use, until the test ends."""
+    """Return a function that sets torch's number of threads until the test ends."""
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)

@@ -186,7 +186,7 @@ def test_option(tmp_path, thrown):
 
 
 def test_option_without_effect(tmp_path):
-    """A file that lets no parts collide is told, when the settings want it."""
+    """A file that lets no parts collide is refused, when the settings want it."""
     file = tmp_path / "robot.xml"
 
     def part(spec):

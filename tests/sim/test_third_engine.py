@@ -21,10 +21,9 @@ class PlainMuJoCo(Engine):
     name = "mujoco"
     capabilities = frozenset({"self_collision"})
 
-    def __init__(self, model, num_envs, device, solver_iterations=30, ls_iterations=20):
+    def __init__(self, model, num_envs, device):
         """Build the worlds."""
         self.mj_model, self.num_envs, self.device = model, num_envs, device
-        model.opt.iterations, model.opt.ls_iterations = solver_iterations, ls_iterations
         self._data = mujoco.MjData(model)
         self._reference = torch.tensor(model.qpos0, dtype=torch.float32)
         self.qpos = self._reference.repeat(num_envs, 1)
@@ -52,10 +51,6 @@ class PlainMuJoCo(Engine):
         self.qpos[mask] = self._reference
         for tensor in (self.qvel, self.qacc_warmstart, self.ctrl, self._sensors):
             tensor[mask] = 0.0
-
-    def clear_diverged(self):
-        """Forget."""
-        self.diverged.zero_()
 
     def flag_diverged(self):
         """Look at all numbers."""

@@ -158,7 +158,7 @@ def spoil(sim):
         tensor[:, np.isin(sim.mj_model.sensor_refid, colliding_pairs(sim.mj_model))] = np.inf
     arrays = [sim._state.qacc_warmstart, sim._state.solver_niter]
     arrays += [getattr(contacts, name) for name in ("found", "residual", "pushing", "change")]
-    arrays += [contacts.normal] if sim._on_map else []
+    arrays += [contacts.normal] if sim._layout.on_map else []
     arrays += [getattr(selves, name) for name in SELF_SCRATCH] if sim._layout.self_kinds else []
     for array in (*arrays, sim._scratch.branch):
         array.numpy().reshape(-1).view(np.float32).fill(np.inf)

@@ -172,7 +172,7 @@ class LeggedRobot(RewardTerms, BaseTask):
 
     def _step(self) -> None:
         """Physics, rewards, resets and observations of one control step."""
-        self.sim.clear_diverged()
+        self.sim.diverged.zero_()
         self.sim.flag_diverged()
         clip = self.cfg.normalization.clip_actions
         self.actions.copy_(self._given_actions.nan_to_num().clamp(-clip, clip))

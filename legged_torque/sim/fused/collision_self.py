@@ -22,7 +22,7 @@ from legged_torque.sim.fused.constraint import Contact, ContactParams, contact_p
 from legged_torque.sim.fused.math import group_sum, quat_to_matrix
 from legged_torque.sim.fused.model import Model, of_world
 from legged_torque.sim.fused.smooth import Pose
-from legged_torque.sim.fused.tree import Tree, places_of_geoms
+from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.types import vec4, vec5
 from legged_torque.utils.mjcf import self_pairs
 
@@ -87,7 +87,7 @@ def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree,
     on_ground = [point[0] for points in tree.points for point in points]
     airborne = np.setdiff1d(ordered_pairs(model), on_ground)
     out.airborne = wp.array(model.sensor_adr[np.isin(model.sensor_refid, airborne)], dtype=wp.int32)
-    out.geom_place = wp.array(places_of_geoms(model, tree), dtype=wp.vec2i)
+    out.geom_place = wp.array(tree.geom_places, dtype=wp.vec2i)
     out.poses = wp.empty((worlds, branches, depth + 1), dtype=Pose)
     room = worlds * MAX_SELF_CONTACTS
     out.found, out.geoms, out.normal = (wp.empty(room, dtype=dtype) for dtype in (Contact, wp.vec2i, wp.vec3))
@@ -140,13 +140,7 @@ def are_near(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i) ->
     return wp.length_sq(apart) <= reach * reach
 
 
-@wp.func
-def collide_nothing(types: wp.vec2i, a: Shape, b: Shape) -> PairContacts:
-    """Return no contact."""
-    return PairContacts()
-
-
-_COLLIDE = {
+_COLLIDE: dict[tuple[int, int], wp.Function] = {
     (SPHERE, SPHERE): sphere_sphere,
     (SPHERE, CAPSULE): sphere_capsule,
     (SPHERE, BOX): sphere_box,
@@ -154,24 +148,6 @@ _COLLIDE = {
     (CAPSULE, BOX): capsule_box,
     (BOX, BOX): box_box,
 }
-
-
-@functools.cache
-def collider(kinds: tuple[tuple[int, int], ...]) -> wp.Function:
-    """Return the function that collides geoms of some pairs of types: a kernel has no code for others."""
-    if not kinds:
-        return collide_nothing
-    first, second = kinds[0]
-    collide, collide_others = _COLLIDE[kinds[0]], collider(kinds[1:])
-
-    @wp.func
-    def collide_shapes(types: wp.vec2i, a: Shape, b: Shape) -> PairContacts:
-        """Return the contacts of two geoms of these types, as MuJoCo finds them."""
-        if types[0] == wp.static(first) and types[1] == wp.static(second):
-            return collide(a, b)
-        return collide_others(types, a, b)
-
-    return collide_shapes
 
 
 @wp.func
@@ -196,8 +172,7 @@ def make_self_contact(
 
 @functools.cache
 def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.Function:
-    """Return ``find_self_contacts`` for pairs of some types of geoms and a number of threads per world."""
-    collide_shapes = collider(kinds)
+    """Return ``find_self_contacts`` for a number of threads per world; it has no code for other pairs of types."""
 
     @wp.func
     def find_self_contacts(model: Model, selves: SelfContacts, world: int, thread: int) -> SelfContacts:
@@ -214,9 +189,11 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
             if start + thread < selves.pair.shape[0]:
                 geoms = selves.pair[start + thread]
                 if are_near(model, selves, world, geoms):
-                    types = wp.vec2i(model.geom_type[geoms[0]], model.geom_type[geoms[1]])
+                    first, second = model.geom_type[geoms[0]], model.geom_type[geoms[1]]
                     a, b = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
-                    touch = collide_shapes(types, a, b)
+                    for i in range(wp.static(len(kinds))):
+                        if first == wp.static(kinds[i][0]) and second == wp.static(kinds[i][1]):
+                            touch = wp.static(_COLLIDE[kinds[i]])(a, b)
             new = int(group_sum(float(touch.count), wp.static(threads)))
             if new > 0:
                 place = end + 0

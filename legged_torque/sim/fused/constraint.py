@@ -126,13 +126,11 @@ class ContactParams:
 @wp.func
 def contact_params(model: Model, world: int, first: int, second: int) -> ContactParams:
     """Return friction, solref and solimp of a contact of two geoms, mixed as MuJoCo does."""
-    weight_first, weight_second = (
-        of_world(model.geom_solmix, world, first),
-        of_world(model.geom_solmix, world, second),
-    )
+    weight, weights = of_world(model.geom_solmix, world, second), of_world(model.geom_solmix, world, first)
+    weights += weight
     mix = float(0.5)
-    if weight_first + weight_second > 2.0 * MIN_VALUE:
-        mix = weight_second / (weight_first + weight_second)
+    if weights > 2.0 * MIN_VALUE:
+        mix = weight / weights
     ref_first, ref_second = of_world(model.geom_solref, world, first), of_world(model.geom_solref, world, second)
     solref = wp.min(ref_first, ref_second)
     if ref_first[0] > 0.0 and ref_second[0] > 0.0:
@@ -148,11 +146,8 @@ def contact_params(model: Model, world: int, first: int, second: int) -> Contact
         mix = 0.0
         solref = 1.0 * ref_first
         friction = 1.0 * friction_first
-    solimp_first, solimp_second = (
-        of_world(model.geom_solimp, world, first),
-        of_world(model.geom_solimp, world, second),
-    )
-    solimp = mix * solimp_second + (1.0 - mix) * solimp_first
+    solimp = mix * of_world(model.geom_solimp, world, second)
+    solimp += (1.0 - mix) * of_world(model.geom_solimp, world, first)
     return ContactParams(friction, solref, solimp)
 
 
@@ -195,23 +190,19 @@ def expected_rows(contact: Contact) -> vec4:
     lowest = along_normal - STICKING_ACCELERATION * contact.friction
     if along_normal < -PARTING_ACCELERATION:
         lowest = INFINITY
-    return vec4(
-        wp.where(reference[0] < lowest, 0.0, 1.0),
-        wp.where(reference[1] < lowest, 0.0, 1.0),
-        wp.where(reference[2] < lowest, 0.0, 1.0),
-        wp.where(reference[3] < lowest, 0.0, 1.0),
-    )
+    rows = vec4()
+    for r in range(4):
+        rows[r] = wp.where(reference[r] < lowest, 0.0, 1.0)
+    return rows
 
 
 @wp.func
 def pushing_rows(x: vec4) -> vec4:
     """Return 1 for the rows that push, from the residuals J qacc - a_ref, else 0."""
-    return vec4(
-        wp.where(x[0] < 0.0, 1.0, 0.0),
-        wp.where(x[1] < 0.0, 1.0, 0.0),
-        wp.where(x[2] < 0.0, 1.0, 0.0),
-        wp.where(x[3] < 0.0, 1.0, 0.0),
-    )
+    rows = vec4()
+    for r in range(4):
+        rows[r] = wp.where(x[r] < 0.0, 1.0, 0.0)
+    return rows
 
 
 @wp.func
@@ -239,14 +230,6 @@ def contact_stiffness(contact: Contact, normal: wp.vec3, pushing: vec4) -> wp.ma
     first = contact.friction * contact.tangent
     second = contact.friction * wp.cross(normal, contact.tangent)
     for k in range(4):
-        direction = normal
-        if k == 0:
-            direction = normal + first
-        if k == 1:
-            direction = normal - first
-        if k == 2:
-            direction = normal + second
-        if k == 3:
-            direction = normal - second
+        direction = normal + wp.where(k % 2 == 0, 1.0, -1.0) * wp.where(k < 2, first, second)
         result += contact.mass * pushing[k] * wp.outer(direction, direction)
     return result

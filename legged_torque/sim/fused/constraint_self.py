@@ -5,8 +5,6 @@ branch, or with the trunk, it adds to the branch's block of the Hessian. Between
 so that they cannot be eliminated one by one: then all threads of the world factor its whole system together.
 """
 
-import functools
-
 import warp as wp
 
 from legged_torque.sim.fused.collision_self import SelfContacts
@@ -145,55 +143,55 @@ def coupled_step(model: Model, selves: SelfContacts, world: int, b: int, joints:
     return step
 
 
-@functools.cache
-def system_solver(threads: int) -> wp.Function:
-    """Return ``solve_system`` for a number of threads per world."""
+@wp.func
+def solve_system(
+    selves: SelfContacts,
+    world: int,
+    thread: int,
+    threads: int,
+    whole: WholeBody,
+    residual: TrunkMotion,
+    added: TrunkSystem,
+) -> TrunkMotion:
+    """Solve a world's whole system by its Cholesky factor; return the trunk's step and leave all in the last row.
 
-    @wp.func
-    def solve_system(
-        selves: SelfContacts, world: int, thread: int, whole: WholeBody, residual: TrunkMotion, added: TrunkSystem
-    ) -> TrunkMotion:
-        """Solve a world's whole system by its Cholesky factor; return the trunk's step and leave all in the last row.
-
-        ``added`` is what the branches add to the trunk's equations. Each thread has every so many rows. The diagonal
-        keeps the pivots, which are squares of the factor's.
-        """
-        size = selves.matrix.shape[2]
-        lin = group_sum3(added.rhs_lin, wp.static(threads)) - residual.lin
-        ang = group_sum3(added.rhs_ang, wp.static(threads)) - residual.ang
-        of_trunk = trunk_matrix(whole, added, wp.static(threads))
+    ``added`` is what the branches add to the trunk's equations. Each thread has every so many rows. The diagonal
+    keeps the pivots, which are squares of the factor's.
+    """
+    size = selves.matrix.shape[2]
+    lin = group_sum3(added.rhs_lin, threads) - residual.lin
+    ang = group_sum3(added.rhs_ang, threads) - residual.ang
+    of_trunk = trunk_matrix(whole, added, threads)
+    if thread == 0:
+        for i in range(6):
+            for j in range(6):
+                selves.matrix[world, size - 6 + i, size - 6 + j] = of_trunk[i, j]
+        for i in range(3):
+            selves.matrix[world, size, size - 6 + i] = lin[i]
+            selves.matrix[world, size, size - 3 + i] = ang[i]
+    for c in range(size):
+        sync_group(threads)
+        inverse = inverse_sqrt(wp.max(selves.matrix[world, c, c], 1.0e-12))
+        for r in range(c + 1 + thread, size + 1, threads):
+            selves.matrix[world, r, c] = inverse * selves.matrix[world, r, c]
+        sync_group(threads)
+        for r in range(c + 1 + thread, size + 1, threads):
+            scaled = selves.matrix[world, r, c]
+            for q in range(c + 1, wp.min(r + 1, size)):
+                selves.matrix[world, r, q] = selves.matrix[world, r, q] - scaled * selves.matrix[world, q, c]
+    for reverse in range(size):
+        c = size - 1 - reverse
+        sync_group(threads)
+        inverse = inverse_sqrt(wp.max(selves.matrix[world, c, c], 1.0e-12))
+        x = inverse * selves.matrix[world, size, c]
+        sync_group(threads)
+        for r in range(thread, c, threads):
+            selves.matrix[world, size, r] = selves.matrix[world, size, r] - x * selves.matrix[world, c, r]
         if thread == 0:
-            for i in range(6):
-                for j in range(6):
-                    selves.matrix[world, size - 6 + i, size - 6 + j] = of_trunk[i, j]
-            for i in range(3):
-                selves.matrix[world, size, size - 6 + i] = lin[i]
-                selves.matrix[world, size, size - 3 + i] = ang[i]
-        for c in range(size):
-            sync_group(wp.static(threads))
-            inverse = inverse_sqrt(wp.max(selves.matrix[world, c, c], 1.0e-12))
-            for r in range(c + 1 + thread, size + 1, wp.static(threads)):
-                selves.matrix[world, r, c] = inverse * selves.matrix[world, r, c]
-            sync_group(wp.static(threads))
-            for r in range(c + 1 + thread, size + 1, wp.static(threads)):
-                scaled = selves.matrix[world, r, c]
-                for q in range(c + 1, wp.min(r + 1, size)):
-                    selves.matrix[world, r, q] = selves.matrix[world, r, q] - scaled * selves.matrix[world, q, c]
-        for reverse in range(size):
-            c = size - 1 - reverse
-            sync_group(wp.static(threads))
-            inverse = inverse_sqrt(wp.max(selves.matrix[world, c, c], 1.0e-12))
-            x = inverse * selves.matrix[world, size, c]
-            sync_group(wp.static(threads))
-            for r in range(thread, c, wp.static(threads)):
-                selves.matrix[world, size, r] = selves.matrix[world, size, r] - x * selves.matrix[world, c, r]
-            if thread == 0:
-                selves.matrix[world, size, c] = x
-        sync_group(wp.static(threads))
-        step = TrunkMotion()
-        for r in range(3):
-            step.lin[r] = selves.matrix[world, size, size - 6 + r]
-            step.ang[r] = selves.matrix[world, size, size - 3 + r]
-        return step
-
-    return solve_system
+            selves.matrix[world, size, c] = x
+    sync_group(threads)
+    step = TrunkMotion()
+    for r in range(3):
+        step.lin[r] = selves.matrix[world, size, size - 6 + r]
+        step.ang[r] = selves.matrix[world, size, size - 3 + r]
+    return step

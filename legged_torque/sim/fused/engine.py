@@ -9,15 +9,15 @@ import mujoco
 import warp as wp
 from torch import Tensor
 
+from legged_torque.sim.engine import HeightMap
 from legged_torque.sim.fused.collision_self import make_self_contacts, pair_kinds
 from legged_torque.sim.fused.constraint import Contact
 from legged_torque.sim.fused.layout import Layout, branches_of
 from legged_torque.sim.fused.model import Model, State, make_model, unread_columns
 from legged_torque.sim.fused.step import make_kernel
 from legged_torque.sim.fused.surface import make_surface
-from legged_torque.sim.fused.tree import check_map, find_floor, read_tree
+from legged_torque.sim.fused.tree import read_tree
 from legged_torque.sim.fused.types import branch_types, vec4
-from legged_torque.sim.height_map import HeightMap
 from legged_torque.sim.parallel import launch_worlds
 from legged_torque.sim.warp_engine import WarpEngine
 from legged_torque.utils.errors import UserError
@@ -34,26 +34,16 @@ class FusedEngine(WarpEngine):
     name = "fused"
     capabilities = frozenset({"height_map", "self_collision", "torques_in_kernel", "applied_forces", "per_world"})
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        num_envs: int,
-        device: str,
-        solver_iterations: int = 30,
-        ls_iterations: int = 20,
-        height_map: HeightMap | None = None,
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, num_envs: int, device: str, height_map: HeightMap | None = None) -> None:
         """Build the worlds; kernels compile at the first step that needs them.
 
         The ground is the model's plane, or a height map with the plane's friction and softness. A UserError if the
         robot has something that this step does not simulate.
         """
-        self._on_map = height_map is not None
-        tree = read_tree(model, on_map=self._on_map)  # raises all reasons at once, before MuJoCo Warp raises its first
-        if self._on_map:
-            check_map(model)
-        super().__init__(model, num_envs, device, solver_iterations, ls_iterations)
-        layout = Layout.of(tree, self._wp_device.is_cuda, self._on_map, pair_kinds(model))
+        on_map = height_map is not None
+        tree = read_tree(model, on_map=on_map)  # raises all reasons at once, before MuJoCo Warp raises its first
+        super().__init__(model, num_envs, device)
+        layout = Layout.of(tree, self._wp_device.is_cuda, on_map, pair_kinds(model))
         data, room = self._data, num_envs * layout.branches
         self._layout, self._has_forces = layout, False
         with wp.ScopedDevice(self._wp_device):
@@ -67,7 +57,7 @@ class FusedEngine(WarpEngine):
             for name in ("residual", "pushing", "change"):
                 setattr(scratch.contacts, name, wp.empty(room * layout.points, dtype=vec4))
             scratch.contacts.found = wp.empty(room * layout.points, dtype=Contact)
-            if self._on_map:
+            if on_map:
                 scratch.contacts.normal = wp.empty(room * layout.points, dtype=wp.vec3)
             if layout.self_kinds:
                 scratch.selves = make_self_contacts(model, self._model, tree, data)
@@ -108,7 +98,7 @@ class FusedEngine(WarpEngine):
         entries = [column // field[0, 0].numel() for column in columns or ()]
         if any(entry < unread_columns(name) for entry in entries):
             raise UserError(f"sim.engine 'fused' does not read '{name}' of the trunk's free joint")
-        if self._on_map and name in ("geom_pos", "geom_quat") and find_floor(self.mj_model) in entries:
+        if self._layout.on_map and name in ("geom_pos", "geom_quat") and self._struct.floor in entries:
             raise UserError(f"sim.engine 'fused' does not read '{name}' of the floor: heights of a map are the world's")
         return field
 

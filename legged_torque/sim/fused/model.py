@@ -7,7 +7,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from legged_torque.sim.fused.tree import Tree, find_floor
+from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.types import vec5
 
 UNLIMITED = 1e10
@@ -164,7 +164,7 @@ def make_model(mj_model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> M
         if hasattr(warp_model, name):
             setattr(model, name, getattr(warp_model, name))
     model.gravity = warp_model.opt.gravity
-    model.floor = find_floor(mj_model)
+    model.floor = tree.floor
     model.timestep = mj_model.opt.timestep
     model.impratio = mj_model.opt.impratio
     model.iterations, model.ls_iterations = mj_model.opt.iterations, mj_model.opt.ls_iterations
@@ -177,13 +177,10 @@ def make_model(mj_model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> M
     model.joint_count = wp.array((tree.joints >= 0).sum(axis=1), dtype=wp.int32)
     model.branch_joint = wp.array(tree.joints, dtype=wp.int32)
     model.branch_actuator = wp.array(np.vectorize(lambda j: actuator_of.get(j, -1))(tree.joints), dtype=wp.int32)
-    padded = [points + [(0, 0, (0.0, 0.0, 0.0), 0.0)] * (tree.most_points - len(points)) for points in tree.points]
-    columns = (("geom", wp.int32), ("depth", wp.int32), ("offset", wp.vec3), ("radius", wp.float32))
-    for place, (name, dtype) in enumerate(columns):
+    padded = [points + [(0, 0, (0.0, 0.0, 0.0), 0.0, 0)] * (tree.most_points - len(points)) for points in tree.points]
+    dtypes = {"geom": wp.int32, "depth": wp.int32, "offset": wp.vec3, "radius": wp.float32, "next": wp.int32}
+    for place, (name, dtype) in enumerate(dtypes.items()):
         values = [[point[place] for point in points] for points in padded]
         setattr(model, f"point_{name}", wp.array(values, dtype=dtype))
-    geoms = [[point[0] for point in points] for points in tree.points]
-    after = [[i + 1 + row[i + 1 :].count(geom) for i, geom in enumerate(row)] for row in geoms]
-    model.point_next = wp.array([row + [0] * (tree.most_points - len(row)) for row in after], dtype=wp.int32)
     model.point_count = wp.array([len(points) for points in tree.points], dtype=wp.int32)
     return model

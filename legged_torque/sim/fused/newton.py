@@ -162,7 +162,6 @@ def newton_solver(layout: Layout) -> wp.Function:
     """Return ``solve``."""
     own, assemble, find_step = branches_of(layout), assembler(layout), stepper(layout)
     line_search, move = line_searcher(layout), mover(layout)
-    solve_coupled = constraint_self.system_solver(layout.threads)
 
     @wp.func
     def solve(
@@ -186,7 +185,9 @@ def newton_solver(layout: Layout) -> wp.Function:
             step = solve_trunk(whole, residual, system, wp.static(own.threads))
             if wp.static(own.collide):  # noqa: SIM102 - this decides what is compiled
                 if scratch.selves.coupled:
-                    step = solve_coupled(scratch.selves, world, thread, whole, residual, added)
+                    step = constraint_self.solve_system(
+                        scratch.selves, world, thread, wp.static(own.threads), whole, residual, added
+                    )
             branch, slopes = find_step(model, scratch, world, thread, branch, rot, step)
             start = slopes + trunk_slopes(whole, residual, step)
             decrease = -start[0] * model.cost_scale

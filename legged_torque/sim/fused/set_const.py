@@ -61,8 +61,7 @@ class DerivedConstants:
         if self._branches_vary:
             self._measure_branches(mask)
         inputs = [self.model, mask, self._rotation, self._measured, self._coms, ROWS]
-        outputs = [self.model.body_invweight0, self.model.dof_invweight0]
-        wp.launch(self._derive, self._dim, inputs, outputs, device=self._device)
+        wp.launch(self._derive, self._dim, inputs, device=self._device)
 
     def _measure_worlds(self, num_worlds: int) -> None:
         """Measure the branches of all worlds, or of one that stands for all."""
@@ -70,13 +69,15 @@ class DerivedConstants:
         with wp.ScopedDevice(self._device):
             self._measured = wp.zeros((num_worlds, branches), dtype=branch_types(depth).Smooth)
             self._coms = wp.zeros((num_worlds, branches, depth), dtype=wp.vec3)
-            self._qpos = wp.array(np.tile(self._reference_pose, (num_worlds, 1)), dtype=wp.float32)
-            self._rest = wp.zeros((num_worlds, len(self._reference_pose) - 1), dtype=wp.float32)
+            self._at_rest = State()
+            self._at_rest.qpos = wp.array(np.tile(self._reference_pose, (num_worlds, 1)), dtype=wp.float32)
+            self._at_rest.qvel = wp.zeros((num_worlds, len(self._reference_pose) - 1), dtype=wp.float32)
+            self._at_rest.ctrl = self._at_rest.qvel
             self._measure_branches(wp.full(num_worlds, True, dtype=wp.bool))
 
     def _measure_branches(self, mask: wp.array) -> None:
         """Measure the branches of some worlds in the reference pose."""
-        inputs, outputs = [self.model, mask, self._qpos, self._rest], [self._measured, self._coms]
+        inputs, outputs = [self.model, self._at_rest, mask], [self._measured, self._coms]
         wp.launch(self._measure, self._measured.shape, inputs, outputs, device=self._device)
 
 
@@ -119,25 +120,18 @@ def inverse_weight(
 
 
 @wp.func
-def write_weight(
-    weight: float,
-    kind: int,
-    world: int,
-    body: int,
-    body_invweight0: wp.array2d(dtype=wp.vec2),
-    dof_invweight0: wp.array2d(dtype=float),
-):
+def write_weight(model: Model, world: int, body: int, kind: int, weight: float):
     """Write an inverse weight of a body to its places."""
     if kind == 2 and body > 1:
-        dof_invweight0[world, dof(body - 1)] = weight
+        model.dof_invweight0[world, dof(body - 1)] = weight
     elif kind == 2:
         for r in range(3):
-            dof_invweight0[world, r] = weight
+            model.dof_invweight0[world, r] = weight
     else:
-        body_invweight0[world, body][kind] = weight
+        model.body_invweight0[world, body][kind] = weight
         if kind == 1 and body == 1:
             for r in range(3):
-                dof_invweight0[world, r + 3] = weight  # the mean is the same about any three axes
+                model.dof_invweight0[world, r + 3] = weight  # the mean is the same about any three axes
 
 
 @wp.func
@@ -159,10 +153,9 @@ def make_measure(layout: Layout) -> wp.Kernel:
     def measure_branches(
         # Model:
         model: Model,
-        # In:
+        # State:
+        state: State,
         mask: wp.array(dtype=wp.bool),
-        qpos: wp.array2d(dtype=float),
-        rest: wp.array2d(dtype=float),
         # Out:
         measured: wp.array2d(dtype=Smooth),
         coms: wp.array3d(dtype=wp.vec3),
@@ -171,10 +164,6 @@ def make_measure(layout: Layout) -> wp.Kernel:
         world, b = wp.tid()
         if not mask[world]:
             return
-        state = State()
-        state.ctrl = rest
-        state.qpos = qpos
-        state.qvel = rest
         poses = wp.zeros(shape=wp.static(depth + 1), dtype=Pose)
         trunk = make_trunk(model, state, world)
         joints = num_joints(model, b)
@@ -207,7 +196,7 @@ def make_derive(layout: Layout) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def derive_constants(
-        # Model:
+        # Model, in and out:
         model: Model,
         # In:
         mask: wp.array(dtype=wp.bool),
@@ -215,9 +204,6 @@ def make_derive(layout: Layout) -> wp.Kernel:
         measured: wp.array2d(dtype=Smooth),
         coms: wp.array3d(dtype=wp.vec3),
         rows: int,
-        # Model out:
-        body_invweight0: wp.array2d(dtype=wp.vec2),
-        dof_invweight0: wp.array2d(dtype=float),
     ):
         world, number = wp.tid()
         if not mask[world]:
@@ -257,6 +243,6 @@ def make_derive(layout: Layout) -> wp.Kernel:
                         body = model.branch_joint[b, body_depth - 1] + 1
                         com = coms[row(world, coms.shape[0]), b, body_depth - 1]
                     weight = inverse_weight(branch, trunk_factor, rot, com, body_depth, kind, rows)
-                    write_weight(weight, kind, world, body, body_invweight0, dof_invweight0)
+                    write_weight(model, world, body, kind, weight)
 
     return derive_constants

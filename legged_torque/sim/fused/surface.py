@@ -5,8 +5,8 @@ import math
 import numpy as np
 import warp as wp
 
+from legged_torque.sim.engine import HeightMap
 from legged_torque.sim.fused.math import inverse_sqrt
-from legged_torque.sim.height_map import HeightMap
 
 NEAR, FAR = 0.05, 0.2
 """A sphere up to the first size, or a geom up to the second [m], is known to be clear of the ground from one number."""

@@ -1,5 +1,6 @@
 """The structure of a robot, and the reasons why the fused step cannot simulate it."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -44,12 +45,14 @@ class Tree:
     """A robot's structure: a floating trunk and branches of hinge joints.
 
     ``points`` are, per branch, those that can touch the floor: geom, depth of its body (0 is the trunk), position in
-    half sizes of the geom, radius in first sizes of the geom.
+    half sizes of the geom, radius in first sizes of the geom, number of the first point of the branch's next geom.
     """
 
     joints: np.ndarray  # joint of each place, -1 behind the end of a branch. Shape: (branches, most joints of one)
-    points: list[list[tuple[int, int, tuple[float, float, float], float]]]
+    points: list[list[tuple[int, int, tuple[float, float, float], float, int]]]
     has_cylinders: bool  # whether any of these geoms is one
+    floor: int  # the geom that the robot stands on
+    geom_places: list[tuple[int, int]]  # branch and depth of each geom's body; 0 and 0 of the trunk's and the world's
 
     @property
     def most_points(self) -> int:
@@ -63,25 +66,28 @@ def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:
     A UserError lists everything that the fused step does not simulate.
     """
     refuse(reasons_against(model, floors), REFUSED, ADVICE)
+    floor = int(_floors(model, FLOORS)[0])
+    posed = model.geom_pos[floor].any() or not np.array_equal(model.geom_quat[floor], (1.0, 0.0, 0.0, 0.0))
+    wrong = ["its floor is not at the origin, where a height map needs it"] if on_map and posed else []
+    refuse(wrong, REFUSED, ADVICE)
     chains = body_chains(model)
-    points: list[list] = [[] for _ in chains]
-    depths = {body: (i, j + 1) for i, chain in enumerate(chains) for j, body in enumerate(chain)}
-    trunk_geoms = 0
-    geoms = np.flatnonzero(_touching(model, find_floor(model)))
-    for geom in geoms:
-        if model.geom_bodyid[geom] == 1:  # spread over the branches
-            branch, depth = trunk_geoms % len(chains), 0
-            trunk_geoms += 1
-        else:
-            branch, depth = depths[model.geom_bodyid[geom]]
-        offsets, radius = _GEOM_POINTS[mujoco.mjtGeom(model.geom_type[geom])]
-        if on_map and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER:
-            offsets = _AROUND_CIRCLES
-        points[branch] += [(int(geom), depth, offset, radius) for offset in offsets]
     joints = np.full((len(chains), max(map(len, chains))), -1)
     for i, chain in enumerate(chains):
         joints[i, : len(chain)] = model.body_jntadr[chain]
-    return Tree(joints, points, mujoco.mjtGeom.mjGEOM_CYLINDER in model.geom_type[geoms])
+    depths = {body: (i, j + 1) for i, chain in enumerate(chains) for j, body in enumerate(chain)}
+    places = [depths.get(body, (0, 0)) for body in model.geom_bodyid.tolist()]
+    points: list[list] = [[] for _ in chains]
+    geoms = np.flatnonzero(_touching(model, floor)).tolist()
+    trunk_branches = itertools.cycle(range(len(chains)))  # geoms of the trunk are spread over the branches
+    for geom in geoms:
+        branch, depth = places[geom]
+        of_branch = points[branch if depth else next(trunk_branches)]
+        offsets, radius = _GEOM_POINTS[mujoco.mjtGeom(model.geom_type[geom])]
+        if on_map and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            offsets = _AROUND_CIRCLES
+        end = len(of_branch) + len(offsets)
+        of_branch += [(geom, depth, offset, radius, end) for offset in offsets]
+    return Tree(joints, points, mujoco.mjtGeom.mjGEOM_CYLINDER in model.geom_type[geoms], floor, places)
 
 
 def reasons_against(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS) -> list[str]:
@@ -93,26 +99,6 @@ def reasons_against(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FL
     if not 0 < len(chains) <= MAX_BRANCHES:
         reasons.append(f"it has {len(chains)} legs, not 1 to {MAX_BRANCHES}")
     return reasons
-
-
-def find_floor(model: mujoco.MjModel) -> int:
-    """Return the geom that an accepted robot stands on."""
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    return int(np.flatnonzero(np.isin(model.geom_type, FLOORS) & collides)[0])
-
-
-def places_of_geoms(model: mujoco.MjModel, tree: Tree) -> np.ndarray:
-    """Return branch and depth of the body of each geom; 0 and 0 of the trunk's and the world's. Shape: (geoms, 2)."""
-    joints = ((b, j, joint) for (b, j), joint in np.ndenumerate(tree.joints) if joint >= 0)
-    places = {int(model.jnt_bodyid[joint]): (b, j + 1) for b, j, joint in joints}
-    return np.array([places.get(body, (0, 0)) for body in model.geom_bodyid.tolist()])
-
-
-def check_map(model: mujoco.MjModel) -> None:
-    """Raise a UserError if the floor of an accepted robot is not at the origin, where a height map needs it."""
-    floor = find_floor(model)
-    posed = model.geom_pos[floor].any() or not np.array_equal(model.geom_quat[floor], (1.0, 0.0, 0.0, 0.0))
-    refuse(["its floor is not at the origin, where a height map needs it"] if posed else [], REFUSED, ADVICE)
 
 
 def _of(part: Any, chosen: np.ndarray) -> str:
@@ -158,7 +144,7 @@ def _of_options(model: mujoco.MjModel) -> list[str]:
             "it moves through a fluid": not (option.density or option.viscosity),
             "equalities, tendons or mocap": not others,
             "a <pair> with the ground, or other than condim 3, one friction and no margin": _plain_pairs(model),
-            "some contacts are excluded": not (_excluded(model) == 0).any(),
+            "some contacts are excluded": not any(0 in divmod(pair, 1 << 16) for pair in model.exclude_signature),
         }
     )
 
@@ -201,8 +187,8 @@ def _of_bodies(model: mujoco.MjModel) -> list[str]:
 
 def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> list[str]:
     """Return properties of the floor and of colliding geoms that the fused step does not simulate."""
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    floor = np.flatnonzero(np.isin(model.geom_type, floors) & collides)
+    collides = _collides(model)
+    floor = _floors(model, floors)
     robot = collides & (model.geom_bodyid > 0)
     own = self_pairs(model)
     alone = len(floor) == 1 and (collides & ~robot).sum() == 1
@@ -227,12 +213,20 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
     )
 
 
+def _collides(model: mujoco.MjModel) -> np.ndarray:
+    """Return which geoms can collide with anything. Shape: (ngeom,), bool."""
+    return (model.geom_contype | model.geom_conaffinity) != 0
+
+
+def _floors(model: mujoco.MjModel, types: Sequence[mujoco.mjtGeom]) -> np.ndarray:
+    """Return the geoms of some types of floors that can collide. Shape: (floors,)."""
+    return np.flatnonzero(np.isin(model.geom_type, types) & _collides(model))
+
+
 def _touching(model: mujoco.MjModel, floor: int) -> np.ndarray:
     """Return which geoms of the robot can touch the floor. Shape: (ngeom,), bool."""
-    by_type, by_affinity = (
-        model.geom_contype & model.geom_conaffinity[floor],
-        model.geom_conaffinity & model.geom_contype[floor],
-    )
+    by_type = model.geom_contype & model.geom_conaffinity[floor]
+    by_affinity = model.geom_conaffinity & model.geom_contype[floor]
     return ((by_type | by_affinity) != 0) & (model.geom_bodyid > 0)
 
 
@@ -240,11 +234,6 @@ def _condims(model: mujoco.MjModel, pairs: np.ndarray) -> np.ndarray:
     """Return the dimension of contacts of pairs of geoms: that of higher priority, else the higher one. Shape: (n,)."""
     priority, condim = model.geom_priority[pairs], model.geom_condim[pairs]
     return np.where(priority == priority.max(axis=1, keepdims=True), condim, 0).max(axis=1)
-
-
-def _excluded(model: mujoco.MjModel) -> np.ndarray:
-    """Return pairs of bodies whose contacts are excluded. Shape: (pairs, 2)."""
-    return np.stack([model.exclude_signature >> 16, model.exclude_signature & 0xFFFF], axis=1)
 
 
 def _of_motors(model: mujoco.MjModel) -> list[str]:
