@@ -102,14 +102,14 @@ def _sum_of_laws(others: wp.Function | None, law: wp.Function, is_weighted: bool
 @functools.cache
 def _strengthened(law: wp.Function, link: wp.Function) -> tuple[wp.Function, Any]:
     """Return what a control law asks for, behind a link that acts on actions, times the strength."""
-    Reads = _struct("AskReads", law=struct_of(law), strength=wp.array2d(dtype=wp.float32), actions=struct_of(link))
+    Reads = _struct("StrengthReads", law=struct_of(law), strength=wp.array2d(dtype=wp.float32), actions=struct_of(link))
 
     @wp.func
-    def asked_torque(reads: Reads, world: int, joint: int, substep: int, pos: float, vel: float) -> float:
+    def strengthened_torque(reads: Reads, world: int, joint: int, substep: int, pos: float, vel: float) -> float:
         wanted = law(reads.law, link(reads.actions, world, substep), world, joint, pos, vel)
         return reads.strength[world, joint] * wanted
 
-    return asked_torque, Reads
+    return strengthened_torque, Reads
 
 
 @functools.cache

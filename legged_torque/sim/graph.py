@@ -49,11 +49,6 @@ def _silent_stderr() -> Iterator[None]:
         os.close(kept)
 
 
-def is_capturing(device: str) -> bool:
-    """Return whether work on the device is captured into a graph and does not run."""
-    return torch.device(device).type == "cuda" and torch.cuda.is_current_stream_capturing()
-
-
 class CudaGraph:
     """A function without arguments that runs once, is then captured, and then replayed.
 
@@ -74,7 +69,8 @@ class CudaGraph:
 
     def __call__(self) -> None:
         """Run, capture or replay the function."""
-        if not self.enabled or not self._is_cuda or self._calls == 0 or is_capturing(self._device):
+        is_eager = not self.enabled or not self._is_cuda or self._calls == 0
+        if is_eager or torch.cuda.is_current_stream_capturing():
             self._calls += 1
             self._function()
             return

@@ -57,7 +57,7 @@ class Health:
         """Return the kernel's arguments for causes or derived tensors; ``marks`` is a second mask for their worlds."""
         chosen = [(i, tensor) for i, tensor in enumerate(self._watched) if tensor.is_derived == is_derived]
         rows = [row for i, tensor in chosen for row in columns(i, tensor.numbers)]
-        table: wp.array = wp.array(rows, dtype=kernels.Column, device=wp.device_from_torch(excused.device))
+        table: wp.array = wp.array(rows, dtype=kernels.WatchedNumber, device=wp.device_from_torch(excused.device))
         return [table, *map(wp.from_torch, (excused, self._marks, marks, self._found, self._counts))]
 
     def begin(self) -> None:
@@ -96,7 +96,7 @@ def columns(i: int, numbers: Tensor) -> list[Any]:
     """Return the places in memory of tensor number ``i``, and the replacements."""
     rows = []
     for column, healthy in enumerate(numbers[0].tolist()):
-        row: Any = kernels.Column()
+        row: Any = kernels.WatchedNumber()
         row.address, row.stride = numbers[:, column].data_ptr(), numbers.stride(0) * numbers.element_size()
         row.tensor, row.healthy = i, healthy
         rows.append(row)

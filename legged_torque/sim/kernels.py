@@ -116,7 +116,7 @@ def apply_random_events(
 
 
 @wp.struct
-class Row:
+class RandomNumber:
     """One random number: its distribution, its place in memory, and how it is scaled to [-1, 1]."""
 
     address: wp.uint64  # of the first world's number
@@ -141,11 +141,11 @@ class Row:
 
 
 @wp.kernel(enable_backward=False)
-def draw(mask: Mask, seeds: Integers, rows: wp.array(dtype=Row), values: Rows):
+def draw_parameters(mask: Mask, seeds: Integers, numbers: wp.array(dtype=RandomNumber), values: Rows):
     """Draw one number of one world."""
     world, column = wp.tid()
     if mask[world]:
-        row = rows[column]
+        row = numbers[column]
         random = wp.rand_init(seeds[world], row.draw)
         offset = row.offset_low + row.offset_span * wp.randf(random)
         scale = row.scale_low + row.scale_span * wp.randf(random)
@@ -161,8 +161,8 @@ def draw(mask: Mask, seeds: Integers, rows: wp.array(dtype=Row), values: Rows):
 
 
 @wp.struct
-class Column:
-    """One number of every world, anywhere in memory."""
+class WatchedNumber:
+    """A number of every world that must be finite, anywhere in memory."""
 
     address: wp.uint64  # of the first world's
     stride: wp.uint64  # from world to world [bytes]
@@ -171,14 +171,14 @@ class Column:
 
 
 @wp.func
-def number_of(column: Column, world: int) -> Numbers:
+def number_of(column: WatchedNumber, world: int) -> Numbers:
     """Return one number of a world, as an array of length 1."""
     return wp.array(ptr=column.address + wp.uint64(world) * column.stride, shape=(1,), dtype=wp.float32)
 
 
 @wp.kernel(enable_backward=False)
 def replace_non_finite(
-    columns: wp.array(dtype=Column),
+    columns: wp.array(dtype=WatchedNumber),
     excused: Mask,
     diverged: Mask,
     marks: Mask,

@@ -83,7 +83,7 @@ class Randomization:
         """
         self.parameters, self.fields = list(parameters), dict[str, Tensor]()
         self.sizes: dict[str, int] = {}
-        rows: list[kernels.Row] = []
+        rows: list[kernels.RandomNumber] = []
         at_start: list[float] = []
         first_draw: dict[str, int] = {}
         num_draws = 1  # number 0 decides what is kept
@@ -112,7 +112,7 @@ class Randomization:
         self._device = device
         self.values = torch.tensor(at_start, device=device).repeat(num_envs, 1)
         self.seeds = torch.zeros(num_envs, dtype=torch.int32, device=device)
-        self._rows: wp.array = wp.array(rows, dtype=kernels.Row, device=device)
+        self._rows: wp.array = wp.array(rows, dtype=kernels.RandomNumber, device=device)
 
     def own_fields(self) -> dict[str, Tensor]:
         """Return the tensors that are no fields of the model, by name of their parameter."""
@@ -145,7 +145,7 @@ class Randomization:
         if self._without_rows:
             raise UserError(f"random parameters without a row per world: {', '.join(self._without_rows)}")
         arrays = [wp.from_torch(mask), wp.from_torch(self.seeds), self._rows, wp.from_torch(self.values)]
-        wp.launch(kernels.draw, (len(self.values), len(self._rows)), arrays, device=self._device)
+        wp.launch(kernels.draw_parameters, (len(self.values), len(self._rows)), arrays, device=self._device)
 
 
 def fixed(parameter: RandomParameter) -> RandomParameter:
@@ -166,7 +166,7 @@ def table(parameter: RandomParameter, field: Tensor, keep_probability: float) ->
     columns = [np.broadcast_to(numbers, len(at_start)).tolist() for numbers in (own, unit, lowest, highest)]
     rows = []
     for default, base, weight, low, high in zip(at_start, *columns, strict=True):
-        row: Any = kernels.Row()
+        row: Any = kernels.RandomNumber()
         row.lowest, row.highest = low, high
         row.base, row.weight, row.own_value = base, weight, default
         row.offset_low, row.offset_span = offset[0], offset[1] - offset[0]

@@ -17,28 +17,28 @@ from legged_torque.sim.fused.types import AnyBranch, AnyVector, vec4
 
 
 @wp.func
-def place_of(model: Model, b: int, j: int) -> int:
+def hinge_index(model: Model, b: int, j: int) -> int:
     """Return the index of a branch's joint among all hinges."""
     return model.branch_joint[b, j] - 1
 
 
 @wp.func
-def show_poses(selves: SelfContacts, world: int, b: int, poses: Poses):
+def write_poses(selves: SelfContacts, world: int, b: int, poses: Poses):
     """Write the poses of a branch for the other threads of its world."""
     for d in range(poses.shape[0]):
         selves.poses[world, b, d] = poses[d]
 
 
 @wp.func
-def show_joints(model: Model, selves: SelfContacts, world: int, b: int, joints: int, values: AnyVector):
+def write_joints(model: Model, selves: SelfContacts, world: int, b: int, joints: int, values: AnyVector):
     """Write the accelerations of a branch's joints, or their step, for the other threads of its world."""
     for j in range(len(values)):
         if j < joints:
-            selves.joints[world, place_of(model, b, j)] = values[j]
+            selves.joints[world, hinge_index(model, b, j)] = values[j]
 
 
 @wp.func
-def show_columns(model: Model, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
+def write_jacobians(model: Model, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
     """Write the columns of a branch's joints in the Jacobians of all contacts of its world."""
     for k in range(selves.first, selves.end):
         geoms = selves.geoms[k]
@@ -48,7 +48,7 @@ def show_columns(model: Model, selves: SelfContacts, world: int, b: int, joints:
                 motion = column(branch.smooth.lever, j) + wp.cross(column(branch.smooth.axis, j), selves.found[k].pos)
                 sign = wp.where(second[0] == b and j < second[1], 1.0, 0.0)
                 sign -= wp.where(first[0] == b and j < first[1], 1.0, 0.0)
-                selves.jacobian[k, place_of(model, b, j)] = sign * motion
+                selves.jacobian[k, hinge_index(model, b, j)] = sign * motion
 
 
 @wp.func
@@ -92,24 +92,24 @@ def with_coupling(selves: SelfContacts) -> SelfContacts:
 
 
 @wp.func
-def push_branch(model: Model, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
+def add_to_branch(model: Model, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
     """Return a branch with the contacts' terms in its gradient and its block of the Hessian."""
     for k in range(selves.first, selves.end):
         force = contact_force(selves.found[k], selves.normal[k], selves.residual[k], selves.pushing[k])
         stiffness = contact_stiffness(selves.found[k], selves.normal[k], selves.pushing[k])
         for j in range(len(branch.acc)):
             if j < joints:
-                motion = selves.jacobian[k, place_of(model, b, j)]
+                motion = selves.jacobian[k, hinge_index(model, b, j)]
                 branch.gradient[j] -= wp.dot(motion, force)
                 pushed = stiffness * motion
                 for i in range(len(branch.acc)):
                     if i < joints:
-                        branch.factor[i, j] += wp.dot(selves.jacobian[k, place_of(model, b, i)], pushed)
+                        branch.factor[i, j] += wp.dot(selves.jacobian[k, hinge_index(model, b, i)], pushed)
     return branch
 
 
 @wp.func
-def show_equations(model: Model, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
+def write_equations(model: Model, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
     """Write a branch's equations into the whole system: its rows, its columns in the trunk's, its right-hand side.
 
     The system has the joints first, then the trunk's translation and rotation; its last row is the right-hand side.
@@ -117,7 +117,7 @@ def show_equations(model: Model, selves: SelfContacts, world: int, b: int, joint
     size = selves.matrix.shape[2]
     for j in range(len(branch.acc)):
         if j < joints:
-            row = place_of(model, b, j)
+            row = hinge_index(model, b, j)
             for c in range(size - 6):
                 selves.matrix[world, row, c] = 0.0
             for k in range(selves.first, selves.end):
@@ -127,7 +127,7 @@ def show_equations(model: Model, selves: SelfContacts, world: int, b: int, joint
                     selves.matrix[world, row, c] = selves.matrix[world, row, c] + wp.dot(pushed, selves.jacobian[k, c])
             for i in range(len(branch.acc)):
                 if i < joints:
-                    selves.matrix[world, row, place_of(model, b, i)] = branch.factor[j, i]
+                    selves.matrix[world, row, hinge_index(model, b, i)] = branch.factor[j, i]
             for r in range(3):
                 selves.matrix[world, size - 6 + r, row] = branch.coupling_lin[r, j]
                 selves.matrix[world, size - 3 + r, row] = branch.coupling_ang[r, j]
@@ -139,7 +139,7 @@ def coupled_step(model: Model, selves: SelfContacts, world: int, b: int, joints:
     """Return a branch's part of the solution of the whole system."""
     for j in range(len(step)):
         if j < joints:
-            step[j] = selves.matrix[world, selves.matrix.shape[2], place_of(model, b, j)]
+            step[j] = selves.matrix[world, selves.matrix.shape[2], hinge_index(model, b, j)]
     return step
 
 

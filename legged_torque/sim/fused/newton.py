@@ -47,9 +47,9 @@ def assembler(layout: Layout) -> wp.Function:
                 branch, add = solver.assemble(branch, rot, acc, scratch.contacts)
                 if wp.static(own.collide):
                     joints = own.num_joints(model, b)
-                    branch = constraint_self.push_branch(model, scratch.selves, world, b, joints, branch)
+                    branch = constraint_self.add_to_branch(model, scratch.selves, world, b, joints, branch)
                     if scratch.selves.coupled:
-                        constraint_self.show_equations(model, scratch.selves, world, b, joints, branch)
+                        constraint_self.write_equations(model, scratch.selves, world, b, joints, branch)
                         whole = solver.add_whole(branch, whole, add)
                 branch.factor = cholesky(branch.factor)
                 system = solver.eliminate(branch, system, add)
@@ -79,7 +79,7 @@ def stepper(layout: Layout) -> wp.Function:
                     joints = own.num_joints(model, b)
                     if scratch.selves.coupled:
                         branch.step = constraint_self.coupled_step(model, scratch.selves, world, b, joints, branch.step)
-                    constraint_self.show_joints(model, scratch.selves, world, b, joints, branch.step)
+                    constraint_self.write_joints(model, scratch.selves, world, b, joints, branch.step)
                 branch, of_rows = solver.along_step(branch, rot, step, scratch.contacts)
                 slopes += solver.slopes_at_start(branch, step, of_rows)
             own.store(scratch, world, i, branch)

@@ -84,8 +84,8 @@ def branches_maker(layout: Layout, applied_forces: bool) -> wp.Function:
             if j < joints:
                 branch.acc[j] = state.qacc_warmstart[world, dof(model.branch_joint[b, j])]
         if wp.static(own.collide):
-            constraint_self.show_poses(scratch.selves, world, b, poses)
-            constraint_self.show_joints(model, scratch.selves, world, b, joints, branch.acc)
+            constraint_self.write_poses(scratch.selves, world, b, poses)
+            constraint_self.write_joints(model, scratch.selves, world, b, joints, branch.acc)
         return branch
 
     @wp.func
@@ -123,7 +123,7 @@ def self_constraint_maker(layout: Layout) -> wp.Function:
                 branch = own.load(scratch, world, i, branch)
                 if own.owns(thread, i):
                     b = thread + i * wp.static(own.threads)
-                    constraint_self.show_columns(model, scratch.selves, world, b, own.num_joints(model, b), branch)
+                    constraint_self.write_jacobians(model, scratch.selves, world, b, own.num_joints(model, b), branch)
             sync_group(wp.static(own.threads))
             constraint_self.start_rows(scratch.selves, world, thread, wp.static(own.threads))
             sync_group(wp.static(own.threads))

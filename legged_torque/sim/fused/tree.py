@@ -92,7 +92,8 @@ def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:
 
 def reasons_against(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS) -> list[str]:
     """Return the reasons why the fused step cannot simulate a robot on a floor of one of some types."""
-    reasons = [*_of_bodies(model), *_of_contacts(model, floors), *_of_motors(model), *_of_options(model)]
+    rules = _of_bodies(model) | _of_contacts(model, floors) | _of_motors(model) | _of_options(model)
+    reasons = [reason for reason, holds in rules.items() if not holds]
     chains = body_chains(model)
     branching = np.flatnonzero(np.bincount(model.body_parentid[2:]) > 1)
     reasons += [f"body '{model.body(body).name}' branches" for body in branching if body > 1]
@@ -105,11 +106,6 @@ def _of(part: Any, chosen: np.ndarray) -> str:
     """Return the names of the chosen bodies or geoms of a model, or the first three of many."""
     names = [f"'{part(i).name}'" for i in np.flatnonzero(chosen)]
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-
-
-def _broken(rules: dict[str, bool]) -> list[str]:
-    """Return the reasons of the rules that do not hold."""
-    return [reason for reason, holds in rules.items() if not holds]
 
 
 _HARMLESS_DISABLED = ("midphase", "nativeccd", "multiccd", "island", "autoreset", "warmstart", "equality")
@@ -125,28 +121,26 @@ def _names(flags: Any, values: int, harmless: Sequence[str]) -> list[str]:
     return [name for name in found if name not in harmless]
 
 
-def _of_options(model: mujoco.MjModel) -> list[str]:
-    """Return options and other parts of the model that the fused step does not simulate."""
+def _of_options(model: mujoco.MjModel) -> dict[str, bool]:
+    """Return whether options and other parts of the model are simulated, by what is said if not."""
     option = model.opt
     disabled = _names(mujoco.mjtDisableBit, option.disableflags, _HARMLESS_DISABLED)
     if option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         disabled = [flag for flag in disabled if flag != "eulerdamp"]
     enabled = _names(mujoco.mjtEnableBit, option.enableflags, _HARMLESS_ENABLED)
     others = model.eq_active0.any() or model.ntendon or model.nmocap
-    return _broken(
-        {
-            "the friction cone must be pyramidal": option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL,
-            "the integrator must be implicitfast or Euler": option.integrator in _INTEGRATORS,
-            f"it disables {', '.join(disabled)}": not disabled,
-            f"it enables {', '.join(enabled)}": not enabled,
-            "it disables groups of actuators": not option.disableactuator,
-            "it has noslip iterations": not option.noslip_iterations,
-            "it moves through a fluid": not (option.density or option.viscosity),
-            "equalities, tendons or mocap": not others,
-            "a <pair> with the ground, or other than condim 3, one friction and no margin": _plain_pairs(model),
-            "some contacts are excluded": not any(0 in divmod(pair, 1 << 16) for pair in model.exclude_signature),
-        }
-    )
+    return {
+        "the friction cone must be pyramidal": option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL,
+        "the integrator must be implicitfast or Euler": option.integrator in _INTEGRATORS,
+        f"it disables {', '.join(disabled)}": not disabled,
+        f"it enables {', '.join(enabled)}": not enabled,
+        "it disables groups of actuators": not option.disableactuator,
+        "it has noslip iterations": not option.noslip_iterations,
+        "it moves through a fluid": not (option.density or option.viscosity),
+        "equalities, tendons or mocap": not others,
+        "a <pair> with the ground, or other than condim 3, one friction and no margin": _plain_pairs(model),
+        "some contacts are excluded": not any(0 in divmod(pair, 1 << 16) for pair in model.exclude_signature),
+    }
 
 
 def _plain_pairs(model: mujoco.MjModel) -> bool:
@@ -162,8 +156,8 @@ def _mixed(solrefs: np.ndarray) -> np.ndarray:
     return ~((solrefs > 0).all(axis=1) | (solrefs <= 0).all(axis=1))
 
 
-def _of_bodies(model: mujoco.MjModel) -> list[str]:
-    """Return properties of bodies and joints that the fused step does not simulate."""
+def _of_bodies(model: mujoco.MjModel) -> dict[str, bool]:
+    """Return whether bodies and joints are simulated."""
     hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
     is_free = model.njnt > 0 and model.jnt_type[0] == free and model.jnt_bodyid[0] == 1
     has_hinge = (model.body_jntnum == 1) & (np.append(model.jnt_type, -1)[model.body_jntadr] == hinge)
@@ -171,22 +165,20 @@ def _of_bodies(model: mujoco.MjModel) -> list[str]:
     root = [model.dof_damping[:6], model.dof_armature[:6], model.dof_frictionloss[:6], model.jnt_stiffness[:1]]
     passive = is_free and any(values.any() for values in root)
     nonlinear = _any_of(model, "jnt_stiffnesspoly", "jnt_springyield", "dof_dampingpoly")
-    return _broken(
-        {
-            "its trunk is not free": is_free,
-            f"each body but the trunk must have one hinge joint, unlike {_of(model.body, odd)}": not odd.any(),
-            "something besides the trunk hangs on the world": not (model.body_parentid[2:] == 0).any(),
-            "bodies are compensated for gravity": not model.body_gravcomp.any(),
-            "joint limits have margins": not model.jnt_margin.any(),
-            "joints limit the forces of their actuators": not model.jnt_actfrclimited.any(),
-            "the trunk's free joint has passive forces or armature": not passive,
-            "springs or dampers are not linear": not nonlinear,
-        }
-    )
+    return {
+        "its trunk is not free": is_free,
+        f"each body but the trunk must have one hinge joint, unlike {_of(model.body, odd)}": not odd.any(),
+        "something besides the trunk hangs on the world": not (model.body_parentid[2:] == 0).any(),
+        "bodies are compensated for gravity": not model.body_gravcomp.any(),
+        "joint limits have margins": not model.jnt_margin.any(),
+        "joints limit the forces of their actuators": not model.jnt_actfrclimited.any(),
+        "the trunk's free joint has passive forces or armature": not passive,
+        "springs or dampers are not linear": not nonlinear,
+    }
 
 
-def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> list[str]:
-    """Return properties of the floor and of colliding geoms that the fused step does not simulate."""
+def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> dict[str, bool]:
+    """Return whether the floor and colliding geoms are simulated."""
     collides = _collides(model)
     floor = _floors(model, floors)
     robot = collides & (model.geom_bodyid > 0)
@@ -199,18 +191,16 @@ def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> lis
     odd_own = np.isin(np.arange(model.ngeom), own) & ~np.isin(model.geom_type, _SELF_KINDS)
     solrefs = np.concatenate([model.geom_solref[geoms], model.jnt_solref, model.dof_solref])
     unlike, own_unlike = _of(model.geom, odd), _of(model.geom, odd_own)
-    return _broken(
-        {
-            "it needs one plane and no other obstacle": alone,
-            f"only spheres, capsules, cylinders and boxes may collide, unlike {unlike}": not odd.any(),
-            f"only spheres, capsules and boxes may collide with each other, unlike {own_unlike}": not odd_own.any(),
-            "condim of contacts with the floor must be 3": bool((_condims(model, on_floor) == 3).all()),
-            "condim of contacts between its parts must be 3": bool((_condims(model, own) == 3).all()),
-            "geoms have margins or gaps": not (model.geom_margin[geoms].any() or model.geom_gap[geoms].any()),
-            "surfaces move or stick": not _any_of(model, "geom_surfacevel", "geom_adhesion"),
-            "a solref mixes its two formats": not _mixed(solrefs).any(),
-        }
-    )
+    return {
+        "it needs one plane and no other obstacle": alone,
+        f"only spheres, capsules, cylinders and boxes may collide, unlike {unlike}": not odd.any(),
+        f"only spheres, capsules and boxes may collide with each other, unlike {own_unlike}": not odd_own.any(),
+        "condim of contacts with the floor must be 3": bool((_condims(model, on_floor) == 3).all()),
+        "condim of contacts between its parts must be 3": bool((_condims(model, own) == 3).all()),
+        "geoms have margins or gaps": not (model.geom_margin[geoms].any() or model.geom_gap[geoms].any()),
+        "surfaces move or stick": not _any_of(model, "geom_surfacevel", "geom_adhesion"),
+        "a solref mixes its two formats": not _mixed(solrefs).any(),
+    }
 
 
 def _collides(model: mujoco.MjModel) -> np.ndarray:
@@ -236,16 +226,14 @@ def _condims(model: mujoco.MjModel, pairs: np.ndarray) -> np.ndarray:
     return np.where(priority == priority.max(axis=1, keepdims=True), condim, 0).max(axis=1)
 
 
-def _of_motors(model: mujoco.MjModel) -> list[str]:
-    """Return properties of actuators that the fused step does not simulate: it has at most a plain motor per hinge."""
+def _of_motors(model: mujoco.MjModel) -> dict[str, bool]:
+    """Return whether actuators are simulated: at most a plain motor per hinge."""
     plain = not any(why_no_motor(model, actuator) for actuator in range(model.nu))
     joints = model.actuator_trnid[:, 0]
-    return _broken(
-        {
-            "actuators must be motors": plain and bool((model.actuator_gainprm[:, 0] == 1).all()),
-            "each motor needs a hinge of its own": len(set(joints)) == len(joints) and 0 not in joints,
-        }
-    )
+    return {
+        "actuators must be motors": plain and bool((model.actuator_gainprm[:, 0] == 1).all()),
+        "each motor needs a hinge of its own": len(set(joints)) == len(joints) and 0 not in joints,
+    }
 
 
 def _any_of(model: mujoco.MjModel, *names: str) -> bool:
