@@ -79,7 +79,7 @@ class MotorChain:
         of_actions, of_torques = (
             [(link.kernel, link.kernel_reads()) for link in links] for links in (self._of_actions, self._of_torques)
         )
-        actions = of_actions[0] if of_actions else (newest_actions, self._actions)
+        actions: Any = of_actions[0] if of_actions else (newest_actions, self._actions)
         return torque_kernel(law, self.strength, actions, of_torques)
 
     def reset(self, mask: Tensor) -> None:
