@@ -18,12 +18,11 @@ from legged_torque.utils.errors import UserError, unknown_name
 class MotorChain:
     """Links in the order of ``motors.chain``: first those that act on actions, then those that act on torques.
 
-    Between them the control law computes the torques that motors are asked for, and each motor gives its strength times
-    them to the next link.
+    Between them the control law computes the desired torques, which are multiplied by the strength of the motors.
 
     Attributes:
         links: The links by name.
-        strength: Factors on the torques that motors are asked for, drawn at random. Shape: (num_envs, num_dof).
+        strength: Factors on the desired torques, drawn at random. Shape: (num_envs, num_dof).
     """
 
     def __init__(self, settings: Any, joints: Joints) -> None:

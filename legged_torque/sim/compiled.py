@@ -60,32 +60,24 @@ class Compiled:
 
     def __init__(self, function: Callable[[], None]) -> None:
         """Prepare; nothing is compiled yet."""
-        self._function = function
-        self._run: Callable[[], None] | None = None
+        import torch._dynamo as dynamo  # takes a second, and only a GPU needs it
+
+        keep_kernels()
+        dynamo.config.recompile_limit = max(dynamo.config.recompile_limit, MOST_VERSIONS)
+        self._function, self._run, self._has_run = function, torch.compile(function, **SETTINGS), False
 
     def __call__(self) -> None:
         """Run the function, always in the same mode of autograd, since each mode would be compiled separately."""
-        import torch._dynamo as dynamo  # takes a second, and only a GPU needs it
-
         with torch.inference_mode(False), torch.no_grad():
-            compiling = contextlib.nullcontext() if self._run else torch_compiles()
-            self._run = self._run or self._compile()
             try:
-                with compiling:
+                with contextlib.nullcontext() if self._has_run else torch_compiles():
                     self._run()
-            except dynamo.exc.TorchDynamoException as error:  # nothing has run yet
+            except torch._dynamo.exc.TorchDynamoException as error:  # nothing has run yet
                 name = getattr(self._function, "__qualname__", str(self._function))
                 warn(f"{name} runs uncompiled, which is slower: {reason(error)}")
                 self._run = self._function
                 self._run()
-
-    def _compile(self) -> Callable[[], None]:
-        """Return a function that is compiled when it is called."""
-        import torch._dynamo as dynamo
-
-        keep_kernels()
-        dynamo.config.recompile_limit = max(dynamo.config.recompile_limit, MOST_VERSIONS)
-        return torch.compile(self._function, **SETTINGS)
+            self._has_run = True
 
 
 def keep_kernels() -> None:

@@ -14,7 +14,7 @@ _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
 
 class MuJoCoWarpEngine(WarpEngine):
-    """Steps worlds by some hundred kernels. A step without sensing sets the contact sensors to zero."""
+    """Steps the worlds with about a hundred kernels. A step without sensing sets the contact sensors to zero."""
 
     name = "mujoco_warp"
     capabilities = frozenset({"self_collision", "applied_forces", "per_world"})

@@ -27,8 +27,8 @@ whose step leads to where the cost is least with the expected rows, it is only c
 
 
 @functools.cache
-def assembler(layout: Layout) -> wp.Function:
-    """Return ``assemble``."""
+def step_finder(layout: Layout) -> tuple[wp.Function, wp.Function]:
+    """Return ``assemble`` and ``find_step``: before and after the trunk's part of the Newton step is known."""
     own = branches_of(layout)
 
     @wp.func
@@ -56,14 +56,6 @@ def assembler(layout: Layout) -> wp.Function:
             own.store(scratch, world, i, branch)
         return branch, system, whole
 
-    return assemble
-
-
-@functools.cache
-def stepper(layout: Layout) -> wp.Function:
-    """Return ``find_step``."""
-    own = branches_of(layout)
-
     @wp.func
     def find_step(
         model: Model, scratch: own.Scratch, world: int, thread: int, branch: AnyBranch, rot: wp.mat33, step: TrunkMotion
@@ -88,12 +80,12 @@ def stepper(layout: Layout) -> wp.Function:
             slopes[1] -= constraint_self.along_step(scratch.selves, world, thread, wp.static(own.threads))
         return branch, group_sum3(slopes, wp.static(own.threads))
 
-    return find_step
+    return assemble, find_step
 
 
 @functools.cache
-def line_searcher(layout: Layout) -> wp.Function:
-    """Return ``line_search``."""
+def line_searcher(layout: Layout) -> tuple[wp.Function, wp.Function]:
+    """Return ``line_search`` and ``move``: along the step."""
     own = branches_of(layout)
 
     @wp.func
@@ -131,14 +123,6 @@ def line_searcher(layout: Layout) -> wp.Function:
                 alpha = 0.5 * (low + high)
         return alpha
 
-    return line_search
-
-
-@functools.cache
-def mover(layout: Layout) -> wp.Function:
-    """Return ``move``."""
-    own = branches_of(layout)
-
     @wp.func
     def move(scratch: own.Scratch, world: int, thread: int, branch: AnyBranch, alpha: float):
         """Move the branches along the step; return also how many rows of the world changed their state."""
@@ -154,14 +138,13 @@ def mover(layout: Layout) -> wp.Function:
             sync_group(wp.static(own.threads))
         return branch, group_sum(flips, wp.static(own.threads))
 
-    return move
+    return line_search, move
 
 
 @functools.cache
 def newton_solver(layout: Layout) -> wp.Function:
     """Return ``solve``."""
-    own, assemble, find_step = branches_of(layout), assembler(layout), stepper(layout)
-    line_search, move = line_searcher(layout), mover(layout)
+    own, (assemble, find_step), (line_search, move) = branches_of(layout), step_finder(layout), line_searcher(layout)
 
     @wp.func
     def solve(
