@@ -34,10 +34,8 @@ def launch_worlds(
         wp.launch(kernel, (end - first, *rest), [first, *inputs], block_dim=block_dim, device=device, record_cmd=True)
         for first, end in itertools.pairwise(ends)
     ]
-    others = [_threads(parts - 1).submit(command.launch) for command in commands[1:]]
-    commands[0].launch()  # like the others, without Python's lock
-    for other in others:
-        other.result()
+    for launch in [_threads(parts).submit(command.launch) for command in commands]:  # without Python's lock
+        launch.result()
 
 
 @functools.cache

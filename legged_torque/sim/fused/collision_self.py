@@ -78,14 +78,14 @@ def pair_kinds(model: mujoco.MjModel) -> tuple[tuple[int, int], ...]:
 def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree, data: mjw.Data) -> SelfContacts:
     """Return the pairs of a robot and room for their contacts, on the current device."""
     (branches, depth), worlds, joints = tree.joints.shape, data.nworld, model.nv - 6
-    out = SelfContacts()
-    out.pair = wp.array(ordered_pairs(model), dtype=wp.vec2i)
+    out, pairs = SelfContacts(), ordered_pairs(model)
+    out.pair = wp.array(pairs, dtype=wp.vec2i)
     named = {frozenset(pair): i for i, pair in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))}
-    out.named = wp.array([named.get(frozenset(pair), -1) for pair in ordered_pairs(model).tolist()], dtype=wp.int32)
+    out.named = wp.array([named.get(frozenset(pair), -1) for pair in pairs.tolist()], dtype=wp.int32)
     for name in ("pair_friction", "pair_solref", "pair_solimp"):
         setattr(out, name, getattr(warp_model, name))
     on_ground = [point[0] for points in tree.points for point in points]
-    airborne = np.setdiff1d(ordered_pairs(model), on_ground)
+    airborne = np.setdiff1d(pairs, on_ground)
     out.airborne = wp.array(model.sensor_adr[np.isin(model.sensor_refid, airborne)], dtype=wp.int32)
     out.geom_place = wp.array(tree.geom_places, dtype=wp.vec2i)
     out.poses = wp.empty((worlds, branches, depth + 1), dtype=Pose)
