@@ -79,18 +79,16 @@ def actuator_problems(model: mujoco.MjModel) -> Iterator[str]:
     yield from with_names(wrong)
 
 
-def use_plain_motors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
+def use_plain_motors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """Put the motors of a file without problems in the order of its joints and make their controls torques.
 
-    Each becomes a motor without gear, limited by the tightest limits in the file. Returns whether this changes
-    ``spec``, so that ``model``, compiled from it, is out of date.
+    Each becomes a motor without gear, limited by the tightest limits in the file, in ``spec``, of which ``model`` was
+    compiled.
     """
     joints = range(1, model.njnt)
     motors = [motors_of(model, joint)[0] for joint in joints]
     names = [_name(model, motor) for motor in motors]
     limits = [torque_range(model, motor) for motor in motors]
-    if motors == list(range(model.nu)) and all(_is_plain(model, motor) for motor in motors):
-        return False
     for place, actuator in enumerate(spec.actuators):
         actuator.name = f"motor {place}"  # names must be unique at all times
     for actuator, joint, name, limit in zip(spec.actuators, joints, names, limits, strict=True):
@@ -101,15 +99,6 @@ def use_plain_motors(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
         spec.joint(model.joint(joint).name).actfrclimited = False
     for key in spec.keys:
         key.ctrl = []  # in the old order and units
-    return True
-
-
-def _is_plain(model: mujoco.MjModel, motor: int) -> bool:
-    """Return whether a motor has no gear, and its own two ranges are equal and the only limits."""
-    limited = model.actuator_ctrllimited[motor] and model.actuator_forcelimited[motor]
-    same = (model.actuator_ctrlrange[motor] == model.actuator_forcerange[motor]).all()
-    no_gear = model.actuator_gainprm[motor, 0] == 1.0 and model.actuator_gear[motor, 0] == 1.0
-    return bool(limited and same and no_gear and not model.jnt_actfrclimited[model.actuator_trnid[motor, 0]])
 
 
 def _name(model: mujoco.MjModel, actuator: int) -> str:

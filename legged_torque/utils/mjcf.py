@@ -195,11 +195,8 @@ def self_pairs(model: mujoco.MjModel) -> np.ndarray:
     return pairs[(roots[:, 0] == roots[:, 1]) & moving.all(axis=1)]
 
 
-def exclude_self_collisions(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
-    """Exclude all contacts between parts of a robot.
-
-    Returns whether this changes ``spec``, so that ``model``, compiled from it, is out of date.
-    """
+def exclude_self_collisions(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Exclude all contacts between parts of a robot in ``spec``, of which ``model`` was compiled."""
     pairs = self_pairs(model)
     bodies = {body.id: body for body in spec.bodies}
     for first, second in np.unique(model.geom_bodyid[pairs], axis=0).tolist():
@@ -210,4 +207,3 @@ def exclude_self_collisions(spec: mujoco.MjSpec, model: mujoco.MjModel) -> bool:
     for pair in list(spec.pairs):
         if {pair.geomname1, pair.geomname2} in unwanted:
             spec.delete(pair)
-    return len(pairs) > 0

@@ -78,10 +78,10 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     if not problems:
         problems += floor_problems(model, [geoms[place] for place in chosen[0]])
     refuse(problems, f"'{settings.file}' cannot be simulated")
-    is_changed = use_plain_motors(spec, model)
-    if _choose_self_collisions(settings, spec, model, notes) or is_changed:
-        with loading(file):
-            model = spec.compile()
+    use_plain_motors(spec, model)
+    _choose_self_collisions(settings, spec, model, notes)
+    with loading(file):
+        model = spec.compile()
     model.opt.timestep = cfg.sim.dt
     feet, penalized, terminating = chosen
     notes += foot_notes(model, [geoms[place] for place in feet])
@@ -90,19 +90,18 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
 
 def _choose_self_collisions(
     settings: type[LeggedRobotCfg.asset], spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]
-) -> bool:
+) -> None:
     """Exclude the robot's contacts with itself unless ``asset.self_collisions`` asks for them, and note that.
 
-    Returns whether ``model`` is out of date. A UserError if contacts were asked for and the file has none.
+    A UserError if contacts were asked for and the file has none.
     """
     pairs = len(self_pairs(model))
     if settings.self_collisions and not pairs:
         why = "no two geoms of its moving parts have contype and conaffinity that match, or are a <pair>"
         raise UserError(f"asset.self_collisions is on, but in '{settings.file}' {why}")
-    if settings.self_collisions or not pairs:
-        return False
-    notes.append(f"{pairs} pairs of parts that could collide do not; asset.self_collisions=True lets them")
-    return exclude_self_collisions(spec, model)
+    if pairs and not settings.self_collisions:
+        notes.append(f"{pairs} pairs of parts that could collide do not; asset.self_collisions=True lets them")
+        exclude_self_collisions(spec, model)
 
 
 def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[float]:
