@@ -45,8 +45,9 @@ class HeightMap(Protocol):
 class Engine(Protocol):
     """Steps and resets ``num_envs`` worlds of one robot.
 
-    An engine is a class with these members and an entry in :data:`~legged_torque.sim.registry.ENGINES`. Deriving from
-    this one is optional and gives it the methods of the capabilities that it lacks, which raise a UserError.
+    An engine is a subclass with these members and an entry in :data:`~legged_torque.sim.registry.ENGINES`. It inherits
+    :meth:`load_state_dict`, a :meth:`check_buffers` that never warns, and methods of the capabilities that it lacks,
+    which raise a UserError.
 
     Tensors are the engine's own memory: writing them changes the state, and their addresses never change. Nothing here
     waits for the host except :meth:`check_buffers`.
@@ -118,7 +119,17 @@ class Engine(Protocol):
         """Return everything on which the next steps of the worlds depend, as references to the engine's memory."""
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Copy tensors from another :meth:`state_dict` into this engine's; a UserError if they do not fit."""
+        """Copy tensors from another :meth:`state_dict` into this engine's.
+
+        A UserError, and nothing is copied, if names, types or shapes differ.
+        """
+        own = self.state_dict()
+        kinds = [{name: (tensor.dtype, tensor.shape) for name, tensor in each.items()} for each in (state, own)]
+        if kinds[0] != kinds[1]:
+            names = sorted(name for name in {*state, *own} if kinds[0].get(name) != kinds[1].get(name))
+            raise UserError(f"the state of the worlds does not fit the engine: {', '.join(names)}")
+        for name, tensor in own.items():
+            tensor.copy_(state[name])
 
     # ---- "torques_in_kernel" -----------------------------------------------------------------------------------------
 
@@ -175,13 +186,3 @@ def shared_field(engine: Engine, name: str, columns: Sequence[int] | None = None
     """Return a copy of a field of the model that all worlds share. Shape: (1, ...)."""
     owner = engine.mj_model.opt if name == "gravity" else engine.mj_model
     return torch.tensor(getattr(owner, name), dtype=torch.float32, device=engine.device).unsqueeze(0)
-
-
-def copy_tensors(state: dict[str, Tensor], into: dict[str, Tensor]) -> None:
-    """Copy tensors into those of the same names; a UserError, and nothing copied, if names, types or shapes differ."""
-    kinds = [{name: (tensor.dtype, tensor.shape) for name, tensor in each.items()} for each in (state, into)]
-    if kinds[0] != kinds[1]:
-        names = sorted(name for name in {*state, *into} if kinds[0].get(name) != kinds[1].get(name))
-        raise UserError(f"the state of the worlds does not fit the engine: {', '.join(names)}")
-    for name, tensor in into.items():
-        tensor.copy_(state[name])

@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from legged_torque.sim import kernels
-from legged_torque.sim.engine import Engine, copy_tensors
+from legged_torque.sim.engine import Engine
 from legged_torque.sim.fused.model import Model
 from legged_torque.sim.fused.set_const import DerivedConstants
 from legged_torque.sim.graph import prepare_device
@@ -86,10 +86,6 @@ class WarpEngine(Engine):
         """Return everything on which the next steps of the worlds depend, as references to the engine's memory."""
         names = ("qpos", "qvel", "qacc_warmstart", "ctrl", "contact_found", "contact_force", "diverged")
         return {name: getattr(self, name) for name in names} | self._carried | self.fields
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Copy tensors from another :meth:`state_dict` into this engine's; a UserError if they do not fit."""
-        copy_tensors(state, self.state_dict())
 
     def applied_forces(self) -> tuple[Tensor, Tensor]:
         """Return MuJoCo's ``xfrc_applied`` and ``qfrc_applied``, which act from the first call on."""

@@ -8,7 +8,7 @@ from support.engine_suite import EngineSuite
 from support.fused import compiled, make_a1
 from support.scripts import assert_told_in_one_line, run_here
 
-from legged_torque.sim.engine import Engine, copy_tensors
+from legged_torque.sim.engine import Engine
 from legged_torque.sim.registry import ENGINES
 from legged_torque.terrain.height_grid import HeightGrid
 
@@ -57,18 +57,10 @@ class PlainMuJoCo(Engine):
         state = torch.cat([self.qpos, self.qvel], dim=1)
         self.diverged |= ~(state.abs() <= 1e4).all(dim=1) | ~(self.qacc_warmstart.abs() <= 1e10).all(dim=1)
 
-    def check_buffers(self):
-        """Nothing is limited."""
-        return
-
     def state_dict(self):
         """Return what worlds carry."""
         names = (*STATE, "contact_found", "contact_force", "diverged")
         return {name: getattr(self, name) for name in names}
-
-    def load_state_dict(self, state):
-        """Go on from it."""
-        copy_tensors(state, self.state_dict())
 
 
 @pytest.fixture(autouse=True)
