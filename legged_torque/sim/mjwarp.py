@@ -33,7 +33,7 @@ class MuJoCoWarpEngine(WarpEngine):
             self._model.opt.graph_conditional = False  # unrolled solver iterations are faster than a device loop
 
     def step(self, sense: bool = True) -> None:
-        """Advance every world by one physics step; ``sense`` decides whether to write the contact sensors."""
+        """Launch one physics step."""
         self._model.opt.disableflags = self._flags if sense else self._flags | _NO_SENSORS
         with wp.ScopedDevice(self._wp_device):
             mjw.step(self._model, self._data)

@@ -60,7 +60,7 @@ class WarpEngine(Engine):
         self._tables: list[Model] = []  # structs of kernels that refer to the model's arrays
 
     def reset(self, mask: Tensor) -> None:
-        """Put the worlds of ``mask`` (num_envs,), bool, back to the reference pose, at rest."""
+        """Reset worlds in one kernel, and what else they carry."""
         data = self._data
         state = (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, data.sensordata)
         inputs = [wp.from_torch(mask), self._reference_pose, *state]
@@ -75,7 +75,7 @@ class WarpEngine(Engine):
         wp.launch(kernels.flag_diverged, data.qpos.shape, state, device=self._wp_device)
 
     def check_buffers(self) -> str | None:
-        """Return a warning if contacts or constraints were dropped since the start because a buffer was full."""
+        """Return a warning that names the buffers which were full."""
         bits = functools.reduce(operator.or_, wp.to_torch(self._overflow).unique().tolist())
         names = [name for name in _BUFFERS if mjw.OverflowType[name] & bits]
         if not names:
@@ -94,10 +94,7 @@ class WarpEngine(Engine):
         return self._carried["xfrc_applied"], self._carried["qfrc_applied"]
 
     def field(self, name: str, columns: Sequence[int] | None = None) -> Tensor:
-        """Return a field of the model with a row per world, which it gets at the first request, to change ``columns``.
-
-        Constants of legs are recomputed from then on if other bodies than the trunk may change.
-        """
+        """Return a field; constants of legs are recomputed from now on if other bodies than the trunk may change."""
         if name not in self._field_names():
             raise unknown_name(f"field for sim.engine '{self.name}'", name, self._field_names())
         constants = self._constants  # while worlds are alike
@@ -110,7 +107,7 @@ class WarpEngine(Engine):
         return field
 
     def update_constants(self, mask: Tensor) -> None:
-        """Recompute what MuJoCo derives from masses and armatures in the worlds of ``mask`` (num_envs,), bool."""
+        """Recompute inverse weights."""
         self._constants.update(mask)
 
     @functools.cached_property

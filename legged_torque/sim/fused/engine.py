@@ -65,11 +65,11 @@ class FusedEngine(WarpEngine):
             scratch.branch = wp.empty(waiting, dtype=branch_types(layout.depth).Branch)
 
     def step(self, sense: bool = True) -> None:
-        """Advance every world by one physics step; ``sense`` decides whether to write the contact sensors."""
+        """Launch one physics step."""
         self._launch(range(1), sense, None, 0)
 
     def drive(self, steps: int, law: wp.Function, reads: Any) -> None:
-        """Advance every world by some physics steps, each under torques of its own, see :meth:`Engine.drive`.
+        """Launch some physics steps under a control law.
 
         On a GPU each step is a launch: within one, worlds drift apart, and threads at different places of this long
         kernel wait for its instructions (one launch for four steps takes 1.1 to 1.6 times as long on an H200).
@@ -85,15 +85,12 @@ class FusedEngine(WarpEngine):
         launch_worlds(kernel, dim, inputs, self._wp_device, BLOCK_DIM)
 
     def applied_forces(self) -> tuple[Tensor, Tensor]:
-        """Return MuJoCo's ``xfrc_applied`` and ``qfrc_applied``, which act from the first call on."""
+        """Return the applied forces; from the first call on, the kernel reads them."""
         self._has_forces = True
         return super().applied_forces()
 
     def field(self, name: str, columns: Sequence[int] | None = None) -> Tensor:
-        """Return a field of the model with a row per world, which it gets at the first request, to change ``columns``.
-
-        A UserError for those of the trunk's free joint, and for the place of a floor that is a height map.
-        """
+        """Return a field; a UserError for columns of the trunk's free joint, and the pose of a floor that is a map."""
         field = super().field(name, columns)
         entries = [column // field[0, 0].numel() for column in columns or ()]
         if any(entry < unread_columns(name) for entry in entries):
