@@ -158,25 +158,3 @@ def test_parameters(device):
         assert_uniform(values[changed], *limits)
     correlation = torch.corrcoef(torch.cat([after, before])[:, changed]) - torch.eye(2 * len(DRAWN), device=device)
     assert correlation.abs().max() < 4.5 / math.sqrt(int(changed.sum()))
-
-
-def test_new_episodes(device):
-    """Exactly the worlds whose time is over start anew: state, parameters, commands and counters."""
-    chances = ["domain_rand.resampling_probability", "domain_rand.push_probability", "commands.resampling_probability"]
-    env, _ = make_env(
-        device, *MANY, HIGH_UP, *(f"--set={name}=0" for name in chances), "--set=commands.heading_command=False"
-    )
-    take_steps(env, 3)
-    ends = torch.arange(NUM, device=device) % 5 == 0
-    env.episode_length_buf = torch.where(ends, int(env.max_episode_length), env.episode_length_buf)
-    before = {"parameters": numbers(env).T.clone(), "commands": env.commands.clone()}
-    _, _, dones, extras = env.step(torch.zeros(NUM, env.num_actions, device=device))
-    assert torch.equal(dones, ends) and torch.equal(extras["time_outs"], ends)
-    for name, now in {"parameters": numbers(env).T, "commands": env.commands}.items():
-        assert torch.equal(now[~ends], before[name][~ends]), name
-        assert (now[ends] != before[name][ends]).any(dim=1).all(), name
-    assert (env.episode_length_buf[ends] == 0).all() and (env.episode_length_buf[~ends] == 4).all()
-    height, velocity = sim_of(env).qpos[:, 2], sim_of(env).qvel
-    assert (height[ends] == 50.0).all() and (height[~ends] < 50.0).any()
-    assert_uniform(velocity[ends][:, 0], -0.5, 0.5)
-    assert_uniform(velocity[ends][:, 6:], -10.5, 10.5)
