@@ -6,6 +6,7 @@ import mujoco
 
 from legged_torque.sim.engine import Engine, HeightMap, require
 from legged_torque.sim.fused.engine import FusedEngine
+from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.mjwarp import MuJoCoWarpEngine
 from legged_torque.sim.robot_file import actuator_problems
 from legged_torque.utils.errors import refuse, unknown_name
@@ -37,6 +38,7 @@ def make_engine(
     """
     engine = engine_class(name)
     refuse(list(actuator_problems(model)), f"sim.engine '{name}' needs motors")
+    prepare_device(device)  # of Warp, which draws at random and checks numbers with any engine
     model.opt.iterations, model.opt.ls_iterations = solver_iterations, ls_iterations
     if height_map is None:
         return engine(model, num_envs, device)

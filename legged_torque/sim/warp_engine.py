@@ -16,7 +16,6 @@ from legged_torque.sim import kernels
 from legged_torque.sim.engine import Engine
 from legged_torque.sim.fused.model import Model
 from legged_torque.sim.fused.set_const import DerivedConstants
-from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.model import CONTACT_DATA, use_known_options
 from legged_torque.utils.errors import UserError, unknown_name
 
@@ -38,7 +37,6 @@ class WarpEngine(Engine):
         """Build the worlds, with room for so many contacts and constraint rows of MuJoCo Warp's own in each."""
         use_known_options(model)
         self.mj_model, self.num_envs, self.device = model, num_envs, device
-        prepare_device(device)
         self._wp_device = wp.get_device(device)
         with wp.ScopedDevice(self._wp_device):
             try:
