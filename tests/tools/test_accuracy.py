@@ -98,7 +98,7 @@ def test_slopes_do_not_creep(friction, impratio, impedance):
 
 
 def test_a_plane_per_foot():
-    """On a slope it is the robot on MuJoCo's tilted plane; states near edges, or with other parts near, are left out."""
+    """On a slope it is the robot on MuJoCo's tilted plane; states near edges, or with more parts near, are left out."""
     axis = 0.05 * np.arange(-40, 41)
     ramp = HeightMap(0.3 * axis[:, None] + 0.0 * axis, 0.05, (-2.0, -2.0), "cpu")
     step = HeightMap(np.where(axis > 0.1, 0.02, 0.0)[:, None] + 0.0 * axis, 0.05, (-2.0, -2.0), "cpu")
