@@ -16,12 +16,10 @@ from legged_torque import SCRIPTS_DIR
 from legged_torque.benchmark.baseline import Baseline
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.args import Parser, add_settings_args, options_of, task_file_words
-from legged_torque.utils.cli import check_at_least, check_output, run_script, slow_imports
+from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError, is_out_of_memory
-from legged_torque.utils.files import write_json
-from legged_torque.utils.paths import without_machine
+from legged_torque.utils.files import without_machine, write_json
 from legged_torque.utils.runs import package_versions
 
 if TYPE_CHECKING:
@@ -62,16 +60,16 @@ def main() -> None:
     args = parse_args()
     changes = ["evaluation.interval=0", *args.set]  # without evaluations iterations are alike
     sizes = []
-    with slow_imports():
+    with cli.slow_imports():
         for num_envs in args.num_envs or [None]:
-            options = dataclasses.replace(options_of(args), num_envs=num_envs, set=changes)
+            options = dataclasses.replace(cli.options_of(args), num_envs=num_envs, set=changes)
             sizes.append(task_registry.get_cfgs(args.task, options))
             check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
         device = resolve_device(args.device)
         from legged_torque.benchmark.learning_time import time_training
         from legged_torque.benchmark.measure import MemoryMeter
     for file in filter(None, (args.json, args.profile)):
-        check_output(file)
+        cli.check_output(file)
     result = {"task": args.task, "device": device_name(device), "versions": package_versions(), "rounds": args.rounds}
     result |= {"preset": args.preset or "parallel", "perturbation": args.perturbation or "none"}
     result |= {"ranges": args.ranges or "default", "set": without_machine(args.set)}
@@ -98,8 +96,8 @@ def main() -> None:
 
 def parse_args() -> argparse.Namespace:
     """Parse and check the command line."""
-    parser = Parser(__doc__)
-    add_settings_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_options(parser, *cli.SETTINGS)
     parser.add_argument("--num_envs", type=int, nargs="+", help="numbers of worlds; default: that of the task")
     parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
@@ -113,13 +111,13 @@ def parse_args() -> argparse.Namespace:
     help_text = "also run N iterations and compare the first tenth with the last"
     parser.add_argument("--endurance", type=int, default=0, metavar="N", help=help_text)
     args = parser.parse_args()
-    check_at_least(args, 1, "rounds")
-    check_at_least(args, 0, "endurance")
+    cli.check_at_least(args, 1, "rounds")
+    cli.check_at_least(args, 0, "endurance")
     if args.profile and len(args.num_envs or [None]) > 1:
         raise UserError("--profile writes one trace: give one number of worlds")
     if args.learn:
-        with slow_imports():
-            _, cfg = task_registry.get_cfgs(args.task, dataclasses.replace(options_of(args), num_envs=None))
+        with cli.slow_imports():
+            _, cfg = task_registry.get_cfgs(args.task, dataclasses.replace(cli.options_of(args), num_envs=None))
         if not 0 < cfg.evaluation.interval <= cfg.runner.total_steps:
             steps = f"evaluation.interval is {cfg.evaluation.interval}, of {cfg.runner.total_steps} steps"
             raise UserError(f"--learn needs evaluations during training: {steps}")
@@ -142,9 +140,7 @@ def measure_size(args: argparse.Namespace, cfgs: tuple, memory: MemoryMeter) -> 
 
 def training_command(args: argparse.Namespace, num_envs: int) -> list[str]:
     """Return the command that trains with the same options."""
-    given = {name: getattr(args, name) for name in ("task", "seed", "perturbation", "ranges", "device", "preset")}
-    words = [f"--{name}={value}" for name, value in given.items() if value is not None]
-    words += [*task_file_words(args.task_file), f"--num_envs={num_envs}", *(f"--set={change}" for change in args.set)]
+    words = [*cli.option_words(args, *cli.SETTINGS, "preset"), f"--num_envs={num_envs}"]
     return [sys.executable, str(SCRIPTS_DIR / "train.py"), *words]
 
 
@@ -177,4 +173,4 @@ def print_comparison(file: Path, baseline: Baseline, rows: list[dict[str, Any]])
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

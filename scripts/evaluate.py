@@ -19,30 +19,21 @@ from typing import TYPE_CHECKING, Any
 
 from legged_torque.envs import task_registry
 from legged_torque.experiments.matrix import GROUNDS
-from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import (
-    add_command_arg,
-    check_at_least,
-    check_output,
-    finite,
-    run_script,
-    slow_imports,
-)
+from legged_torque.utils import cli
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.files import write_json
+from legged_torque.utils.files import portable_path, without_machine, write_json
 from legged_torque.utils.metrics import UNITS
-from legged_torque.utils.paths import portable_path, without_machine
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import LoadedRun, set_seed
 
 if TYPE_CHECKING:
     from rsl_rl.runners import OnPolicyRunner
 
+    from legged_torque.envs.base.crossing import Grounds
     from legged_torque.envs.base.legged_robot import LeggedRobot
     from legged_torque.envs.base.metrics import CommandBreakdown
-    from legged_torque.learning.crossing import Grounds
 
 WORLDS, STEPS = 16, 2000  # of one checkpoint, where robots do not cross tiles
 CURVE_WORLDS, CURVE_STEPS = 256, 1000  # of each of all checkpoints
@@ -52,18 +43,18 @@ CURVE_SEED = 1000  # added to the training's seed: worlds other than in training
 def main() -> None:
     """Roll out a checkpoint with mean actions, print the metrics, write them as JSON."""
     args = parse_args()
-    options = options_of(args)
+    options = cli.options_of(args)
     grounds = None
-    with slow_imports():
+    with cli.slow_imports():
         if args.terrain:
-            from legged_torque.learning.crossing import Grounds
+            from legged_torque.envs.base.crossing import Grounds
 
             grounds = Grounds.of(args.terrain, args.level, args.command)
         run = task_registry.load_run(options)
         if args.all_checkpoints and not args.json:
             args.json = run.folder / "curve.json"
         if args.json:
-            check_output(args.json)
+            cli.check_output(args.json)
         if args.seed is None:
             args.seed = run.train_cfg.seed + CURVE_SEED if args.all_checkpoints else 1
         import torch
@@ -91,18 +82,18 @@ def main() -> None:
 
 def parse_args() -> argparse.Namespace:
     """Return the command line; a UserError if it makes no sense."""
-    parser = Parser(__doc__)
-    add_task_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_task_args(parser)
     hint = f"""measure every checkpoint of the run; by default in {CURVE_WORLDS} worlds for {CURVE_STEPS} steps,
         an episode, into curve.json in the run's folder"""
     parser.add_argument("--all_checkpoints", action="store_true", help=hint)
     parser.add_argument("--steps", type=int, help=f"control steps; default: {STEPS}")
-    add_command_arg(parser)
+    cli.add_command_arg(parser)
     hint = """kinds of rough ground to cross, or all; then --num_envs is for each kind and level, and --command a speed
         straight on, 0.6 0 0 unless it is given"""
     parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
     hint = "difficulties of rough ground, 0 to 1; default: the ten of training, 0 to 0.9"
-    parser.add_argument("--level", nargs="+", type=finite, help=hint)
+    parser.add_argument("--level", nargs="+", type=cli.finite, help=hint)
     parser.add_argument("--json", type=Path, help="file to write")
     args = parser.parse_args()
     if args.all_checkpoints and (args.terrain or args.checkpoint is not None):
@@ -115,7 +106,7 @@ def parse_args() -> argparse.Namespace:
     args.num_envs = num_envs if args.num_envs is None else args.num_envs
     args.steps = steps if args.steps is None else args.steps
     args.level = args.level or GROUNDS["levels"]
-    check_at_least(args, 1, "steps")
+    cli.check_at_least(args, 1, "steps")
     return args
 
 
@@ -167,7 +158,7 @@ def print_breakdown(breakdown: CommandBreakdown) -> None:
 
 def cross_tiles(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, grounds: Grounds) -> dict[str, Any]:
     """Let a policy try to cross tiles, print what came out, and return it."""
-    from legged_torque.learning.crossing import cross
+    from legged_torque.envs.base.crossing import cross
 
     results = cross(env, runner.get_inference_policy(env.device), grounds)
     time_limit, trained = grounds.time_limit(env.cfg.terrain.tile_size), runner.logger.tot_timesteps
@@ -193,4 +184,4 @@ def circumstances(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, ru
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

@@ -18,14 +18,13 @@ from legged_torque.experiments.job import Launcher
 from legged_torque.experiments.local_launcher import CPU_JOBS, GPU_JOBS, MPS_JOBS, LocalLauncher, multi_process_service
 from legged_torque.experiments.matrix import SETTINGS_FILE, cell_state, check_same, read_matrix
 from legged_torque.experiments.run import ExperimentRun, claim_folder
-from legged_torque.utils.args import Parser, add_options
-from legged_torque.utils.cli import check_output, run_script, slow_imports
+from legged_torque.utils import cli
 from legged_torque.utils.errors import UserError, unknown_name
 
 
 def main() -> None:
     """Run all cells of a matrix, or list what is left to do."""
-    parser = Parser(__doc__)
+    parser = cli.Parser(__doc__)
     parser.add_argument("file", type=Path, help="description of the matrix, see experiments/")
     parser.add_argument("--out", type=Path, help="folder of the results; default: logs/experiments/<name of the file>")
     help_text = "auto, cpu or cuda:N; auto uses all GPUs, or else the CPU"
@@ -40,12 +39,12 @@ def main() -> None:
     parser.add_argument("--launcher", default="local", help=help_text)
     parser.add_argument("--address", help="of the Ray cluster; default: auto, the one that this machine belongs to")
     parser.add_argument("--dry-run", action="store_true", help="only list what is left to do")
-    add_options(parser, "task_file")
+    cli.add_options(parser, "task_file")
     args = parser.parse_args()
-    with slow_imports():
+    with cli.slow_imports():
         matrix = read_matrix(experiment_path(args.file), args.task_file)
     out = (args.out or Path("logs", "experiments", args.file.stem)).resolve()
-    check_output(out / SETTINGS_FILE)
+    cli.check_output(out / SETTINGS_FILE)
     launcher = make_launcher(args)
     if args.dry_run:
         check_same(matrix, out)
@@ -67,7 +66,7 @@ def make_launcher(args: argparse.Namespace) -> Launcher:
             raise UserError("--mps is for this machine; on a cluster, start the service on each node")
         if args.task_file:
             raise UserError("--task_file is for this machine; on a cluster, install the tasks: docs/howto/own_tasks.md")
-        with slow_imports():
+        with cli.slow_imports():
             from legged_torque.experiments.ray_launcher import RayLauncher
         return RayLauncher(args.address or "auto", args.device, args.jobs)
     if args.launcher != "local":
@@ -81,4 +80,4 @@ def make_launcher(args: argparse.Namespace) -> Launcher:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

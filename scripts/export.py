@@ -9,20 +9,19 @@ from pathlib import Path
 
 from legged_torque.deploy.description import DESCRIPTION_FILE
 from legged_torque.envs import task_registry
-from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import Parser, check_output, run_script, script_command, slow_imports
+from legged_torque.utils import cli
 
 
 def main() -> None:
     """Load a checkpoint and write policy.onnx, policy.pt and policy.yaml; print what the latter does not describe."""
-    parser = Parser(__doc__)
-    add_task_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_task_args(parser)
     parser.add_argument("--out", type=Path, help="folder to write; default: exported_<checkpoint> in the run's folder")
     args = parser.parse_args()
     if args.out:
-        check_output(args.out / DESCRIPTION_FILE)
-    options = options_of(args)
-    with slow_imports():
+        cli.check_output(args.out / DESCRIPTION_FILE)
+    options = cli.options_of(args)
+    with cli.slow_imports():
         run = task_registry.load_run(options)
         from legged_torque.deploy.export import export_policy, nominal_cfg
     env, runner = task_registry.make_loaded(run, options, nominal_cfg(run.env_cfg))
@@ -38,8 +37,8 @@ def main() -> None:
         print("  policy.yaml does not describe the whole task, so sim2sim.py refuses it; the networks are complete:")
         print("".join(f"  - {problem}\n" for problem in unsupported), end="")
     else:
-        print(f"See it in plain MuJoCo: {script_command('sim2sim')} {out}")
+        print(f"See it in plain MuJoCo: {cli.script_command('sim2sim')} {out}")
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

@@ -9,26 +9,26 @@ from pathlib import Path
 from legged_torque import RESOURCES_DIR
 from legged_torque import __file__ as package
 from legged_torque.envs import task_registry
-from legged_torque.utils.cli import Parser, check_output, finite, run_script, script_command, slow_imports
+from legged_torque.utils import cli
+from legged_torque.utils.devices import choose_offscreen_renderer, disable_renderer
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_whole
-from legged_torque.utils.rendering import choose_offscreen_renderer, disable_renderer
 
 
 def main() -> None:
     """Import a robot and, if asked, stand it up."""
-    parser = Parser(__doc__)
+    parser = cli.Parser(__doc__)
     parser.add_argument("file", type=Path, help="MJCF or URDF; its meshes are used if they are near it")
     parser.add_argument("--name", default="", help="name of the robot; default: that of the file")
     parser.add_argument("--out", type=Path, help="folder for both files; default: where the library keeps its robots")
-    parser.add_argument("--torque_limit", type=finite, help="[N m] of all joints; default: those of the file")
+    parser.add_argument("--torque_limit", type=cli.finite, help="[N m] of all joints; default: those of the file")
     parser.add_argument("--check", action="store_true", help="hold the nominal pose for 5 s and draw a picture of it")
     parser.add_argument("--force", action="store_true", help="write over files that exist")
     args = parser.parse_args()
     if args.torque_limit is not None and args.torque_limit <= 0:
         raise UserError(f"--torque_limit must be above 0, not {args.torque_limit}")
     no_picture = choose_offscreen_renderer() if args.check else disable_renderer()
-    with slow_imports():
+    with cli.slow_imports():
         from legged_torque.importer.mjcf import mjcf
         from legged_torque.importer.robot import import_robot
         from legged_torque.importer.settings import settings
@@ -38,7 +38,7 @@ def main() -> None:
     model_file = folder / f"{robot.name}.xml"
     code_file = (args.out or Path(package).parent / "envs" / "robots") / f"{robot.name}.py"
     for file in (model_file, code_file):
-        check_output(file)
+        cli.check_output(file)
         if file.exists() and not args.force:
             raise UserError(f"'{file}' exists; --force writes over it, --name and --out write elsewhere")
     taken = [task for task in task_registry.names() if task.startswith(f"{robot.name}_")]
@@ -66,8 +66,8 @@ def main() -> None:
             print(f"wrote {folder / robot.name}.png")
     if args.out:
         print(f"To have its tasks, put {code_file.name} into {Path(package).parent / 'envs' / 'robots'}")
-    print(f"Train it: {script_command('train')} --task={robot.name}_position")
+    print(f"Train it: {cli.script_command('train')} --task={robot.name}_position")
 
 
 if __name__ == "__main__":
-    run_script(main, draws=True)
+    cli.run_script(main, draws=True)

@@ -14,9 +14,9 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 import legged_torque
-from legged_torque.utils.cli import Parser, run_script, slow_imports
+from legged_torque.utils import cli
+from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import collect_errors
-from legged_torque.utils.rendering import choose_offscreen_renderer
 from legged_torque.utils.runs import package_versions
 
 PURPOSES = {
@@ -32,9 +32,9 @@ PURPOSES = {
 
 def main() -> None:
     """Print a block of lines per topic."""
-    Parser(__doc__).parse_args()
+    cli.Parser(__doc__).parse_args()
     no_renderer = choose_offscreen_renderer()  # before anything imports mujoco
-    with slow_imports():
+    with cli.slow_imports():
         import torch
 
         from legged_torque.viewer.native import check_display
@@ -127,4 +127,4 @@ def lacking(need: Requirement) -> str:
 
 
 if __name__ == "__main__":
-    run_script(main, draws=True)
+    cli.run_script(main, draws=True)

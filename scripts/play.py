@@ -17,24 +17,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from legged_torque import resource_path
 from legged_torque.envs import task_registry
 from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
-from legged_torque.utils.args import add_task_args, options_of
-from legged_torque.utils.cli import (
-    Parser,
-    add_command_arg,
-    check_at_least,
-    check_output,
-    finite,
-    run_script,
-    slow_imports,
-)
-from legged_torque.utils.devices import resolve_device
+from legged_torque.utils import cli
+from legged_torque.utils.devices import choose_offscreen_renderer, resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.options import Options
-from legged_torque.utils.rendering import choose_offscreen_renderer
 from legged_torque.utils.runs import load_config
 from legged_torque.utils.task_registry import LoadedRun, experiment_dir, set_seed
 
@@ -55,8 +44,8 @@ def main() -> None:
     args = parse_args()
     args.no_renderer = choose_offscreen_renderer()
     kinds, levels = named_kinds(args.terrain), rising_levels(args.level)
-    options = options_of(args)
-    with slow_imports():
+    options = cli.options_of(args)
+    with cli.slow_imports():
         import rsl_rl.runners  # noqa: F401  # before MuJoCo: Triton's LLVM cannot be loaded after that of Mesa's renderer
 
         run = task_registry.load_run(options) if args.agent == "policy" else None
@@ -87,14 +76,14 @@ def main() -> None:
 
 def parse_args() -> argparse.Namespace:
     """Return the command line; a UserError if it makes no sense."""
-    parser = Parser(__doc__)
-    add_task_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_task_args(parser)
     parser.set_defaults(seed=1)
     hint = "control steps, 50 of them a second; default: %(default)s"
     parser.add_argument("--steps", type=int, default=500, help=hint)
     hint = "who acts: the run's policy, or zero or random actions (from -1 to 1) without a run; default: %(default)s"
     parser.add_argument("--agent", choices=("policy", *AGENTS), default="policy", help=hint)
-    add_command_arg(parser)
+    cli.add_command_arg(parser)
     add_terrain_args(parser)
     parser.add_argument("--video", type=Path, help="mp4 to write; default: in the run's folder")
     parser.add_argument("--no_video", action="store_true", help="print metrics alone")
@@ -108,7 +97,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--host", default="127.0.0.1", help=hint)
     parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
     args = parser.parse_args()
-    check_at_least(args, 1, "steps")
+    cli.check_at_least(args, 1, "steps")
     if not 1 <= args.port <= 65535:
         raise UserError(f"--port must be from 1 to 65535, not {args.port}")
     choose_worlds(args)
@@ -116,15 +105,15 @@ def parse_args() -> argparse.Namespace:
     if args.level and not args.terrain:
         raise UserError("--level needs --terrain: the kinds of rough ground")
     if args.video:
-        check_output(args.video)
+        cli.check_output(args.video)
     return args
 
 
 def show(args: argparse.Namespace, run: LoadedRun) -> None:
     """Show a policy live, and one that it is compared with."""
     compared = load_compared(args, run) if args.compare else None
-    watch, device = import_viewer(args), resolve_device(args.device)  # what is missing is told before anything slow
-    with slow_imports():
+    watch, device = import_viewer(args), resolve_device(args.device)  # refuses what is missing, before slow imports
+    with cli.slow_imports():
         from legged_torque.viewer.session import Session
     session = Session(task_registry.get_task_class(args.task), run, device)
     session.follow_newest(args.checkpoint in (None, -1))
@@ -132,7 +121,7 @@ def show(args: argparse.Namespace, run: LoadedRun) -> None:
         session.companion = Session(task_registry.get_task_class(compared.config["task"]), compared, device)
     if args.command:
         session.set_command(tuple(args.command))
-    watch(session, resource_path(run.env_cfg.asset.file))
+    watch(session)
 
 
 def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
@@ -164,7 +153,7 @@ def choose_worlds(args: argparse.Namespace) -> None:
 
 
 def check_agent(args: argparse.Namespace) -> None:
-    """Raise a UserError if what is asked for does not go with who acts or what is shown."""
+    """Raise a UserError for options that exclude each other."""
     if args.agent != "policy" and (args.load_run or args.checkpoint is not None or args.viewer != "none"):
         raise UserError(f"--agent {args.agent} has no run: --load_run, --checkpoint and --viewer are for the policy's")
     if args.headless and args.viewer == "native":
@@ -183,16 +172,16 @@ def agent(name: str, env: LeggedRobot) -> Callable[[TensorDict], Tensor]:
     return lambda obs: actions.uniform_(-1.0, 1.0) if name == "random" else actions
 
 
-def add_terrain_args(parser: Parser) -> None:
+def add_terrain_args(parser: cli.Parser) -> None:
     """Add what chooses the ground."""
     hint = "kinds of rough ground, or all: a column of tiles of each; default: the ground of the training"
     parser.add_argument("--terrain", nargs="+", metavar="KIND", default=[], help=hint)
     hint = "difficulties of rough ground, 0 to 1: a row of tiles of each; default: those of the training"
-    parser.add_argument("--level", nargs="+", type=finite, default=[], help=hint)
+    parser.add_argument("--level", nargs="+", type=cli.finite, default=[], help=hint)
 
 
-def import_viewer(args: argparse.Namespace) -> Callable[[Session, Path], None]:
-    """Return the function that shows a session of a robot's MJCF; a UserError if a package or a screen is missing."""
+def import_viewer(args: argparse.Namespace) -> Callable[[Session], None]:
+    """Return the function that shows a session; a UserError if a package or a screen is missing."""
     if args.viewer == "native":
         from legged_torque.viewer import native
 
@@ -221,4 +210,4 @@ def roll_out(
 
 
 if __name__ == "__main__":
-    run_script(main, draws=True)
+    cli.run_script(main, draws=True)

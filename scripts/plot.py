@@ -13,13 +13,13 @@ import importlib
 import os
 import sys
 
-from legged_torque.utils.cli import Parser, run_script
+from legged_torque.utils import cli
 from legged_torque.utils.errors import unknown_name
 
 FIGURES = {
     "curves": "legged_torque.paper.plot:plot_curves",
     "pretraining": "legged_torque.paper.plot:plot_pretraining",
-    "randomization": "legged_torque.envs.randomization_picture:plot_randomization",
+    "randomization": "legged_torque.paper.randomization_picture:plot_randomization",
     "terrain": "legged_torque.terrain.picture:plot_terrain",
 }
 """Functions ("module:name") by figure: each parses its own command line, ``sys.argv``, and draws."""
@@ -38,10 +38,10 @@ def main() -> None:
         return
     if not name.startswith("-") and not is_completing:
         raise unknown_name("figure", name, FIGURES)
-    parser = Parser(__doc__)
+    parser = cli.Parser(__doc__)
     parser.add_argument("figure", choices=FIGURES, help="the figure to draw")
     parser.parse_args(sys.argv[1:] or ["--help"])
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

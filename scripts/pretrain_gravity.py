@@ -12,18 +12,16 @@ import shlex
 from pathlib import Path
 
 from legged_torque.envs import task_registry
-from legged_torque.utils.args import Parser, add_build_args, options_of, task_file_words
-from legged_torque.utils.cli import check_output, run_script, script_command, slow_imports
+from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.files import write_json
-from legged_torque.utils.paths import without_machine
+from legged_torque.utils.files import without_machine, write_json
 
 
 def main() -> None:
     """Parse the command line, and make the policy or check it."""
-    parser = Parser(__doc__)
-    add_build_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_options(parser, *cli.SETTINGS, "num_envs")
     parser.set_defaults(task="a1_torque_gravity")
     parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in the current directory")
     parser.add_argument("--num_configurations", type=int, help="random initial states; default: as in the task")
@@ -43,8 +41,8 @@ def check(args: argparse.Namespace) -> None:
     for name in ("num_configurations", "num_steps", "json"):
         if getattr(args, name) is not None:
             raise UserError(f"--{name} is for making a policy, which --check_standing does not do")
-    options = options_of(args)
-    with slow_imports():
+    options = cli.options_of(args)
+    with cli.slow_imports():
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
         from legged_torque.paper.gravity.trials import check_standing
         from legged_torque.utils.progress import CompileProgress
@@ -57,25 +55,25 @@ def pretrain(args: argparse.Namespace) -> None:
     for name in ("num_configurations", "num_steps", "seed"):
         if getattr(args, name) is not None:
             args.set.append(f"pretraining.{name}={getattr(args, name)}")
-    options = options_of(args)
-    with slow_imports():
+    options = cli.options_of(args)
+    with cli.slow_imports():
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
-        from legged_torque.learning.pretrained import make_pretrained, pretrained_file
+        from legged_torque.paper.gravity.pretrained import make_pretrained, pretrained_file
         from legged_torque.utils.progress import CompileProgress
     file, device = pretrained_file(options.task, train_cfg, options.log_root), resolve_device(options.device)
     if args.json:
-        check_output(args.json)
+        cli.check_output(args.json)
     print(f"Pre-training {args.task} on {device_name(device)}.", flush=True)
     with CompileProgress():
         report = make_pretrained(file, args.task, env_cfg, train_cfg, device)
     if args.json:
         write_json(args.json, without_machine(report))
     print(f"The policy is in {file}")
-    words = [*task_file_words(args.task_file), f"--task={args.task}"]
+    words = [*cli.option_words(args, "task_file"), f"--task={args.task}"]
     words += [f"--log_root={args.log_root}"] if args.log_root else []
     words += [word for change in args.set for word in ("--set", change)]  # another policy would be made otherwise
-    print(f"Train from it: {script_command('train')} {shlex.join(words)}")
+    print(f"Train from it: {cli.script_command('train')} {shlex.join(words)}")
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

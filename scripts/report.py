@@ -6,13 +6,12 @@ Takes the folder of an experiment, a folder with runs of train.py (logs/a1_torqu
 from pathlib import Path
 
 from legged_torque.paper.report import check_extra
-from legged_torque.utils.args import Parser
-from legged_torque.utils.cli import check_at_least, check_output, run_script, slow_imports
+from legged_torque.utils import cli
 
 
 def main() -> None:
     """Read the results, draw figures, write tables and the report: as Markdown, and as one page for a browser."""
-    parser = Parser(__doc__)
+    parser = cli.Parser(__doc__)
     parser.add_argument("experiment", type=Path, help="folder of experiment.py's results, or with runs of train.py")
     help_text = "folder for the report, its tables and figures; default: report, in the folder of the results"
     parser.add_argument("--out", type=Path, help=help_text)
@@ -24,11 +23,11 @@ def main() -> None:
     parser.add_argument("--videos", type=Path, help=help_text)
     args = parser.parse_args()
     if args.from_step is not None:
-        check_at_least(args, 0, "from_step")
+        cli.check_at_least(args, 0, "from_step")
     out = args.out or args.experiment / "report"
-    check_output(out / "report.md")
-    check_output(out / "report.html")
-    with slow_imports():
+    cli.check_output(out / "report.md")
+    cli.check_output(out / "report.html")
+    with cli.slow_imports():
         check_extra()
         from legged_torque.paper.report.experiment import read_experiment
         from legged_torque.paper.report.report import find_videos, write_report
@@ -40,4 +39,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

@@ -15,18 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from legged_torque import resource_path
-from legged_torque.utils.cli import (
-    Parser,
-    add_command_arg,
-    check_at_least,
-    check_output,
-    finite,
-    run_script,
-    slow_imports,
-)
+from legged_torque.utils import cli
+from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_json
-from legged_torque.utils.rendering import choose_offscreen_renderer
 
 if TYPE_CHECKING:
     from legged_torque.deploy.policy import Policy
@@ -35,30 +27,30 @@ if TYPE_CHECKING:
 
 def parse_args() -> argparse.Namespace:
     """Parse and check the command line."""
-    parser = Parser(__doc__)
+    parser = cli.Parser(__doc__)
     parser.add_argument("policy", type=Path, help="policy.yaml, policy.onnx, or the folder of both")
     parser.add_argument("--xml", type=Path, help="MJCF of the robot; default: that of the training")
     parser.add_argument("--steps", type=int, default=2000, help="control steps of each robot; default: %(default)s")
     parser.add_argument("--robots", type=int, default=16, help="robots, one after another; default: %(default)s")
-    add_command_arg(parser)
+    cli.add_command_arg(parser)
     hint = "largest velocity of a push per axis [m/s]; default: none"
-    parser.add_argument("--push_velocity", type=finite, default=0.0, help=hint)
+    parser.add_argument("--push_velocity", type=cli.finite, default=0.0, help=hint)
     parser.add_argument(
-        "--push_probability", type=finite, help="probability of a push per control step; default: 0.002"
+        "--push_probability", type=cli.finite, help="probability of a push per control step; default: 0.002"
     )
     parser.add_argument("--seed", type=int, default=1, help="random seed; default: %(default)s")
     hint = "kinds of rough ground, or all; each robot starts on one of their tiles; default: the ground of training"
     parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
     hint = "difficulties of rough ground, 0 to 1; default: those of training"
-    parser.add_argument("--level", nargs="+", type=finite, default=(), help=hint)
+    parser.add_argument("--level", nargs="+", type=cli.finite, default=(), help=hint)
     hint = "with height fields: corrected to those of training, or MuJoCo's own; default: %(default)s"
     parser.add_argument("--contacts", choices=("training", "mujoco"), default="training", help=hint)
     parser.add_argument("--video", type=Path, help="mp4 of the first robot")
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
     args = parser.parse_args()
-    check_at_least(args, 1, "steps", "robots")
-    check_at_least(args, 0, "seed", "push_velocity")
+    cli.check_at_least(args, 1, "steps", "robots")
+    cli.check_at_least(args, 0, "seed", "push_velocity")
     if args.level and not args.terrain:
         raise UserError("--level needs --terrain: the kinds of rough ground")
     if args.push_probability is not None and not args.push_velocity:
@@ -68,7 +60,7 @@ def parse_args() -> argparse.Namespace:
     if not 0.0 <= args.push_probability <= 1.0:
         raise UserError(f"--push_probability must be from 0 to 1, not {args.push_probability}")
     for file in filter(None, (args.json, args.video)):
-        check_output(file)
+        cli.check_output(file)
     return args
 
 
@@ -76,13 +68,13 @@ def main() -> None:
     """Load a policy and a robot, simulate, print the metrics, and write JSON and video if asked to."""
     args = parse_args()
     no_renderer = None if args.viewer else choose_offscreen_renderer()
-    with slow_imports():
+    with cli.slow_imports():
         import numpy as np
 
         from legged_torque.deploy.ground import select_ground
         from legged_torque.deploy.policy import Policy
         from legged_torque.deploy.robot import MujocoRobot
-        from legged_torque.deploy.simulation import Events, Simulation
+        from legged_torque.deploy.simulation import Simulation
         from legged_torque.envs import LeggedRobotCfg
         from legged_torque.utils.display import Counter
         from legged_torque.utils.metrics import UNITS, estimates, ratios
@@ -93,8 +85,7 @@ def main() -> None:
         select_ground(policy.description, LeggedRobotCfg().terrain, args.terrain, args.level)
     xml = args.xml or resource_path(policy.description["robot"]["file"])
     robot = MujocoRobot(xml, policy.description, args.contacts)
-    events = Events(args.command, args.push_velocity, args.push_probability)
-    simulation = Simulation(policy, robot, events)
+    simulation = Simulation(policy, robot, args.command, args.push_velocity, args.push_probability)
     notes = robot.notes + simulation.notes
     recorder = SimulationRecorder(simulation) if args.video else None
     sums = []
@@ -130,4 +121,4 @@ def write_results(args: argparse.Namespace, policy: Policy, notes: list[str], me
 
 
 if __name__ == "__main__":
-    run_script(main, draws=True)
+    cli.run_script(main, draws=True)

@@ -20,17 +20,14 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.envs import task_registry
-from legged_torque.utils import distributed
-from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of, task_file_words
-from legged_torque.utils.busy_cores import busy_cores_note
-from legged_torque.utils.cli import check_at_least, check_output, run_script, script_command, slow_imports
+from legged_torque.utils import cli, distributed
 from legged_torque.utils.config import flat, to_dict
-from legged_torque.utils.devices import device_name, resolve_device
+from legged_torque.utils.devices import busy_cores_note, device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.options import DEFAULT_PRESET, Options
 from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, package_versions
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
-from legged_torque.viewer.beside import Beside
+from legged_torque.viewer.training_viewer import TrainingViewer
 
 if TYPE_CHECKING:
     from legged_torque.learning.runner import OnPolicyRunner
@@ -38,24 +35,24 @@ if TYPE_CHECKING:
 
 def main() -> None:
     """Parse the command line and train."""
-    parser = Parser(__doc__)
-    add_task_args(parser)
-    add_train_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_task_args(parser)
+    cli.add_options(parser, *cli.TRAINING)
     parser.add_argument("--list", action="store_true", help="print all tasks and exit")
     hint = "web: a page beside the training, on which its newest policy walks; default: %(default)s"
     parser.add_argument("--viewer", choices=("none", "web"), default="none", help=hint)
     hint = "iterations from one short video of the policy to the next, made beside the training; default: no videos"
     parser.add_argument("--video_interval", type=int, default=0, metavar="N", help=hint)
     args = parser.parse_args()
-    check_at_least(args, 0, "video_interval")
-    options = options_of(args)
+    cli.check_at_least(args, 0, "video_interval")
+    options = cli.options_of(args)
     if args.list:
         print("\n".join(task_registry.names()))
         return
     if options.resume:
         if options.preset:
             raise UserError("--preset cannot be given with --resume, which keeps the settings of the run")
-        with slow_imports():
+        with cli.slow_imports():
             if distributed.world_size() > 1:
                 from legged_torque.learning.first_run import use_first_run
 
@@ -69,36 +66,37 @@ def main() -> None:
     elif options.load_run or options.checkpoint is not None:
         raise UserError("--load_run and --checkpoint need --resume")
     else:
-        with slow_imports():
+        with cli.slow_imports():
             env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     folder = experiment_dir(train_cfg, options.log_root)
     if distributed.rank() == 0:  # the others write nothing
-        check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)
-    with slow_imports():
+        cli.check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)
+    with cli.slow_imports():
         from legged_torque.utils.progress import CompileProgress
     is_first = distributed.rank() == 0
-    beside = Beside(is_first and args.viewer == "web", args.video_interval if is_first else 0)
+    viewer = TrainingViewer(is_first and args.viewer == "web", args.video_interval if is_first else 0)
     set_seed(train_cfg.seed)
     with CompileProgress() if is_first else contextlib.nullcontext():  # one line for all processes
-        train(options, env_cfg, train_cfg, beside)
+        train(options, env_cfg, train_cfg, viewer)
 
 
-def train(options: Options, env_cfg: Any, train_cfg: Any, beside: Beside) -> None:
+def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer) -> None:
     """Build the task and train it, from a pre-trained policy if the task has one."""
     import torch
 
     from legged_torque.envs.base.held_pose import standing_note
     from legged_torque.envs.base.legged_robot import LeggedRobot
-    from legged_torque.learning.pretrained import find_pretrained, pretrained_file, start_from
 
     is_first = distributed.rank() == 0
-    pretrained = pretrained_file(options.task, train_cfg, options.log_root)
     starts_pretrained = bool(train_cfg.pretraining.function) and not options.resume and is_first
     if starts_pretrained:
+        from legged_torque.paper.gravity.pretrained import find_pretrained, pretrained_file, start_from
+
+        pretrained = pretrained_file(options.task, train_cfg, options.log_root)
         find_pretrained(pretrained, options.task, env_cfg, train_cfg, resolve_device(options.device))
     env, _ = task_registry.make_env(options.task, options, env_cfg)
     if is_first and isinstance(env, LeggedRobot) and not options.resume:
-        print_notes(filter(None, [standing_note(env)]))
+        print_notes([standing_note(env)])
     runner, _ = task_registry.make_alg_runner(env, options.task, options, train_cfg)
     if starts_pretrained:
         start_from(runner, pretrained)  # the other processes get the networks of the first one
@@ -110,9 +108,9 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, beside: Beside) -> Non
     if remaining < 1:
         raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
     if is_first:
-        print_notes(filter(None, [busy_cores_note(torch.get_num_threads()) if env.device == "cpu" else None]))
-        announce(runner, options, env_cfg, train_cfg, total, beside.page)
-        runner.on_checkpoint = functools.partial(beside.show, task_words(options))
+        print_notes([busy_cores_note(torch.get_num_threads()) if env.device == "cpu" else ""])
+        announce(runner, options, env_cfg, train_cfg, total, viewer.page)
+        runner.on_checkpoint = functools.partial(viewer.show, cli.option_words(options, "task_file", "task"))
     is_complete = False
     try:
         runner.learn(remaining, init_at_random_ep_len=True)
@@ -121,11 +119,11 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, beside: Beside) -> Non
         runner.close()
         raise
     finally:
-        beside.close(is_waiting=is_complete)
+        viewer.close(is_waiting=is_complete)
     if is_first:
         print(f"The run is in {runner.log_dir}")
         for what, script in {"See it walk": "play", "Measure it": "evaluate", "Take it elsewhere": "export"}.items():
-            print(f"{what}: {script_command(script)} {run_words(options, runner.log_dir)}")
+            print(f"{what}: {cli.script_command(script)} {run_words(options, runner.log_dir)}")
     runner.close()
     if runner.stopped_by:
         sys.exit(128 + runner.stopped_by)  # as shells tell it: 130 after Ctrl-C
@@ -140,19 +138,14 @@ def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: 
     place = device_name(device) if num_processes == 1 else f"{num_processes} x {device_name(device)}"
     print(f"Training {options.task} on {place}: {num_processes * runner.env.num_envs} worlds, {total} iterations.")
     print(f"Curves: tensorboard --logdir {runner.log_dir}")
-    how = page or f"{script_command('play')} {run_words(options, runner.log_dir)} --viewer web"
+    how = page or f"{cli.script_command('play')} {run_words(options, runner.log_dir)} --viewer web"
     print(f"See it learn: {how}", flush=True)
-
-
-def task_words(options: Options) -> list[str]:
-    """Return the options with which other scripts find a task."""
-    return [*task_file_words(options.task_file), f"--task={options.task}"]
 
 
 def run_words(options: Options, run_dir: str) -> str:
     """Return the options with which other scripts find a run."""
-    return shlex.join([*task_words(options), f"--load_run={run_dir}"])
+    return shlex.join([*cli.option_words(options, "task_file", "task"), f"--load_run={run_dir}"])
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from legged_torque.utils.rendering import disable_renderer
+from legged_torque.utils.devices import disable_renderer
 
 disable_renderer()  # before anything imports mujoco
 
@@ -28,8 +28,7 @@ from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.sim.height_map import HeightMap
 from legged_torque.sim.model import FLOOR, build_model
 from legged_torque.sim.simulator import ENGINES, Simulator
-from legged_torque.utils.args import Parser, add_task_args, options_of
-from legged_torque.utils.cli import check_at_least, run_script
+from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.mjcf import read_spec
 from legged_torque.utils.options import Options
@@ -321,14 +320,14 @@ def walk(run: LoadedRun, options: Options, steps: int) -> tuple[LeggedRobot, Phy
 
 def main() -> None:
     """Let a trained policy walk, keep its states, make the others of them, and step each with both engines."""
-    parser = Parser(__doc__)
-    add_task_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_task_args(parser)
     parser.set_defaults(num_envs=WALKERS, seed=1)
     parser.add_argument("--steps", type=int, default=100, help="control steps to walk; the states after each are kept")
     parser.add_argument("--worlds", type=int, default=1500, help="states of each kind; default: %(default)s")
     args = parser.parse_args()
-    check_at_least(args, 1, "steps", "worlds")
-    options = options_of(args)
+    cli.check_at_least(args, 1, "steps", "worlds")
+    options = cli.options_of(args)
     run = task_registry.load_run(options)
     set_seed(args.seed)
     env, walking_states = walk(run, options, args.steps)
@@ -357,4 +356,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 
-from legged_torque.utils.rendering import disable_renderer
+from legged_torque.utils.devices import disable_renderer
 
 disable_renderer()  # before anything imports mujoco
 
@@ -18,8 +18,7 @@ import torch
 from legged_torque import RESOURCES_DIR
 from legged_torque.sim.model import build_model, collision_geoms
 from legged_torque.sim.simulator import ENGINES, Simulator
-from legged_torque.utils.args import Parser, add_options
-from legged_torque.utils.cli import check_at_least, run_script
+from legged_torque.utils import cli
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.mjcf import read_spec
 
@@ -90,11 +89,11 @@ def _same(sims: list[Simulator], worlds: torch.Tensor) -> bool:
 
 def main() -> None:
     """Print the counts of both engines."""
-    parser = Parser(__doc__)
+    parser = cli.Parser(__doc__)
     parser.add_argument("--count", type=int, default=400, help="bad numbers per engine; default: %(default)s")
-    add_options(parser, "device")
+    cli.add_options(parser, "device")
     args = parser.parse_args()
-    check_at_least(args, 1, "count")
+    cli.check_at_least(args, 1, "count")
     device, spec = resolve_device(args.device), read_spec(RESOURCES_DIR / "robots/a1/a1.xml")
     model, is_good = build_model(spec, collision_geoms(spec)), True
     for engine in ENGINES:
@@ -105,4 +104,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from legged_torque.utils.rendering import disable_renderer
+from legged_torque.utils.devices import disable_renderer
 
 disable_renderer()  # before anything imports mujoco
 
@@ -32,8 +32,7 @@ from legged_torque.envs import task_registry
 from legged_torque.learning.ppo import OnDevicePPO
 from legged_torque.sim.fused.tables import FUSED_FIELDS, unread_columns
 from legged_torque.sim.simulator import Simulator
-from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import check_at_least, run_script
+from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError
 
@@ -160,12 +159,12 @@ def _median_seconds(function: Callable[[], object], device: str) -> float:
 
 def main() -> None:
     """Time updates and physics of a task, and print their rates as shares of the peaks."""
-    parser = Parser(__doc__)
-    add_build_args(parser)
+    parser = cli.Parser(__doc__)
+    cli.add_options(parser, *cli.SETTINGS, "num_envs")
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
     args = parser.parse_args()
-    check_at_least(args, 1, "rounds")
-    device, options = resolve_device(args.device), options_of(args)
+    cli.check_at_least(args, 1, "rounds")
+    device, options = resolve_device(args.device), cli.options_of(args)
     options.set = ["evaluation.interval=0", *options.set]  # without evaluations iterations are alike
     env_cfg, train_cfg = task_registry.get_cfgs(args.task, options)
     with tempfile.TemporaryDirectory() as folder:
@@ -187,4 +186,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    cli.run_script(main)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,9 @@ from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 
 DESCRIPTION_FILE = "policy.yaml"
 NETWORK_FILE = "policy.onnx"
-SCHEMA_FILE = Path(__file__).with_name("policy.schema.json")
 FORMAT_VERSION = 1
+SCHEMA: dict[str, Any] = json.loads(Path(__file__).with_name("policy.schema.json").read_text(encoding="utf-8"))
+"""The JSON schema of descriptions."""
 
 
 def read(path: str | Path) -> tuple[dict[str, Any], Path]:
@@ -50,28 +50,13 @@ def read(path: str | Path) -> tuple[dict[str, Any], Path]:
 
 def to_yaml(description: dict[str, Any]) -> str:
     """Return the text of a description, section by section with the schema's comment above each."""
-    parts, sections = [], _schema()["properties"]
+    parts = []
     for key, value in description.items():
-        comment = "".join(f"# {line}\n" for line in sections[key].get("description", "").splitlines())
+        comment = SCHEMA["properties"][key].get("description", "").splitlines()
         flow = None if isinstance(value, (dict, list)) else False  # plain values on one line
-        parts.append(
-            comment + yaml.dump({key: value}, Dumper=Dumper, sort_keys=False, width=100, default_flow_style=flow)
-        )
+        text = yaml.dump({key: value}, Dumper=Dumper, sort_keys=False, width=100, default_flow_style=flow)
+        parts.append("".join(f"# {line}\n" for line in comment) + text)
     return "\n".join(parts)
-
-
-def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
-    """Check structure, values and their consistency; a UserError names the first wrong entry, and ``where`` it is."""
-    _check_schema(description, where)
-    for path, value in _numbers(description):
-        if not abs(value) <= LARGEST and not path.startswith("training."):
-            raise UserError(f"{where}: {path} is not a finite number, at most {LARGEST:g} either way")
-    _check_joints(description, where)
-    _check_terms(description, where)
-    _check_ranges(description, where)
-    timing = description["timing"]
-    if not math.isclose(timing["physics_frequency"], timing["control_frequency"] * timing["decimation"], rel_tol=1e-6):
-        raise UserError(f"{where}: timing.physics_frequency is not control_frequency times decimation")
 
 
 def interface(description: dict[str, Any]) -> dict[str, str]:
@@ -79,29 +64,9 @@ def interface(description: dict[str, Any]) -> dict[str, str]:
     return {key: json.dumps(description[key]) for key in ("joint_order", "nominal_pose", "observations", "actions")}
 
 
-def _schema() -> dict[str, Any]:
-    """Return the schema of descriptions."""
-    return json.loads(SCHEMA_FILE.read_text(encoding="utf-8"))
-
-
-def _check_schema(description: Any, where: str) -> None:
-    """Check structure, types and single values."""
-    try:
-        import jsonschema
-    except ImportError:
-        raise missing_extra("jsonschema") from None
-    draft = jsonschema.Draft202012Validator  # which would take 4.0 as an integer
-    types = draft.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
-    validator = jsonschema.validators.extend(draft, type_checker=types)(_schema())
-    error = jsonschema.exceptions.best_match(validator.iter_errors(description))
-    if error is not None:
-        path = ".".join(str(key) for key in error.absolute_path) or "the file"
-        message = " ".join(error.message.split())
-        raise UserError(f"{where}: {path}: {message if len(message) < 160 else '... ' + message[-150:]}")
-
-
-def _check_joints(description: dict[str, Any], where: str) -> None:
-    """Check that values by joint cover all joints and no others."""
+def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
+    """Check structure, values and their consistency; a UserError names the first wrong entry, and ``where`` it is."""
+    _check_schema(description, where)
     joints = description["joint_order"]
     by_joint = {key: description[key] for key in ("nominal_pose", "torque_limits", "joints")}
     by_joint |= {f"gains.{key}": values for key, values in description["gains"].items()}
@@ -112,10 +77,40 @@ def _check_joints(description: dict[str, Any], where: str) -> None:
         for name in joints:
             if name not in values:
                 raise UserError(f"{where}: {path} lacks the joint '{name}'")
+    _check_terms(description, where)
+    sections = ("torque_limits", "commands", "initial_state")
+    ranges = {f"{section}.{key}": limits for section in sections for key, limits in description[section].items()}
+    ranges |= {f"clip of {term['name']}": term["clip"] for term in description["observations"]["terms"]}
+    ranges["actions.clip"] = description["actions"]["clip"]
+    for path, limits in ranges.items():
+        if isinstance(limits, list) and len(limits) == 2 and limits[0] > limits[1]:
+            raise UserError(f"{where}: {path} must be [lowest, highest], not {limits}")
+    timing = description["timing"]
+    if not math.isclose(timing["physics_frequency"], timing["control_frequency"] * timing["decimation"], rel_tol=1e-6):
+        raise UserError(f"{where}: timing.physics_frequency is not control_frequency times decimation")
+
+
+def _check_schema(description: Any, where: str) -> None:
+    """Check structure, types and single values, also that numbers are finite."""
+    try:
+        import jsonschema
+    except ImportError:
+        raise missing_extra("jsonschema") from None
+    draft = jsonschema.Draft202012Validator  # which would take 4.0 as an integer, and NaN as a number
+    types = draft.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
+    types = types.redefine("number", lambda _, value: type(value) in (int, float) and abs(value) <= LARGEST)
+    validator = jsonschema.validators.extend(draft, type_checker=types)(SCHEMA)
+    error = jsonschema.exceptions.best_match(validator.iter_errors(description))
+    if error is not None:
+        path = ".".join(str(key) for key in error.absolute_path) or "the file"
+        if error.validator == "type" and "number" in error.validator_value and type(error.instance) in (int, float):
+            raise UserError(f"{where}: {path} is not a finite number, at most {LARGEST:g} either way")
+        message = " ".join(error.message.split())
+        raise UserError(f"{where}: {path}: {message if len(message) < 160 else '... ' + message[-150:]}")
 
 
 def _check_terms(description: dict[str, Any], where: str) -> None:
-    """Check the sizes of the terms of observations and actions; terms of a user's task may have any size."""
+    """Check the terms of observations and actions, and their sizes; terms of a user's task may have any size."""
     observations, actions, network = (description[key] for key in ("observations", "actions", "network"))
     num_joints, num_actions = len(description["joint_order"]), sum(term["size"] for term in actions["terms"])
     sizes = dict.fromkeys(("projected_gravity", "angular_velocity", "command"), 3)
@@ -134,31 +129,14 @@ def _check_terms(description: dict[str, Any], where: str) -> None:
                 raise UserError(f"{where}: the term '{name}' must have size {size}, not {term['size']}")
             if isinstance(term["scale"], list) and len(term["scale"]) != size:
                 raise UserError(f"{where}: the term '{name}' must have one scale or {size}, not {len(term['scale'])}")
-    num_observations = sum(term["size"] for term in observations["terms"]) * observations["history_length"]
+    in_group = ["group" in term for term in observations["terms"]]
+    if in_group != sorted(in_group):
+        raise UserError(f"{where}: the terms of further groups must come after those without a group")
+    steps = [1 if "group" in term else observations["history_length"] for term in observations["terms"]]
+    num_observations = sum(count * term["size"] for count, term in zip(steps, observations["terms"], strict=True))
     for key, value in {"num_observations": num_observations, "num_actions": num_actions}.items():
         if network[key] != value:
             raise UserError(f"{where}: network.{key} is {network[key]}, but the terms have {value} numbers")
-
-
-def _check_ranges(description: dict[str, Any], where: str) -> None:
-    """Check that no range has its ends swapped."""
-    sections = ("torque_limits", "commands", "initial_state")
-    ranges = {f"{section}.{key}": limits for section in sections for key, limits in description[section].items()}
-    ranges |= {f"clip of {term['name']}": term["clip"] for term in description["observations"]["terms"]}
-    ranges["actions.clip"] = description["actions"]["clip"]
-    for path, limits in ranges.items():
-        if isinstance(limits, list) and len(limits) == 2 and limits[0] > limits[1]:
-            raise UserError(f"{where}: {path} must be [lowest, highest], not {limits}")
-
-
-def _numbers(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
-    """Return every number of nested lists and dictionaries, with its dotted path."""
-    if isinstance(value, (dict, list)):
-        entries = value.items() if isinstance(value, dict) else enumerate(value)
-        for key, entry in entries:
-            yield from _numbers(entry, f"{path}.{key}" if path else str(key))
-    elif isinstance(value, (int, float)):
-        yield path, value
 
 
 def missing_extra(package: str) -> UserError:

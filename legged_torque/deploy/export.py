@@ -71,7 +71,7 @@ def export_policy(
 
     Args:
         task: The task, with settings of :func:`nominal_cfg` and the counters of the checkpoint. Its state is changed.
-        model: The policy's network.
+        model: The policy's network. It reads the observation group "policy", then any groups of single terms.
         folder: Where to write; files of an earlier export there are replaced, ``policy.yaml`` last.
         name: Name of the task.
         training: "run", "checkpoint", "iterations" and "total_steps" of the policy.
@@ -80,38 +80,45 @@ def export_policy(
         Largest difference between the exported networks and the model, and what is unsupported.
 
     Raises:
-        UserError: If the network has memory or reads other observations than those of the policy, or a package is
-            missing.
+        UserError: If the network has memory or reads other observations or images, or a package is missing.
     """
     for package in ("onnx", "onnxruntime", "jsonschema"):
         if importlib.util.find_spec(package) is None:
             raise missing_extra(package)
-    if model.is_recurrent or list(model.obs_groups) != ["policy"]:
-        raise UserError("only policies without memory that read the observation group 'policy' can be exported")
-    description = describe(task, name, training)
+    if model.is_recurrent:
+        raise UserError("only policies without memory can be exported")
+    if getattr(model, "obs_groups_2d", []):  # of rsl_rl's CNNModel
+        raise UserError(f"policies that see images cannot be exported: {', '.join(model.obs_groups_2d)}")
+    further = task.observations.groups
+    if model.obs_groups[:1] != ["policy"] or not further.keys() >= set(model.obs_groups[1:]):
+        allowed = f"'policy', then groups of single terms ({', '.join(further) or 'here none'})"
+        raise UserError(f"obs_groups.actor of an exported policy must be {allowed}, not {', '.join(model.obs_groups)}")
+    description = describe(task, model, name, training)
     folder.parent.mkdir(parents=True, exist_ok=True)
     if folder.exists() and not folder.is_dir():
         raise UserError(f"'{folder}' is not a folder")
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
         part = Path(temporary)
-        write_networks(model, part, interface(description))
-        description["network"]["sha256"] = hashlib.sha256((part / NETWORK_FILE).read_bytes()).hexdigest()
-        check(description)
-        difference = check_networks(model, load_network(part / NETWORK_FILE, description), part)
-        _write(description, part)
-        unknown = parts_without_function(description) + motors_without_description(task)
-        description["unsupported"] = unknown or differences(task, Policy(part))
-        _write(description, part)
+        difference = write_networks(model, part, description)
+        (part / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
+        unknown = parts_without_function(description)
+        for link, motor in task.motors.links.items():  # which may do anything over time
+            if type(motor) is not IdealMotor and type(motor).describe is Motor.describe:
+                unknown.append(f"the motor '{link}' has no describe()")
+        description["unsupported"] = unknown or differences(task, model, Policy(part))
+        (part / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
         folder.mkdir(exist_ok=True)
         for file in (NETWORK_FILE, TORCHSCRIPT_FILE, DESCRIPTION_FILE):
             os.replace(part / file, folder / file)
     return difference, description["unsupported"]
 
 
-def write_networks(model: MLPModel, folder: Path, meaning: dict[str, str]) -> None:
+def write_networks(model: MLPModel, folder: Path, description: dict[str, Any]) -> float:
     """Write the mean policy as ONNX and TorchScript, normalization of observations included.
 
-    The ONNX network stores its :func:`~legged_torque.deploy.description.interface`, the ``meaning``.
+    The ONNX network stores its :func:`~legged_torque.deploy.description.interface`; its checksum is added to the
+    ``description``, which is checked. Returns the largest difference of both networks from the model on random
+    observations; if it is too large, a UserError is raised.
     """
     import onnx
 
@@ -130,38 +137,54 @@ def write_networks(model: MLPModel, folder: Path, meaning: dict[str, str]) -> No
             dynamo=False,
         )
         exported = onnx.load(folder / NETWORK_FILE)
-        onnx.helper.set_model_props(exported, meaning)
+        onnx.helper.set_model_props(exported, interface(description))
         onnx.save(exported, folder / NETWORK_FILE)
         torch.jit.script(model.as_jit().cpu().eval()).save(str(folder / TORCHSCRIPT_FILE))
+    description["network"]["sha256"] = hashlib.sha256((folder / NETWORK_FILE).read_bytes()).hexdigest()
+    check(description)
+    obs = torch.randn(NUM_SAMPLES, model.obs_dim, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        expected = model.as_jit().cpu().eval()(obs).numpy()
+        scripted = torch.jit.load(str(folder / TORCHSCRIPT_FILE))(obs).numpy()
+    (run,) = load_network(folder / NETWORK_FILE, description).run(["actions"], {"obs": obs.numpy()})
+    difference = max(_difference(run, expected), _difference(scripted, expected))
+    if not difference <= TOLERANCE:
+        raise UserError(f"the exported network differs from the checkpoint's by {difference:.3g}; nothing was written")
+    return difference
 
 
-def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str, Any]:
+def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, Any]) -> dict[str, Any]:
     """Return the contents of ``policy.yaml`` but for the network's checksum; arguments as of :func:`export_policy`."""
-    cfg, asset, ranges = task.cfg, task.cfg.asset, task.cfg.commands.ranges
-    is_rough = cfg.terrain.mesh_type == "heightfield"
-    clip = float(cfg.normalization.clip_actions)
-    file, model = Path(asset.file), task.sim.mj_model
+    cfg, asset, ranges, mj_model = task.cfg, task.cfg.asset, task.cfg.commands.ranges, task.sim.mj_model
+    clip, file = float(cfg.normalization.clip_actions), Path(asset.file)
     if file.is_absolute() and file.is_relative_to(RESOURCES_DIR):
         file = file.relative_to(RESOURCES_DIR.parent)
-    return {
+    joints = {}  # for comparison with other files of the robot
+    for joint, axis in zip(task.dof_names, task.asset.dof_axes(), strict=True):
+        passive = {
+            key: float(getattr(mj_model.joint(joint), key)[0]) for key in ("damping", "armature", "frictionloss")
+        }
+        joints[joint] = {"axis": [round(float(part), 6) + 0.0 for part in axis], **passive}
+    observations = {"history_length": cfg.env.history_length, "terms": _observation_terms(task, model)}
+    description = {
         "format_version": FORMAT_VERSION,
         "task": name,
         "unsupported": [],
-        "robot": {"name": file.stem, "file": file.as_posix(), "trunk": model.body(1).name}
-        | {"mass": round(float(model.body_mass.sum()), 6), "self_collisions": asset.self_collisions},
+        "robot": {"name": file.stem, "file": file.as_posix(), "trunk": mj_model.body(1).name}
+        | {"mass": round(float(mj_model.body_mass.sum()), 6), "self_collisions": asset.self_collisions},
         "versions": package_versions() | {"legged_torque": __version__},
         "training": training,
         "network": {"file": NETWORK_FILE, "torchscript": TORCHSCRIPT_FILE, "input": "obs", "output": "actions"}
-        | {"num_observations": task.obs_buf["policy"].shape[1], "num_actions": task.num_actions},
+        | {"num_observations": model.obs_dim, "num_actions": task.num_actions},
         "joint_order": list(task.dof_names),
         "nominal_pose": _by_joint(task, task.default_dof_pos),
         "nominal_trunk_height": cfg.rewards.base_height_target,
-        "observations": {"history_length": cfg.env.history_length, "terms": _observation_terms(task)},
+        "observations": observations,
         "actions": {"clip": [-clip, clip], "terms": _action_terms(task)},
         "gains": {"stiffness": _by_joint(task, task.p_gains[0]), "damping": _by_joint(task, task.d_gains[0])},
         "torque_limits": _by_joint(task, task.torque_limits.T),
         "motors": task.motors.describe(),
-        "joints": _joints(task),
+        "joints": joints,
         "timing": {
             "control_frequency": 1.0 / task.dt,
             "physics_frequency": 1.0 / cfg.sim.dt,
@@ -175,35 +198,26 @@ def describe(task: LeggedRobot, name: str, training: dict[str, Any]) -> dict[str
         | {name: list(getattr(cfg.domain_rand, setting)) for name, setting in INITIAL_STATE.items()},
         "pushes": {"set_factor": cfg.domain_rand.push_set_factor},
         "episode": {"length": cfg.env.episode_length_s, "ends_on_contact_of": list(asset.terminate_after_contacts_on)},
-        **({"terrain": dataclasses.asdict(Layout.of(cfg.terrain))} if is_rough else {}),
     }
+    if cfg.terrain.mesh_type == "heightfield":
+        description["terrain"] = dataclasses.asdict(Layout.of(cfg.terrain))
+    return description
 
 
-def _observation_terms(task: LeggedRobot) -> list[dict[str, Any]]:
-    """Return the terms of the policy's observations in their order."""
-    clip, sizes = float(task.cfg.normalization.clip_observations), task.observations.sizes
-    points = {f"points_{axis}": list(getattr(task.cfg.terrain, f"measured_points_{axis}")) for axis in "xy"}
-    scan = points | {"offset": OFFSET, "limit": CLIP, "delay": task.cfg.terrain.measure_delay}
-    return [
-        {
-            "name": term.name,
-            "size": sizes[term.name],
-            "scale": list(term.scale) if isinstance(term.scale, Sequence) else term.scale,
-            **{key: getattr(term, key) for key in ("frame", "unit", "meaning")},
-            "clip": [-clip, clip],
-            **({"scan": scan} if term.name == "height_scan" else {}),
-        }
-        for term in task.observations.policy_terms()
-    ]
-
-
-def _joints(task: LeggedRobot) -> dict[str, Any]:
-    """Return axes and passive forces of the joints, for comparison with other files of the robot."""
-    result = {}
-    for name, axis in zip(task.dof_names, task.asset.dof_axes(), strict=True):
-        joint = task.sim.mj_model.joint(name)
-        passive = {field: float(getattr(joint, field)[0]) for field in ("damping", "armature", "frictionloss")}
-        result[name] = {"axis": [round(float(part), 6) + 0.0 for part in axis], **passive}
+def _observation_terms(task: LeggedRobot, model: MLPModel) -> list[dict[str, Any]]:
+    """Return the terms of the network's observations in their order, those of the group "policy" first."""
+    clip, settings, result = float(task.cfg.normalization.clip_observations), task.cfg.terrain, []
+    for term in task.observations.policy_terms() + [task.observations.groups[name] for name in model.obs_groups[1:]]:
+        size = task.obs_buf[term.group].shape[1] if term.group else task.observations.sizes[term.name]
+        scale = list(term.scale) if isinstance(term.scale, Sequence) else term.scale
+        entry = {"name": term.name, "size": size, "scale": scale}
+        entry |= {key: getattr(term, key) for key in ("frame", "unit", "meaning")} | {"clip": [-clip, clip]}
+        if term.group:
+            entry["group"] = term.group
+        if term.name == "height_scan":
+            points = {"points_x": list(settings.measured_points_x), "points_y": list(settings.measured_points_y)}
+            entry["scan"] = {**points, "offset": OFFSET, "limit": CLIP, "delay": settings.measure_delay}
+        result.append(entry)
     return result
 
 
@@ -223,27 +237,7 @@ def _action_terms(task: LeggedRobot) -> list[dict[str, Any]]:
     ]
 
 
-def motors_without_description(task: LeggedRobot) -> list[str]:
-    """Return a line for each link of the motors that does not say what it does: it may do anything over time."""
-    links = task.motors.links.items()
-    silent = [name for name, link in links if type(link) is not IdealMotor and type(link).describe is Motor.describe]
-    return [f"the motor '{name}' has no describe()" for name in silent]
-
-
-def check_networks(model: MLPModel, session: Any, folder: Path) -> float:
-    """Return the largest difference of the exported networks on random observations; too large, it is a UserError."""
-    obs = torch.randn(NUM_SAMPLES, model.obs_dim, generator=torch.Generator().manual_seed(0))
-    with torch.inference_mode():
-        expected = model.as_jit().cpu().eval()(obs).numpy()
-        scripted = torch.jit.load(str(folder / TORCHSCRIPT_FILE))(obs).numpy()
-    run = session.run(["actions"], {"obs": obs.numpy()})[0]
-    difference = max(_difference(run, expected), _difference(scripted, expected))
-    if not difference <= TOLERANCE:
-        raise UserError(f"the exported network differs from the checkpoint's by {difference:.3g}; nothing was written")
-    return difference
-
-
-def differences(task: LeggedRobot, policy: Policy) -> list[str]:
+def differences(task: LeggedRobot, model: MLPModel, policy: Policy) -> list[str]:
     """Return which of the exported policy's observations or torques differ from the task's in random states."""
     generator = torch.Generator().manual_seed(0)
 
@@ -258,13 +252,23 @@ def differences(task: LeggedRobot, policy: Policy) -> list[str]:
     task.set_state(qpos, draw(task.sim.qvel, 3.0))
     wanted = task._compute_torques(task.actions)
     task.torques.copy_(task.motors.apply(wanted, task.dof_pos, task.dof_vel, 0))
-    obs, torques = map(np.array, zip(*(_computed(task, policy, world) for world in range(task.num_envs)), strict=True))
-    expected = task.obs_buf["policy"].cpu().numpy()
+    parts = (task.base_ang_vel, task.dof_pos, task.dof_vel, task.projected_gravity, task.base_pos, task.base_quat)
+    obs, torques = [], []
+    for world in range(task.num_envs):
+        *measured, position, quat = (part[world].cpu().numpy() for part in parts)
+        points = np.pad(policy.scan_places(position, quat), [(0, 0), (0, 1)], constant_values=position[2])
+        state, in_world = State(*measured), torch.as_tensor(points, dtype=torch.float32, device=task.device)
+        state.heights = task.terrain.height_above(in_world).cpu().numpy()
+        policy.reset()
+        policy.last_action = actions = task.actions[world].cpu().numpy()
+        obs.append(policy.observation(state, task.commands[world].cpu().numpy()))
+        torques.append(policy.torques(actions, state.joint_positions, state.joint_velocities))
+    seen, expected = np.array(obs), torch.cat([task.obs_buf[name] for name in model.obs_groups], dim=1).cpu().numpy()
     columns = task.observations.policy_columns("height_scan") if policy.scan else []
     compared = [
-        ("observations", np.delete(obs, columns, axis=1), np.delete(expected, columns, axis=1), TOLERANCE),
-        ("heights of the scan", obs[:, columns], expected[:, columns], SCAN_TOLERANCE),
-        ("torques", torques, task.torques.cpu().numpy(), TOLERANCE),
+        ("observations", np.delete(seen, columns, axis=1), np.delete(expected, columns, axis=1), TOLERANCE),
+        ("heights of the scan", seen[:, columns], expected[:, columns], SCAN_TOLERANCE),
+        ("torques", np.array(torques), task.torques.cpu().numpy(), TOLERANCE),
     ]
     found = [(name, _difference(ours, theirs), tolerance) for name, ours, theirs, tolerance in compared]
     return [
@@ -274,27 +278,9 @@ def differences(task: LeggedRobot, policy: Policy) -> list[str]:
     ]
 
 
-def _computed(task: LeggedRobot, policy: Policy, world: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a policy's observations and torques in the state of one world. Shapes: (observations,), (joints,)."""
-    parts = (task.base_ang_vel, task.dof_pos, task.dof_vel, task.projected_gravity, task.base_pos, task.base_quat)
-    *measured, position, quat = (part[world].cpu().numpy() for part in parts)
-    points = np.pad(policy.scan_places(position, quat), [(0, 0), (0, 1)], constant_values=position[2])
-    state, in_world = State(*measured), torch.as_tensor(points, dtype=torch.float32, device=task.device)
-    state.heights = task.terrain.height_above(in_world).cpu().numpy()
-    policy.reset()
-    policy.last_action = actions = task.actions[world].cpu().numpy()
-    obs = policy.observation(state, task.commands[world].cpu().numpy())
-    return obs, policy.torques(actions, state.joint_positions, state.joint_velocities)
-
-
 def _difference(ours: np.ndarray, theirs: np.ndarray) -> float:
     """Return the largest difference, relative where numbers are larger than 1."""
     return float((np.abs(ours - theirs) / np.maximum(np.abs(theirs), 1.0)).max(initial=0.0))
-
-
-def _write(description: dict[str, Any], folder: Path) -> None:
-    """Write ``policy.yaml``."""
-    (folder / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
 
 
 def _by_joint(task: LeggedRobot, values: Tensor) -> dict[str, Any]:

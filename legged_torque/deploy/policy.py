@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from legged_torque.deploy.description import interface, missing_extra, read
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.heading import heading
-from legged_torque.utils.problems import refuse
 
 
 @dataclass
@@ -86,6 +85,7 @@ class Policy:
         sizes = [term["size"] for term in terms]
         self._scale = np.concatenate([np.full(term["size"], term["scale"], dtype) for term in terms])
         self._clip: np.ndarray = np.repeat(np.array([term["clip"] for term in terms], dtype), sizes, axis=0).T
+        self._num_kept = sum(term["size"] for term in terms if "group" not in term)  # of which there is a history
         scans = [term["scan"] for term in terms if "scan" in term]
         self.scan: dict[str, Any] | None = scans[0] if scans else None
         points = [(x, y) for scan in scans for x in scan["points_x"] for y in scan["points_y"]]
@@ -100,20 +100,20 @@ class Policy:
         self._history: np.ndarray | None = None
 
     def observation(self, state: State, command: np.ndarray) -> np.ndarray:
-        """Return the network's observations, the newest step first. Shape: (observations,).
+        """Return the network's observations: the newest step, those before, then terms with groups of their own.
 
         Call it once per control step, since it keeps the history. The command is v_x, v_y [m/s] and the yaw rate
-        [rad/s] in the trunk's frame. Shape: (3,).
+        [rad/s] in the trunk's frame. Shapes: (3,) to (observations,).
         """
         now = np.concatenate([np.asarray(value(self, state, command), self.dtype) for value in self._observations])
         if now.shape != self._scale.shape:
             raise ValueError(f"a state and a command make {now.size} observations, not {self._scale.size}")
-        now = np.clip(now * self._scale, *self._clip)
+        now, others = np.split(np.clip(now * self._scale, *self._clip), [self._num_kept])
         if self._history is None:
             self._history = np.tile(now, self.description["observations"]["history_length"])
         else:
             self._history = np.concatenate([now, self._history[: -now.size]])
-        return self._history.copy()
+        return np.concatenate([self._history, others])
 
     def act(self, obs: np.ndarray) -> np.ndarray:
         """Return clipped mean actions, or held ones where new ones are not due, kept as ``last_action``.

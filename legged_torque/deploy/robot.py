@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from legged_torque.deploy import hfield_contacts
-from legged_torque.deploy.ground import ground_heights, place_ground
-from legged_torque.deploy.joints import find_joints
+from legged_torque.deploy import ground
 from legged_torque.deploy.policy import State
-from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import drawing_notes, exclude_self_collisions, loading, self_pairs
+from legged_torque.utils.errors import UserError, refuse, unknown_name, with_names
+from legged_torque.utils.mjcf import (
+    drawing_notes,
+    exclude_self_collisions,
+    joint_axes,
+    joint_limits,
+    loading,
+    motors_of,
+    self_pairs,
+    torque_per_control,
+    torque_range,
+    why_no_motor,
+)
 
+MASS_TOLERANCE = 1e-3  # share of the mass below which robots count as equally heavy
+PARALLEL = 0.999  # least cosine between axes that count as parallel
+_ABOVE = 100.0  # height from which rays look down on the ground [m]
 _WARNINGS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
 
@@ -32,7 +45,6 @@ class MujocoRobot:
         quat: The trunk's orientation (w, x, y, z). Shape: (4,).
         velocity: The trunk's linear velocity in the world [m/s]. Shape: (3,).
         angular_velocity: The trunk's angular velocity in its own frame [rad/s]. Shape: (3,).
-        joints: The policy's joints and motors.
         weight: m g of the whole robot [N].
         origins: Where episodes may start: the middles of the ground's tiles, or the origin [m]. Shape: (places, 3).
     """
@@ -48,26 +60,40 @@ class MujocoRobot:
         Raises:
             UserError: If the file cannot be read, or lacks a joint or a motor that the policy needs.
         """
-        self.notes: list[str] = []
-        self.file = Path(xml)
-        self.model, self.origins = self._load(self.file, description)
+        self.file, self.notes = Path(xml), list[str]()
+        collided = description["robot"]["self_collisions"]
+        with loading(self.file):
+            spec = mujoco.MjSpec.from_file(str(self.file))
+            self.notes += drawing_notes(spec)
+            self.origins = ground.place_ground(spec, description, self.notes)
+            self.model = spec.compile()
+            pairs = len(self_pairs(self.model))
+            if pairs and not collided:
+                exclude_self_collisions(spec, self.model)
+                self.model = spec.compile()
+                self.notes.append(f"{pairs} pairs of parts that the MJCF lets collide do not, as in training")
+            if collided and not pairs:
+                self.notes.append("parts of the robot collided with each other in training, those of the MJCF do not")
         self.data = mujoco.MjData(self.model)
         old, step = self.model.opt.timestep, 1.0 / description["timing"]["physics_frequency"]
         if not np.isclose(old, step, rtol=1e-6):
             self.notes.append(f"time step: the MJCF has {old:g} s, policy.yaml's {step:g} s is used")
         self.model.opt.timestep = step
-        self._step = hfield_contacts.STEPS[contacts]
+        self._step = ground.step if contacts == "training" else mujoco.mj_step
         if self.model.nhfield:
-            self.notes.append(hfield_contacts.NOTES[contacts])
-        self._find_root()
-        self.joints = find_joints(self.model, description)
-        self.notes += self.joints.notes
-        others = self.model.nu - len(self.joints.motors)
+            self.notes.append(ground.CONTACT_NOTES[contacts])
+        (free,) = np.nonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        if len(free) != 1:
+            raise UserError(f"the MJCF must have one free joint, that of the trunk; it has {len(free)}")
+        self.trunk = int(self.model.jnt_bodyid[free[0]])
+        qpos, qvel = self.data.joint(int(free[0])).qpos, self.data.joint(int(free[0])).qvel
+        self.position, self.quat = qpos[:3], qpos[3:]
+        self.velocity, self.angular_velocity = qvel[:3], qvel[3:]
+        self._find_joints(description)
+        others = self.model.nu - len(self._motors)
         if others:
             self.notes.append(f"{others} motors of the MJCF are not driven by the policy and get 0")
-        self._find_geoms(description["episode"]["ends_on_contact_of"])
-        collides = description["robot"]["self_collisions"]
-        self._is_felt = self._is_ground | (collides & (self.model.body_rootid[self.model.geom_bodyid] == self.trunk))
+        self._find_geoms(description["episode"]["ends_on_contact_of"], collided)
         self.weight = float(self.model.body_mass.sum() * np.linalg.norm(self.model.opt.gravity))
 
     # ---- sensors and motors ------------------------------------------------------------------------------------------
@@ -79,19 +105,19 @@ class MujocoRobot:
 
     def joint_positions(self) -> np.ndarray:
         """Return joint positions. Shape: (joints,) [rad]."""
-        return self.joints.signs * self.data.qpos[self.joints.qpos]
+        return self._signs * self.data.qpos[self._qpos]
 
     def joint_velocities(self) -> np.ndarray:
         """Return joint velocities. Shape: (joints,) [rad/s]."""
-        return self.joints.signs * self.data.qvel[self.joints.dofs]
+        return self._signs * self.data.qvel[self._dofs]
 
     def applied_torques(self) -> np.ndarray:
         """Return the motors' torques in the last physics step. Shape: (joints,) [N m]."""
-        return self.joints.signs * self.data.qfrc_actuator[self.joints.dofs]
+        return self._signs * self.data.qfrc_actuator[self._dofs]
 
     def step(self, torques: np.ndarray) -> None:
         """Advance by one physics step with torques of shape (joints,) [N m]."""
-        self.data.ctrl[self.joints.motors] = torques / self.joints.torque_per_control
+        self.data.ctrl[self._motors] = torques / self._torque_per_control
         self._step(self.model, self.data)
 
     def planar_velocity(self) -> np.ndarray:
@@ -114,22 +140,36 @@ class MujocoRobot:
         """
         mujoco.mj_resetData(self.model, self.data)
         self.position[:], self.quat[:] = position, quat
-        self.data.qpos[self.joints.qpos] = self.joints.signs * np.clip(joint_positions, *self.joints.limits)
+        self.data.qpos[self._qpos] = self._signs * np.clip(joint_positions, *self._limits)
         self.velocity[:], self.angular_velocity[:] = velocities[:2]
-        self.data.qvel[self.joints.dofs] = self.joints.signs * velocities[2]
+        self.data.qvel[self._dofs] = self._signs * velocities[2]
         mujoco.mj_kinematics(self.model, self.data)  # places the ground
 
-    # ---- the ground --------------------------------------------------------------------------------------------------
+    # ---- the ground and contacts -------------------------------------------------------------------------------------
 
     def ground_heights(self, places: np.ndarray) -> np.ndarray:
         """Return heights of the ground at x and y of places, -inf where there is none. Shapes: (n, 2), (n,) [m]."""
-        return ground_heights(self.model, self.data, self._grounds, places)
+        model, data, down = self.model, self.data, np.array([0.0, 0.0, -1.0])
+        heights = np.full(len(places), -np.inf)
+        for i, (x, y) in enumerate(places):
+            above = np.array([x, y, _ABOVE])
+            for geom in self._grounds.tolist():
+                kind = model.geom_type[geom]
+                if kind == mujoco.mjtGeom.mjGEOM_HFIELD:
+                    depth = mujoco.mj_rayHfield(model, data, geom, above, down)
+                elif kind == mujoco.mjtGeom.mjGEOM_MESH:
+                    depth = mujoco.mj_rayMesh(model, data, geom, above, down)
+                else:
+                    is_plane = kind == mujoco.mjtGeom.mjGEOM_PLANE  # which is infinite; its size is only drawn
+                    size = np.zeros(3) if is_plane else model.geom_size[geom]
+                    depth = mujoco.mju_rayGeom(data.geom_xpos[geom], data.geom_xmat[geom], size, above, down, kind)
+                if depth >= 0.0:
+                    heights[i] = max(heights[i], _ABOVE - depth)
+        return heights
 
     def height(self) -> float:
         """Return the height of the trunk's origin above the ground; infinite where there is none [m]."""
         return float(self.position[2] - self.ground_heights(self.position[np.newaxis, :2])[0])
-
-    # ---- contacts ----------------------------------------------------------------------------------------------------
 
     def has_fallen(self) -> bool:
         """Return whether a geom that ends episodes touched the ground or another part of the robot in the last step.
@@ -163,45 +203,82 @@ class MujocoRobot:
 
     # ---- reading the MJCF --------------------------------------------------------------------------------------------
 
-    def _load(self, file: Path, description: dict[str, Any]) -> tuple[mujoco.MjModel, np.ndarray]:
-        """Compile the file with the policy's ground; return it with the places where episodes may start."""
-        with loading(file):
-            spec = mujoco.MjSpec.from_file(str(file))
-            self.notes += drawing_notes(spec)
-            origins = place_ground(spec, description, self.notes)
-            model = spec.compile()
-            collided, pairs = description["robot"]["self_collisions"], len(self_pairs(model))
-            if pairs and not collided:
-                exclude_self_collisions(spec, model)
-                model = spec.compile()
-                self.notes.append(f"{pairs} pairs of parts that the MJCF lets collide do not, as in training")
-            if collided and not pairs:
-                self.notes.append("parts of the robot collided with each other in training, those of the MJCF do not")
-            return model, origins
+    def _find_joints(self, description: dict[str, Any]) -> None:
+        """Find the policy's joints by name, and their motors by transmission. Adds notes on differences.
 
-    def _find_root(self) -> None:
-        """Find the free joint of the trunk."""
-        (free,) = np.nonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-        if len(free) != 1:
-            raise UserError(f"the MJCF must have one free joint, that of the trunk; it has {len(free)}")
-        self.trunk = int(self.model.jnt_bodyid[free[0]])
-        qpos, qvel = self.data.joint(int(free[0])).qpos, self.data.joint(int(free[0])).qvel
-        self.position, self.quat = qpos[:3], qpos[3:]
-        self.velocity, self.angular_velocity = qvel[:3], qvel[3:]
+        A UserError, which lists all problems, if a joint is missing or has no motor of its own.
+        """
+        model, order = self.model, description["joint_order"]
+        hinge_or_slide = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+        names = {model.joint(i).name: i for i in range(model.njnt) if model.jnt_type[i] in hinge_or_slide}
+        missing = [name for name in order if name not in names]
+        refuse([str(unknown_name("joint of the policy in the MJCF", name, names)) for name in missing])
+        ids, motors, wrong = [names[name] for name in order], list[int](), defaultdict[str, list[str]](list)
+        for name, joint in zip(order, ids, strict=True):
+            found = motors_of(model, joint)
+            reason = why_no_motor(model, found[0]) if len(found) == 1 else ""
+            if len(found) != 1:
+                wrong[f"each joint of the policy must have one motor in the MJCF, not {len(found)}"].append(name)
+            elif reason:
+                wrong[f"each joint's actuator must be a motor, ctrl its torque; one {reason}"].append(name)
+            motors += found[:1]
+        refuse(list(with_names(wrong)))
+        axes = [description["joints"][name]["axis"] for name in order]
+        cosines = (joint_axes(model)[ids] * axes).sum(axis=1)
+        self._qpos, self._dofs, self._motors = model.jnt_qposadr[ids], model.jnt_dofadr[ids], np.array(motors)
+        self._signs = np.where(cosines < -PARALLEL, -1.0, 1.0)  # of the file's axes, as seen from the policy's
+        self._limits = np.sort(joint_limits(model)[ids].T * self._signs, axis=0)  # [rad] about the policy's axes
+        self._torque_per_control = self._signs * [torque_per_control(model, motor) for motor in motors]
+        self._compare_joints(description, cosines)
 
-    def _find_geoms(self, ends_on_contact_of: list[str]) -> None:
-        """Find the ground and the geoms whose contact ends an episode: by parts of names, else those of the trunk."""
+    def _compare_joints(self, description: dict[str, Any], cosines: np.ndarray) -> None:
+        """Add a note on everything that differs from the training, with the joints that it concerns.
+
+        ``cosines`` are those between the axes of the MJCF and the policy's. Shape: (joints,).
+        """
+        mass, trained_mass = float(self.model.body_mass.sum()), description["robot"]["mass"]
+        if not np.isclose(mass, trained_mass, rtol=MASS_TOLERANCE):
+            self.notes.append(f"mass: the MJCF has {mass:.3f} kg, the robot of the training {trained_mass:.3f} kg")
+        different = defaultdict[str, list[str]](list)
+        for i, name in enumerate(description["joint_order"]):
+            trained, (low, high) = description["joints"][name], self._limits[:, i]
+            if cosines[i] < -PARALLEL:
+                different["axes: those of the MJCF point the other way; angles and torques are negated"].append(name)
+            elif cosines[i] <= PARALLEL:
+                different["axes: those of the MJCF are not the policy's"].append(name)
+            if not low - 1e-6 <= description["nominal_pose"][name] <= high + 1e-6:
+                note = "nominal pose: beyond the joint limits of the MJCF, where episodes start instead"
+                different[note].append(name)
+            for field in ("damping", "armature", "frictionloss"):
+                own = float(getattr(self.model, f"dof_{field}")[self._dofs[i]])
+                if not np.isclose(own, trained[field], rtol=1e-4, atol=1e-9):
+                    note = f"{field} of joints: the MJCF has {own:g}, the robot of the training {trained[field]:g}"
+                    different[note].append(name)
+            weakest, strongest = sorted(self._signs[i] * limit for limit in torque_range(self.model, self._motors[i]))
+            limits = description["torque_limits"][name]
+            if not np.allclose((weakest, strongest), limits, rtol=1e-4):
+                here, there = f"{weakest:g} to {strongest:g} N m", f"{limits[0]:g} to {limits[1]:g} N m"
+                note = f"motor limits: the MJCF has {here}, policy.yaml {there}; the tighter ones act"
+                different[note].append(name)
+        for note, names in different.items():
+            self.notes.append(f"{note} ({', '.join(names) if len(names) < len(cosines) else 'all joints'})")
+
+    def _find_geoms(self, ends_on_contact_of: list[str], collided: bool) -> None:
+        """Find the ground and the geoms whose contact ends an episode: by parts of names, else those of the trunk.
+
+        What the robot may touch is the ground and, if they ``collided`` in training, its own parts.
+        """
         model = self.model
         self._is_ground = model.body_weldid[model.geom_bodyid] == 0
         (self._grounds,) = np.nonzero(self._is_ground & (model.geom_contype | model.geom_conaffinity != 0))
+        self._is_felt = self._is_ground | (collided & (model.body_rootid[model.geom_bodyid] == self.trunk))
         names = [model.geom(i).name or model.body(model.geom_bodyid[i]).name for i in range(model.ngeom)]
         matching = {part: np.array([part in name for name in names]) & ~self._is_ground for part in ends_on_contact_of}
-        is_ending = np.any([np.zeros(model.ngeom, bool), *matching.values()], axis=0)
+        self._is_ending = np.any([np.zeros(model.ngeom, bool), *matching.values()], axis=0)
         missing = ", ".join(part for part, geoms in matching.items() if not geoms.any())
-        if missing and is_ending.any():
+        if missing and self._is_ending.any():
             self.notes.append(f"no geom's name contains {missing}: it ends no episode")
         elif missing:
             trunk = model.body(self.trunk).name
             self.notes.append(f"no geom's name contains {missing}: those of '{trunk}' end an episode")
-            is_ending = model.geom_bodyid == self.trunk
-        self._is_ending = is_ending
+            self._is_ending = model.geom_bodyid == self.trunk

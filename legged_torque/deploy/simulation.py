@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -19,15 +18,6 @@ from legged_torque.utils.metrics import NUM_SUMS, step_sums
 PUSH_ADDED = 0.5  # share of pushes that add a velocity, as in training; the others set one
 
 
-@dataclass
-class Events:
-    """Commands and pushes."""
-
-    command: tuple[float, float, float] | None = None  # fixed, [m/s, m/s, rad/s]; None draws them as in training
-    push_velocity: float = 0.0  # largest draw of each axis of a push's velocity, either way [m/s]
-    push_probability: float = 0.0  # of a push per control step
-
-
 class Simulation:
     """Runs a policy as in evaluation: random initial states and commands, pushes, new episodes.
 
@@ -40,23 +30,34 @@ class Simulation:
         notes: Differences from the training, a line each.
     """
 
-    def __init__(self, policy: Policy, robot: MujocoRobot, events: Events) -> None:
-        """Prepare; :meth:`run` starts an episode."""
-        self.policy, self.robot, self.events = policy, robot, events
+    def __init__(
+        self,
+        policy: Policy,
+        robot: MujocoRobot,
+        command: tuple[float, float, float] | None = None,
+        push_velocity: float = 0.0,
+        push_probability: float = 0.0,
+    ) -> None:
+        """Prepare; :meth:`run` starts an episode.
+
+        Args:
+            policy: The policy.
+            robot: The robot that it drives.
+            command: Fixed v_x, v_y [m/s] and yaw rate [rad/s]; None draws them as in training.
+            push_velocity: Largest draw of each axis of a push's velocity, either way [m/s].
+            push_probability: Of a push per control step.
+        """
+        self.policy, self.robot = policy, robot
+        self._push_velocity, self._push_probability = push_velocity, push_probability
         description = policy.description
         self._timing, self._start = description["timing"], description["initial_state"]
+        self._commands, pushes = description["commands"], description.get("pushes", {})
         self._max_steps = math.ceil(description["episode"]["length"] * self._timing["control_frequency"] - 1e-6)
-        commands = description["commands"]
-        ranges = [commands[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")]
-        if events.command is not None:
-            ranges = [[value, value] for value in events.command]
-        self._command_range = np.array(ranges, float).T
-        self._resampling_probability = commands["resampling_probability"]
-        self._headings, self._heading_gain = commands.get("heading"), commands.get("heading_gain", 0.0)
+        ranges = [self._commands[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")]
+        self._command_range = np.array([command, command] if command else np.transpose(ranges), float)
         self._scan_delay = policy.scan["delay"] if policy.scan else 0
-        self._push_set_factor = description.get("pushes", {}).get("set_factor", 1.0)
-        self.notes: list[str] = []
-        if events.push_probability and "pushes" not in description:
+        self._push_set_factor, self.notes = pushes.get("set_factor", 1.0), list[str]()
+        if push_probability and not pushes:
             self.notes.append(
                 "pushes: policy.yaml does not name pushes.set_factor, so 1.0 is taken; trainings have 1.1 by default"
             )
@@ -111,32 +112,37 @@ class Simulation:
         power = np.abs(robot.applied_torques() * robot.joint_velocities()).sum()
         if ended:
             self._new_episode()
-        elif self._rng.random() < self._resampling_probability:
+        elif self._rng.random() < self._commands["resampling_probability"]:
             self._draw_command()
-        if self._rng.random() < self.events.push_probability:
+        if self._rng.random() < self._push_probability:
             self._push()
         self._follow_heading()
         velocity = robot.planar_velocity()
         numbers = (np.linalg.norm(velocity[:2]), force, power, robot.height(), fell, ended)
         arrays = [command[None], velocity[None], *(np.array([number]) for number in numbers)]
-        return step_sums(np, *arrays, tracked=2 if self._headings else 3)[:, 0]
+        return step_sums(np, *arrays, tracked=2 if "heading" in self._commands else 3)[:, 0]
 
     def _push(self) -> None:
         """Push the trunk: half of the pushes add to its velocity, the others set it."""
         velocity = self.robot.velocity
-        drawn = self._rng.uniform(-self.events.push_velocity, self.events.push_velocity, 3)
+        drawn = self._rng.uniform(-self._push_velocity, self._push_velocity, 3)
         velocity[:] = velocity + drawn if self._rng.random() < PUSH_ADDED else self._push_set_factor * drawn
 
     def _new_episode(self) -> None:
         """Draw an initial state and a command, and reset the policy."""
         rng, start, num_joints = self._rng, self._start, len(self.policy.joint_order)
-        angles = [rng.uniform(*start[name]) for name in ("roll", "pitch", "yaw")]
-        pose = self.policy.nominal_pose * self._draw("joint_position_scale", num_joints)
+
+        def drawn(name: str, size: int) -> np.ndarray:
+            low, high = start[name]
+            return rng.uniform(low, high, size)
+
+        angles = [drawn(name, 1).item() for name in ("roll", "pitch", "yaw")]
+        pose = self.policy.nominal_pose * drawn("joint_position_scale", num_joints)
         sizes = {"trunk_linear_velocity": 3, "trunk_angular_velocity": 3, "joint_velocity": num_joints}
-        velocities = tuple(self._draw(name, size) for name, size in sizes.items())
+        velocities = tuple(drawn(name, size) for name, size in sizes.items())
         position = start["trunk_position"] + self._origin
         if any(start["trunk_place"]):
-            position[:2] += self._draw("trunk_place", 2)
+            position[:2] += drawn("trunk_place", 2)
         self.robot.reset(position, quaternion(*angles), pose, velocities)
         self.policy.reset()
         self._draw_command()
@@ -145,20 +151,15 @@ class Simulation:
     def _draw_command(self) -> None:
         """Draw a command, and a heading if yaw rates follow one."""
         self.command = self._rng.uniform(*self._command_range)
-        if self._headings:
-            self._heading = self._rng.uniform(*self._headings)
+        if "heading" in self._commands:
+            self._heading = self._rng.uniform(*self._commands["heading"])
 
     def _follow_heading(self) -> None:
         """Command the yaw rate that turns the trunk to its heading, if there is one, as in training."""
-        if self._headings:
+        if "heading" in self._commands:
             x_ahead, y_ahead, _ = heading(self.robot.quat)
             left = (self._heading - math.atan2(y_ahead, x_ahead) + math.pi) % (2.0 * math.pi) - math.pi
-            self.command[2] = np.clip(self._heading_gain * left, *self._command_range[:, 2])
-
-    def _draw(self, name: str, size: int) -> np.ndarray:
-        """Draw numbers from a range of the initial state. Shape: (size,)."""
-        low, high = self._start[name]
-        return self._rng.uniform(low, high, size)
+            self.command[2] = np.clip(self._commands.get("heading_gain", 0.0) * left, *self._command_range[:, 2])
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:

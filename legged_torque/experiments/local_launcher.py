@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
-import signal
 import subprocess
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
@@ -16,13 +13,12 @@ from typing import Any, BinaryIO
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, command_of, step_words
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.processes import ending_with_parent
 
 CPU_JOBS, GPU_JOBS, MPS_JOBS = 1, 2, 4
 """Steps at a time on the CPU, a GPU, and a GPU with ``--mps``, by default: more are hardly faster."""
 MAX_JOBS = 1000
 MPS = "nvidia-cuda-mps-control"
-_LIBC = ctypes.CDLL(None)
-_PR_SET_PDEATHSIG = 1  # Linux
 
 
 class LocalProcess(subprocess.Popen[bytes]):
@@ -32,20 +28,14 @@ class LocalProcess(subprocess.Popen[bytes]):
         """Start a command with additional environment variables, whose output goes to ``log``."""
         self.place = place
         super().__init__(
-            command,
+            ending_with_parent(command),
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=subprocess.STDOUT,
             env=os.environ | {"PYTHONUNBUFFERED": "1"} | variables,
             start_new_session=True,
-            preexec_fn=end_with_parent if sys.platform == "linux" else None,
             **how,
         )
-
-
-def end_with_parent() -> None:
-    """Ask the system to send SIGTERM to this process when its parent ends for any reason."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 class LocalLauncher:

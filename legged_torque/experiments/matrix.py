@@ -14,7 +14,6 @@ from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
-from legged_torque.utils.args import task_file_words
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import Count, check_value
 from legged_torque.utils.options import Options
@@ -214,7 +213,7 @@ def check_same(matrix: Matrix, out: Path) -> None:
 def step_words(matrix: Matrix, cell: Cell, state: CellState, device: str) -> list[str]:
     """Return the script of a cell's next step and its arguments, for a device named as ``--device`` takes it."""
     words = [f"--task={cell.task}", f"--log_root={cell.folder.parent}", f"--experiment_name={cell.name}"]
-    words += [f"--device={device}", *task_file_words(matrix.task_files)]
+    words += [f"--device={device}", *(f"--task_file={file}" for file in matrix.task_files)]
     if state.step == "evaluate":
         name, numbers = state.missing[0], matrix.evaluation
         if name == ROUGH_GROUND:

@@ -13,10 +13,9 @@ from legged_torque.experiments.job import LOST
 from legged_torque.experiments.local_launcher import GPU_JOBS, check_jobs
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, last_checkpoint, step_words
 from legged_torque.experiments.ray_node import Files, NodeStep, Report, is_checkpoint, versions_here, write_files
-from legged_torque.learning.pretrained import PRETRAINED
 from legged_torque.learning.worlds import remove_other_worlds, worlds_file
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.runs import CONFIG_FILE
+from legged_torque.utils.runs import CONFIG_FILE, PRETRAINED
 
 SEND_EVERY = 60.0  # seconds between checkpoints that are brought home while a training goes on
 ANSWER = 10.0  # seconds within which a cluster must answer

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
 from statistics import fmean
-from types import FrameType
 from typing import BinaryIO
 
 from rich.console import Console
@@ -37,7 +36,7 @@ class CountedStop(StopRequest):
 
     count = 0
 
-    def _handle(self, number: int, frame: FrameType | None) -> None:
+    def _handle(self, number: int) -> None:
         """Count a signal."""
         self.requested = True
         self.count += 1

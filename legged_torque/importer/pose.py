@@ -9,7 +9,7 @@ import numpy as np
 from mujoco.minimize import least_squares
 
 from legged_torque.importer.legs import PITCHING, Leg, lowest_point, zero_pose
-from legged_torque.importer.source import GRAVITY, Source
+from legged_torque.importer.source import Source
 
 BANDWIDTH = 4.0  # natural frequency of a joint under its gains, with the inertia of the leg below it [Hz]
 DAMPING_RATIO = 0.5  # of the same
@@ -52,14 +52,23 @@ def find_stance(source: Source, legs: list[Leg], ranges: np.ndarray, torques: np
             f"{bare.sum()} joints without rotor inertia (armature): assumed 0.01 kg m^2 per 33.5 N m, as on the A1; "
             "put the motor's own there if you know it"
         )
+    mujoco.mj_crb(model, data)
+    matrix = np.zeros((model.nv, model.nv))
+    for row, unit in zip(matrix, np.eye(model.nv), strict=True):
+        mujoco.mj_mulM(model, data, row, unit)
+    inertia = np.diag(matrix)[6:] - model.dof_armature[6:] + armature  # about each joint, of all that it moves
+    mujoco.mj_comVel(model, data)
+    mujoco.mj_rne(model, data, 0, data.qfrc_bias)
+    holding, jac = data.qfrc_bias.copy(), np.zeros((3, model.nv))  # torques of a robot that stands evenly on all feet
     lows = [lowest_point(data, leg.bodies[-1], leg.foot) for leg in legs]
-    inertia, holding = _inertias(model, data) + armature, _holding_torques(model, data, legs, lows)
+    for leg, low in zip(legs, lows, strict=True):
+        mujoco.mj_jac(model, data, jac, None, low, leg.bodies[-1])
+        holding -= jac.T @ np.array([0, 0, source.weight / len(legs)])
     height = -float(np.mean([low[2] for low in lows]))
-    stiffness = np.maximum((2 * np.pi * BANDWIDTH) ** 2 * inertia, np.abs(holding) / SAG)
-    weight = GRAVITY * float(model.body_mass.sum())
+    stiffness = np.maximum((2 * np.pi * BANDWIDTH) ** 2 * inertia, np.abs(holding[6:]) / SAG)
     for leg in legs:
         joints = model.body_jntadr[leg.bodies] - 1
-        stiffness[joints] = np.maximum(stiffness[joints], TIPPING * weight * height / len(legs))
+        stiffness[joints] = np.maximum(stiffness[joints], TIPPING * source.weight * height / len(legs))
     damping = 2 * DAMPING_RATIO * np.sqrt(stiffness * inertia)
     return Stance(angles, height, armature, stiffness, damping)
 
@@ -96,16 +105,27 @@ def _nominal_pose(source: Source, legs: list[Leg], ranges: np.ndarray) -> np.nda
 def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarray, ahead: float) -> float:
     """Bend a leg until its foot is below its hip, or ``ahead`` of that [m], soles being level.
 
-    Writes the angles of the leg's joints. Returns by how much the foot misses its place [m].
+    The trunk is at the origin. Writes the leg's angles. Returns by how much the foot misses its place [m].
     """
     data, body = zero_pose(model), leg.bodies[-1]
     joints = model.body_jntadr[leg.bodies]
     pitch = joints[np.abs(data.xaxis[joints, 1]) > PITCHING]
     if not pitch.size:
         return 0.0
-    goal, level = _goal(data, leg, joints, pitch, ahead), data.xmat[body].reshape(3, 3).copy()
-    low, high = ranges[joints - 1].T
-    angles[pitch[:3] - 1] = _first_bend(data, leg, pitch, ranges)
+    foot, level = lowest_point(data, body, leg.foot), data.xmat[body].reshape(3, 3).copy()
+    chain = [*data.xanchor[joints[list(joints).index(pitch[0]) :]], foot]
+    links = np.diff([place[::2] for place in chain], axis=0)  # in the plane of x and z
+    lengths = CROUCH[leg.has_sole] * np.linalg.norm(links, axis=1)
+    if leg.has_sole:
+        lengths[-1] = abs(links[-1][1])  # feet stay level
+    goal = chain[0] + np.array([ahead, 0.0, -lengths.sum()])
+    if leg.has_sole or len(pitch) == len(joints):  # which keeps its feet to the side of its hips
+        goal[1] = foot[1]
+    forwards, signs = leg.has_sole, np.sign(data.xaxis[pitch, 1])
+    if len(pitch) > 1:  # knees bend to where they have more room
+        middle = ranges[pitch[1] - 1].mean() * signs[1]
+        forwards = middle > UNDECIDED or (forwards and middle > -UNDECIDED)
+    angles[pitch[:3] - 1] = [angle * sign for angle, sign in zip(BEND[forwards], signs, strict=False)]
 
     def misses(columns: np.ndarray) -> np.ndarray:
         """Return by how much the foot misses its place [m] and is not level, for each column of angles."""
@@ -118,54 +138,7 @@ def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarra
             rows.append([*(lowest_point(data, body, leg.foot) - goal), *(LEVELING * leg.has_sole * lean)])
         return np.transpose(rows)
 
+    low, high = ranges[joints - 1].T
     start = np.clip(angles[joints - 1], low, high)
     found, _ = least_squares(start, misses, bounds=(low, high), verbose=0)
     return float(np.linalg.norm(misses(found)[:3]))
-
-
-def _goal(data: mujoco.MjData, leg: Leg, joints: np.ndarray, pitch: np.ndarray, ahead: float) -> np.ndarray:
-    """Return where the foot of a leg shall be, the trunk being at the origin [m]. Shape: (3,).
-
-    ``pitch`` are those of its joints that turn about y, in ``data`` at angles of 0.
-    """
-    foot = lowest_point(data, leg.bodies[-1], leg.foot)
-    chain = [*data.xanchor[joints[list(joints).index(pitch[0]) :]], foot]
-    links = np.diff([place[::2] for place in chain], axis=0)  # in the plane of x and z
-    lengths = CROUCH[leg.has_sole] * np.linalg.norm(links, axis=1)
-    if leg.has_sole:
-        lengths[-1] = abs(links[-1][1])  # feet stay level
-    goal = chain[0] + np.array([ahead, 0.0, -lengths.sum()])
-    if leg.has_sole or len(pitch) == len(joints):  # which keeps its feet to the side of its hips
-        goal[1] = foot[1]
-    return goal
-
-
-def _first_bend(data: mujoco.MjData, leg: Leg, pitch: np.ndarray, ranges: np.ndarray) -> np.ndarray:
-    """Return angles of the first joints in ``pitch`` to start from [rad]; knees bend to where they have more room."""
-    forwards, signs = leg.has_sole, np.sign(data.xaxis[pitch, 1])
-    if len(pitch) > 1:
-        middle = ranges[pitch[1] - 1].mean() * signs[1]
-        forwards = middle > UNDECIDED or (forwards and middle > -UNDECIDED)
-    return np.array([angle * sign for angle, sign in zip(BEND[forwards], signs, strict=False)])
-
-
-def _inertias(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Return the inertia about each joint of all that it moves, without armature [kg m^2]. Shape: (joints,)."""
-    mujoco.mj_crb(model, data)
-    matrix = np.zeros((model.nv, model.nv))
-    for row, unit in zip(matrix, np.eye(model.nv), strict=True):
-        mujoco.mj_mulM(model, data, row, unit)
-    return np.diag(matrix)[6:] - model.dof_armature[6:]
-
-
-def _holding_torques(model: mujoco.MjModel, data: mujoco.MjData, legs: list[Leg], lows: list[np.ndarray]) -> np.ndarray:
-    """Return the torques that hold the robot still, evenly supported on all feet [N m]. Shape: (joints,)."""
-    mujoco.mj_comVel(model, data)
-    mujoco.mj_rne(model, data, 0, data.qfrc_bias)
-    torques = data.qfrc_bias.copy()
-    force = np.array([0, 0, GRAVITY * model.body_mass.sum() / len(legs)])
-    for leg, low in zip(legs, lows, strict=True):
-        jac = np.zeros((3, model.nv))
-        mujoco.mj_jac(model, data, jac, None, low, leg.bodies[-1])
-        torques -= jac.T @ force
-    return torques[6:]

@@ -11,9 +11,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.mjcf import kept_warnings, motors_of, torque_range
-from legged_torque.utils.problems import refuse
 
 MESH_TYPES = (".stl", ".obj", ".msh")  # files that MuJoCo reads
 COLLISION_GROUP = 3  # of Menagerie's collision geoms, also of those that one of its files switches off
@@ -45,42 +44,52 @@ class Source:
         """Names of the hinge joints, in the order of the file."""
         return [self.model.joint(i).name for i in range(1, self.model.njnt)]
 
+    @property
+    def weight(self) -> float:
+        """Weight [N]."""
+        return GRAVITY * float(self.model.body_mass.sum())
+
 
 def read_source(file: Path) -> Source:
     """Read a MJCF or URDF; a UserError says why it cannot become a robot of this library."""
+    what = f"cannot import '{file}'"
     if not file.is_file():
-        raise UserError(f"cannot import '{file}': there is no such file")
+        raise UserError(f"{what}: there is no such file")
     with kept_warnings(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # problems are reported when the result is loaded
         try:
             root = ET.parse(file).getroot()
             if any("xacro" in part.tag for part in root.iter()):  # MuJoCo would read the rest and nothing else
-                raise UserError(f"cannot import '{file}': it is a xacro; make a URDF of it: xacro {file} > robot.urdf")
+                raise UserError(f"{what}: it is a xacro; make a URDF of it: xacro {file} > robot.urdf")
             spec = mujoco.MjSpec.from_file(str(file))
-            _check_names(spec, file)
+            names = dict.fromkeys(part.name for part in [*spec.bodies, *spec.joints])
+            odd = ", ".join(repr(name) for name in names if not NAME.fullmatch(name))
+            if odd:
+                raise UserError(f"{what}: names may have letters, digits and _ . : / -, not {odd}")
             notes = _prepare(spec, file, root.tag == "robot")
             model = _compile(spec, notes)
             speeds = [float(limit.get("velocity", 0)) for limit in root.findall("joint/limit")]  # of a URDF
         except (ValueError, ET.ParseError, mujoco.FatalError) as error:
-            raise UserError(f"cannot import '{file}': {' '.join(str(error).split())}") from None
-    _check(model, file)
+            raise UserError(f"{what}: {' '.join(str(error).split())}") from None
+    hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
+    others = [model.joint(i).name for i in range(1, model.njnt) if model.jnt_type[i] != hinge]
+    several = [model.body(b).name for b in range(1, model.nbody) if model.body_jntnum[b] > 1]
+    rules = {
+        "its trunk does not float": model.njnt < 2 or model.jnt_type[0] != free,
+        f"only hinge joints can be imported, not {', '.join(others)}": others,
+        f"a body may have one joint, {', '.join(several)} have more": several,
+        f"its {model.neq} equalities (closed loops, mimicked joints) cannot be imported": model.neq,
+        f"its {model.ntendon} tendons cannot be imported": model.ntendon,
+    }
+    refuse([reason for reason, is_broken in rules.items() if is_broken], what)
     sites: dict[int, list] = {}
     for site in range(model.nsite):
         name = model.site(site).name.removeprefix(SITE)
         sites.setdefault(int(model.site_bodyid[site]), []).append((name, model.site_pos[site].copy()))
     keys = [model.key(i).name for i in range(model.nkey)]
-    home = keys.index("home") if "home" in keys else 0
-    pose = model.key_qpos[home][7:].copy() if keys else None
+    pose = model.key_qpos[keys.index("home") if "home" in keys else 0][7:].copy() if keys else None
     limits = _torque_limits(model, notes)
     return Source(file, model, sites, pose, limits, [speed for speed in speeds if speed > 0], notes)
-
-
-def _check_names(spec: mujoco.MjSpec, file: Path) -> None:
-    """Raise a UserError that lists all names of bodies and joints that are not plain."""
-    names = dict.fromkeys(part.name for part in [*spec.bodies, *spec.joints])
-    odd = [repr(name) for name in names if not NAME.fullmatch(name)]
-    if odd:
-        raise UserError(f"cannot import '{file}': names may have letters, digits and _ . : / -, not {', '.join(odd)}")
 
 
 def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
@@ -111,7 +120,10 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
         notes.append(f"'{roots[0].name}' was fixed to the world; it floats now")
         for key in list(spec.keys):
             spec.delete(key)
-        _drop_footprint(roots[0], notes)
+        (link, *others) = roots[0].bodies
+        if not (others or roots[0].explicitinertial or list(roots[0].geoms) or link.joints):
+            link.pos, link.quat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
+            notes.append(f"'{roots[0].name}' is no more than a frame: the trunk's origin is that of '{link.name}'")
     for body in spec.bodies:
         if body.name and not body.joints and body.name != "world":
             body.add_site(name=SITE + body.name)
@@ -123,15 +135,6 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
     spec.compiler.fusestatic = True
     spec.compiler.discardvisual = True
     return notes
-
-
-def _drop_footprint(root: mujoco.MjsBody, notes: list[str]) -> None:
-    """Put the trunk's origin at its first real link if the root of a URDF is an empty frame above it."""
-    (link, *others) = root.bodies
-    is_frame = not (others or root.explicitinertial or list(root.geoms))
-    if is_frame and not link.joints:
-        link.pos, link.quat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
-        notes.append(f"'{root.name}' is no more than a frame: the trunk's origin is that of '{link.name}'")
 
 
 def _compile(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
@@ -156,10 +159,17 @@ def _compile(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
 
 
 def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
-    """Set the paths of meshes; drop those that are missing or that MuJoCo cannot read, and return notes."""
-    missing, lost, types = {}, dict[str, None](), ", ".join(MESH_TYPES)
+    """Set the paths of meshes; drop those that are missing or that MuJoCo cannot read, and return notes.
+
+    A mesh is at its path in the file, or at an end of it below a parent folder.
+    """
+    missing, lost, types, folder = {}, dict[str, None](), ", ".join(MESH_TYPES), file.absolute().parent
+    roots = [folder / spec.meshdir, folder, *list(folder.parents)[:PARENTS]]
     for mesh in [mesh for mesh in spec.meshes if mesh.file]:
-        found = _find(mesh.file, file.absolute().parent, spec.meshdir)
+        parts = Path(mesh.file.split("://")[-1]).parts
+        paths = [root.joinpath(*parts[start:]) for root in roots for start in range(len(parts))]
+        files = (path.with_suffix(kind) for path in paths for kind in (path.suffix, *MESH_TYPES))
+        found = next((path for path in files if path.suffix.lower() in MESH_TYPES and path.is_file()), None)
         mesh.name = mesh.name or Path(mesh.file).stem
         if found:
             mesh.file = str(found)
@@ -180,30 +190,6 @@ def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
         spec.delete(mesh)
     links = ", ".join(lost)
     return [f"collision meshes of {links} are missing or not {types}: shapes follow from inertias"] if lost else []
-
-
-def _find(name: str, folder: Path, meshdir: str) -> Path | None:
-    """Return the path of a mesh: that in the file, or the end of it below a parent folder; None if there is none."""
-    parts = Path(name.split("://")[-1]).parts
-    roots = [folder / meshdir, folder, *list(folder.parents)[:PARENTS]]
-    paths = [root.joinpath(*parts[start:]) for root in roots for start in range(len(parts))]
-    files = (path.with_suffix(kind) for path in paths for kind in (path.suffix, *MESH_TYPES))
-    return next((file for file in files if file.suffix.lower() in MESH_TYPES and file.is_file()), None)
-
-
-def _check(model: mujoco.MjModel, file: Path) -> None:
-    """Raise a UserError, with all reasons, unless the model is a floating trunk and bodies with a hinge each."""
-    hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
-    others = [model.joint(i).name for i in range(1, model.njnt) if model.jnt_type[i] != hinge]
-    several = [model.body(b).name for b in range(1, model.nbody) if model.body_jntnum[b] > 1]
-    rules = {
-        "its trunk does not float": model.njnt < 2 or model.jnt_type[0] != free,
-        f"only hinge joints can be imported, not {', '.join(others)}": others,
-        f"a body may have one joint, {', '.join(several)} have more": several,
-        f"its {model.neq} equalities (closed loops, mimicked joints) cannot be imported": model.neq,
-        f"its {model.ntendon} tendons cannot be imported": model.ntendon,
-    }
-    refuse([reason for reason, is_broken in rules.items() if is_broken], f"cannot import '{file}'")
 
 
 def _torque_limits(model: mujoco.MjModel, notes: list[str]) -> np.ndarray:

@@ -8,7 +8,6 @@ from legged_torque.learning.protocols import Health
 from legged_torque.sim.health import Watched
 from legged_torque.utils import distributed
 from legged_torque.utils.display import warn
-from legged_torque.utils.errors import TrainingError
 
 PATIENCE = 5  # iterations in a row without learning
 MAX_DIVERGED = 0.5  # share of the worlds that may diverge in an iteration
@@ -55,8 +54,3 @@ class TrainingGuard:
             reasons.append(f"not finite, with resets of worlds: {names}")
         self.problem = "; ".join(reasons)
         return {f"Health/not_finite/{tensor.tag}": float(count) for tensor, count in found.items()}
-
-    def check(self) -> None:
-        """Raise a TrainingError if training cannot go on."""
-        if self.problem:
-            raise TrainingError(f"training cannot learn: {self.problem}")

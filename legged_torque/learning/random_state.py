@@ -27,13 +27,11 @@ def restore_random_state(device: str, state: dict[str, Tensor]) -> None:
 @contextlib.contextmanager
 def own_random_numbers(device: str, state: dict[str, Tensor]) -> Iterator[None]:
     """Context that draws from a stream of its own, whose state moves on, and leaves torch's streams as they were."""
-    outside = random_state(device)
-    restore_random_state(device, state)
-    try:
+    gpus = [device] if torch.device(device).type == "cuda" else []
+    with torch.random.fork_rng(gpus):
+        restore_random_state(device, state)
         yield
         state.update(random_state(device))
-    finally:
-        restore_random_state(device, outside)
 
 
 def seeded_state(device: str, seed: int) -> dict[str, Tensor]:

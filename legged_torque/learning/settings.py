@@ -28,9 +28,9 @@ Activation: TypeAlias = Literal[
 class TrainingCfg(BaseConfig):
     """Base of the settings of trainings; their sections are those of ``LeggedRobotCfgPPO``."""
 
-    def check(self) -> None:
+    def check(self, path: str = "") -> None:
         """Raise a UserError that names the first setting with a value that is not allowed, alone or with others."""
-        super().check()
+        super().check(path)
         cfg: Any = self
         rate = cfg.algorithm
         if getattr(rate, "schedule", None) == "adaptive" and rate.learning_rate > rate.max_learning_rate:

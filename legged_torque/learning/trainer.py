@@ -20,7 +20,7 @@ from legged_torque.learning.worlds import Worlds, remove_other_worlds
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils import distributed
 from legged_torque.utils.display import warn
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.runs import checkpoint_file, claim_run_dir, evaluations_file, tagged
 
@@ -120,7 +120,8 @@ class Trainer:
             self.save_checkpoint()  # writes the last log too
         self.stopped_by = stop.number
         self._log.stop()
-        guard.check()
+        if guard.problem:
+            raise TrainingError(f"training cannot learn: {guard.problem}")
 
     def collect_rollout(self) -> None:
         """Let the learner act and observe for one rollout, after curricula that hold for a rollout have moved on."""

@@ -26,6 +26,14 @@ TREND = 10  # evaluations with whose mean the last one is compared
 CELLS = 12  # characters of the curve of the tracking
 ENTRY = 36  # width of a name and its value in the panel [characters]
 NAME = 16  # width of the name in that
+_SHOWN = {
+    "Train/mean_reward": ("reward", "{:.2f}"),
+    "Train/mean_episode_length": ("episode length", "{:.1f} s"),
+    "kl": ("KL", "{:.4f}"),
+    "action_std": ("noise", "{:.2f}"),
+    "learning_rate": ("learning rate", "{:.1e}"),
+}
+"""Numbers by their names in the logs or the learner's: their names and formats in the display."""
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _EVALUATION = "Evaluation"
 _ELSEWHERE = re.compile(rf"{_EVALUATION}_(\w+)/track_percentage")
@@ -75,15 +83,15 @@ class TrainingDisplay(Display):
         Args:
             done: Iterations so far.
             steps: Steps of all worlds so far.
-            numbers: Numbers by their names in the logs, and "kl", "skipped_updates", "noise" and "learning_rate". Once
-                an episode has ended, "reward" and "length" [s] as well.
+            numbers: Numbers by their names in the logs, and the learner's. Once an episode has ended,
+                "Train/mean_reward" and "Train/mean_episode_length" [s] as well.
         """
         measured = {name: number for name, number in numbers.items() if name.startswith(_EVALUATION)}
         self.done, self._env_steps, self._numbers = done, steps, dict(numbers)
         self._measured = {**self._measured, **measured}
         if not math.isnan(tracking := numbers.get(f"{_EVALUATION}/track_percentage", math.nan)):
             self._tracking = [*self._tracking, tracking]
-        new = (numbers.get("Health/diverged_worlds", 0.0), numbers["skipped_updates"])
+        new = (numbers.get("Health/diverged_worlds", 0.0), numbers.get("skipped_updates", 0.0))
         self._bad = {name: count + int(more) for (name, count), more in zip(self._bad.items(), new, strict=True)}
         if not self._is_quiet:
             self.show(LINE_AFTER_EVALUATION if measured else LINE_EVERY)
@@ -117,10 +125,7 @@ class TrainingDisplay(Display):
         entries = {"steps": f"{self._env_steps:,}"}
         if speed is not None:
             entries["steps/s"] = f"{speed * self._steps:,.0f}"
-        if "reward" in numbers:
-            entries |= {"reward": f"{numbers['reward']:.2f}", "episode length": f"{numbers['length']:.1f} s"}
-        formats = {"kl": ("KL", ".4f"), "noise": ("noise", ".2f"), "learning_rate": ("learning rate", ".1e")}
-        entries |= {name: f"{numbers[key]:{style}}" for key, (name, style) in formats.items() if key in numbers}
+        entries |= {name: form.format(numbers[key]) for key, (name, form) in _SHOWN.items() if key in numbers}
         if self._tracking:
             entries["tracking"] = f"{self._tracking[-1]:.3f} (best {max(self._tracking):.3f})"
             entries["falls"] = f"{self._measured[f'{_EVALUATION}/falls_per_minute']:.1f} per minute"

@@ -27,8 +27,6 @@ from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_errors
 
 _STYLES = re.compile("\033\\[[0-9;]*m")  # escape sequences of bold or colored text
-_SHOWN = {"skipped_updates": "skipped_updates", "kl": "kl", "learning_rate": "learning_rate", "action_std": "noise"}
-"""Numbers of a learner that the display shows, and their names there."""
 _NOT_LOSSES = ("learning_rate", "action_std", "all_skipped")  # numbers of a learner that are logged elsewhere, or not
 
 
@@ -47,7 +45,7 @@ class TrainingLog:
         self.steps_per_iteration = distributed.world_size() * env.num_envs * cfg["num_steps_per_env"]
         self.broken_pipe: BrokenPipeError | None = None
         self._iterations = (0, 0)  # the first and the one after the last
-        self._verbose = self._is_broken = False
+        self._verbose = False
         self._unwritten: dict[str, Any] | None = None
 
     def start(self, first: int, last: int, verbose: bool) -> None:
@@ -87,8 +85,7 @@ class TrainingLog:
             return
         numbers = log.pop("numbers")
         losses = {name: number for name, number in numbers.items() if name not in _NOT_LOSSES}
-        shown = {"skipped_updates": 0.0, **self._logger.ep_extras[-1]}
-        shown |= {_SHOWN[name]: number for name, number in numbers.items() if name in _SHOWN}
+        shown = {**self._logger.ep_extras[-1], **numbers}
         policy = {name: numbers.get(name, math.nan) for name in ("learning_rate", "action_std")}
         policy["action_std"] = torch.tensor(policy["action_std"])
         first, last = self._iterations
@@ -96,13 +93,12 @@ class TrainingLog:
             with contextlib.redirect_stdout(io.StringIO()) as block:
                 self._logger.log(**log, start_it=first, total_it=last, loss_dict=losses, **policy, rnd_weight=None)
         except Exception as error:  # writers raise about anything
-            if not self._is_broken:
-                warn(f"logs end here: {last_line(error)}. Training goes on")
-            self._is_broken, self._logger.writer = True, NoLogWriter("")
+            warn(f"logs end here: {last_line(error)}. Training goes on")
+            self._logger.writer = NoLogWriter("")
             self._logger.ep_extras.clear()
         if self._logger.rewbuffer:
-            shown["reward"] = fmean(self._logger.rewbuffer)
-            shown["length"] = fmean(self._logger.lenbuffer) * self._env.dt
+            shown["Train/mean_reward"] = fmean(self._logger.rewbuffer)
+            shown["Train/mean_episode_length"] = fmean(self._logger.lenbuffer) * self._env.dt
         try:
             if self._verbose:
                 print(block.getvalue() if sys.stdout.isatty() else _STYLES.sub("", block.getvalue()), flush=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from legged_torque.learning import checkpoint
 from legged_torque.utils import distributed
@@ -46,7 +47,8 @@ class Worlds:
         state = {"worlds": self._task.world_state_dict()}
         for other in self._others:
             state |= other.state_dict()
-        processes = distributed.gather(on_cpu(state))
+        copies = tree_map(lambda value: value.detach().cpu().clone() if isinstance(value, Tensor) else value, state)
+        processes = distributed.gather(copies)
         if distributed.rank() > 0:
             return ""
         try:
@@ -108,10 +110,3 @@ def check_identity(was: dict[str, Any], now: dict[str, Any]) -> None:
     for name in was.keys() | now.keys():
         if was.get(name) != now.get(name):
             raise UserError(f"the {name} is another one")
-
-
-def on_cpu(state: Any) -> Any:
-    """Return nested dictionaries with copies of their tensors on the CPU."""
-    if isinstance(state, dict):
-        return {key: on_cpu(value) for key, value in state.items()}
-    return state.detach().cpu().clone() if isinstance(state, Tensor) else state

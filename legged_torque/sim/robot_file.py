@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 from legged_torque.sim.model import FLOOR
+from legged_torque.utils.errors import with_names
 from legged_torque.utils.mjcf import motors_of, torque_range, why_no_motor
-from legged_torque.utils.problems import with_names
 
 _ONE_NUMBER = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))  # types of joints
 

@@ -23,8 +23,7 @@ from legged_torque.sim.model import CONTACT_DATA, max_constraints, max_contacts,
 from legged_torque.sim.per_world import check_fields, expand, owner
 from legged_torque.sim.robot_file import actuator_problems
 from legged_torque.sim.warp_step import WarpStep
-from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.problems import refuse
+from legged_torque.utils.errors import UserError, refuse, unknown_name
 
 ENGINES = ("fused", "mujoco_warp")
 """What may step the worlds: one kernel per step for legged robots, or MuJoCo Warp for any robot."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from legged_torque.terrain.terrain import Terrain
 
 TERRAINS: dict[str, type[Terrain] | str] = {
-    "plane": "legged_torque.terrain.plane:Plane",
+    "plane": "legged_torque.terrain.terrain:Plane",
     "heightfield": "legged_torque.terrain.rough:RoughGround",
 }
 """Kinds of ground, by ``terrain.mesh_type``; a class, or its name, ``"module:Class"``."""

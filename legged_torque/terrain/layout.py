@@ -22,7 +22,8 @@ class Layout:
     """A map of square tiles with flat ground around it: rows along x get more difficult, columns along y are kinds.
 
     The middle of the map is the world's origin, so that numbers of single precision are as fine as they can be.
-    The fields are the settings of section ``terrain`` with these names.
+    The fields are the settings of section ``terrain`` with these names. A UserError if tiles are not whole cells, there
+    are too many, or columns cannot be of these kinds.
     """
 
     num_rows: int
@@ -37,14 +38,12 @@ class Layout:
 
     @classmethod
     def of(cls, settings: Any) -> Layout:
-        """Return the layout that the section ``terrain`` of a task's settings asks for; errors of :meth:`check`."""
+        """Return the layout that the section ``terrain`` of a task's settings asks for."""
         values = to_dict(settings)
-        layout = cls(**{field.name: values[field.name] for field in dataclasses.fields(cls)})
-        layout.check()
-        return layout
+        return cls(**{field.name: values[field.name] for field in dataclasses.fields(cls)})
 
-    def check(self) -> None:
-        """Raise a UserError if tiles are not whole cells, there are too many, or columns cannot be of these kinds."""
+    def __post_init__(self) -> None:
+        """Check that the layout is possible."""
         for name in ("tile_size", "border_size"):
             cells = getattr(self, name) / self.horizontal_scale
             if abs(cells - round(cells)) > 1e-6 * cells:
@@ -113,10 +112,9 @@ class Layout:
         Shape: :attr:`shape`, float32.
         """
         heights = np.zeros(self.shape, np.float32)
-        for row in range(self.num_rows):
-            for col in range(self.num_cols):
-                x, y = self._border + row * self._tile, self._border + col * self._tile
-                heights[x : x + self._tile + 1, y : y + self._tile + 1] = self.tile(row, col)
+        for row, col in np.ndindex(self.num_rows, self.num_cols):
+            x, y = self._border + row * self._tile, self._border + col * self._tile
+            heights[x : x + self._tile + 1, y : y + self._tile + 1] = self.tile(row, col)
         return heights
 
     def origins(self, heights: np.ndarray) -> np.ndarray:
@@ -125,13 +123,11 @@ class Layout:
         Shape: (num_rows, num_cols, 3), float32.
         """
         result = np.empty((self.num_rows, self.num_cols, 3), np.float32)
-        reach = round(0.5 * START_SIZE / self.horizontal_scale)
-        middle = self._tile // 2
-        for row in range(self.num_rows):
-            for col in range(self.num_cols):
-                x, y = self._border + row * self._tile + middle, self._border + col * self._tile + middle
-                highest = heights[x - reach : x + reach + 1, y - reach : y + reach + 1].max()
-                result[row, col] = (row - 0.5 * self.num_rows + 0.5), (col - 0.5 * self.num_cols + 0.5), highest
+        reach, middle = round(0.5 * START_SIZE / self.horizontal_scale), self._border + self._tile // 2
+        for row, col in np.ndindex(self.num_rows, self.num_cols):
+            x, y = middle + row * self._tile, middle + col * self._tile
+            highest = heights[x - reach : x + reach + 1, y - reach : y + reach + 1].max()
+            result[row, col] = (row - 0.5 * self.num_rows + 0.5), (col - 0.5 * self.num_cols + 0.5), highest
         result[..., :2] *= self.tile_size
         return result
 

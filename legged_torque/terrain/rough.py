@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from legged_torque.terrain.height_map import HeightMap
-from legged_torque.terrain.hfield import add_hfield
 from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.errors import UserError
@@ -30,27 +29,35 @@ class RoughGround(Terrain):
         columns: Column of that tile. Shape: (num_envs,), int64.
     """
 
-    def __init__(self, layout: Layout, num_envs: int, device: str, first_levels: int, curriculum: bool) -> None:
-        """Make the map, and spread worlds over all columns and the first levels, which ``curriculum`` changes."""
+    def __init__(self, settings: Any, num_envs: int, device: str) -> None:
+        """Make the map of a section ``terrain``, and spread worlds over all columns and the first levels.
+
+        A UserError if there can be no such map, or the device has no room for it.
+        """
+        self.layout = layout = Layout.of(settings)
+        if torch.device(device).type == "cuda":
+            needed, (free, _) = COPIES * BYTES * math.prod(layout.shape), torch.cuda.mem_get_info(device)
+            if needed > free:
+                raise UserError(
+                    f"the map of terrain.num_rows x terrain.num_cols tiles needs {needed / 2**20:.0f} MiB, and "
+                    f"{device} has {free / 2**20:.0f} left: raise terrain.horizontal_scale, or make the map smaller"
+                )
         heights = layout.heights()
-        self.layout, self._curriculum = layout, curriculum
         self.map: HeightMap = HeightMap(heights, layout.horizontal_scale, layout.corner, device)
         self._origins = torch.as_tensor(layout.origins(heights), device=device)
         worlds = torch.arange(num_envs, device=device)
         self.columns = worlds * layout.num_cols // num_envs
-        self.levels = worlds % first_levels
+        self._curriculum: bool = settings.curriculum
+        self.levels = worlds % (settings.max_init_terrain_level + 1 if self._curriculum else layout.num_rows)
 
     @classmethod
     def build(cls, settings: Any, num_envs: int, device: str) -> RoughGround:
-        """Make the ground of a section ``terrain``; a UserError if it asks for what cannot be."""
-        layout = Layout.of(settings)
-        _check_memory(layout, device)
-        first_levels = settings.max_init_terrain_level + 1 if settings.curriculum else settings.num_rows
-        return cls(layout, num_envs, device, first_levels, settings.curriculum)
+        """Make the ground of a section ``terrain``; errors of the constructor."""
+        return cls(settings, num_envs, device)
 
     def add_to(self, spec: mujoco.MjSpec, floor: str) -> None:
         """Make the floor a height field."""
-        add_hfield(spec, self.map, floor)
+        self.map.add_to(spec, floor)
 
     def height(self, points: Tensor) -> Tensor:
         """Return the height of the surface."""
@@ -92,15 +99,3 @@ class RoughGround(Terrain):
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the mean level of all worlds."""
         return {"terrain_level": self.levels.float().mean()}
-
-
-def _check_memory(layout: Layout, device: str) -> None:
-    """Refuse a map for which a GPU has no room."""
-    if torch.device(device).type != "cuda":
-        return
-    needed, (free, _) = COPIES * BYTES * math.prod(layout.shape), torch.cuda.mem_get_info(device)
-    if needed > free:
-        raise UserError(
-            f"the map of terrain.num_rows x terrain.num_cols tiles needs {needed / 2**20:.0f} MiB, and {device} has "
-            f"{free / 2**20:.0f} left: raise terrain.horizontal_scale, or make the map smaller"
-        )

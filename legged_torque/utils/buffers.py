@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError
 
 
@@ -28,31 +29,18 @@ class Buffers:
         return dict(self._buffers)
 
 
-def copy_state(target: dict[str, Any], source: Any, name: str = "") -> None:
-    """Copy nested dictionaries of tensors in place. A UserError names an entry that does not fit; then nothing changes.
+def copy_state(target: dict[str, Any], source: Any) -> None:
+    """Copy nested dictionaries of tensors, as ``state_dict`` of an object returns them, from those of another process.
 
-    Args:
-        target: What ``state_dict`` of an object returns.
-        source: The same of another process.
-        name: Where in a larger dictionary both stand.
+    The tensors of ``target`` are written in place. A UserError names an entry that does not fit; then nothing changes.
     """
-    for tensor, value in _pairs(target, source, name):
-        tensor.copy_(value)
-
-
-def _pairs(target: dict[str, Any], source: Any, name: str) -> list[tuple[Tensor, Tensor]]:
-    """Return tensors and their new values."""
-    if not isinstance(source, dict) or source.keys() != target.keys():
-        known = source if isinstance(source, dict) else {}
-        different = ", ".join(sorted(map(str, target.keys() ^ known.keys())))
-        raise UserError(f"the state of '{name or 'the worlds'}' has other entries: {different}")
-    pairs = []
-    for key, tensor in target.items():
-        path, value = f"{name}.{key}" if name else key, source[key]
-        if isinstance(tensor, dict):
-            pairs += _pairs(tensor, value, path)
-            continue
+    tensors, values = flat(target), flat(source)
+    if tensors.keys() != values.keys():
+        different = sorted(tensors.keys() ^ values.keys())
+        raise UserError(f"the state of the worlds has other entries: {', '.join(different)}")
+    for path, tensor in tensors.items():
+        value = values[path]
         if not isinstance(value, Tensor) or (value.shape, value.dtype) != (tensor.shape, tensor.dtype):
             raise UserError(f"the state '{path}' is not of the shape {tuple(tensor.shape)} and the type {tensor.dtype}")
-        pairs.append((tensor, value))
-    return pairs
+    for path, tensor in tensors.items():
+        tensor.copy_(values[path])

@@ -1,9 +1,10 @@
-"""Parsing of command lines, and errors as one line with an exit status. Needs no torch."""
+"""The command line of the scripts: options with legged_gym's names, and errors as one line. Needs no torch."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import errno
 import gc
 import math
@@ -16,14 +17,21 @@ import tempfile
 import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from legged_torque import SCRIPTS_DIR
+from legged_torque.utils.devices import disable_renderer
 from legged_torque.utils.errors import TrainingError, UserError, is_out_of_memory, unknown_name
-from legged_torque.utils.rendering import disable_renderer
+from legged_torque.utils.limits import describe, types_of
+from legged_torque.utils.options import Options
+from legged_torque.utils.task_registry import task_registry
 
 MAX_NAME = 255  # bytes of the name of a file, on the usual systems
 COMMAND = "legged-torque"  # the console command that runs every script
+SETTINGS = ("task", "task_file", "seed", "perturbation", "ranges", "device", "set")  # options of every task
+RUNS = ("log_root", "experiment_name", "load_run", "checkpoint")  # of scripts that keep or load runs
+TRAINING = ("max_iterations", "resume", "run_name", "preset", "logger", "verbose")  # of trainings alone
+_GROUPS = {"task and settings": (*SETTINGS, "num_envs"), "runs": RUNS, "training": TRAINING}
 _SCRIPT = re.compile(r"python scripts/(\w+)\.py")
 _EXAMPLE = re.compile(r": ``(python scripts/[^`]+)``")
 
@@ -82,6 +90,67 @@ class Parser(argparse.ArgumentParser):
         return namespace
 
 
+def add_options(parser: Parser, *names: str) -> None:
+    """Add fields of :class:`Options` in groups of ``--help``."""
+    types, defaults = types_of(Options), Options()
+    fields = {field.name: field for field in dataclasses.fields(Options)}
+    for title, members in _GROUPS.items():
+        chosen = [name for name in members if name in names]
+        group = parser.add_argument_group(title) if chosen else parser
+        for name in chosen:
+            hint, how = types[name], {**fields[name].metadata, "default": getattr(defaults, name)}
+            if hint is bool:
+                how["action"] = "store_true"
+            elif hint == list[str]:
+                how["action"] = "append"
+            elif hint not in (str, str | None):
+                how |= {"type": int, "help": f"{how['help']}; {describe(hint).removesuffix(' or null')}"}
+            if aliases := how.pop("aliases", ()):
+                how["action"] = _OneValue
+            action = group.add_argument(f"--{name}", *aliases, **how)
+            if name == "task":
+                action.completer = lambda **_: task_registry.names()  # type: ignore[attr-defined] # for argcomplete
+
+
+class _OneValue(argparse.Action):
+    """An option with several names, which must not be given different values; of a repeated name the last counts."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        """Keep the value; a UserError if another name has given another one."""
+        self.given = {**getattr(self, "given", {}), option_string: values}
+        if len(set(self.given.values())) > 1:
+            given = ", ".join(f"{option}={value}" for option, value in self.given.items())
+            raise UserError(f"these options mean the same, but differ: {given}")
+        setattr(namespace, self.dest, values)
+
+
+def add_task_args(parser: Parser) -> None:
+    """Add the options of scripts that build a task and keep or load runs of it."""
+    add_options(parser, *SETTINGS, "num_envs", *RUNS)
+    hint = "for legged_gym's sake: no window is opened, which none is unless it is asked for"
+    parser.add_argument("--headless", action="store_true", help=hint)
+
+
+def options_of(args: argparse.Namespace) -> Options:
+    """Return the shared options of a parsed command line, and load the files of tasks that it names.
+
+    Options that its parser does not have keep their defaults.
+    """
+    names = [field.name for field in dataclasses.fields(Options)]
+    options = Options(**{name: getattr(args, name) for name in names if hasattr(args, name)})
+    if options.task_file:
+        with slow_imports():
+            task_registry.import_files(options.task_file)
+    return options
+
+
+def option_words(args: object, *names: str) -> list[str]:
+    """Return words that give another script the values that some options have; those of None are left out."""
+    values = {name: getattr(args, name) for name in names}
+    lists = {name: value if isinstance(value, list) else [value] for name, value in values.items()}
+    return [f"--{name}={value}" for name, each in lists.items() for value in each if value is not None]
+
+
 @contextlib.contextmanager
 def slow_imports() -> Iterator[None]:
     """Context for imports that take seconds, of torch and Warp. Check the command line before.
@@ -117,13 +186,14 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
         disable_renderer()
     try:
         main()
-    except TrainingError as error:
-        _end(1, f"error: {error}")
-    except KeyboardInterrupt:
-        _end(130, "interrupted")
+        return
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python writes when it ends
         sys.exit(1)
+    except KeyboardInterrupt:
+        status, line = 130, "interrupted"
+    except TrainingError as error:
+        status, line = 1, f"error: {error}"
     except Exception as error:
         if isinstance(error, UserError):
             message = " ".join(str(error).splitlines())
@@ -136,12 +206,8 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
             message = f"this does not fit in memory, lower --num_envs: {reason}"
         else:
             raise
-        _end(2, f"error: {message}")
-
-
-def _end(status: int, message: str) -> NoReturn:
-    """End the process with a line on standard error."""
-    print(message, file=sys.stderr)
+        status, line = 2, f"error: {message}"
+    print(line, file=sys.stderr)
     sys.exit(status)
 
 

@@ -6,7 +6,6 @@ import ast
 import importlib.util
 import os
 import sys
-from pathlib import Path
 
 import legged_torque
 from legged_torque import SCRIPTS_DIR, __version__
@@ -24,44 +23,32 @@ def main() -> None:
         os.environ["_ARGCOMPLETE"] = str(1 + bool(words))  # how many words of the line are the command's name
     else:
         words = sys.argv[1:]
-    if words and not words[0].startswith("-"):
-        run_script(lambda: start(*words))
-    else:
-        run_script(show_overview)
+    others = sorted(file.stem for file in SCRIPTS_DIR.glob("[!_]*.py") if file.stem not in USUAL)
+    is_script = bool(words) and not words[0].startswith("-")
+    run_script(lambda: start(words, [*USUAL, *others]) if is_script else show_overview([*USUAL, *others]))
 
 
-def start(name: str, *words: str) -> None:
-    """Run a script as ``python scripts/<name>.py`` does; a UserError if there is none."""
-    if name not in scripts():
-        raise unknown_name("command", name, scripts())
-    sys.argv = [f"{COMMAND} {name}", *words]
+def start(words: list[str], scripts: list[str]) -> None:
+    """Run a script as ``python scripts/<name>.py`` does; a UserError if none of them has the name."""
+    name = words[0]
+    if name not in scripts:
+        raise unknown_name("command", name, scripts)
+    sys.argv = [f"{COMMAND} {name}", *words[1:]]
     spec = importlib.util.spec_from_file_location("__main__", SCRIPTS_DIR / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = sys.modules["__main__"] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
 
 
-def show_overview() -> None:
-    """Answer ``--help`` and ``--version``, and complete the name of a script."""
+def show_overview(scripts: list[str]) -> None:
+    """Answer ``--help``, a line per script with the purpose in its docstring, and ``--version``; complete a name."""
+    overview = "commands:\n"
+    for name in scripts:
+        text = ast.get_docstring(ast.parse((SCRIPTS_DIR / f"{name}.py").read_text("utf-8"))) or ""
+        purpose = text.partition("\n")[0].partition(":")[0].rstrip(".")
+        overview += f"  {name:<20} {purpose}\n"
     parser = Parser(str(legged_torque.__doc__))
-    parser.prog, parser.epilog = COMMAND, f"commands:\n{overview()}"
+    parser.prog, parser.epilog = COMMAND, overview
     parser.add_argument("--version", action="version", version=f"{COMMAND} {__version__}")
-    parser.add_argument("command", choices=scripts(), metavar="command", help="one of those below, with its options")
+    parser.add_argument("command", choices=scripts, metavar="command", help="one of those below, with its options")
     parser.parse_args(sys.argv[1:] or ["--help"])
-
-
-def scripts() -> list[str]:
-    """Return the names of all scripts, the usual ones first."""
-    others = sorted(file.stem for file in SCRIPTS_DIR.glob("[!_]*.py"))
-    return [*USUAL, *(name for name in others if name not in USUAL)]
-
-
-def overview() -> str:
-    """Return a line per script, with the first line of its docstring."""
-    return "\n".join(f"  {name:<20} {purpose(SCRIPTS_DIR / f'{name}.py')}" for name in scripts())
-
-
-def purpose(file: Path) -> str:
-    """Return the purpose of a script, by its docstring."""
-    text = ast.get_docstring(ast.parse(file.read_text("utf-8"))) or ""
-    return text.partition("\n")[0].partition(":")[0].rstrip(".")

@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import copy
 import inspect
-from collections.abc import Callable
 from typing import Any
 
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import check_value, types_of
-from legged_torque.utils.plain_yaml import parse_value
+from legged_torque.utils.plain_yaml import parse_yaml
 
 
 class Section:
@@ -32,18 +31,37 @@ class Section:
         super().__init_subclass__()
         _check_names(cls)
         for name in _entries(cls):
-            if inspect.isclass(getattr(cls, name)):
-                setattr(cls, name, _merge(cls, name))
+            if not inspect.isclass(getattr(cls, name)):
+                continue
+            found = dict.fromkeys(getattr(owner, name) for owner in (cls, *cls.__bases__) if hasattr(owner, name))
+            parts = [part for part in found if not any(o is not part and issubclass(o, part) for o in found)]
+            if len(parts) > 1 or not issubclass(parts[0], Section):
+                bases = parts if any(issubclass(part, Section) for part in parts) else [*parts, Section]
+                names = {"__qualname__": f"{cls.__qualname__}.{name}", "__module__": cls.__module__}
+                parts = [type(name, tuple(bases), names)]
+            setattr(cls, name, parts[0])
 
     def __init__(self) -> None:
         """Instantiate the nested sections, all the way down."""
-        for key in section_keys(self):
+        for key in _entries(type(self)):
             value = getattr(self, key)
             if inspect.isclass(value):
                 value = value()
             elif isinstance(value, (list, tuple, dict)):
                 value = copy.deepcopy(list(value) if isinstance(value, tuple) else value)  # YAML knows no tuples
             setattr(self, key, value)
+
+    def check(self, path: str = "") -> None:
+        """Raise a UserError that names the first setting, here or below, with a value that is not allowed.
+
+        ``path`` is where the section stands in its configuration.
+        """
+        for key in section_keys(self):
+            value, dotted = getattr(self, key), f"{path}.{key}" if path else key
+            if isinstance(value, Section):
+                value.check(dotted)
+            else:
+                check_value(dotted, value, _type_of(self, key))
 
 
 def _is_entry(name: str, value: Any) -> bool:
@@ -55,16 +73,6 @@ def _entries(owner: type) -> list[str]:
     """Return the names of all settings and sections of a class, inherited ones included and first."""
     found = [(name, value) for base in reversed(owner.__mro__[:-1]) for name, value in vars(base).items()]
     return list(dict.fromkeys(name for name, value in found if _is_entry(name, value)))
-
-
-def _merge(cls: type[Section], name: str) -> type[Section]:
-    """Return the section ``name`` of ``cls``: its own nested class, and those of all its bases, as bases of a class."""
-    found = [getattr(owner, name) for owner in (cls, *cls.__bases__) if hasattr(owner, name)]
-    parts = [part for part in dict.fromkeys(found) if not any(o is not part and issubclass(o, part) for o in found)]
-    if len(parts) == 1 and issubclass(parts[0], Section):
-        return parts[0]
-    bases = [*parts, *(() if any(issubclass(part, Section) for part in parts) else (Section,))]
-    return type(name, tuple(bases), {"__qualname__": f"{cls.__qualname__}.{name}", "__module__": cls.__module__})
 
 
 def _check_names(cls: type[Section]) -> None:
@@ -91,10 +99,6 @@ def _check_names(cls: type[Section]) -> None:
 class BaseConfig(Section):
     """A whole configuration."""
 
-    def check(self) -> None:
-        """Raise a UserError that names the first setting with a value that is not allowed, alone or with others."""
-        check_section(self)
-
     def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
         """Return the settings of an earlier run, as nested dictionaries, in today's layout."""
         return values
@@ -106,14 +110,13 @@ class BaseConfig(Section):
 
 def section_keys(section: Any) -> list[str]:
     """Return the names of a section's entries, inherited ones included, in the order of their definition."""
-    names = dict.fromkeys([*_entries(type(section)), *vars(section)])
-    return [name for name in names if not name.startswith("_")]
+    return [name for name in vars(section) if not name.startswith("_")]
 
 
 def to_dict(section: Any) -> dict[str, Any]:
     """Return a configuration as nested dictionaries of plain values."""
-    values = {key: getattr(section, key) for key in section_keys(section)}
-    return {key: to_dict(value) if isinstance(value, Section) else value for key, value in values.items()}
+    values = ((key, getattr(section, key)) for key in section_keys(section))
+    return {key: to_dict(value) if isinstance(value, Section) else value for key, value in values}
 
 
 def flat(values: Any, path: str = "") -> dict[str, Any]:
@@ -124,19 +127,10 @@ def flat(values: Any, path: str = "") -> dict[str, Any]:
     return {name: value for part in parts for name, value in part.items()}
 
 
-def check_section(section: Any, path: str = "") -> None:
-    """Raise a UserError that names the first setting of a section, or below it, whose value is not allowed."""
-    for key in section_keys(section):
-        value, dotted = getattr(section, key), f"{path}.{key}" if path else key
-        if isinstance(value, Section):
-            check_section(value, dotted)
-        else:
-            check_value(dotted, value, _type_of(section, key))
-
-
-def _type_of(section: Any, key: str) -> Any:
+def _type_of(section: Section, key: str) -> Any:
     """Return the declared type of a setting; that of its value if a class of its own has declared none."""
-    return types_of(type(section)).get(key, type(getattr(section, key)))
+    owner: type = type(section)
+    return types_of(owner).get(key, type(getattr(section, key)))
 
 
 def update_from_dict(section: Any, values: dict[str, Any], path: str = "") -> None:
@@ -158,32 +152,26 @@ def set_by_path(section: Any, dotted_path: str, value: Any) -> None:
 
 def _set(section: Any, keys: list[str], value: Any, path: str) -> None:
     """Set the entry below ``section``, which is at ``path``, that ``keys`` lead to."""
-    key, *rest = keys
-    dotted = _known(key, section_keys(section), path)
+    (key, *rest), dotted = keys, _dotted(path, keys[0], section_keys(section))
     old, hint = getattr(section, key), _type_of(section, key)
     if isinstance(old, Section):
         _set(old, rest, value, dotted) if rest else update_from_dict(old, value, dotted)
-    elif not rest:
-        setattr(section, key, _read(dotted, value, hint))
-    elif isinstance(old, dict) and not rest[1:]:
-        _known(rest[0], list(old), dotted)
-        setattr(section, key, _read(dotted, value, hint, lambda entry: {**old, rest[0]: entry}))
-    else:
+        return
+    if rest and (rest[1:] or not isinstance(old, dict)):
         raise UserError(f"config key '{dotted}' is a value, it has no entry '{'.'.join(rest)}'")
+    for entry in rest:  # at most one, of a dictionary
+        _dotted(dotted, entry, list(old))
+    if isinstance(value, str):
+        with contextlib.suppress(UserError):  # of a text that is no value itself
+            setattr(section, key, check_value(dotted, {**old, rest[0]: value} if rest else value, hint))
+            return
+        value = parse_yaml(value, f"the value '{value}'")
+    setattr(section, key, check_value(dotted, {**old, rest[0]: value} if rest else value, hint))
 
 
-def _known(key: str, names: list[str], path: str) -> str:
-    """Return the dotted path of an entry; a UserError if it is not one of the names."""
+def _dotted(path: str, key: str, names: list[str]) -> str:
+    """Return the dotted path of the entry ``key`` at ``path``; a UserError if it is not one of the names."""
     prefix = f"{path}." if path else ""
     if key not in names:
         raise unknown_name("config key", f"{prefix}{key}", [f"{prefix}{name}" for name in names])
     return f"{prefix}{key}"
-
-
-def _read(name: str, value: Any, hint: Any, whole: Callable[[Any], Any] = lambda value: value) -> Any:
-    """Return a value, or what a text stands for, in a type; ``whole`` completes it to the value of a setting."""
-    if isinstance(value, str):
-        with contextlib.suppress(UserError):
-            return check_value(name, whole(value), hint)
-        value = parse_value(value)
-    return check_value(name, whole(value), hint)

@@ -1,11 +1,22 @@
-"""The device of a process."""
+"""The device of a process, its renderer, and the cores of the machine. MuJoCo must not be imported here."""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes.util
+import os
 import re
+import time
+from pathlib import Path
 
 from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
+
+COUNTS = Path("/proc/stat")  # Linux's times of the cores
+MANY = 0.3  # busy cores from which on others are in the way
+SECONDS = 0.3  # of observing them
+INSTALL_HINT = "on Debian: apt-get install libosmesa6, then MUJOCO_GL=osmesa"
+_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 
 
 def resolve_device(device: str | None) -> str:
@@ -41,3 +52,53 @@ def device_name(device: str) -> str:
         return torch.cuda.get_device_name(device)
     threads = torch.get_num_threads()
     return f"CPU, {threads} thread{'s' if threads > 1 else ''}"
+
+
+def busy_cores() -> float:
+    """Return how many cores other processes use, while this one sleeps a moment; 0 elsewhere than on Linux."""
+    with contextlib.suppress(OSError, ValueError):
+        seconds = []  # for which all cores together have been busy since the start of the machine
+        for wait in (0.0, SECONDS):
+            time.sleep(wait)
+            ticks = [int(number) for number in COUNTS.read_text().split("\n", 1)[0].split()[1:9]]
+            seconds.append((sum(ticks) - sum(ticks[3:5])) / os.sysconf("SC_CLK_TCK"))  # but idle or waiting for disks
+        return (seconds[1] - seconds[0]) / SECONDS
+    return 0.0
+
+
+def busy_cores_note(threads: int) -> str:
+    """Return a note on computing with so many threads while other processes use the cores; empty if enough are free."""
+    cores = os.cpu_count() or 1
+    others = busy_cores() if threads > 1 else 0.0
+    if others < MANY or threads <= cores - others:
+        return ""
+    return (
+        f"other processes use {others:.1f} of {cores} cores, and torch has {threads} threads, which wait for each "
+        "other: OMP_NUM_THREADS=1 is likely faster"
+    )
+
+
+def disable_renderer() -> None:
+    """Let MuJoCo import without a renderer, on which scripts that draw nothing must not depend."""
+    os.environ["MUJOCO_GL"] = "disable"
+
+
+def choose_offscreen_renderer() -> str | None:
+    """Set ``MUJOCO_GL`` to a renderer that needs no screen; return why there is none, or None if there is one.
+
+    To be called before MuJoCo is imported. The user's choice is taken if its library is installed; otherwise EGL where
+    there is a GPU, then Mesa's software renderer. If there is none, MuJoCo imports without one, so that everything else
+    works.
+    """
+    asked = os.environ.get("MUJOCO_GL", "").lower()
+    if asked in _LIBRARIES:
+        candidates = [asked]
+    else:
+        has_gpu = any(Path(path).exists() for path in ("/dev/nvidiactl", "/dev/dri"))
+        candidates = ["egl", "osmesa"] if has_gpu else ["osmesa", "egl"]
+    for name in candidates:
+        if ctypes.util.find_library(_LIBRARIES[name]):
+            os.environ["MUJOCO_GL"] = name
+            return None
+    disable_renderer()
+    return f"the library of {' or '.join(candidates)} is not installed ({INSTALL_HINT})"

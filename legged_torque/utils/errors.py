@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 OUT_OF_MEMORY = ("out of memory", "Failed to allocate", "can't allocate memory")
 """Parts of the messages of CUDA, Warp and torch on the CPU when memory has run out."""
@@ -39,6 +39,19 @@ def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
     shown = [by_lower_case[name] for name in near] if near and len(allowed) > MANY else allowed
     others = f" and {len(allowed) - len(shown)} others" if len(shown) < len(allowed) else ""
     return UserError(f"unknown {kind} '{given}';{hint} allowed: {', '.join(shown)}{others}")
+
+
+def refuse(problems: Sequence[str], what: str = "", advice: str = "") -> None:
+    """Raise a UserError that lists all problems, after ``what`` cannot be done and before ``advice``; none is fine."""
+    if problems:
+        message = "; ".join([*problems, advice] if advice else problems)
+        raise UserError(f"{what}: {message}" if what else message)
+
+
+def with_names(problems: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield each problem followed by the names of the parts that have it."""
+    for problem, names in problems.items():
+        yield f"{problem} ({', '.join(names)})"
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""Files that are complete or absent, and errors that name the file."""
+"""Files that are complete or absent, errors that name the file, and paths that name no folder of one machine."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from legged_torque.utils.errors import UserError
-
-_PART = re.compile(r"\.(\d+)\.part$")  # end of the name of an unfinished file: the process's id
 
 
 @contextlib.contextmanager
@@ -77,20 +75,13 @@ def held(lock: Path) -> Iterator[None]:
 def remove_stale_parts(folder: Path) -> None:
     """Remove the unfinished files of killed processes from a folder."""
     for path in folder.glob("*.part"):
-        writer = _PART.search(path.name)
-        if writer and not is_running(int(writer[1])):
+        writer = re.search(r"\.(\d+)\.part$", path.name)
+        try:
+            os.kill(int(writer[1]) if writer else os.getpid(), 0)
+        except ProcessLookupError:
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
-
-
-def is_running(process: int) -> bool:
-    """Return whether there is a process of this id."""
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):  # another user's, or no id at all
-        return True
-    return True
+        except (OSError, OverflowError):  # of another user, or no process's number at all
+            continue
 
 
 def is_whole_archive(file: Path) -> bool:
@@ -103,3 +94,23 @@ def is_whole_archive(file: Path) -> bool:
             return archive.testzip() is None and not has_folders
     except Exception:  # zipfile raises about anything for a damaged file
         return False
+
+
+def portable_path(path: str | Path) -> str:
+    """Return a path relative to the current folder; only its name if it is absolute and lies elsewhere."""
+    path = Path(path)
+    if not path.is_absolute():
+        return str(path)
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else path.name
+
+
+def without_machine(value: Any) -> Any:
+    """Return settings with every absolute path, alone or as KEY=PATH, replaced by :func:`portable_path`."""
+    if isinstance(value, dict):
+        return {key: without_machine(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [without_machine(entry) for entry in value]
+    if not isinstance(value, str):
+        return value
+    key, equals, path = value.rpartition("=")
+    return key + equals + portable_path(path) if Path(path).is_absolute() else value

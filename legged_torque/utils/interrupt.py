@@ -42,12 +42,14 @@ class StopRequest:
             signal.signal(number, handler)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
-        """Let nothing be written to a terminal that is gone, and handle the signal."""
-        if number == signal.SIGHUP:
-            leave_terminal()
-        self._handle(number, frame)
+        """Handle a signal; drop all further output to a terminal that is closed, where every write would fail."""
+        for stream in (1, 2) if number == signal.SIGHUP else ():
+            with contextlib.suppress(OSError):
+                if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty is false for a terminal that is closed
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+        self._handle(number)
 
-    def _handle(self, number: int, frame: FrameType | None) -> None:
+    def _handle(self, number: int) -> None:
         """Note the first signal; interrupt at the second."""
         if self.requested and number != signal.SIGHUP:
             raise KeyboardInterrupt
@@ -58,11 +60,3 @@ class StopRequest:
 def write_error(text: str) -> None:
     """Write a line to standard error from a signal's handler, where print fails inside another print."""
     os.write(2, f"\n{text}\n".encode())
-
-
-def leave_terminal() -> None:
-    """Drop all further output to a terminal that is closed, where every write would fail."""
-    for stream in (1, 2):
-        with contextlib.suppress(OSError):
-            if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty is false for one that is closed
-                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)

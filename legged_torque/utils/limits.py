@@ -105,20 +105,17 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
     if origin is dict and isinstance(value, dict):
         keys = (check_value(f"{name}.{key}", key, parts[0]) for key in value)
         return {key: check_value(f"{name}.{key}", value[key], parts[1]) for key in keys}
-    if hint in (int, float) and isinstance(value, (int, float)) and not isinstance(value, bool):
-        if not abs(value) <= (LARGEST if hint is float else LARGEST_INT):
-            size = f"finite, at most {LARGEST:g} either way" if hint is float else "an integer of 64 bits"
-            raise UserError(f"{name} must be {size}, not {value}")
-        if hint(value) == value:
-            return hint(value)
-    elif value in parts if origin is Literal else hint not in (int, float) and _is_a(value, origin or hint):
-        return value
+    kind = origin or hint
+    if kind in (int, float):
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            if not abs(value) <= (LARGEST if kind is float else LARGEST_INT):
+                size = f"finite, at most {LARGEST:g} either way" if kind is float else "an integer of 64 bits"
+                raise UserError(f"{name} must be {size}, not {value}")
+            if kind(value) == value:
+                return kind(value)
+    elif value in parts if kind is Literal else not isinstance(kind, type) or isinstance(value, kind):
+        return value  # of a kind that is not a type, such as Any, everything is
     raise UserError(f"{name} must be {describe(hint) or hint}, not {value!r}")
-
-
-def _is_a(value: Any, kind: Any) -> bool:
-    """Return whether a value is of a kind; of one that is not a type, ``Any`` for instance, everything is."""
-    return isinstance(value, kind) if isinstance(kind, type) else True
 
 
 def describe(hint: Any) -> str:
@@ -139,18 +136,16 @@ def describe(hint: Any) -> str:
     return _NAMES.get(hint, "")
 
 
+@functools.cache
 def types_of(section: type) -> dict[str, Any]:
     """Return the types that a class and its bases declare for their settings; a UserError if one is not known."""
-    return {name: hint for owner in reversed(section.__mro__) for name, hint in _own_types(owner).items()}
-
-
-@functools.cache
-def _own_types(owner: type) -> dict[str, Any]:
-    """Return the types that a class itself declares."""
-    try:
-        return inspect.get_annotations(owner, eval_str=True)
-    except NameError as error:
-        raise UserError(f"a type in {owner.__module__}.{owner.__qualname__} is not known: {error}") from None
+    types: dict[str, Any] = {}
+    for owner in reversed(section.__mro__):
+        try:
+            types |= inspect.get_annotations(owner, eval_str=True)
+        except NameError as error:
+            raise UserError(f"a type in {owner.__module__}.{owner.__qualname__} is not known: {error}") from None
+    return types
 
 
 def _numbers(value: Any) -> Iterator[float]:

@@ -6,11 +6,10 @@ import copy
 from dataclasses import dataclass, field
 from typing import Any
 
-from legged_torque.utils.config import BaseConfig, section_keys, set_by_path, update_from_dict
+from legged_torque.utils.config import section_keys, set_by_path, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import Count, Number, Worlds, check_value, types_of
 
-DEFAULT_TASK = "a1_torque_multihead"
 DEFAULT_PRESET = "parallel"
 
 
@@ -26,7 +25,7 @@ class Options:
     The type of a field bounds its values, see ``utils.limits``, and makes it a number, a flag or a list for argparse.
     """
 
-    task: str = _option("name of the task, see train.py --list; default: %(default)s", DEFAULT_TASK)
+    task: str = _option("name of the task, see train.py --list; default: %(default)s", "a1_torque_multihead")
     device: str = _option(
         "auto, cpu or cuda:N; auto takes the GPU if there is one, with torchrun one for each process",
         "auto",
@@ -71,10 +70,6 @@ class Options:
         self.load_run = None if str(self.load_run) == "-1" else self.load_run
         self.checkpoint = None if self.checkpoint == -1 else self.checkpoint
 
-    def gives_num_envs(self) -> bool:
-        """Return whether the number of worlds is given, so that it does not depend on the device."""
-        return self.num_envs is not None or any(item.startswith("env.num_envs=") for item in self.set)
-
 
 def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: dict[str, Any] | None = None) -> None:
     """Change settings as the options say; a UserError names a value that is not allowed.
@@ -96,15 +91,22 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
         apply_perturbation(env_cfg, options.perturbation)
     if options.ranges:
         update_from_dict(env_cfg, _named("ranges", options.ranges, env_cfg.parameter_ranges()))
-    for path in ("env.num_envs", "seed", "runner.experiment_name", "runner.run_name", "runner.logger"):
-        value = getattr(options, path.rpartition(".")[2])
-        if value is not None:
-            _set_either(env_cfg, train_cfg, path, value)
+    paths = ("env.num_envs", "seed", "runner.experiment_name", "runner.run_name", "runner.logger")
+    changes = [(path, value) for path in paths if (value := getattr(options, path.rpartition(".")[2])) is not None]
     for item in options.set:
         path, separator, text = item.partition("=")
         if not separator:
             raise UserError(f"--set takes KEY=VALUE, not '{item}'")
-        _set_either(env_cfg, train_cfg, path, text)
+        changes.append((path, text))
+    sections = {key: cfg for cfg in (env_cfg, train_cfg) for key in section_keys(cfg)}
+    for path, value in changes:
+        for old, new in (env_cfg.renamed() | train_cfg.renamed()).items():
+            if f"{path}.".startswith(f"{old}."):
+                raise UserError(f"'{path}' is now '{new}{path.removeprefix(old)}'")
+        section = path.split(".")[0]
+        if section not in sections:
+            raise unknown_name("config section", section, sections)
+        set_by_path(sections[section], path, value)
 
 
 def apply_perturbation(env_cfg: Any, name: str) -> None:
@@ -117,15 +119,3 @@ def _named(kind: str, name: str, choices: dict[str, dict[str, Any]]) -> dict[str
     if name not in choices:
         raise unknown_name(kind, name, choices)
     return choices[name]
-
-
-def _set_either(env_cfg: BaseConfig, train_cfg: BaseConfig, path: str, value: Any) -> None:
-    """Set an entry of the task's or the training's settings, whose sections have different names."""
-    for old, new in (env_cfg.renamed() | train_cfg.renamed()).items():
-        if f"{path}.".startswith(f"{old}."):
-            raise UserError(f"'{path}' is now '{new}{path.removeprefix(old)}'")
-    section = path.split(".")[0]
-    sections = {key: cfg for cfg in (env_cfg, train_cfg) for key in section_keys(cfg)}
-    if section not in sections:
-        raise unknown_name("config section", section, sections)
-    set_by_path(sections[section], path, value)

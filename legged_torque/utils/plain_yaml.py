@@ -14,11 +14,6 @@ MAX_LENGTH, MAX_DEPTH, MAX_ENTRIES = 1_000_000, 50, 100_000
 """Characters and levels of a text, and values of a level; settings have about 10 000, 6 and 100."""
 
 
-def parse_value(text: str) -> Any:
-    """Return the value that a piece of text stands for, see :func:`parse_yaml`."""
-    return parse_yaml(text, f"the value '{text}'")
-
-
 def parse_yaml(text: str, source: str) -> Any:
     """Return the content of a YAML text; a UserError names its ``source`` if it is invalid or too large."""
     try:

@@ -23,7 +23,7 @@ TORCH_FOLDER = "torch"  # in the folder of Warp's cache, where torch keeps what 
 TORCH_COMPILES = threading.Event()  # set while torch or Triton compiles in this process
 
 
-class CompileProgress:
+class CompileProgress(threading.Thread):
     """While this context is open, lines on standard error (or ``stream``) report that kernels are being compiled.
 
     "compiling kernels, once per machine: 12 modules, 34 s" is repeated every ten seconds, or is part of the view of a
@@ -36,32 +36,36 @@ class CompileProgress:
 
     def __init__(self, stream: TextIO | None = None) -> None:
         """Prepare; nothing is watched yet."""
+        super().__init__(name="compile progress", daemon=True)
         self.modules: set[str] = set()
         self._stream = stream or sys.stderr
         self._build = re.compile(rf"(\w+)_p{os.getpid()}_t\d+")  # folder of a build of this process
         self._seconds, self._last_look = 0.0, time.monotonic()
         self._last_line = -math.inf
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="compile progress", daemon=True)
+        self._is_closed = threading.Event()
 
     def __enter__(self) -> CompileProgress:
         """Start watching."""
-        self._thread.start()
+        self.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
         """Stop watching."""
-        self._stop.set()
-        self._thread.join()
+        self._is_closed.set()
+        self.join()
 
-    def _watch(self) -> None:
+    def run(self) -> None:
         """Look again and again until the context is closed."""
-        while not self._stop.wait(_POLL):
+        while not self._is_closed.wait(_POLL):
             self.look(time.monotonic())
 
     def look(self, now: float) -> None:
         """Look for builds at a time [s], and report them if that is due."""
-        builds = {found[1] for found in map(self._build.fullmatch, _entries()) if found}
+        names, folder = list[str](), wp.config.kernel_cache_dir  # None before Warp's start
+        for place in (folder, os.path.join(folder, "lto")) if folder else ():  # and that of link-time optimization
+            with contextlib.suppress(OSError):
+                names += os.listdir(place)
+        builds = {found[1] for found in map(self._build.fullmatch, names) if found}
         seconds, self._last_look = now - self._last_look, now
         view = Display.shown if self._stream.isatty() else None
         if builds or TORCH_COMPILES.is_set():
@@ -87,12 +91,3 @@ def torch_compiles() -> Iterator[None]:
         yield
     finally:
         TORCH_COMPILES.clear()
-
-
-def _entries() -> list[str]:
-    """Return the names in Warp's cache, and in its folder for link-time optimization; none before Warp's start."""
-    folder, names = wp.config.kernel_cache_dir, []
-    for place in (folder, os.path.join(folder, "lto")) if folder else ():
-        with contextlib.suppress(OSError):
-            names += os.listdir(place)
-    return names

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import importlib.metadata
-import itertools
 import math
 import platform
 from datetime import datetime
@@ -19,6 +18,7 @@ from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 
 CONFIG_FILE = "config.yaml"
 EVALUATIONS_FILE = "evaluations.csv"  # a row per evaluation during training
+PRETRAINED = "pretrained"  # folder of pre-trained policies, in that of all experiments
 MOVED = {"legged_torque.control.gravity_pretraining:pretrain": "legged_torque.paper.gravity.pretraining:pretrain"}
 """Present names of functions that the settings of older runs name by their former modules."""
 _CHECKPOINT = "model_"
@@ -28,7 +28,7 @@ _PACKAGES = ("legged_torque", "torch", "warp-lang", "mujoco", "mujoco-warp", "rs
 def new_run_dir(log_root: Path, run_name: str) -> Path:
     """Return the folder for a run that starts now; it is not created yet."""
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    return log_root / (f"{name}_{run_name}" if run_name else name)
+    return log_root / tagged(name, run_name)
 
 
 def claim_run_dir(run_dir: Path, config: dict[str, Any]) -> Path:
@@ -38,16 +38,16 @@ def claim_run_dir(run_dir: Path, config: dict[str, Any]) -> Path:
     """
     with write_errors(run_dir):
         remove_stale_parts(run_dir.parent)
-        part, candidate = part_of(run_dir), run_dir
+        part, candidate, number = part_of(run_dir), run_dir, 1
         save_config(part, config)
-        for number in itertools.count(2):
+        while True:
             try:
                 return part.rename(candidate)
             except OSError as error:
                 if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
                     raise
-                candidate = run_dir.with_name(f"{run_dir.name}_{number}")
-    raise AssertionError("there is always another number")
+            number += 1
+            candidate = run_dir.with_name(f"{run_dir.name}_{number}")
 
 
 def tagged(word: str, name: str) -> str:

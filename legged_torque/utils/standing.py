@@ -90,36 +90,24 @@ def hold_pose(
                 raise UserError("the simulation diverges under PD control: check masses, gains and the time step")
             if step >= steps // 2:
                 errors = np.maximum(errors, np.abs(data.qpos[7:] - pose))
-            fall = _fall(data, float(place[2]), may_not_touch)
+            height, upright = float(data.qpos[2]), 1.0 - 2.0 * (data.qpos[4] ** 2 + data.qpos[5] ** 2)
+            tilt = float(np.arccos(np.clip(upright, -1.0, 1.0)))  # between the trunk's z axis and the vertical
+            touching = np.intersect1d(data.contact.geom, may_not_touch)
+            if touching.size:
+                fall = f"'{model.geom(int(touching[0])).name}' touches the ground"
+            elif not stands(height, place[2], tilt):
+                sunk = f"has sunk from {place[2]:.2f} to {height:.2f} m"
+                fall = f"the trunk {sunk if tilt < MOST_TILT else f'is tilted by {tilt:.2f} rad'}"
             if fall:
                 fall = f"after {(step + 1) * model.opt.timestep:.2f} s {fall}"
                 break
     return Standing(
         fall=fall,
         nominal=float(place[2]),
-        height=float(data.qpos[2]),
-        tilt=_tilt(data),
+        height=height,
+        tilt=tilt,
         drift=float(np.linalg.norm(data.qpos[:2] - place[:2])),
         error=float(errors.max()),
         joint=model.joint(int(errors.argmax()) + 1).name,
         saturated=float(np.mean(saturated)),
     )
-
-
-def _fall(data: mujoco.MjData, nominal: float, may_not_touch: Sequence[int]) -> str:
-    """Return how a robot has fallen whose trunk was at the height ``nominal`` [m]; empty if it stands."""
-    touching = np.intersect1d(data.contact.geom, may_not_touch)
-    if touching.size:
-        return f"'{data.model.geom(int(touching[0])).name}' touches the ground"
-    height, tilt = float(data.qpos[2]), _tilt(data)
-    if stands(height, nominal, tilt):
-        return ""
-    if tilt < MOST_TILT:
-        return f"the trunk has sunk from {nominal:.2f} to {height:.2f} m"
-    return f"the trunk is tilted by {tilt:.2f} rad"
-
-
-def _tilt(data: mujoco.MjData) -> float:
-    """Return the angle between the trunk's z axis and the vertical [rad]."""
-    upright = 1.0 - 2.0 * (data.qpos[4] ** 2 + data.qpos[5] ** 2)
-    return float(np.arccos(np.clip(upright, -1.0, 1.0)))

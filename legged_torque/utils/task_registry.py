@@ -1,11 +1,21 @@
-"""The registry of tasks, as in legged_gym."""
+"""The registry of tasks, as in legged_gym.
+
+Tasks from outside the package are in files that a command line names and in modules of installed packages. Both run
+their author's code, so the user names or installs them; nothing that a run or an experiment has written does.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import importlib
+import importlib.metadata
+import importlib.util
 import math
 import pkgutil
-from collections.abc import Iterable
+import sys
+import traceback
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,11 +35,13 @@ from legged_torque.utils.runs import (
     load_config,
     new_run_dir,
 )
-from legged_torque.utils.task_files import import_installed_tasks, import_task_files
 
 if TYPE_CHECKING:
     from rsl_rl.env import VecEnv
     from rsl_rl.runners import OnPolicyRunner
+
+ENTRY_POINTS = "legged_torque.tasks"
+"""Group of the entry points of installed packages, each of a module that registers tasks."""
 
 
 @dataclass
@@ -75,8 +87,26 @@ class TaskRegistry:
         self._tasks[name] = (task_class, env_cfg, train_cfg)
 
     def import_files(self, files: Iterable[str | Path]) -> None:
-        """Import files that register tasks, see :func:`~legged_torque.utils.task_files.import_task_files`."""
-        import_task_files(self._tasks, files)
+        """Import Python files that register tasks, each once.
+
+        A file is imported by its name, and its folder becomes the last place to import from: it may use files next to
+        it, and settings may name its classes, ``"my_task:MyRobot"``. A UserError says why a file cannot be used.
+        """
+        for file in map(Path, files):
+            name, path = file.stem, file.absolute()
+            if not path.is_file() or path.suffix != ".py" or not name.isidentifier():
+                raise UserError(f"--task_file takes a Python file with the name of a module, not '{file}'")
+            if name in sys.modules:
+                other = getattr(sys.modules[name], "__file__", None) or name  # Python's own have none
+            else:
+                spec = importlib.util.find_spec(name)
+                other = spec.origin if spec else None  # of a folder, too
+            if other and Path(other).resolve() != path.resolve():
+                raise UserError(f"'{file}' cannot be imported: there is another module '{name}'; rename the file")
+            if name not in sys.modules:
+                sys.path.append(str(path.parent))
+                with self._adding(f"'{file}'"):
+                    importlib.import_module(name)
 
     def names(self) -> list[str]:
         """Return the names of all tasks, in the order of their registration, those of installed packages last."""
@@ -96,7 +126,8 @@ class TaskRegistry:
         With ``args``, a UserError names the first value that is not allowed, before torch and the classes that the
         settings name are imported.
         """
-        env_cfg, train_cfg = self._copies(name)
+        env_cfg, train_cfg = (copy.deepcopy(cfg) for cfg in self._get(name)[1:])
+        train_cfg.runner.experiment_name = train_cfg.runner.experiment_name or name
         if args is None:
             return env_cfg, train_cfg
         apply_options(env_cfg, train_cfg, args, run_config)
@@ -105,7 +136,8 @@ class TaskRegistry:
         train_cfg.check_code_names([registered for _, _, registered in self._tasks.values()])
         on_cpu = resolve_device(args.device) == "cpu"  # imports torch
         train_cfg.import_code()
-        if on_cpu and run_config is None and not args.gives_num_envs():
+        is_given = args.num_envs is not None or any(item.startswith("env.num_envs=") for item in args.set)
+        if on_cpu and run_config is None and not is_given:
             env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
         return env_cfg, train_cfg
 
@@ -185,12 +217,6 @@ class TaskRegistry:
         runner.load(str(run.checkpoint), {"actor": True, "iteration": True})
         return env, runner
 
-    def _copies(self, name: str) -> tuple[Any, Any]:
-        """Return copies of the settings of a task and of its training."""
-        env_cfg, train_cfg = (copy.deepcopy(cfg) for cfg in self._get(name)[1:])
-        train_cfg.runner.experiment_name = train_cfg.runner.experiment_name or name
-        return env_cfg, train_cfg
-
     def _get(self, name: str) -> tuple[type[VecEnv] | str, Any, Any]:
         """Return class and settings of a task; an unknown name is a UserError."""
         if name not in self._tasks:
@@ -200,28 +226,52 @@ class TaskRegistry:
         return self._tasks[name]
 
     def _import_installed(self) -> None:
-        """Make the tasks of installed packages known, the first time that one may be meant."""
-        if self._looks_for_installed:
-            self._looks_for_installed = False
-            import_installed_tasks(self._tasks)
+        """Import the :data:`ENTRY_POINTS` of installed packages, the first time that one of their tasks may be meant.
+
+        A broken one does not affect the others: a line on standard error says what is wrong, and its tasks are missing.
+        """
+        points = importlib.metadata.entry_points(group=ENTRY_POINTS) if self._looks_for_installed else ()
+        self._looks_for_installed = False
+        for point in points:
+            if point.module not in sys.modules:
+                try:
+                    with self._adding(f"the entry point '{point.name} = {point.value}'"):
+                        point.load()
+                except UserError as error:
+                    print(f"Note: {error}", file=sys.stderr)
+
+    @contextlib.contextmanager
+    def _adding(self, source: str) -> Iterator[None]:
+        """Context for an import that registers tasks; after an error, the tasks are as before.
+
+        A UserError says in which line the import fails, or that it registers none.
+        """
+        before = dict(self._tasks)
+        try:
+            yield
+            if len(self._tasks) == len(before):
+                raise UserError("it registers no task: it must call task_registry.register")
+        except (Exception, SystemExit) as error:  # some read the command line themselves, and end the process
+            self._tasks = before
+            if isinstance(error, UserError):
+                raise UserError(f"{source}: {error}") from error
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            file, line = last.filename, last.lineno
+            if isinstance(error, SyntaxError):
+                file, line = error.filename or "?", error.lineno
+            place = f"line {line} of '{Path(file).name}'"
+            raise UserError(f"{source} cannot be imported: {place}: {type(error).__name__}: {error}") from error
 
 
 def print_notes(notes: Iterable[str]) -> None:
-    """Print notes for the user, once for all processes."""
-    for note in notes if distributed.rank() == 0 else ():
+    """Print notes for the user, once for all processes, and nothing for those that are empty."""
+    for note in filter(None, notes) if distributed.rank() == 0 else ():
         print(f"Note: {note}", flush=True)
 
 
 def experiment_dir(train_cfg: Any, log_root: str | None = None) -> Path:
-    """Return the folder that holds the runs of an experiment."""
-    return all_experiments_dir(log_root) / train_cfg.runner.experiment_name
-
-
-def all_experiments_dir(log_root: str | None = None) -> Path:
-    """Return the folder that holds all experiments: ``log_root``, or ``logs/`` in the current directory."""
-    if log_root == "":
-        raise UserError("--log_root must be a folder, not empty")
-    return Path(log_root or "logs")
+    """Return the folder that holds the runs of an experiment; the default of ``log_root`` is ``logs``."""
+    return Path(log_root or "logs") / train_cfg.runner.experiment_name
 
 
 def num_iterations(env: VecEnv, train_cfg: Any) -> int:

@@ -1,1 +1,1 @@
-"""Watching and steering a trained robot live, and videos. The web page needs the extra ``viewer``."""
+"""Live views of trained robots, and videos. The page needs the extra ``viewer``, videos need ``video``."""

@@ -1,49 +1,54 @@
-"""Who may use the page: browsers on this machine, from nowhere but the page itself, or whoever has its token."""
+"""Access to the page: only from this machine and from the page itself, or with the token in the printed address."""
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import http
 import ipaddress
 import secrets
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from http.cookies import SimpleCookie
 from typing import Any
+from unittest import mock
 from urllib.parse import parse_qs, urlsplit
 
+import viser
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 
 class Guard:
-    """Decides about requests: those for the page and its files, and the page's own connection.
+    """Accepts or refuses HTTP requests and WebSocket handshakes.
 
     Attributes:
-        token: What the address of the page must hold the first time; empty if none is needed.
+        token: Required in the first request; empty if the server is reachable from this machine only.
     """
 
     def __init__(self, host: str) -> None:
-        """Ask for a token unless ``host``, the address that is served at, is one that only this machine reaches."""
+        """Require a token unless the server's address is a loopback address."""
         self.token = "" if is_local(host) else secrets.token_hex(16)
-        self._cookie = f"legged_torque_{secrets.token_hex(4)}"  # cookies of all ports of a machine are in one pot
+        self._cookie = f"legged_torque_{secrets.token_hex(4)}"  # cookies are shared by all ports of a machine
 
     def refusal(self, request: Request) -> str:
-        """Return why a request is refused; empty if it is not."""
+        """Return why a request is refused, or an empty string."""
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin", "")
         if origin and urlsplit(origin).netloc != host:
             return "only the page itself may connect, no page of another site"
-        if not self.token:  # a site's name may be pointed at this machine to pass for the page
-            name = urlsplit(f"//{host}").hostname or ""
-            return "" if name == "localhost" or is_address(name) else "open the page by its address, not by a name"
+        if not self.token:  # another site may have its name resolved to this machine to pass as the page
+            name = urlsplit(f"//{host}").hostname or "none"
+            is_address = ":" in name or name.replace(".", "").isdecimal()
+            return "" if name == "localhost" or is_address else "open the page by its address, not by a name"
         cookie = SimpleCookie(request.headers.get("Cookie", "")).get(self._cookie)
         given = (_token_of(request), cookie.value if cookie else "")
         is_known = any(secrets.compare_digest(text.encode(), self.token.encode()) for text in given)
         return "" if is_known else "open the address that play.py has printed, with its token"
 
-    def answer(self, connection: ServerConnection, request: Request, serve: Callable[..., Any]) -> Response | None:
-        """Answer a request with a refusal, or as ``serve`` does; a browser that has the token keeps it as a cookie."""
+    def answer(
+        self, serve: Callable[..., Response | None], connection: ServerConnection, request: Request
+    ) -> Response | None:
+        """Refuse a request or answer it as ``serve`` does. A valid token is kept by the browser as a cookie."""
         refusal = self.refusal(request)
         if refusal:
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"{refusal}\n")
@@ -52,32 +57,27 @@ class Guard:
             response.headers["Set-Cookie"] = f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
         return response
 
-    @contextlib.contextmanager
-    def at_the_door(self, change: Callable[[Callable], Callable] = lambda serve: serve) -> Iterator[None]:
-        """Let every server that is started meanwhile ask this guard first: viser has no setting for it.
 
-        ``change`` returns what serves requests that are let in, in place of the server's own function.
-        """
-        module: Any = websockets.asyncio.server  # for mypy, to which its attributes are fixed
-        start = module.serve
+class GuardedServer(viser.ViserServer):
+    """A viser server whose requests pass a :class:`Guard`."""
 
-        def guarded(*args: Any, process_request: Callable[..., Any], **settings: Any) -> Any:
-            serve = change(process_request)
+    def __init__(self, guard: Guard, host: str, port: int, label: str) -> None:
+        """Serve at an address. viser has no hook for requests, so the function that it calls is replaced meanwhile."""
+        start = websockets.asyncio.server.serve
 
-            def ask(connection: ServerConnection, request: Request) -> Response | None:
-                return self.answer(connection, request, serve)
+        def serve(*args: Any, process_request: Callable[..., Response | None], **settings: Any) -> Any:
+            return start(*args, process_request=functools.partial(guard.answer, process_request), **settings)
 
-            return start(*args, process_request=ask, **settings)
+        with mock.patch.object(websockets.asyncio.server, "serve", serve):
+            super().__init__(host, port, label=label, verbose=False)
 
-        module.serve = guarded
-        try:
-            yield
-        finally:
-            module.serve = start
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """Refuse to open a tunnel from the internet, which viser does for any page that asks."""
+        return None
 
 
 def is_local(host: str) -> bool:
-    """Return whether only this machine reaches an address; one that cannot be found is left to who serves there."""
+    """Return whether only this machine reaches an address; unknown addresses count as others."""
     try:
         found = socket.getaddrinfo(host or "0.0.0.0", None)
     except OSError:
@@ -85,15 +85,6 @@ def is_local(host: str) -> bool:
     return all(ipaddress.ip_address(address[0]).is_loopback for *_, address in found)
 
 
-def is_address(name: str) -> bool:
-    """Return whether a host is given by its IP address."""
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
-
-
 def _token_of(request: Request) -> str:
-    """Return the token in the address of a request; empty if there is none."""
+    """Return the token in the address of a request, or an empty string."""
     return parse_qs(urlsplit(request.path).query).get("token", [""])[0]

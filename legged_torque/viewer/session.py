@@ -1,17 +1,17 @@
-"""A task and a trained policy that run live and take requests, without any window or page."""
+"""A task with a trained policy that runs live and takes requests, without any window or page."""
 
 from __future__ import annotations
 
 import copy
-import dataclasses
 import functools
 import math
-import queue
 import threading
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any, Concatenate, ParamSpec
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,45 +19,73 @@ import torch
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.terrain.rough import RoughGround
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.math import quat_rotate_yaw
 from legged_torque.utils.options import apply_perturbation
 from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers
 from legged_torque.utils.task_registry import LoadedRun, task_registry
 from legged_torque.viewer.pacing import Pacer
-from legged_torque.viewer.reading import Reading, TaskReader, WatchedRobot, watched, weighted_terms
-from legged_torque.viewer.state import AS_LOADED, Command, SessionState
+from legged_torque.viewer.snapshot import Snapshot, WatchedRobot, watched, weighted_terms
 
 HISTORY_STEPS = 500  # control steps that are kept for plots: 10 s
-SCAN_INTERVAL = 1.0  # seconds between looks for new checkpoints
-IDLE = 0.02  # seconds between looks for requests while paused
-SLOWEST, FASTEST = 0.1, 1.0  # limits of the speed, in simulated seconds per second
-LARGEST = 100.0  # of all numbers in requests: velocities [m/s, rad/s], angles [rad] and weights
-SMOOTHING = 0.06  # weight of the newest step in the shown reward terms: they are means over about a third of a second
+SCAN_INTERVAL = 1.0  # seconds between two looks for new checkpoints
+IDLE = 0.02  # seconds between two looks for requests while paused
+SLOWEST, FASTEST = 0.1, 1.0  # limits of the speed [simulated seconds per second]
+MAX_NUMBER = 100.0  # of numbers in requests: velocities [m/s, rad/s], angles [rad] and weights
+SMOOTHING = 0.06  # share of the newest step in the shown reward terms: they are means over about 0.3 s
+AS_LOADED = "as loaded"  # the perturbation of the run or of the command line
 
-Arguments = ParamSpec("Arguments")
+Command = tuple[float, float, float]  # commanded v_x, v_y [m/s] and yaw rate [rad/s]
 
 
-def request(method: Callable[Concatenate[Session, Arguments], None]) -> Callable[Concatenate[Session, Arguments], None]:
-    """Make a method of :class:`Session` a request: a call is only queued, and :meth:`Session.tick` carries it out."""
+@dataclass(frozen=True)
+class Message:
+    """An event in one line."""
+
+    text: str = ""
+    is_error: bool = False
+
+
+def request(method: Callable[..., None]) -> Callable[..., None]:
+    """Make a method of :class:`Session` a request: a call is queued, and :meth:`Session.tick` carries it out."""
 
     @functools.wraps(method)
-    def ask(self: Session, *args: Arguments.args, **kwargs: Arguments.kwargs) -> None:
-        self.requests.put(functools.partial(method, self, *args, **kwargs))
+    def ask(self: Session, *args: Any) -> None:
+        self.requests.append(functools.partial(method, self, *args))
 
     return ask
 
 
-def check_numbers(what: str, *numbers: float) -> None:
-    """Refuse, by UserError, what a page may send in place of its sliders' numbers: NaN, or more than a robot knows."""
-    if not all(abs(number) <= LARGEST for number in numbers):
-        raise UserError(f"{what} must be of numbers up to {LARGEST:g}, not {', '.join(map(str, numbers))}")
+def check_numbers(name: str, *numbers: float) -> None:
+    """Raise a UserError for numbers that no slider sends: NaN or very large ones."""
+    if not all(abs(number) <= MAX_NUMBER for number in numbers):
+        raise UserError(f"{name} must be of numbers up to {MAX_NUMBER:g}, not {', '.join(map(str, numbers))}")
 
 
 class Session:
-    """Steps a task with a policy's mean actions in one thread, which also carries out requests.
+    """Steps a task with a policy's mean actions and carries out requests in between, all in one thread.
 
-    Requests may come from any thread. The thread in :meth:`run` carries them out between two steps, so that nothing
-    changes in the middle of one. :attr:`state` and :attr:`history` may be read from any thread.
+    Requests and :meth:`stop` may be called from any thread. Attributes may be read from any thread, but only the
+    stepping thread may touch the task's tensors. ``history`` must be copied before iterating, all others are replaced
+    as a whole.
     """
+
+    companion: Session | None = None  # another policy, which steps with this one under the followed world's command
+    snapshot: Snapshot | None = None  # the last step; None before the first
+    sim_time = 0.0  # simulated time since the start [s]
+    real_time = 0.0  # simulated seconds per second over the last steps
+    speed = 1.0  # the wanted ones
+    is_paused = False
+    world = 0  # the followed world
+    rewards = np.zeros(0)  # its weighted reward terms per second, smoothed; (terms,)
+    falls = 0  # in all worlds since the task was built
+    command: Command | None = None  # of all worlds; None if commands are drawn as in training
+    perturbation = AS_LOADED
+    is_mixing_set = False  # whether a user has set them
+    checkpoint = 0  # iterations of the loaded checkpoint
+    trained_steps = 0  # its environment steps
+    checkpoints: tuple[int, ...] = ()  # all of the run
+    follows_newest = False  # whether new ones are loaded as soon as they are saved
+    message = Message()  # the last event
 
     def __init__(
         self,
@@ -67,19 +95,15 @@ class Session:
         clock: Callable[[], float] = time.perf_counter,  # [s]
         sleep: Callable[[float], None] = time.sleep,  # [s]
     ) -> None:
-        """Build the task, load the checkpoint and be ready to step; a UserError if that cannot be loaded."""
+        """Build the task and load the checkpoint; a UserError if that cannot be loaded."""
         self._make_task = functools.partial(watched(task_class), device=device)
         self._cfg, self._run_dir = run.env_cfg, run.folder
         self._clock, self._sleep = clock, sleep
-        self.requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # not carried out yet
-        self._stop = threading.Event()
-        self.companion: Session | None = None  # steps with this one, under the command of its followed world
-        self._refused: dict[int, float] = {}
-        self._next_scan = -math.inf
-        # The last steps of the followed world; copy it before iterating in another thread.
-        self.history: deque[Reading] = deque(maxlen=HISTORY_STEPS)
-        self.state = SessionState()  # what is shown
-        self.task = self._make_task(self._cfg)  # only the stepping thread may touch its tensors
+        self._stop, self._next_scan, self._tried = threading.Event(), -math.inf, -1
+        self.requests: deque[Callable[[], None]] = deque()  # not carried out yet, the present one included
+        self.history: deque[Snapshot] = deque(maxlen=HISTORY_STEPS)  # the last steps of the followed world
+        self.mixing: dict[str, float] = {}  # weights of the action terms that have one, by name
+        self.task = self._make_task(self._cfg)
         self._obs = self.task.get_observations()
         task = run.config.get("task")
         self.name = f"{task}, {run.folder.name}"  # of the run, for users
@@ -101,119 +125,102 @@ class Session:
     # ---- the stepping thread -----------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Step in time with the clock until :meth:`stop`."""
+        """Step in real time until :meth:`stop`."""
         while not self._stop.is_set():
             self.tick()
 
     def tick(self) -> None:
         """Carry out the requests, then make one step when it is due, or none while paused."""
-        self._prepare()
-        if self.state.is_paused:
+        self.carry_out_requests()
+        if self.companion:
+            self.companion.carry_out_requests()
+        if self.is_paused:
             self._sleep(IDLE)
             return
         self._pacer.wait()
-        self._step()
-        if self.companion and self.state.reading:
-            v_x, v_y, yaw_rate = self.state.reading.commands[self.state.world].tolist()
-            self.companion.follow((v_x, v_y, yaw_rate))
+        snapshot = self.step()
+        if self.companion:
+            v_x, v_y, yaw_rate = snapshot.commands[self.world].tolist()
+            if self.companion.command != (v_x, v_y, yaw_rate):
+                self.companion.hold((v_x, v_y, yaw_rate))
+            self.companion.step()
 
-    def follow(self, command: Command) -> None:
-        """Make one step under a command, as the companion of another session."""
-        if command != self.state.command:
-            self.set_command(command)
-        self._prepare()
-        self._step()
-
-    def _prepare(self) -> None:
-        """Carry out the requests, and look for new checkpoints."""
-        while not self.requests.empty():
+    def carry_out_requests(self) -> None:
+        """Carry out the requests and look for new checkpoints. Errors become messages, and the robots walk on."""
+        while self.requests:
             try:
-                self.requests.get()()
+                self.requests[0]()
             except UserError as error:
-                self._tell(str(error), is_error=True)
+                self.message = Message(str(error), is_error=True)
+            except Exception as error:
+                traceback.print_exc()
+                self.message = Message(f"{type(error).__name__}: {error}", is_error=True)
+            self.requests.popleft()
         if self._clock() >= self._next_scan:
             self._scan()
 
     @torch.no_grad()
-    def _step(self) -> None:
-        """Make one control step and show it."""
-        self._reader.before_step()
+    def step(self) -> Snapshot:
+        """Make one control step."""
         self._obs = self.task.step(self._policy(self._obs))[0]
-        self.task.total_steps.copy_(self._trained_steps)  # curricula stay where the checkpoint was saved
-        reading = self._reader.read(self.state.time + self.task.dt, self.state.world)
-        self.history.append(reading)
-        self._rewards += SMOOTHING * (reading.rewards - self._rewards)
-        self._falls += int(reading.resets[0])
-        self._show(
-            reading=reading,
-            rewards=dict(zip(self.task.reward_names, self._rewards.tolist(), strict=True)),
-            time=reading.time,
-            real_time=self._pacer.achieved(),
-            falls=self._falls,
-        )
-
-    def _show(self, **changes: Any) -> None:
-        """Replace the state by one with some changes."""
-        self.state = dataclasses.replace(self.state, **changes)
-
-    def _tell(self, message: str, is_error: bool = False) -> None:
-        """Show a line."""
-        self._show(message=message, is_error=is_error, message_number=self.state.message_number + 1)
+        self.task.total_steps.copy_(self._trained_steps)  # curricula stay at the checkpoint's level
+        self.snapshot = self.task.snapshot(self.sim_time + self.task.dt, self.world)
+        self.history.append(self.snapshot)
+        self.sim_time, self.falls = self.snapshot.time, self.falls + self.snapshot.falls
+        self.rewards = self.rewards + SMOOTHING * (self.snapshot.rewards - self.rewards)
+        self.real_time = self._pacer.achieved()
+        return self.snapshot
 
     @torch.no_grad()
     def _adopt(self, task: WatchedRobot) -> None:
-        """Go on with a task: the first one, or one that was built with another perturbation."""
+        """Continue with a task: the first one, or one with another perturbation."""
         self.task = self._runner.env = task
-        self._reader = TaskReader(task)
-        self._rewards, self._falls = np.zeros(len(task.reward_names)), 0
+        self.snapshot, self.falls, self.rewards = None, 0, np.zeros(len(task.reward_names))
         self.history.clear()
-        self._show(task_number=self.state.task_number + 1, reading=None, falls=0, rewards={})
-        self._apply_command()
+        self.hold(self.command)
         self._apply_mixing()
         self._obs = task.reset()
         self._pacer.restart()
 
-    def _apply_command(self) -> None:
-        """Give all worlds the chosen command, or one of their own each."""
-        self.task.command_generator.hold(self.state.command)
+    def hold(self, command: Command | None) -> None:
+        """Give all worlds a command, or a random one each, from the next step on."""
+        self.command = command
+        self.task.command_generator.hold(command)
         self.task.command_generator.resample(torch.ones_like(self.task.reset_buf))
 
     def _apply_mixing(self) -> None:
         """Set the chosen weights, or those of the curriculum. They stay, since only rollouts change them."""
         self.task.update_curriculum()
         weights = weighted_terms(self.task)
-        if self.state.is_mixing_set:
+        if self.is_mixing_set:
             for name, weight in weights.items():
-                weight.fill_(self.state.mixing[name])
-        self._show(mixing={name: weight.item() for name, weight in weights.items()})
+                weight.fill_(self.mixing[name])
+        self.mixing = {name: weight.item() for name, weight in weights.items()}
 
-    # ---- requests: a call from any thread is carried out by the stepping thread --------------------------------------
+    # ---- requests ----------------------------------------------------------------------------------------------------
 
     @request
     def set_command(self, command: Command | None) -> None:
         """Command v_x, v_y [m/s] and a yaw rate [rad/s] in all worlds; None draws commands as in training."""
         check_numbers("a command", *(command or ()))
-        self._show(command=command)
-        self._apply_command()
+        self.hold(command)
 
     @request
     def push(self, angle: float, speed: float) -> None:
-        """Add a horizontal velocity [m/s] to every trunk at once, in a direction from its front to its left [rad]."""
+        """Add a horizontal velocity [m/s] to every trunk, in a direction from its heading to its left [rad]."""
         check_numbers("a push", angle, speed)
-        w, x, y, z = self.task.base_quat.unbind(dim=1)
-        heading = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) + angle
-        velocity = speed * torch.stack([heading.cos(), heading.sin(), torch.zeros_like(heading)], dim=1)
+        push = self.task.base_pos.new_tensor([speed * math.cos(angle), speed * math.sin(angle), 0.0])
         everywhere = torch.ones_like(self.task.reset_buf)
-        self.task.sim.push(everywhere, velocity, everywhere)
+        self.task.sim.push(everywhere, quat_rotate_yaw(self.task.base_quat, push), everywhere)
         if self.companion:
             self.companion.push(angle, speed)
-        self._tell(f"pushed with {speed:.1f} m/s")
+        self.message = Message(f"pushed with {speed:.1f} m/s")
 
     @request
     def set_paused(self, is_paused: bool) -> None:
-        """Pause, or go on without catching up."""
+        """Pause, or continue without catching up."""
         self._pacer.restart()
-        self._show(is_paused=is_paused, real_time=0.0)
+        self.is_paused = is_paused
 
     @request
     def reset(self) -> None:
@@ -222,47 +229,46 @@ class Session:
             self._obs = self.task.reset()
         if self.companion:
             self.companion.reset()
-        self._tell("reset")
+        self.message = Message("reset")
 
     @request
     def set_tile(self, level: int, column: int) -> None:
-        """Move the followed robot onto a tile of rough ground, where its episodes start from now on."""
-        ground, world = self.task.terrain, self.state.world
+        """Move the followed robot to a tile of rough ground, where its episodes start from now on."""
+        ground, world = self.task.terrain, self.world
         if not isinstance(ground, RoughGround):
             raise UserError("there are no tiles on a plane")
-        layout = ground.layout
-        ground.levels[world] = min(max(level, 0), layout.num_rows - 1)
-        ground.columns[world] = min(max(column, 0), layout.num_cols - 1)
+        ground.levels[world] = min(max(level, 0), ground.layout.num_rows - 1)
+        ground.columns[world] = min(max(column, 0), ground.layout.num_cols - 1)
         with torch.no_grad():
             self._obs = self.task.reset(world)
-        self._tell(f"robot {world} is on a new tile")
+        self.message = Message(f"robot {world} is on a new tile")
 
     @request
     def set_speed(self, speed: float) -> None:
         """Set the simulated seconds per second, from :data:`SLOWEST` to :data:`FASTEST`."""
         check_numbers("a speed", speed)
-        self._pacer.speed = min(max(speed, SLOWEST), FASTEST)
+        self.speed = self._pacer.speed = min(max(speed, SLOWEST), FASTEST)
         self._pacer.restart()
-        self._show(speed=self._pacer.speed)
 
     @request
     def follow_world(self, world: int) -> None:
-        """Choose the world of history, torques and reward terms."""
+        """Choose the world whose values are shown."""
         self.history.clear()
-        self._rewards[:] = 0.0
-        self._show(world=min(max(world, 0), self.task.num_envs - 1))
+        self.rewards = np.zeros_like(self.rewards)
+        self.world = min(max(world, 0), self.task.num_envs - 1)
 
     @request
     def set_mixing(self, weights: Sequence[float] | None) -> None:
-        """Set the weights of the action terms in ``state.mixing``, in their order; None sets them as in training."""
+        """Set the weights in :attr:`mixing`, in their order; None sets them as in training."""
         check_numbers("a weight", *(weights or ()))
-        mixing = self.state.mixing if weights is None else dict(zip(self.state.mixing, weights, strict=True))
-        self._show(mixing=mixing, is_mixing_set=weights is not None)
+        self.is_mixing_set = weights is not None
+        if weights is not None:
+            self.mixing = dict(zip(self.mixing, weights, strict=True))
         self._apply_mixing()
 
     @request
     def load_checkpoint(self, number: int) -> None:
-        """Let another checkpoint of the run act while the robots walk on; if it is broken, the old one goes on."""
+        """Load another checkpoint of the run while the robots walk on; if it is broken, the old policy continues."""
         actor = self._runner.alg.policy()
         weights, counters = copy.deepcopy(actor.state_dict()), self.task.state_dict()
         try:
@@ -273,24 +279,23 @@ class Session:
             raise
         finally:
             self._apply_mixing()
-        self._tell(f"model_{number} acts now")
+        self.message = Message(f"loaded model_{number}")
 
     @request
     def follow_newest(self, is_on: bool) -> None:
         """Load each new checkpoint as soon as it is saved, or stop doing so."""
-        self._refused.clear()
-        self._next_scan = -math.inf  # at once
-        self._show(follows_newest=is_on)
+        self._next_scan, self._tried = -math.inf, -1  # look at once
+        self.follows_newest = is_on
 
     @request
     def set_perturbation(self, name: str) -> None:
-        """Rebuild the task with one of its perturbations, or :data:`AS_LOADED`; if that fails, the old one goes on."""
+        """Rebuild the task with a perturbation of its settings or :data:`AS_LOADED`; on errors, the old one stays."""
         cfg = copy.deepcopy(self._cfg)
         if name != AS_LOADED:
             apply_perturbation(cfg, name)
         if self.companion:
             self.companion.set_perturbation(name)
-        self._tell(f"building the worlds with perturbation '{name}' ...")
+        self.message = Message(f"building the worlds with perturbation '{name}' ...")
         old = self.task
         task = self._make_task(cfg)
         task.step_graph.enabled = old.step_graph.enabled
@@ -298,34 +303,24 @@ class Session:
         if isinstance(task.terrain, RoughGround) and isinstance(old.terrain, RoughGround):
             task.terrain.levels.copy_(old.terrain.levels)
             task.terrain.columns.copy_(old.terrain.columns)
-        self._show(perturbation=name)
+        self.perturbation = name
         self._adopt(task)
-        self._tell(f"perturbation '{name}'")
+        self.message = Message(f"perturbation '{name}'")
 
     # ---- checkpoints -------------------------------------------------------------------------------------------------
 
     def _scan(self) -> None:
-        """Look for new checkpoints, and load the newest one if that is wanted."""
+        """Look for checkpoints, and load the newest one if that is wanted; a broken one is tried once."""
         self._next_scan = self._clock() + SCAN_INTERVAL
-        numbers = tuple(checkpoint_numbers(self._run_dir))
-        if numbers != self.state.checkpoints:
-            self._show(checkpoints=numbers)
-        if self.state.follows_newest and numbers and numbers[-1] != self.state.checkpoint:
-            changed = self._modified(numbers[-1])
-            if self._refused.get(numbers[-1]) != changed:
-                self._refused[numbers[-1]] = changed  # a broken one is not tried again before it changes
-                self.load_checkpoint(numbers[-1])
-
-    def _modified(self, number: int) -> float:
-        """Return when a checkpoint was last written [s]; -1 if it is gone."""
-        try:
-            return checkpoint_file(self._run_dir, number).stat().st_mtime
-        except OSError:
-            return -1.0
+        self.checkpoints = tuple(checkpoint_numbers(self._run_dir))
+        newest = max(self.checkpoints, default=-1)
+        if self.follows_newest and newest not in (self.checkpoint, self._tried):
+            self._tried = newest
+            self.load_checkpoint(newest)
 
     def _load(self, number: int) -> None:
         """Load a checkpoint into the networks and its counters into the task."""
         with torch.no_grad():
             infos = self._runner.load(str(checkpoint_file(self._run_dir, number)), {"actor": True})
         self._trained_steps = self.task.total_steps.clone()
-        self._show(checkpoint=number, trained_steps=int(infos["total_timesteps"]))
+        self.checkpoint, self.trained_steps = number, int(infos["total_timesteps"])

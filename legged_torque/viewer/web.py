@@ -5,69 +5,52 @@ from __future__ import annotations
 import html
 import threading
 import time
-from collections.abc import Sequence
-from pathlib import Path
+import traceback
+from collections.abc import Callable
 
-import numpy as np
-import viser
-
-from legged_torque.viewer.access import Guard
+from legged_torque.utils.interrupt import StopRequest
+from legged_torque.viewer.access import Guard, GuardedServer
 from legged_torque.viewer.controls import Controls
-from legged_torque.viewer.ground import Ground, drawn_model, ground_of
-from legged_torque.viewer.layers import commanded_pose
-from legged_torque.viewer.pacing import stopping_on_ctrl_c
+from legged_torque.viewer.ground import Ground, drawn_task
 from legged_torque.viewer.plots import WIDTH, Plots
 from legged_torque.viewer.ports import free_port
-from legged_torque.viewer.recording import Recording
+from legged_torque.viewer.poses import commanded_pose
+from legged_torque.viewer.recording import Recording, notify
 from legged_torque.viewer.scene import Scene
 from legged_torque.viewer.session import Session
-from legged_torque.viewer.state import SessionState
-from legged_torque.viewer.steering import Steering
 
 FRAME_INTERVAL = 1.0 / 30.0  # seconds between drawings of the robots
 PLOT_INTERVAL = 0.2  # seconds between drawings of the plots and the status
-
-
-class PrivateServer(viser.ViserServer):
-    """A server that opens no way in from the internet, which viser does for any page that asks."""
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refuse."""
-        return None
+RED, COLOR = "#e03131", (47, 125, 246)  # of errors, of controls
 
 
 class Page:
-    """Draws a session in a thread of its own, which never touches the task's tensors."""
+    """Draws a session in a thread of its own, which never touches the task's tensors.
 
-    def __init__(
-        self, session: Session, robot: Path, title: str, host: str, port: int, no_renderer: str | None = None
-    ) -> None:
-        """Serve the page at a port or the next free one.
+    If drawing fails, the error is shown on the page, and everything else goes on.
 
-        Args:
-            session: What is shown.
-            robot: Its MJCF, visual geoms included.
-            title: Of the page.
-            host: Address that is served at.
-            port: The first one to try.
-            no_renderer: Why no videos can be drawn here; None if they can.
-        """
+    Attributes:
+        guard: Decides who may use the page.
+        server: Of viser.
+        controls: The right panel.
+    """
+
+    def __init__(self, session: Session, title: str, host: str, port: int, no_renderer: str | None = None) -> None:
+        """Serve the page at a port or the next free one; ``no_renderer`` is a reason why no videos can be drawn."""
         self._session, self.guard = session, Guard(host)
-        self._steering = Steering()
-        with self.guard.at_the_door(self._steering.around):
-            self.server = PrivateServer(host, free_port(host, port), label=title, verbose=False)
-        self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 125, 246))
-        self._ground = ground_of(session.task)
-        model, geoms = drawn_model(robot, None, session.task.dof_names), session.task.asset.geom_names
-        self._scene = Scene(self.server, model, session.task.num_envs, geoms, self._ground)
-        if session.companion:
-            self._scene.name_robots(session.name, session.companion.name)
-        self.controls = Controls(self.server, session, self._scene)
-        self._plots = Plots(self.server, session)
-        self._recording = Recording(self.server, session.task, no_renderer)
-        self.server.gui.main_panel.dock_right()
-        self.server.gui.main_panel.set_width(WIDTH)
-        self._message_shown = 0
+        self.server = GuardedServer(self.guard, host, free_port(host, port), title)
+        gui, task, companion = self.server.gui, session.task, session.companion
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=COLOR)
+        model, self._ground = drawn_task(task)
+        names = (session.name, companion.name) if companion else ()
+        self._scene = Scene(self.server, model, task.num_envs, task.asset.geom_names, self._ground, names)
+        self.controls = Controls(gui, session, self._scene.view, self._ground)
+        self._plots = Plots(gui, session)
+        self._recording = Recording(self.server, session, no_renderer)
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(WIDTH)
+        self._errors: dict[str, str] = {}  # of the last drawing, by part of the page
+        self._message_shown = session.message
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
         self._thread.start()
@@ -86,73 +69,73 @@ class Page:
         self.server.stop()
 
     def _run(self) -> None:
-        """Draw until closed; plots and status less often than the robots."""
+        """Draw until closed; plots, controls and status less often than the robots."""
         next_plots = 0.0
         while not self._closed.wait(FRAME_INTERVAL):
-            state, shares = self._session.state, self._steering.take()
-            if shares:
-                self.controls.steer(shares)
-            if state.reading is not None:
-                past = list(self._session.history) or [state.reading]
-                self._recording.update(past)
-                ghost = commanded_pose(past, self._session.task.dt)
-                self._scene.update(state.reading, state.world, ghost, self._beside())
+            self._attempt("scene", self._draw_scene)
+            self._attempt("recording", self._recording.update)
             if time.perf_counter() >= next_plots:
                 next_plots = time.perf_counter() + PLOT_INTERVAL
                 with self.server.atomic():
-                    self._plots.update(state)
-                    companion = self._session.companion
-                    beside = [(companion.name, companion.state)] if companion else []
-                    self.controls.status.content = status_html(state, self._ground, beside)
-                    self.controls.update(state)
-                    self._notify(state)
+                    self._attempt("plots", self._plots.update)
+                    self._attempt("controls", self.controls.update)
+                    self._attempt("status", self._draw_status)
 
-    def _beside(self) -> np.ndarray | None:
-        """Return the positions of the companion's robot, as a row of ``sim.qpos``; None without one."""
-        companion = self._session.companion
-        reading = companion.state.reading if companion else None
-        return reading.qpos[0] if reading else None
+    def _attempt(self, part: str, draw: Callable[[], None]) -> None:
+        """Draw a part of the page; an error is shown until it has been drawn again."""
+        try:
+            draw()
+            self._errors.pop(part, None)
+        except Exception as error:
+            text = f"{part}: {type(error).__name__}: {error}"
+            if self._errors.get(part) != text:
+                self._errors[part] = text
+                traceback.print_exc()
 
-    def _notify(self, state: SessionState) -> None:
-        """Show an error as a notification on the page."""
-        if state.is_error and state.message_number != self._message_shown:
-            for client in self.server.get_clients().values():
-                client.add_notification("That did not work", state.message, color="red", auto_close_seconds=10)
-        self._message_shown = state.message_number
+    def _draw_scene(self) -> None:
+        """Draw the robots."""
+        session, snapshot = self._session, self._session.snapshot
+        if snapshot:
+            companion = session.companion.snapshot if session.companion else None
+            ghost = commanded_pose(list(session.history) or [snapshot], session.task.dt)
+            self._scene.update(snapshot, session.world, ghost, companion.qpos[0] if companion else None)
+
+    def _draw_status(self) -> None:
+        """Write the status, and show a new error of the session as a notification, too."""
+        message = self._session.message
+        self.controls.status.content = status_html(self._session, self._ground, list(self._errors.values()))
+        if message.is_error and message is not self._message_shown:
+            notify(self.server, "That did not work", message.text)
+        self._message_shown = message
 
 
-def status_html(
-    state: SessionState, ground: Ground | None = None, beside: Sequence[tuple[str, SessionState]] = ()
-) -> str:
-    """Return the status line by line: checkpoint, time, tile of the followed robot on rough ground, last message.
-
-    ``beside`` are names and states of companions, with a line each.
-    """
-    running = "paused" if state.is_paused else f"{state.real_time:.2f} x real time"
-    color = "#e03131" if state.is_error else "inherit"
+def status_html(session: Session, ground: Ground | None, errors: list[str]) -> str:
+    """Return the status line by line: checkpoint, time, companion, tile on rough ground, errors, last message."""
+    running = "paused" if session.is_paused else f"{session.real_time:.2f} x real time"
     lines = [
-        f"<b>model_{state.checkpoint}</b>, after {state.trained_steps / 1e6:,.1f} million steps",
-        f"{state.time:.1f} s simulated, {running}, {state.falls} falls",
-        *(
-            f"beside: <b>{html.escape(name)}</b>, model_{other.checkpoint}, {other.falls} falls"
-            for name, other in beside
-        ),
-        *([ground.tile_text(*state.reading.tile.astype(int))] if ground and state.reading else []),
-        f'<span style="color:{color}">{html.escape(state.message) or "&nbsp;"}</span>',
+        f"<b>model_{session.checkpoint}</b>, after {session.trained_steps / 1e6:,.1f} million steps",
+        f"{session.sim_time:.1f} s simulated, {running}, {session.falls} falls",
     ]
+    if other := session.companion:
+        lines.append(f"companion: <b>{html.escape(other.name)}</b>, model_{other.checkpoint}, {other.falls} falls")
+    if ground and session.snapshot and session.snapshot.tile:
+        lines.append(ground.tile_text(*session.snapshot.tile))
+    lines += [f'<span style="color:{RED}">{html.escape(error)}</span>' for error in errors]
+    color = RED if session.message.is_error else "inherit"
+    lines.append(f'<span style="color:{color}">{html.escape(session.message.text) or "&nbsp;"}</span>')
     return f'<div style="font-size:13px;line-height:1.5;padding:4px 12px">{"<br>".join(lines)}</div>'
 
 
-def watch(session: Session, robot: Path, title: str, host: str, port: int, no_renderer: str | None = None) -> None:
+def watch(session: Session, title: str, host: str, port: int, no_renderer: str | None = None) -> None:
     """Serve a :class:`Page` and step until Ctrl-C."""
-    page = Page(session, robot, title, host, port, no_renderer)
+    page = Page(session, title, host, port, no_renderer)
     if page.server.get_port() != port:
         print(f"Port {port} is taken.")
     if page.guard.token:
         print("Warning: other machines reach this page, unencrypted; whoever has its address can steer the robots.")
     print(f"See it walk: {page.url} (Ctrl-C ends)", flush=True)
     try:
-        with stopping_on_ctrl_c(session.stop):
+        with StopRequest(lambda text: session.stop()):
             session.run()
     finally:
         page.close()

@@ -6,8 +6,8 @@ import copy
 from typing import Any
 
 from legged_torque.envs import task_registry
-from legged_torque.learning.pretrained import check_spaces, pretrained_file, start_from
 from legged_torque.paper.gravity.dynamics import RobotDynamics
+from legged_torque.paper.gravity.pretrained import check_spaces, pretrained_file, start_from
 from legged_torque.paper.gravity.pretraining import act_by_controller, act_by_policy, make_controller
 from legged_torque.paper.gravity.standing import measure_standing, place_on_ground, use_standing_trials
 from legged_torque.utils.cli import script_command

@@ -26,7 +26,7 @@ from legged_torque.paper.report.style import name_of
 from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
 from legged_torque.paper.values import ENVIRONMENTS, PAPER_METRICS, TABLE_I
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.paths import portable_path, without_machine
+from legged_torque.utils.files import portable_path, without_machine
 
 MEDIA_TYPES = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
 VIDEOS = [".gif", ".mp4", ".webm"]

@@ -4,12 +4,13 @@ import dataclasses
 import re
 import shutil
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 import yaml
-from support.exports import TRAINING, export_random
+from support.exports import TRAINING, change, export_random
 from support.scripts import SMALL, assert_told_in_one_line, run_here
 from support.settings import TASKS, error_of, torques_in_torch
 
@@ -229,6 +230,59 @@ def test_terms_of_a_user(make_task, tmp_path, monkeypatch, name):
     assert Policy(tmp_path / "out").act(np.zeros(45 + 7 * (method == "observation_terms"))).shape == (12,)
     monkeypatch.undo()
     assert error_of(Policy, tmp_path / "out") == f"'{tmp_path / 'out'}': {problem}"
+
+
+RAYS = {"name": "rays", "scale": 0.5, "unit": "m", "frame": "trunk", "meaning": "three rays", "group": "rays"}
+
+
+def test_groups_of_the_actor(make_task, tmp_path, monkeypatch):
+    """An actor that also reads a group of its own: its term comes last and has no history, in the file and in numpy."""
+    robot, groups = task_registry.get_task_class("a1_position"), ["policy", "rays"]
+    own_terms, changes = robot.observation_terms, {"env.history_length": 2, "commands.resampling_probability": 1.0}
+
+    def terms_with_rays(task):
+        return [*own_terms(task), ObservationTerm(value=lambda: task.dof_pos[:, :3] + 0.2, mirror=None, **RAYS)]
+
+    monkeypatch.setattr(robot, "observation_terms", terms_with_rays)
+    export_random(make_task, "a1_position", tmp_path / "out", True, False, groups, **changes)
+    description = read_yaml(tmp_path / "out")
+    assert description["unsupported"][0].startswith("no numpy function for the observation term 'rays'; there are")
+    assert description["network"]["num_observations"] == 2 * 45 + 3
+    assert description["observations"]["terms"][-1] == RAYS | {"size": 3, "clip": [-100.0, 100.0]}
+    change("observations.terms.0.group", "rays")(description)
+    assert "the terms of further groups must come after those without a group" in error_of(check, description)
+    for offset, is_right in ((0.1, False), (0.2, True)):
+        rays = lambda policy, state, command, offset=offset: state.joint_positions[:3] + offset  # noqa: E731
+        monkeypatch.setitem(OBSERVATIONS, "rays", rays)
+        task, model = export_random(make_task, "a1_position", tmp_path / "out", True, is_right, groups, **changes)
+        if not is_right:
+            assert "observations of LeggedRobot differ by 0.05" in read_yaml(tmp_path / "out")["unsupported"][0]
+    policy, scripted, obs = Policy(tmp_path / "out"), torch.jit.load(str(tmp_path / "out" / "policy.pt")), task.reset()
+    for _ in range(3):
+        seen = policy.observation(measured(task, 1), task.commands[1].numpy())
+        np.testing.assert_allclose(seen, torch.cat([obs["policy"], obs["rays"]], dim=1)[1], rtol=1e-5, atol=1e-5)
+        with torch.inference_mode():
+            actions = model(obs)
+            np.testing.assert_allclose(scripted(torch.from_numpy(seen)[None])[0], actions[1], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(policy.act(seen), actions[1], rtol=1e-5, atol=1e-5)
+        obs = task.step(actions)[0]
+        assert not task.reset_buf[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"obs_groups": ["critic"]}, "must be 'policy', then groups of single terms (here none), not critic"),
+        ({"obs_groups": ["policy", "critic"]}, "(here none), not policy, critic"),
+        ({"obs_groups_2d": ["camera", "depth"]}, "policies that see images cannot be exported: camera, depth"),
+        ({"is_recurrent": True}, "only policies without memory can be exported"),
+    ],
+)
+def test_networks_that_are_not_exported(make_task, tmp_path, change, message):
+    """Networks with memory, and what a robot cannot feed them, are refused by name before anything is written."""
+    model = SimpleNamespace(**{"is_recurrent": False, "obs_groups": ["policy"], **change})
+    line = error_of(export_policy, make_task("a1_position", 3), model, tmp_path / "out", "a1_position", TRAINING)
+    assert message in line and not list(tmp_path.iterdir())
 
 
 def test_motors_of_a_user(tmp_path):

@@ -5,7 +5,6 @@ import math
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -16,7 +15,7 @@ from support.scripts import assert_told_in_one_line, run_here
 
 from legged_torque.deploy.description import check
 from legged_torque.deploy.robot import MujocoRobot
-from legged_torque.deploy.simulation import Events, Simulation, quaternion
+from legged_torque.deploy.simulation import Simulation, quaternion
 from legged_torque.viewer import video
 
 
@@ -183,7 +182,7 @@ def test_standing_robot(policy):
 def test_random_numbers(policy):
     """A robot's walk depends on its seed alone, and commands are drawn from their ranges or fixed."""
     robot = MujocoRobot(XML, policy.description)
-    simulation = Simulation(policy, robot, Events(push_velocity=1.0, push_probability=0.1))
+    simulation = Simulation(policy, robot, push_velocity=1.0, push_probability=0.1)
     runs = [simulation.run(30, seed) for seed in ([1, 0], [1, 1], [1, 0])]
     np.testing.assert_array_equal(runs[0], runs[2])
     assert not np.array_equal(runs[0], runs[1])
@@ -194,7 +193,7 @@ def test_random_numbers(policy):
     low, high = np.min(drawn, axis=0), np.max(drawn, axis=0)
     assert (low[:3] > -1).all() and (low[:3] < -0.9).all() and (high[:3] < 1).all() and (high[:3] > 0.9).all()
     assert (low[3:] < 0.7).all() and (low[3:] > 0.499).all() and (high[3:] > 1.4).all() and (high[3:] < 1.501).all()
-    simulation = Simulation(policy, robot, Events(command=(0.5, 0.0, -0.2)))
+    simulation = Simulation(policy, robot, command=(0.5, 0.0, -0.2))
     simulation.run(3, 1)
     assert simulation.command.tolist() == [0.5, 0.0, -0.2]
 
@@ -205,16 +204,14 @@ def test_torques_are_refreshed(policy, monkeypatch, refresh, computed):
     calls, own = [], policy.torques
     monkeypatch.setattr(policy, "torques", lambda *values: calls.append(values) or own(*values))
     monkeypatch.setitem(policy.description["timing"], "refresh_torques", refresh)
-    Simulation(policy, MujocoRobot(XML, policy.description), Events()).run(1, 1)
+    Simulation(policy, MujocoRobot(XML, policy.description)).run(1, 1)
     assert len(calls) == computed
 
 
-def test_recorder(policy, monkeypatch):
+def test_recorder(policy):
     """A video shows the states, commands and velocities that the robot has had."""
-    saved, seen = [], []
-    monkeypatch.setattr(video, "write_video", lambda *args: saved.append(args))
-    robot = MujocoRobot(XML, policy.description)
-    simulation = Simulation(policy, robot, Events(command=(0.5, -0.1, 0.2)))
+    seen, robot = [], MujocoRobot(XML, policy.description)
+    simulation = Simulation(policy, robot, command=(0.5, -0.1, 0.2))
     recorder = video.SimulationRecorder(simulation)
 
     def on_step():
@@ -223,11 +220,8 @@ def test_recorder(policy, monkeypatch):
         seen.append((robot.data.qpos.tolist(), [0.5, -0.1, 0.2], velocity))
 
     simulation.run(3, 1, on_step)
-    recorder.save(Path("out.mp4"), None)
-    ((file, model, trunk, steps, control_step, ground),) = saved
-    assert ground is None, "a plane"
-    assert (file, model, control_step) == (Path("out.mp4"), robot.model, 0.02) and model.body(trunk).name == "trunk"
-    assert [(m.qpos.tolist(), m.command.tolist(), m.velocity.tolist()) for (m,) in steps] == seen
+    assert recorder.model is robot.model and robot.model.body(recorder.trunk).name == "trunk"
+    assert [(m.qpos.tolist(), m.command.tolist(), m.velocity.tolist()) for (m,) in recorder.steps] == seen
 
 
 @pytest.mark.parametrize("factor", [None, 1.1, 1.5])
@@ -241,7 +235,7 @@ def test_pushes(policy, monkeypatch, factor):
     monkeypatch.setattr(policy, "description", others | pushes)
     check(policy.description)
     robot = MujocoRobot(XML, policy.description)
-    simulation = Simulation(policy, robot, Events(push_velocity=0.5, push_probability=1.0))
+    simulation = Simulation(policy, robot, push_velocity=0.5, push_probability=1.0)
     assert len(simulation.notes) == (factor is None) and all("pushes.set_factor" in note for note in simulation.notes)
     simulation.run(1, 1)
     after = np.empty((1000, 3))
@@ -259,7 +253,7 @@ def test_pushes(policy, monkeypatch, factor):
 def test_episodes_end(policy):
     """After 20 s, or with the trunk on the ground, an episode starts anew; such steps count only as falls."""
     robot = MujocoRobot(XML, policy.description)
-    simulation = Simulation(policy, robot, Events())
+    simulation = Simulation(policy, robot)
     assert simulation._max_steps == 1000
     simulation.run(0, 1)
     robot.reset(*random_state(1, height=0.03))

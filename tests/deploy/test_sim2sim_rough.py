@@ -14,16 +14,14 @@ from support.ground import ground_cfg
 from support.scripts import assert_told_in_one_line, run_here
 from support.settings import error_of, flatten
 
-from legged_torque.deploy import hfield_contacts
+from legged_torque.deploy import ground
 from legged_torque.deploy.description import check
-from legged_torque.deploy.ground import select_ground
 from legged_torque.deploy.policy import Policy, State
 from legged_torque.deploy.robot import MujocoRobot
-from legged_torque.deploy.simulation import Events, Simulation, quaternion
+from legged_torque.deploy.simulation import Simulation, quaternion
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.height_map import HeightMap
-from legged_torque.terrain.hfield import add_hfield
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.config import to_dict
 
@@ -108,7 +106,7 @@ def test_heights_are_needed(policy):
 def test_motion_is_the_task_s(exported, policy, robot):
     """From the task's states, the policy acts as in the task, and the robot moves as there and lands as there."""
     _, task, model = exported
-    simulation = Simulation(policy, robot, Events())
+    simulation = Simulation(policy, robot)
     simulation.run(0, 1)
     for world in range(task.num_envs):
         task.reset()
@@ -143,7 +141,7 @@ def test_motion_is_the_task_s(exported, policy, robot):
 def test_level_map_is_a_plane(policy):
     """A robot that falls onto a level map, feet sinking in deep, moves as on a plane; with MuJoCo's contacts not."""
     description = copy.deepcopy(policy.description)
-    select_ground(description, A1Cfg().terrain, ["flat"], [0.0])
+    ground.select_ground(description, A1Cfg().terrain, ["flat"], [0.0])
     on_map, untouched = MujocoRobot(XML, description), MujocoRobot(XML, description, contacts="mujoco")
     assert [len(robot.notes) for robot in (on_map, untouched)] == [1, 1]
     assert "not tested independently" in on_map.notes[0] and "MuJoCo's own" in untouched.notes[0]
@@ -167,14 +165,14 @@ def test_slope_is_a_tilted_plane():
     scene = "<mujoco><option timestep='0.002'/><worldbody>{}</worldbody></mujoco>"
     ball = '<geom type="sphere" size="0.02" mass="0.3" friction="0.3" solref="-1000 -80"/>'
     body = f'<body pos="-0.3 -0.2 0.2"><freejoint/>{ball}</body>'
-    ground = '<geom name="floor" type="plane" size="0 0 0.05" solref="-1000 -80" zaxis="0.3 0.2 1"/>'
-    specs = [mujoco.MjSpec.from_string(scene.format(ground + body)) for _ in range(2)]
+    plane = '<geom name="floor" type="plane" size="0 0 0.05" solref="-1000 -80" zaxis="0.3 0.2 1"/>'
+    specs = [mujoco.MjSpec.from_string(scene.format(plane + body)) for _ in range(2)]
     places = np.arange(-20, 21) * 0.05
-    add_hfield(specs[0], HeightGrid(-0.3 * places[:, None] - 0.2 * places, 0.05, (-1.0, -1.0)), "floor")
+    HeightGrid(-0.3 * places[:, None] - 0.2 * places, 0.05, (-1.0, -1.0)).add_to(specs[0], "floor")
     models = [spec.compile() for spec in specs]
     on_map, on_plane = (mujoco.MjData(model) for model in models)
     for _ in range(400):
-        hfield_contacts.step(models[0], on_map)
+        ground.step(models[0], on_map)
         mujoco.mj_step(models[1], on_plane)
     np.testing.assert_allclose(on_map.qpos[:3], on_plane.qpos[:3], atol=1e-5)
     assert on_plane.qpos[0] > 0.2 and on_plane.ncon == 1
@@ -185,7 +183,7 @@ def test_slope_is_a_tilted_plane():
 
 def test_episodes_start_on_tiles(policy, robot):
     """Every robot has a tile for all of its episodes, any of them; one that leaves the map has fallen."""
-    simulation, tiles, places = Simulation(policy, robot, Events()), [], []
+    simulation, tiles, places = Simulation(policy, robot), [], []
     for seed in range(40):
         simulation.run(0, seed)
         for _ in range(2):
@@ -208,7 +206,7 @@ def test_episodes_start_on_tiles(policy, robot):
 
 def test_headings(policy, robot):
     """Yaw rates turn to a heading the shorter way, half of what is left per second, within their range."""
-    simulation = Simulation(policy, robot, Events())
+    simulation = Simulation(policy, robot)
     simulation.run(0, 1)
     for heading, angle, rate in ((3.0, -3.0, -0.5 * (2 * math.pi - 6.0)), (1.0, 0.2, 0.4), (0.0, 3.0, -1.0)):
         robot.reset(np.zeros(3), quaternion(0.1, 0.0, angle), policy.nominal_pose, STILL)
@@ -218,14 +216,14 @@ def test_headings(policy, robot):
     robot.reset(robot.origins[0] + [0.0, 0.0, 0.4], quaternion(0, 0, 0), policy.nominal_pose, STILL)
     robot.velocity[0] = 0.25
     assert simulation._finish_step(np.array([0.5, 0.0, 0.3]))[1] == 0.5, "tracking does not count the yaw rate"
-    fixed = Simulation(policy, robot, Events(command=(0.5, 0.0, -0.2)))
+    fixed = Simulation(policy, robot, command=(0.5, 0.0, -0.2))
     fixed.run(2, 1)
     assert fixed.command.tolist() == [0.5, 0.0, -0.2]
 
 
 def test_height_is_above_the_ground(policy, robot):
     """The metric is the trunk's height above the ground below it, wherever that is."""
-    simulation = Simulation(policy, robot, Events())
+    simulation = Simulation(policy, robot)
     for seed in range(3):
         steps, *_, height, _, falls = simulation.run(60, seed)
         assert (steps, falls) == (60.0, 0.0) and 0.25 < height / steps < 0.35
@@ -239,7 +237,7 @@ def test_chosen_kinds(policy):
     """Tiles of other kinds at other difficulties take the place of those of the training, and of a plane."""
     description = copy.deepcopy(policy.description)
     for trained in (description["terrain"], None):
-        select_ground(description, A1Cfg().terrain, ["pits", "flat"], [0.6, 0.25])
+        ground.select_ground(description, A1Cfg().terrain, ["pits", "flat"], [0.6, 0.25])
         heights = MujocoRobot(XML, description).origins[:, 2].astype(float)
         depths, counts = np.unique(heights.round(6), return_counts=True)
         assert depths.tolist() == [-0.6, -0.25, 0.0] and counts.tolist() == [4, 4, 8]

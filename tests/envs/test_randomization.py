@@ -10,7 +10,7 @@ import torch
 from support.settings import error_of, get_cfgs
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.envs.randomization_picture import initial_state
+from legged_torque.paper.randomization_picture import initial_state
 from legged_torque.sim.randomization import Randomization, RandomParameter, changes_legs
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError

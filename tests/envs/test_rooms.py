@@ -11,7 +11,7 @@ from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.motors.joints import by_joint
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.terrain import TERRAINS
-from legged_torque.terrain.plane import Plane
+from legged_torque.terrain.terrain import Plane
 from legged_torque.utils.mirroring import SCALAR
 
 LEGS = ("FR", "FL", "RR", "RL")

@@ -3,7 +3,6 @@
 import copy
 from pathlib import Path
 
-import pytest
 import torch
 from rsl_rl.modules import MLP
 from rsl_rl.utils.logger import Logger
@@ -255,7 +254,6 @@ class A1TDCfgPPO(A1CfgPPO):
         class_name = f"{__name__}:TDLearner"
 
 
-@pytest.mark.xfail(not hasattr(LeggedRobot, "keep_final_observations"), reason="step() does not keep them", strict=True)
 def test_it_learns_in_a_task_of_the_package(tmp_path):
     """Named by a registered task, it is trained, evaluated, saved and loaded like PPO."""
     registry = TaskRegistry()

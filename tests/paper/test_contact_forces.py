@@ -22,7 +22,7 @@ def grasp_matrix(points):
     return torch.cat([axes, moments], dim=3).permute(0, 3, 1, 2).flatten(2)
 
 
-def random_problems(count=300, dtype=torch.float64):
+def random_problems(count=300):
     """Feet around a trunk, wrenches and reference forces that many of them cannot bear, and any contact state."""
     generator = torch.Generator().manual_seed(0)
     feet = torch.tensor([[0.2, -0.13, -0.3], [0.2, 0.13, -0.3], [-0.2, -0.13, -0.3], [-0.2, 0.13, -0.3]])
@@ -32,32 +32,35 @@ def random_problems(count=300, dtype=torch.float64):
     )
     reference = torch.tensor([0.0, 0.0, 30.0]) + 40.0 * torch.randn(count, 4, 3, generator=generator)
     mask = torch.rand(count, 4, generator=generator) < 0.75
-    return grasp_matrix(points.to(dtype)), wrench.to(dtype), reference.to(dtype), mask
+    return grasp_matrix(points.double()), wrench.double(), reference.double(), mask
 
 
-def cost_and_gradient(problem, forces, regularization):
+def cost_and_gradient(problem, forces):
     """The documented objective of each problem, halved, and its gradient by the forces, masked ones left out."""
     grasp, wrench, reference, mask = (part.numpy().astype(float) for part in problem)
     forces = forces.numpy().astype(float)
     weights = np.array([1.0, 1.0, 1.0, ARM**-2, ARM**-2, ARM**-2])
     error = np.einsum("nij,nj->ni", grasp, (forces * mask[..., None]).reshape(len(forces), -1)) - wrench
     deviation = (forces - reference) * mask[..., None]
-    cost = 0.5 * (weights * error**2).sum(1) + 0.5 * regularization * (deviation**2).sum((1, 2))
-    gradient = np.einsum("nij,ni->nj", grasp, weights * error).reshape(forces.shape) + regularization * deviation
+    cost = 0.5 * (weights * error**2).sum(1) + 0.5 * REGULARIZATION * (deviation**2).sum((1, 2))
+    gradient = np.einsum("nij,ni->nj", grasp, weights * error).reshape(forces.shape) + REGULARIZATION * deviation
     return cost, gradient * mask[..., None]
 
 
-def above_optimum(gradient, forces, mask, limits):
+def above_optimum(gradient, forces, mask):
     """The most by which a convex cost can be above its minimum: over the corners of each contact's allowed forces."""
-    mu = limits.friction
+    mu = LIMITS.friction
     sides = np.array([[mu, 0, 1], [-mu, 0, 1], [0, mu, 1], [0, -mu, 1]])
-    corners = np.concatenate([limits.lowest * sides, limits.highest * sides])
+    corners = np.concatenate([LIMITS.lowest * sides, LIMITS.highest * sides])
     least = (gradient @ corners.T).min(axis=2)
     return (((gradient * forces.numpy()).sum(2) - least) * mask.numpy()).sum(1)
 
 
 def test_forces_are_allowed_and_optimal():
-    """Inside pyramids and limits, exactly zero where nothing touches, and no allowed forces cost less."""
+    """Inside pyramids and limits, exactly zero where nothing touches, and no allowed forces cost less.
+
+    With the controller's precision and iterations, forces are worse than these by no more than 3 N.
+    """
     problem = random_problems()
     mask = problem[3]
     forces, residual = ForceDistribution(LIMITS, ARM, REGULARIZATION, "cpu", torch.float64)(*problem, CONVERGED)
@@ -71,24 +74,12 @@ def test_forces_are_allowed_and_optimal():
         normal > 0.999 * LIMITS.highest,
     ):
         assert at_limit.sum() > 10  # every kind of limit matters in these problems
-    cost, gradient = cost_and_gradient(problem, forces, REGULARIZATION)
-    assert (above_optimum(gradient, forces, mask, LIMITS) <= 1e-6 * cost + 1e-6).all()
+    cost, gradient = cost_and_gradient(problem, forces)
+    assert (above_optimum(gradient, forces, mask) <= 1e-6 * cost + 1e-6).all()
     given = (problem[0] @ (forces * mask.unsqueeze(2)).flatten(1).unsqueeze(2)).squeeze(2)
     torch.testing.assert_close(residual, given - problem[1], rtol=0, atol=1e-9)
-
-
-def test_forces_within_all_limits_stay():
-    """Forces that give the wrench and that the contacts can bear are not changed (eq. 10)."""
-    grasp, _, _, mask = random_problems()
-    generator = torch.Generator().manual_seed(1)
-    normal = 20.0 + 100.0 * torch.rand(len(mask), 4, 1, generator=generator)
-    tangential = 0.25 * normal * (2.0 * torch.rand(len(mask), 4, 2, generator=generator) - 1.0)
-    reference = torch.where(mask.unsqueeze(2), torch.cat([tangential, normal], dim=2), 0.0).double()
-    wrench = (grasp @ reference.flatten(1).unsqueeze(2)).squeeze(2)
-    solve = ForceDistribution(LIMITS, ARM, REGULARIZATION, "cpu", torch.float64)
-    forces, residual = solve(grasp, wrench, reference, mask, CONVERGED)
-    torch.testing.assert_close(forces, reference, rtol=0, atol=1e-3)
-    torch.testing.assert_close(residual, torch.zeros_like(residual), rtol=0, atol=1e-3)
+    single, _ = ForceDistribution(LIMITS, ARM, REGULARIZATION, "cpu")(*(part.float() for part in problem[:3]), mask)
+    assert (cost_and_gradient(problem, single)[0] - cost <= 0.5 * 3.0**2).all()
 
 
 @pytest.mark.parametrize(
@@ -101,7 +92,7 @@ def test_forces_within_all_limits_stay():
     ],
 )
 def test_one_contact_by_hand(wanted, expected):
-    """A contact right under the trunk gives the nearest allowed force."""
+    """A contact at the trunk's origin gives the nearest allowed force."""
     grasp = grasp_matrix(torch.tensor([[[0.0, 0.0, 0.0]]], dtype=torch.float64))
     wrench = torch.tensor([[*wanted, 0.0, 0.0, 0.0]], dtype=torch.float64)
     solve = ForceDistribution(LIMITS, ARM, 1e-9, "cpu", torch.float64)
@@ -109,18 +100,6 @@ def test_one_contact_by_hand(wanted, expected):
     forces, residual = solve(grasp, wrench, torch.zeros(1, 1, 3, dtype=torch.float64), mask, CONVERGED)
     np.testing.assert_allclose(forces[0, 0], expected, rtol=0, atol=1e-3)
     np.testing.assert_allclose(residual[0, :3], np.array(expected) - wanted, rtol=0, atol=1e-3)
-
-
-def test_single_precision_suffices():
-    """With the controller's precision and iterations, forces are worse than the best ones by no more than 3 N."""
-    problem = random_problems()
-    exact, _ = ForceDistribution(LIMITS, ARM, REGULARIZATION, "cpu", torch.float64)(*problem, CONVERGED)
-    single = tuple(part.float() for part in problem[:3])
-    forces, _ = ForceDistribution(LIMITS, ARM, REGULARIZATION, "cpu")(*single, problem[3])
-    lowest, _ = cost_and_gradient(problem, exact, REGULARIZATION)
-    cost, _ = cost_and_gradient(problem, forces, REGULARIZATION)
-    assert torch.isfinite(forces).all()
-    assert (cost - lowest <= 0.5 * 3.0**2).all()
 
 
 @pytest.mark.parametrize("limits", [(0.0, 0.0, 100.0), (0.5, -1.0, 100.0), (0.5, 10.0, 10.0)])

@@ -8,8 +8,8 @@ from support.rollouts import make_ppo, record_rollout, shift_policy, state_of
 from support.scripts import assert_told_in_one_line, contents, run_here
 from support.settings import error_of, get_cfgs
 
-from legged_torque.learning.pretrained import check_making, check_spaces, read_pretrained
 from legged_torque.paper.gravity import pretraining as gravity_pretraining
+from legged_torque.paper.gravity.pretrained import check_making, check_spaces, read_pretrained
 
 
 @pytest.fixture(scope="module")
@@ -56,9 +56,12 @@ def same(network, other):
 
 
 def test_a_policy_is_found_or_made(made, trained):
-    """Training starts from the file if there is one and else makes it, with the same result whatever its own seed."""
+    """Training starts from the file if there is one and else makes it, with the same result whatever its own seed.
+
+    Random numbers of a training are the same whether it had to make its policy or found one.
+    """
     root, file, _, _ = made
-    other, (found, _), (made_here, _) = trained
+    other, (found, found_files), (made_here, made_files) = trained
     assert f"Starting from the pre-trained policy '{file.relative_to(root)}'." in found
     assert "making it" not in found and "Round" not in found
     assert f"There is no pre-trained policy '{other}' yet; making it." in made_here
@@ -67,14 +70,8 @@ def test_a_policy_is_found_or_made(made, trained):
     for network in networks:
         network.pop(STD)
     assert same(*networks)
-
-
-def test_making_leaves_the_training_as_it_is(trained):
-    """Random numbers of a training are the same whether it had to make its policy or found one."""
-    _, (_, found), (_, made_here) = trained
-    infos = [torch.load(files[0], weights_only=True)["infos"] for files in (found, made_here)]
+    infos = [torch.load(files[0], weights_only=True)["infos"] for files in (found_files, made_files)]
     assert torch.equal(*(info["random_states"][0]["cpu"] for info in infos))
-    assert [info["total_timesteps"] for info in infos] == [16 * 8] * 2
 
 
 def test_first_iterations_train_the_critic_alone(made, trained):
@@ -114,9 +111,10 @@ def test_a_resumed_training_has_its_policy(trained, tmp_path):
 
 
 def test_what_does_not_fit_is_refused(made):
-    """The first setting that differs is named, with both values; nothing is trained."""
+    """The first setting that differs is named, with both values, also those of its making; nothing is trained."""
     root, file, _, _ = made
-    words, before = [*SMALL, f"--task={TASK}", "--max_iterations=1"], contents(root)
+    same = words_of(**FEW, num_configurations=CONFIGURATIONS, num_steps=STEPS)
+    before = contents(root)
     for setting, message in {
         "control.torque_scale=5": "its control.torque_scale is 8.0, here it is 5.0",
         "env.history_length=2": "its env.history_length is 1, here it is 2",
@@ -124,27 +122,16 @@ def test_what_does_not_fit_is_refused(made):
         "actor.hidden_dims=[64]": "its actor.hidden_dims is [512, 256, 128], here it is [64]",
         "actor.activation=relu": "its actor.activation is 'elu', here it is 'relu'",
         "obs_groups.actor=[critic]": "its obs_groups.actor is ['policy'], here it is ['critic']",
+        "pretraining.max_residual=2.5": "was made with pretraining.max_residual 3.0, here it is 2.5: remove the file",
     }.items():
-        result = run_here("train.py", *words, f"--set={setting}", root=root)
+        words = [*SMALL, f"--task={TASK}", "--max_iterations=1", *same, f"--set={setting}"]
+        result = run_here("train.py", *words, root=root)
         assert_told_in_one_line(result, message)
         assert f"'{file.relative_to(root)}'" in result[2]
     assert contents(root) == before
     check_spaces(file, *get_cfgs(task="a1_torque"))  # another task with the same spaces may use it
-
-
-def test_one_made_with_other_settings_is_refused(made):
-    """The settings of its making are compared, but not those of a training that starts from it."""
-    root, file, _, _ = made
-    same = words_of(**FEW, num_configurations=CONFIGURATIONS, num_steps=STEPS)
-    words, before = [*SMALL, f"--task={TASK}", "--max_iterations=1"], contents(root)
-    result = run_here("train.py", *words, *same, "--set=pretraining.max_residual=2.5", root=root)
-    assert_told_in_one_line(result, "was made with pretraining.max_residual 3.0, here it is 2.5: remove the file")
-    assert "or take it as it is with --set pretraining.max_residual=3.0" in result[2] and contents(root) == before
-    result = run_here("train.py", *words, root=root)
-    assert_told_in_one_line(result, f"was made with pretraining.num_configurations {CONFIGURATIONS}, here it is 20000")
-    assert contents(root) == before
     _, train_cfg = get_cfgs(*same, *words_of(critic_warmup_iterations=3, file="x.pt"), task=TASK)
-    check_making(file, train_cfg)
+    check_making(file, train_cfg)  # settings of a training that starts from it
 
 
 @pytest.mark.parametrize("content", ["text", "half", "other", "missing"])
@@ -160,13 +147,6 @@ def test_broken_file(made, content, tmp_path):
     assert f"'{file}' is not {expected}" in error_of(read_pretrained, file)
 
 
-def test_a_task_without_pretraining(tmp_path):
-    """There is nothing to make for it, and nothing is left behind."""
-    result = run_here("pretrain_gravity.py", "--device=cpu", "--task=a1_torque", root=tmp_path)
-    assert_told_in_one_line(result, "task 'a1_torque' has no pre-training")
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
@@ -174,15 +154,16 @@ def test_a_task_without_pretraining(tmp_path):
         ("max_residual=-1", "pretraining.max_residual must be greater than 0, not -1"),
         ("num_configurations=3", "pretraining.num_rounds is 4, more than there are configurations"),
         ("held_out=0", "pretraining.held_out must be between 0 and 1, not 0"),
-        ("held_out=1", "pretraining.held_out must be between 0 and 1, not 1"),
         ("controller.nonsense=1", "unknown config key 'pretraining.controller.nonsense'"),
     ],
 )
 def test_settings_that_make_no_sense(setting, message, tmp_path):
-    """They are refused by their names before anything is made."""
+    """They are refused by their names before anything is made, and so is a task without pre-training."""
     few = words_of(num_configurations=8, num_steps=1, num_epochs=1, held_out=0.5)  # soon over if it were not refused
     result = run_here("pretrain_gravity.py", *SMALL, *few, f"--set=pretraining.{setting}", root=tmp_path)
     assert_told_in_one_line(result, message)
+    result = run_here("pretrain_gravity.py", "--device=cpu", "--task=a1_torque", root=tmp_path)
+    assert_told_in_one_line(result, "task 'a1_torque' has no pre-training")
     assert not list(tmp_path.iterdir())
 
 
@@ -190,7 +171,8 @@ def test_critic_warmup():
     """While only the critic learns, it learns as ever; policy and learning rate stay. Then they move."""
     warm, usual = (make_ppo(schedule="adaptive", desired_kl=1e-3) for _ in range(2))
     before = state_of(warm)
-    warm.learn_actor(False)
+    warm.warm_up_iterations = 1
+    warm.set_progress(0, 2)
     usual.schedule = "fixed"
     for alg in (warm, usual):
         record_rollout(alg)
@@ -202,7 +184,7 @@ def test_critic_warmup():
     for key, value in before.items():
         torch.testing.assert_close(learned[key], other[key] if key.startswith("critic") else value)
         assert not key.startswith("critic") or not torch.equal(learned[key], value)
-    warm.learn_actor(True)
+    warm.set_progress(1, 2)
     record_rollout(warm)
     shift_policy(warm, 0.2)
     shifted = state_of(warm)

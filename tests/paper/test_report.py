@@ -1,7 +1,6 @@
 """Reports: tables, figures, Markdown, and a page that is whole, escaped, and refers to nothing outside of it."""
 
 import base64
-import copy
 import csv
 import gzip
 import io
@@ -12,7 +11,6 @@ import pandas as pd
 import pytest
 import yaml
 from support.reports import (
-    HEADER,
     SETTINGS,
     Page,
     line,
@@ -22,6 +20,7 @@ from support.reports import (
     write_grounds,
     write_part,
     write_result,
+    write_rows,
 )
 
 from legged_torque.experiments.times import Times, write_times
@@ -30,9 +29,10 @@ from legged_torque.paper.report.evaluations import METRIC_NAMES
 from legged_torque.paper.report.experiment import read_experiment
 from legged_torque.paper.report.figures_curves import draw_curves, smoothed
 from legged_torque.paper.report.report import fenced, markdown_table, to_html
-from legged_torque.paper.report.tables import holm, welch
+from legged_torque.paper.report.tables import welch
 
 EVIL = "</code></pre><script>alert(1)</script> <img src=http://evil.example/x.png> & `x` | **y** ![z](/etc/passwd)"
+NAMES = ["Figure 3", "Figure 3 over seconds", "Figure 5a", "Figure 5b", "Figure 6", "Figure 7"]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -50,23 +50,49 @@ def rows_of(content):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """An experiment: position complete, torque with one seed, unfinished, and multihead not begun."""
+    """An experiment with hostile texts: position complete, torque with one seed, unfinished, multihead not begun."""
     folder = tmp_path_factory.mktemp("experiment") / "paper"
     write_experiment(folder)
+    (folder / "experiment.yaml").write_text(f"# {EVIL}\n# ```\n" + (folder / "experiment.yaml").read_text())
+    settings = {
+        task: {"device_name": f"GPU {EVIL}", "env": SETTINGS["env"] | {"control": {"what": task, "same": EVIL}}}
+        for task in ("a1_position", "a1_torque")
+    }
     for seed, tracking in ((1, 0.7), (2, 0.8)):
-        for environment, other, loss in (("low", "high", 0.0), ("high_frequency", "doubled", 0.2)):
-            cell = folder / f"a1_position-{environment}-s{seed}"
-            write_part(cell / "2026-01-01_00-00-00", whole_run(tracking - loss))
-            write_result(cell, other, tracking - loss - 0.1)
-    write_part(folder / "a1_torque-low-s1" / "2026-01-01_00-00-00", [line(i, i / 100) for i in range(10, 60, 10)])
+        cell = folder / f"a1_position-low-s{seed}"
+        write_part(cell / "2026-01-01_00-00-00", whole_run(tracking), **settings["a1_position"])
+        write_result(cell, "high", tracking - 0.1)
+        run = folder / f"a1_position-high_frequency-s{seed}" / "2026-01-01_00-00-00"
+        write_part(run, whole_run(tracking - 0.2), **settings["a1_position"])
+        rows = [line(80, 0.1), line(90, tracking - 0.4), line(110, tracking - 0.4 + 0.02 * seed)]
+        write_rows(run / "evaluations_doubled.csv", rows)
+    run = folder / "a1_torque-low-s1" / "2026-01-01_00-00-00"
+    write_part(run, [line(i, i / 100) for i in range(10, 60, 10)], **settings["a1_torque"])
+    (run.parent / "result_<script>&.json").write_text("{")
+    write_times(folder / "a1_position-low-s1", Times(110_000_000, {"gpu training": 55.0}))
+    (folder / "videos").mkdir()
+    for name in ("a1_torque.mp4", "a1_position.gif", "a1_other.mp4", "a1_torque.txt"):
+        (folder / "videos" / name).write_bytes(name.encode())
     return folder
 
 
 @pytest.fixture(scope="module")
 def report(folder):
     """The folder of the report on the experiment."""
-    assert run_script(folder) == 0
+    assert run_script(folder, "--videos", folder / "videos") == 0
     return folder / "report"
+
+
+@pytest.fixture(scope="module")
+def text(report):
+    """The report as Markdown."""
+    return (report / "report.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def page(report):
+    """The report's page."""
+    return Page((report / "report.html").read_text())
 
 
 # ------------------------------------------------------------------------------------------------ tables and text
@@ -76,16 +102,16 @@ def test_table(report):
     """One row per task, column and metric, with the paper's value and nothing where there is nothing."""
     table = rows_of((report / "table.csv").read_bytes())
     assert list(table[0]) == ["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean"]
-    rows = {(row["task"], row["environment"], row["metric"]): row for row in table}
+    rows = {(row.pop("task"), row.pop("environment"), row.pop("metric")): list(row.values()) for row in table}
     assert len(rows) == len(table) == 3 * 4 * len(METRIC_NAMES)
-    row = rows["a1_position", "low", "track_percentage"]
-    assert float(row["mean"]) == pytest.approx(0.75) and float(row["standard_error"]) == pytest.approx(0.05)
-    assert (row["seeds"], row["paper_mean"]) == ("2", "0.7642")
-    row = rows["a1_position", "doubled", "track_xy"]
-    assert float(row["mean"]) == pytest.approx(0.45) and row["paper_mean"] == "0.1602"
-    assert rows["a1_position", "low -> high", "track_xy"]["paper_mean"] == ""
-    row = rows["a1_multihead", "low", "track_percentage"]
-    assert (row["mean"], row["standard_error"], row["seeds"], row["paper_mean"]) == ("", "", "0", "0.7669")
+    for key, mean, error, *others in (
+        (("a1_position", "low", "track_percentage"), 0.75, 0.05, "2", "0.7642"),  # sqrt(0.005 / 2)
+        (("a1_position", "doubled", "track_xy"), 3.65, 0.55, "2", "0.1602"),  # 3.1 and 4.2, while it trained
+        (("a1_position", "low -> high", "track_xy"), 0.65, 0.05, "2", ""),  # of the last checkpoint
+    ):
+        assert list(map(float, rows[key][:2])) == pytest.approx([mean, error]) and rows[key][2:] == others
+    assert rows["a1_torque", "low", "track_percentage"] == ["0.5", "", "1", ""]
+    assert rows["a1_multihead", "low", "track_percentage"] == ["", "", "0", "0.7669"]
 
 
 def test_evaluations(report, folder, tmp_path):
@@ -93,7 +119,7 @@ def test_evaluations(report, folder, tmp_path):
     content = (report / "evaluations.csv.gz").read_bytes()
     evaluations = rows_of(gzip.decompress(content))
     assert list(evaluations[0]) == ["task", "environment", "seed", "steps", "seconds", *METRIC_NAMES]
-    assert len(evaluations) == 4 * 5 + 5
+    assert len(evaluations) == 4 * 5 + 2 * 3 + 5
     row = next(row for row in evaluations if row["environment"] == "high_frequency" and row["seed"] == "2")
     cells = ("task", "steps", "seconds", "track_percentage", "height")
     assert [row[name] for name in cells] == ["a1_position", "10000000", "10.5", "0.1", "1"]
@@ -101,27 +127,26 @@ def test_evaluations(report, folder, tmp_path):
     assert (tmp_path / "again" / "evaluations.csv.gz").read_bytes() == content and content[4:8] == bytes(4)  # no time
 
 
-def test_text(report, folder):
+def test_text(text, folder):
     """Numbers stand beside the paper's, marked if not final; test, devices and commands are named, no folder is."""
-    text = " ".join((report / "report.md").read_text().split())
+    words = " ".join(text.split())
     low, often = "≈ 0.7500 ± 0.0500 | 0.7642", "✗ 0.5500 ± 0.0500 | 0.7163"
-    assert (
-        "**5 of 80 numbers are at least as good" in text and "4 are better, 1 within it, 10 worse, 65 missing" in text
-    )
-    assert f"| Track % [share] | PD | {low} | {often} |" in text
-    assert "| | Default torque | 0.5000 (1) † | – | – | – |" in text  # after those of the paper
-    assert "| Track % [share] | PD | 0.6500 ± 0.0500 |" in text.partition("## In other environments")[2]
-    assert "over 2 seeds (how many, if not all)" in text and "PD is `a1_position`" in text
-    assert "Welch's t-test" in text and "Holm's correction" in text
-    assert "All pairs: no test is possible; it takes at least two seeds of two tasks." in text
-    assert "NVIDIA H200" in text and "python 3.11.0, torch 2.11.0" in text
-    assert "python scripts/experiment.py paper/experiment.yaml --out paper_again" in text
-    assert str(folder.parent) not in text
+    assert "**4 of 80 numbers are at least as good" in words and "3 are better, 1 within it, 11 worse, 65 mi" in words
+    assert f"| Track % [share] | PD | {low} | {often} |" in words
+    assert "| | Default torque | 0.5000 (1) † | – | – | – |" in words  # after those of the paper
+    assert "| Track % [share] | PD | 0.6500 ± 0.0500 |" in words.partition("## In other environments")[2]
+    assert "All pairs: no test is possible; it takes at least two seeds of two tasks." in words
+    assert "NVIDIA H200" in words and "python 3.11.0, torch 2.11.0" in words
+    assert "python scripts/experiment.py paper/experiment.yaml --out paper_again" in words
+    assert str(folder.parent) not in words
+    assert "| `env.control.what` | a1_position | a1_torque |" in text and "`env.control.same`" not in text
+    times = "5 trainings took 0:08:12 in all, with their evaluations: 98.5 s and 0.995 million steps/s each on average"
+    assert f"- {times}" in text and "0:00:55 of GPU time for training; 110000000 steps" in text  # 4 x 110.5 s + 50.5 s
 
 
-def test_missing_parts(report):
+def test_missing_parts(text):
     """Cells without data, unfinished runs and missing evaluations are listed."""
-    top = (report / "report.md").read_text().partition("## What is missing")[2].partition("\n## ")[0]
+    top = text.partition("## What is missing")[2].partition("\n## ")[0]
     assert "- `a1_multihead` in low: no data, no training has begun." in top
     assert "- `a1_torque` in low: no training has begun with seed 2." in top
     found = next(line for line in top.splitlines() if "`a1_torque` in low, seed 1" in line)
@@ -141,8 +166,8 @@ def test_significant_differences(tmp_path):
     assert "Nothing: all trainings and evaluations are complete." in text
     assert "| PD | ✗ **0.7020 ± 0.0006** | 0.7642 |" in text
     assert "|  | Default torque | **5.0200 ± 0.0058** | – |" in text  # its error is the smallest
-    p = holm([welch([0.701, 0.702, 0.703], [0.501, 0.502, 0.503]), 0.0, 0.0])[0]
-    assert p < 0.05 and "| PD − Default torque | **+0.2000, p = " in text
+    p = 3.0 * welch([0.701, 0.702, 0.703], [0.501, 0.502, 0.503])  # the smallest of three
+    assert p < 0.05 and f"| PD − Default torque | **+0.2000, p = {p:.2g}** |" in text
     assert "Against PD:" in text and "| Multi-head − PD | **-0.1000, p = " in text
 
 
@@ -181,7 +206,6 @@ def test_rough_ground(tmp_path):
         (None, [], "there is no folder"),
         ("", [], "e/experiment.yaml'"),
         ("tasks: [", [], "experiment.yaml' is not valid YAML"),
-        ("tasks: [a]\nseeds: [1]\nenvironments: [low]", [], "'environments' must hold entries 'name: value'"),
         ("good", ["--from_step=-1"], "--from_step must be at least 0, not -1.0"),
         ("good", ["--videos=nowhere"], "there is no video in 'nowhere' that is named <task>.gif, <task>.mp4"),
     ],
@@ -189,11 +213,9 @@ def test_rough_ground(tmp_path):
 def test_mistakes(tmp_path, capsys, plan, words, message):
     """A mistake is one line, with exit status 2, and nothing is written."""
     if plan is not None:
-        (tmp_path / "e").mkdir()
-    if plan == "good":
         write_experiment(tmp_path / "e")
-    elif plan:
-        (tmp_path / "e" / "experiment.yaml").write_text(plan)
+        if plan != "good":
+            (tmp_path / "e" / "experiment.yaml").write_text(plan) if plan else (tmp_path / "e/experiment.yaml").unlink()
     assert run_script(tmp_path / "e", "--out", tmp_path / "out", *words) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and message in error
@@ -212,16 +234,14 @@ def test_without_the_extra(folder, tmp_path, monkeypatch, capsys, package):
 # -------------------------------------------------------------------------------------------------------- figures
 
 
-def test_figures(report, tmp_path):
+def test_figures(report, text, tmp_path):
     """All figures are there as PNG, and none without data."""
-    for name in ("figure3", "figure3overseconds", "figure5a", "figure5b", "figure6", "figure7"):
-        assert (report / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-        assert f"({name}.png)" in (report / "report.md").read_text()
+    for name in (name.lower().replace(" ", "") for name in NAMES):
+        assert (report / f"{name}.png").read_bytes().startswith(b"\x89PNG") and f"({name}.png)" in text
     write_experiment(tmp_path / "empty")
     assert run_script(tmp_path / "empty", "--out", tmp_path / "out2") == 0
     assert not list((tmp_path / "out2").glob("figure*"))
-    names = "Figure 3, Figure 3 over seconds, Figure 5a, Figure 5b, Figure 6, Figure 7"
-    assert f"No {names}: there are no data" in (tmp_path / "out2" / "report.md").read_text()
+    assert f"No {', '.join(NAMES)}: there are no data" in (tmp_path / "out2" / "report.md").read_text()
 
 
 def test_curves(folder):
@@ -249,85 +269,41 @@ def test_running_medians():
 # ----------------------------------------------------------------------------------------------------------- page
 
 
-def markdown_tables(text):
-    """The cells of all tables of a Markdown file without their marks."""
-    tables, before = [], ""
-    for each in text.splitlines():
-        if each.startswith("| ") and not before.startswith("| "):
-            tables.append([])
-        if each.startswith("| ") and not each.startswith("| ---"):
-            cells = re.split(r" \| ", each[2:-2])
-            tables[-1].append([re.sub(r"`|\*\*", "", cell) for cell in cells])
-        before = each
-    return tables
-
-
-@pytest.fixture(scope="module")
-def hostile(tmp_path_factory):
-    """An experiment with hostile texts; its report as Markdown, as a page, and as a page that was read; pictures."""
-    folder = tmp_path_factory.mktemp("hostile")
-    write_experiment(folder, {"high_frequency": ["high_frequency", "doubled"]}, (1, 2, 3), ["a1_position", "a1_new"])
-    (folder / "experiment.yaml").write_text(f"# {EVIL}\n# ```\n" + (folder / "experiment.yaml").read_text())
-    for task, tracking in {"a1_position": 0.70, "a1_new": 0.74}.items():
-        for seed in (1, 2, 3):
-            run = folder / f"{task}-high_frequency-s{seed}" / "2026-01-01_00-00-00"
-            settings = copy.deepcopy(SETTINGS) | {"device_name": f"GPU {EVIL}"}
-            settings["env"]["control"] = {"what": task, "same": EVIL}
-            write_part(run, [line(90, tracking), line(110, tracking + 0.01 * seed)], **settings)
-            rows = [line(80, 0.1), line(90, tracking - 0.1), line(110, tracking - 0.1 + 0.02 * seed)]
-            (run / "evaluations_doubled.csv").write_text("\n".join([HEADER, *rows]) + "\n")
-    (folder / "a1_new-high_frequency-s1" / "result_<script>&.json").write_text("{")
-    write_times(folder / "a1_new-high_frequency-s1", Times(110_000_000, {"gpu training": 55.0}))
-    (folder / "videos").mkdir()
-    for name in ("a1_new.mp4", "a1_position.gif", "a1_other.mp4", "a1_new.txt"):
-        (folder / "videos" / name).write_bytes(name.encode())
-    out = folder / "report"
-    assert run_script(folder, "--videos", folder / "videos") == 0
-    text = (out / "report.html").read_text()
-    return (out / "report.md").read_text(), text, Page(text), {file.read_bytes() for file in out.glob("*.png")}
-
-
-def test_tables_of_the_page(hostile):
+def test_tables_of_the_page(text, page):
     """The first tables compare with the paper, and the page has the cells of the Markdown, in the signs' colours."""
-    text, _, page, _ = hostile
-    assert page.tables == markdown_tables(text) and len(page.tables) > 5
+    tables = []
+    for block in re.findall(r"(?:^\|.*\n)+", text, re.M):
+        rows = [each[2:-2].split(" | ") for each in block.splitlines() if not each.startswith("| ---")]
+        tables.append([[re.sub(r"`|\*\*", "", cell) for cell in row] for row in rows])
+    assert page.tables == tables and len(tables) == 5
     assert re.findall(r"^## (.*)", text, re.M)[:2] == ["Table I", "Best torque method against the paper's best"]
-    assert page.tables[1][0] == ["metric", "method", "high_frequency", "paper", "doubled", "paper"]
-    assert page.tables[1][1] == ["Track % [share]", "PD", "✗ 0.7100 ± 0.0029", "0.7163", "✗ 0.6200 ± 0.0058", "0.6765"]
-    assert page.tables[1][2][:2] == ["", "a1_new"] and {"better", "within", "worse", None} == set(page.kinds)
+    assert page.tables[1][0] == ["metric", "method", "low", "paper", "high_frequency", "paper", "doubled", "paper"]
+    assert page.tables[1][1][6:] == ["✗ 0.3650 ± 0.0550", "0.6765"]
+    assert {"better", "within", "worse", None} == set(page.kinds)
 
 
-def test_the_page_is_whole(hostile):
+def test_the_page_is_whole(report, page):
     """It refers to nothing but itself: pictures and videos are in it, byte by byte, links lead to its own headings."""
-    _, source, page, files = hostile
+    source, files = (report / "report.html").read_text(), {file.read_bytes() for file in report.glob("*.png")}
     data = [reference.partition(",")[::2] for reference in page.references if reference.startswith("data:")]
     pictures = {base64.b64decode(content) for kind, content in data if kind == "data:image/png;base64"}
     assert pictures == files and len(files) > 3
-    assert ("data:video/mp4;base64", base64.b64encode(b"a1_new.mp4").decode()) in data
+    assert ("data:video/mp4;base64", base64.b64encode(b"a1_torque.mp4").decode()) in data
     assert ("data:image/gif;base64", base64.b64encode(b"a1_position.gif").decode()) in data
     assert len(data) == len(pictures) + 2
     links = [reference for reference in page.references if not reference.startswith("data:")]
     assert len(links) > 5 and all(f'id="{link.removeprefix("#")}"' in source for link in links)
-    assert "@import" not in source and "url(" not in source
+    assert "@import" not in source and "url(" not in source and "<script" not in source
     assert 'name="viewport"' in source and "prefers-color-scheme: dark" in source
 
 
-def test_texts_from_files_are_escaped(hostile):
+def test_texts_from_files_are_escaped(text, page):
     """They are shown as they are: none of their tags and pictures is one, and none of their fences ends the plan."""
-    text, source, page, _ = hostile
-    assert "<script" not in source and "evil.example/x.png" not in "".join(page.references)
+    assert "evil.example/x.png" not in "".join(page.references)
     shown = EVIL.replace("`", "").replace("**", "")
     assert f"GPU {shown}" in page.text and f"# {EVIL}" in page.text and "result_<script>&.json" in page.text
     assert "\n````yaml\n# <" in text and "\n````\n\nTo repeat it:" in text
-
-
-def test_settings_and_times(hostile):
-    """Settings that differ between tasks, and the times: six trainings of 110.5 s, 110e6 steps each."""
-    text, _, page, _ = hostile
-    assert "| `env.control.what` | a1_position | a1_new |" in text and "`env.control.same`" not in text
-    assert "All settings of a1_new" in page.text and "same: " in page.text and "All settings of" not in text
-    times = "6 trainings took 0:11:03 in all, with their evaluations: 110.5 s and 0.995 million steps/s each on average"
-    assert f"- {times}" in text and "0:00:55 of GPU time for training; 110000000 steps" in text
+    assert "All settings of a1_torque" in page.text and "same: " in page.text and "All settings of" not in text
 
 
 def test_markdown():

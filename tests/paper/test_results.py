@@ -3,21 +3,20 @@
 import gzip
 import json
 import math
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
-from support.reports import HEADER, SETTINGS, line, whole_run, write_experiment, write_part, write_result
+from scipy import stats
+from support.reports import HEADER, SETTINGS, line, whole_run, write_experiment, write_part, write_run
 from support.settings import error_of
 
 from legged_torque.experiments.matrix import Cell, Matrix
 from legged_torque.paper.report.evaluations import METRIC_NAMES, read_curves, read_evaluations
 from legged_torque.paper.report.experiment import Experiment, Training, read_experiment
 from legged_torque.paper.report.report import run_problems
-from legged_torque.paper.report.tables import best_torque, cells_of, compare, holm, summarize, verdict, welch
+from legged_torque.paper.report.tables import best_torque, holm, summarize, verdict, welch
 from legged_torque.paper.values import ENVIRONMENTS, PAPER_METRICS, TABLE_I, paper_value
 from legged_torque.utils.metrics import METRICS
 
@@ -28,22 +27,6 @@ METRIC = {metric.name: metric for metric in METRICS}
 def evaluations(*millions):
     """Evaluations after so many million steps."""
     return pd.DataFrame({"steps": [1_000_000 * million for million in millions]})
-
-
-@pytest.fixture
-def folder(tmp_path):
-    """An experiment: position complete, torque with one seed, unfinished, and multihead not begun."""
-    write_experiment(tmp_path)
-    for seed, tracking in ((1, 0.7), (2, 0.8)):
-        cell = tmp_path / f"a1_position-low-s{seed}"
-        write_part(cell / "2026-01-01_00-00-00", whole_run(tracking))
-        write_result(cell, "high", tracking - 0.1)
-        cell = tmp_path / f"a1_position-high_frequency-s{seed}"
-        write_part(cell / "2026-01-01_00-00-00", whole_run(tracking - 0.2))
-        rows = [line(80, 0.1), line(90, tracking - 0.4), line(110, tracking - 0.4 + 0.02 * seed)]
-        (cell / "2026-01-01_00-00-00" / "evaluations_doubled.csv").write_text("\n".join([HEADER, *rows]) + "\n")
-    write_part(tmp_path / "a1_torque-low-s1" / "2026-01-01_00-00-00", [line(i, i / 100) for i in range(10, 60, 10)])
-    return tmp_path
 
 
 # ----------------------------------------------------------------------------------------------------- reading
@@ -75,26 +58,18 @@ def test_rows_of_a_run(tmp_path):
     assert read_evaluations(tmp_path / "none.csv", problems).empty and len(problems) == 2
 
 
-@pytest.fixture
-def curves(tmp_path):
-    """The same curve as a run's evaluations, as JSON of learning_curve.py, and twice as evaluations of a report."""
+def test_learning_curves(tmp_path):
+    """Every kind of file gives task, seed and evaluations; a report's file has those of many trainings."""
     lines = [line(1, 0.1), line(2, 0.2, height="")]
-    config = {"task": "a1_torque", "env": {}, "train": {"seed": 3}, "versions": {}}
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
-    (tmp_path / "evaluations.csv").write_text("\n".join([HEADER, *lines]) + "\n")
+    write_run(tmp_path / "run", lines, {"task": "a1_torque", "env": {}, "train": {"seed": 3}, "versions": {}})
     points = [{"steps": 1e6 * i, **dict.fromkeys(METRIC_NAMES, float(i)), "track_percentage": 0.1 * i} for i in (1, 2)]
     (tmp_path / "curve.json").write_text(json.dumps({"task": "a1_torque", "seed": 3, "points": points}))
     rows = [f"a1_torque,{name},3,{text}" for name in ("low", "high") for text in lines]
     text = "\n".join([f"task,environment,seed,{HEADER}", *rows]) + "\n"
     (tmp_path / "evaluations.csv.gz").write_bytes(gzip.compress(text.encode()))
-    return tmp_path
-
-
-def test_learning_curves(curves):
-    """Every kind of file gives task, seed and evaluations; a report's file has those of many trainings."""
-    files = {"evaluations.csv": [""], "curve.json": [""], "evaluations.csv.gz": ["low", "high"]}
+    files = {"run/evaluations.csv": [""], "curve.json": [""], "evaluations.csv.gz": ["low", "high"]}
     for name, environments in files.items():
-        table = read_curves(curves / name)
+        table = read_curves(tmp_path / name)
         assert set(table["task"]) == {"a1_torque"} and set(table["seed"]) == {3}
         assert list(dict.fromkeys(table["environment"])) == environments
         for _, rows in table.groupby("environment"):
@@ -103,25 +78,23 @@ def test_learning_curves(curves):
             assert rows["height"].isna().tolist() == [False, name != "curve.json"]
 
 
-def test_files_without_curves(curves):
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("none.csv", None, "cannot read"),
+        ("other.json", '{"task": "a1_torque"}', "is not a file that evaluate.py has written"),
+        ("half.json", '{"task": "a1_torque", "seed": 1, "points": [{"track_xy": 1}]}', "has no column 'steps'"),
+        ("wrong.json", '{"task": "a1_torque", "seed": 1, "points": [{"steps": 1, "speed": "x"}]}', "row 0 of"),
+        ("twice.csv", "steps,steps,task\n1,2,a\n", "two columns of the same name"),
+        ("text.csv.gz", "no gzip", "cannot read"),
+        ("evaluations.csv", f"{HEADER}\n", "has no config.yaml"),
+    ],
+)
+def test_files_without_curves(tmp_path, name, content, message):
     """They are refused by their name."""
-    (curves / "other.json").write_text('{"task": "a1_torque"}')
-    (curves / "half.json").write_text('{"task": "a1_torque", "seed": 1, "points": [{"track_xy": 1}]}')
-    (curves / "wrong.json").write_text('{"task": "a1_torque", "seed": 1, "points": [{"steps": 1, "speed": "x"}]}')
-    (curves / "twice.csv").write_text("steps,steps\n1,2\n")
-    (curves / "text.csv.gz").write_text("no gzip")
-    (curves / "alone").mkdir()
-    shutil.copy(curves / "evaluations.csv", curves / "alone")
-    for name, message in {
-        "none.csv": "cannot read",
-        "other.json": "is not a file that evaluate.py has written",
-        "half.json": "has no column 'steps'",
-        "wrong.json": "row 0 of",
-        "twice.csv": "two columns of the same name",
-        "text.csv.gz": "cannot read",
-        "alone/evaluations.csv": "has no config.yaml",
-    }.items():
-        assert message in error_of(read_curves, curves / name)
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    assert message in error_of(read_curves, tmp_path / name)
 
 
 def test_parts_are_merged(tmp_path):
@@ -149,90 +122,52 @@ def test_counted_evaluations():
 
 
 def test_finished_runs():
-    """A run is finished if less than an interval between evaluations is left; without settings it has 110 million."""
+    """A run is finished if less than an interval between evaluations is left; without settings it has 110 million.
+
+    Evaluations count in the last 18%, in whole millions of steps: from 90 of 110 million on, as in Table I.
+    """
     run = Training(CELL, {"low": evaluations(99, 104)})
-    assert run.total_steps == 110_000_000 and not run.is_finished(104e6)
-    run.configs.append(SETTINGS | {"max_iterations": 108})
-    assert run.total_steps == 108_000_000 and run.is_finished(104e6) and not run.is_finished(103e6)
-    run.configs.append(SETTINGS | {"max_iterations": 108, "processes": 2})
-    assert run.total_steps == 216_000_000
-    assert not Training(CELL).is_finished(0)
+    assert run.total_steps == 110_000_000 and not run.is_finished(104e6) and not Training(CELL).is_finished(0)
+    for changes, total, start in (({}, 108, 89), ({"processes": 2}, 216, 177), ({"max_iterations": 1}, 1, 1)):
+        run.configs.append(SETTINGS | {"max_iterations": 108} | changes)
+        assert run.total_steps == total * 1e6
+        assert run.is_finished((total - 4) * 1e6) and not run.is_finished((total - 5) * 1e6)
+        assert Experiment(Path(), Matrix([], {}, []), [run], []).last_part() == start * 1e6
+    assert Experiment(Path(), Matrix([], {}, []), [], []).last_part() == 90e6
 
 
-@pytest.mark.parametrize(("iterations", "start"), [(110, 90e6), (330, 271e6), (1, 1e6)])
-def test_last_part(iterations, start):
-    """Evaluations count in the last 18%, in whole millions of steps: from 90 of 110 million on, as in Table I."""
-    runs = [Training(CELL, configs=[SETTINGS | {"max_iterations": number}]) for number in (1, iterations)]
-    assert Experiment(Path(), Matrix([], {}, []), runs, []).last_part() == start
+def test_broken_files(tmp_path):
+    """Files that cannot be read are named, and everything else is still there; other runs are left out.
 
-
-def test_broken_files(folder):
-    """Files that cannot be read are named, and everything else is still there; other runs are left out."""
-    (folder / "a1_position-low-s1" / "result_high.json").write_text('{"task": ')
-    (folder / "a1_position-low-s2" / "2026-01-01_00-00-00" / "config.yaml").write_text("walk")
-    (folder / "a1_gravity-low-s1").mkdir()
-    experiment = read_experiment(folder)
+    Values that are not finite do not count; a metric without any has no number, and the report says so.
+    """
+    write_experiment(tmp_path, {"low": ["low", "high"]})
+    runs = [tmp_path / f"a1_position-low-s{seed}" / "2026-01-01_00-00-00" for seed in (1, 2)]
+    none = {"height": ""}
+    counted = [line(90, 0.5, height="nan"), line(100, 0.7, height="inf"), line(110, 0, track_percentage="", **none)]
+    for run, last in zip(runs, (whole_run(0.7)[2:], counted), strict=True):
+        write_part(run, [*whole_run(0.8)[:2], *last])
+    (tmp_path / "a1_position-low-s1" / "result_high.json").write_text('{"task": ')
+    (runs[1] / "config.yaml").write_text("walk")
+    (tmp_path / "a1_gravity-low-s1").mkdir()
+    experiment = read_experiment(tmp_path)
     assert experiment.unplanned == ["a1_gravity-low-s1"]
     first, second = experiment.runs_of("a1_position", "low")
     assert first.problems == ["'a1_position-low-s1/result_high.json' cannot be read"] and first.results == {}
     assert len(second.problems) == 1 and "lacks the entries" in second.problems[0] and len(second.rows) == 5
+    assert run_problems(second, 90e6)[1] == "1 of the 3 evaluations that count have no track_percentage"
+    cells = summarize(experiment, 90e6).loc["low"].loc["a1_position"]
+    assert cells["values"]["track_percentage"] == pytest.approx([0.7, 0.6])
+    assert len(cells["values"]["height"]) == 1 and not cells["is_final"]["height"]
+    assert cells["values"]["track_xy"] == pytest.approx([7.0, 4.0]) and cells["is_final"]["track_xy"]
 
 
 # -------------------------------------------------------------------------------------------------- statistics
 
 
-def test_means_and_standard_errors(folder):
-    """A seed's number is the mean of its evaluations; mean and standard error are those over the seeds."""
-    table = summarize(read_experiment(folder), 90e6)
-    assert list(table.index.unique("column")) == ["low", "high_frequency", "doubled", "low -> high"]
-    cell = table.loc["low", "a1_position", "track_percentage"]
-    assert cell["values"] == pytest.approx([0.7, 0.8]) and cell["is_final"] and cell["paper"] == 0.7642
-    assert cell["mean"] == pytest.approx(0.75) and cell["standard_error"] == pytest.approx(0.05)  # sqrt(0.005 / 2)
-    values = table["values"]
-    assert values["low", "a1_position", "collision_force"] == pytest.approx([7.0, 8.0])
-    assert values["doubled", "a1_position", "track_percentage"] == pytest.approx([0.31, 0.42])  # while it trained
-    assert values["low -> high", "a1_position", "track_xy"] == pytest.approx([0.6, 0.7])  # of the last checkpoint
-    single = table.loc["low", "a1_torque", "track_percentage"]
-    assert single["values"] == pytest.approx([0.5]) and np.isnan(single["standard_error"]) and not single["is_final"]
-    assert (table["seeds"]["low"]["a1_multihead"] == 0).all()
-
-
-def test_evaluations_without_a_value(folder):
-    """Values that are not finite do not count; a metric without any has no number, and the report says so."""
-    file = next(folder.glob("a1_position-low-s2/*/evaluations.csv"))
-    none = {"height": ""}
-    counted = [line(90, 0.5, height="nan"), line(100, 0.7, height="inf"), line(110, 0, track_percentage="", **none)]
-    file.write_text("\n".join([HEADER, *whole_run(0.8)[:2], *counted]) + "\n")
-    cells = summarize(read_experiment(folder), 90e6).loc["low"].loc["a1_position"]
-    assert cells["values"]["track_percentage"] == pytest.approx([0.7, 0.6])
-    assert len(cells["values"]["height"]) == 1 and not cells["is_final"]["height"]
-    assert cells["values"]["track_xy"] == pytest.approx([7.0, 4.0]) and cells["is_final"]["track_xy"]
-    problems = run_problems(read_experiment(folder).runs_of("a1_position", "low")[1], 90e6)
-    assert problems[0] == "1 of the 3 evaluations that count have no track_percentage"
-
-
-def test_compare(tmp_path):
-    """The tests of a metric in a column are one family; those with one seed are not counted in it."""
-    write_experiment(tmp_path, {"low": ["low"]}, seeds=[1, 2, 3])
-    trackings = {"a1_position": (0.7, 0.71, 0.72), "a1_torque": (0.5, 0.52, 0.54), "a1_multihead": (0.8,)}
-    for task, values in trackings.items():
-        for seed, tracking in enumerate(values, start=1):
-            write_part(tmp_path / f"{task}-low-s{seed}" / "2026-01-01_00-00-00", whole_run(tracking))
-    cells = cells_of(summarize(read_experiment(tmp_path), 90e6), "low", METRIC["track_percentage"])
-    pairs = [("a1_position", "a1_torque"), ("a1_position", "a1_multihead"), ("a1_torque", "a1_multihead")]
-    p = welch([0.7, 0.71, 0.72], [0.5, 0.52, 0.54])
-    assert compare(cells, pairs) == pytest.approx([p, math.nan, math.nan], nan_ok=True)
-    assert compare(cells, pairs[:1] * 2) == pytest.approx([2 * p, 2 * p])
-
-
 def test_welch_by_hand():
-    """t, degrees of freedom that are not whole, and cases without a test."""
-    # variances 1 and 4, three values each: t = -3 / sqrt(5/3), freedom = (5/3)^2 / ((1/9 + 16/9) / 2) = 50/17
-    freedom, t_squared = 50 / 17, 9 / (5 / 3)
-    angles = math.pi / 2 * (np.arange(200_000) + 0.5) / 200_000  # the density, integrated: t = sqrt(freedom) tan(angle)
-    density = np.cos(angles) ** (freedom - 1)
-    tail = density[angles > math.atan(math.sqrt(t_squared / freedom))].sum() / density.sum()
-    assert welch([1, 2, 3], [3, 5, 7]) == pytest.approx(tail, abs=1e-5)
+    """Variances 1 and 4, three values each: t = -3 / sqrt(5/3), freedom (5/3)^2 / ((1/9 + 16/9) / 2) = 50/17."""
+    assert welch([1, 2, 3], [3, 5, 7]) == pytest.approx(2.0 * stats.t.cdf(-3.0 / math.sqrt(5 / 3), 50 / 17))
     assert welch([1, 2, 3], [3, 5, 7]) == welch([3, 5, 7], [1, 2, 3])
     assert welch([1, 2], [1, 2]) == 1.0
     assert all(math.isnan(welch(*pair)) for pair in (([1], [1, 2]), ([], [1, 2]), ([1, 1], [2, 2])))
@@ -246,21 +181,16 @@ def test_holm_by_hand():
 
 
 @pytest.mark.parametrize(
-    ("name", "values", "paper", "sign"),
+    ("name", "mean", "error", "papers"),
     [
-        ("track_percentage", [0.80, 0.82], 0.79, "✓"),  # 0.81 ± 0.01
-        ("track_percentage", [0.80, 0.82], 0.815, "≈"),
-        ("track_percentage", [0.80, 0.82], 0.83, "✗"),
-        ("track_xy", [0.03, 0.05], 0.06, "✓"),  # 0.04 ± 0.01: low is good
-        ("track_xy", [0.03, 0.05], 0.035, "≈"),
-        ("track_xy", [0.03, 0.05], 0.02, "✗"),
-        ("collision_force", [130.0], 131.0, "✓"),  # one seed: no error
-        ("collision_force", [130.0], 130.0, "≈"),
+        ("track_percentage", 0.81, 0.01, (0.79, 0.815, 0.83)),
+        ("track_xy", 0.04, 0.01, (0.06, 0.035, 0.02)),  # low is good
+        ("collision_force", 130.0, math.nan, (131.0, 130.0, 129.0)),  # one seed: no error
     ],
 )
-def test_verdict(name, values, paper, sign):
+def test_verdict(name, mean, error, papers):
     """Better or worse by more than the standard error, in the metric's own direction."""
-    assert verdict(METRIC[name], pd.Series(values).mean(), pd.Series(values).sem(), paper) == sign
+    assert [verdict(METRIC[name], mean, error, paper) for paper in papers] == ["✓", "≈", "✗"]
 
 
 def test_best_torque_methods():

@@ -23,8 +23,7 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.experiments.matrix import read_plan
 from legged_torque.learning import checkpoint
-from legged_torque.utils.args import options_of
-from legged_torque.utils.cli import Parser
+from legged_torque.utils.cli import Parser, options_of
 from legged_torque.utils.config import Section, flat, section_keys, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import check_value, types_of

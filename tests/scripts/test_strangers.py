@@ -14,7 +14,7 @@ from support.strangers import LOADING, Payload, edit_config, load_run
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.learning import checkpoint
-from legged_torque.learning.pretrained import start_from
+from legged_torque.paper.gravity.pretrained import start_from
 from legged_torque.utils.plain_yaml import parse_yaml
 from legged_torque.utils.task_registry import TaskRegistry, task_registry
 

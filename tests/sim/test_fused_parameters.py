@@ -21,7 +21,6 @@ from support.fused import (
 from legged_torque.sim.fused.step import FusedStep
 from legged_torque.sim.simulator import Simulator
 from legged_torque.terrain.height_map import HeightMap
-from legged_torque.terrain.hfield import add_hfield
 from legged_torque.utils.errors import UserError
 
 
@@ -176,7 +175,7 @@ def test_derived_constants_of_unlike_legs():
 def test_derived_constants_on_a_hfield():
     """With MuJoCo Warp a hfield is a floor like any other: inverse weights follow the masses, as by mj_setConst."""
     spec = make_a1()
-    add_hfield(spec, HeightMap(np.random.default_rng(0).uniform(size=(4, 5)), 1.0, (-2.0, -2.0), "cpu"), "floor")
+    HeightMap(np.random.default_rng(0).uniform(size=(4, 5)), 1.0, (-2.0, -2.0), "cpu").add_to(spec, "floor")
     model = compiled(spec)
     sim = Simulator(model, 2, "cpu", "mujoco_warp", per_world=["body_mass"])
     sim.field("body_mass")[1, 1] *= 1.7

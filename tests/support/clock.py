@@ -1,4 +1,6 @@
-"""Shared by tests: clock."""
+"""Shared by tests: a clock that does not run, and waiting by the real one."""
+
+import time
 
 
 class Clock:
@@ -13,3 +15,14 @@ class Clock:
     def sleep(self, seconds):
         self.slept.append(seconds)
         self.now += seconds
+
+
+def wait_for(condition, timeout=30.0):
+    """Wait until a condition holds, and return its value."""
+    end = time.monotonic() + timeout
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.05)
+    raise AssertionError(f"waited in vain for {condition.__name__}")

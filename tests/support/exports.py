@@ -15,15 +15,15 @@ from legged_torque.envs import task_registry
 TRAINING = {"run": "run", "checkpoint": "model_7.pt", "iterations": 7, "total_steps": 20_000_000}
 
 
-def export_random(make_task, name, folder, normalization=False, supported=True, **overrides):
+def export_random(make_task, name, folder, normalization=False, supported=True, groups=("policy",), **overrides):
     """Export a small random network of a task after 20 million steps; return the task and the model.
 
-    ``supported`` says whether ``policy.yaml`` can describe all of the task.
+    ``supported`` says whether ``policy.yaml`` can describe all of the task; ``groups`` are those that the actor reads.
     """
     task = make_task(name, num_envs=3, **overrides)
     task.load_state_dict({"total_steps": torch.tensor(TRAINING["total_steps"]), "num_diverged": torch.tensor(0)})
     _, train_cfg = task_registry.get_cfgs(name)
-    train_cfg.actor.hidden_dims = [16, 16]
+    train_cfg.actor.hidden_dims, train_cfg.obs_groups.actor = [16, 16], list(groups)
     train_cfg.actor.obs_normalization = normalization
     torch.manual_seed(3)
     runner, _ = task_registry.make_alg_runner(task, name, train_cfg=train_cfg, log_root=None)

@@ -38,11 +38,16 @@ def whole_run(tracking):
     return [line(10, 0.1), line(80, 0.2), line(90, tracking - 0.05), line(100, tracking), line(110, tracking + 0.05)]
 
 
+def write_rows(file, lines):
+    """Write a table of evaluations."""
+    file.write_text("\n".join([HEADER, *lines]) + "\n")
+
+
 def write_run(folder, lines, config):
     """Write the folder of a run."""
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
-    (folder / "evaluations.csv").write_text("\n".join([HEADER, *lines]) + "\n")
+    write_rows(folder / "evaluations.csv", lines)
 
 
 def write_part(folder, lines, **settings):

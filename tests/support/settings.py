@@ -3,7 +3,7 @@
 import pytest
 
 from legged_torque.envs import task_registry
-from legged_torque.utils.args import Parser, add_task_args, add_train_args, options_of
+from legged_torque.utils.cli import TRAINING, Parser, add_options, add_task_args, options_of
 from legged_torque.utils.errors import UserError
 
 TASKS = ["a1_position", "a1_torque", "a1_torque_gravity", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
@@ -22,7 +22,7 @@ def parse(*words):
     """The options that train.py makes of a command line, on the CPU."""
     parser = Parser("test")
     add_task_args(parser)
-    add_train_args(parser)
+    add_options(parser, *TRAINING)
     return options_of(parser.parse_args(["--device=cpu", *words]))
 
 

@@ -16,7 +16,6 @@ from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.terrain import make_terrain
 from legged_torque.terrain.height_map import HeightMap
-from legged_torque.terrain.hfield import add_hfield
 from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.tiles import TILES, Grid
 from legged_torque.utils.config import to_dict
@@ -42,7 +41,7 @@ def test_surface_is_that_of_mujocos_hfield(name):
     layout = Layout(2, 1, 8.0, 0.5, 0.05, [0.1, 1.0], {name: 1.0}, 3)
     surface = HeightMap(layout.heights(), 0.05, layout.corner, "cpu")
     spec = mujoco.MjSpec.from_string(FLOOR)
-    add_hfield(spec, surface, "floor")
+    surface.add_to(spec, "floor")
     model = spec.compile()
     assert model.geom("floor").type == mujoco.mjtGeom.mjGEOM_HFIELD
     np.testing.assert_array_equal(model.geom("floor").friction, [0.7, 0.02, 0.01])

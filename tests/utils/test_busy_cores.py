@@ -6,37 +6,37 @@ import sys
 
 import pytest
 
-from legged_torque.utils import busy_cores
+from legged_torque.utils import devices
 
 CORES = os.cpu_count() or 1
 
 
 @pytest.mark.parametrize(
     ("others", "threads", "is_noted"),
-    [(CORES, 2, True), (CORES, 1, False), (0.1, CORES + 2, False), (None, 2, False), (CORES, CORES + 2, True)],
+    [(CORES, 2, True), (CORES, 1, False), (0.1, CORES + 2, False), (0.0, 2, False), (CORES, CORES + 2, True)],
 )
 def test_note(others, threads, is_noted, monkeypatch):
     """It is given if threads must share cores with others; a single thread waits for no other."""
-    monkeypatch.setattr(busy_cores, "busy_cores", lambda: others)
-    note = busy_cores.busy_cores_note(threads)
-    assert (note is not None) == is_noted
+    monkeypatch.setattr(devices, "busy_cores", lambda: others)
+    note = devices.busy_cores_note(threads)
+    assert bool(note) == is_noted
     if is_noted:
         assert f"other processes use {CORES:.1f} of {CORES} cores, and torch has {threads} threads" in note
 
 
 def test_no_counts(tmp_path, monkeypatch):
     """Nothing is known where the system does not count, or counts something else."""
-    monkeypatch.setattr(busy_cores, "COUNTS", tmp_path / "stat")
-    assert busy_cores.busy_cores() is None
+    monkeypatch.setattr(devices, "COUNTS", tmp_path / "stat")
+    assert devices.busy_cores() == 0.0
     (tmp_path / "stat").write_text("cpu many\n")
-    assert busy_cores.busy_cores() is None
+    assert devices.busy_cores() == 0.0
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the counts are Linux's")
 def test_another_process(monkeypatch):
     """A process that computes without end is seen."""
-    monkeypatch.setattr(busy_cores, "SECONDS", 1.0)
+    monkeypatch.setattr(devices, "SECONDS", 1.0)
     with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as other:
-        others = busy_cores.busy_cores()
+        others = devices.busy_cores()
         other.kill()
     assert others > 0.4

@@ -13,8 +13,7 @@ from support.settings import error_of, get_cfgs, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.commands import fix_command
-from legged_torque.utils.args import Parser, add_task_args, task_file_words
-from legged_torque.utils.cli import run_script, script_command
+from legged_torque.utils.cli import Parser, add_task_args, option_words, run_script, script_command
 from legged_torque.utils.options import Options
 
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("[!_]*.py"))
@@ -151,9 +150,11 @@ def test_fixed_command():
     assert task.commands.tolist() == [[0.5, -0.25, 0.125]] * 3
 
 
-def test_words_for_task_files():
-    """They stand in the commands that one script prints or starts for another."""
-    assert task_file_words(["a.py", "b c.py"]) == ["--task_file=a.py", "--task_file=b c.py"]
+def test_words_for_another_script():
+    """Options that are given, each value of a list as an option of its own."""
+    options = Options(task="a", task_file=["a.py", "b c.py"])
+    words = ["--task_file=a.py", "--task_file=b c.py", "--task=a"]
+    assert option_words(options, "task_file", "seed", "set", "task") == words
 
 
 def test_a_missing_package(capsys):

@@ -24,7 +24,7 @@ from legged_torque.learning.training_display import TrainingDisplay, blocks, rea
 from legged_torque.utils.display import REDRAW_EVERY, Counter, is_terminal, read_progress, warn
 
 STYLES = re.compile(r"\033\[[\d;?]*[A-Za-z]")
-NUMBERS = {"kl": 0.0123, "skipped_updates": 0.0, "noise": 0.5, "learning_rate": 1e-3, "Health/diverged_worlds": 0.0}
+NUMBERS = {"kl": 0.0123, "action_std": 0.5, "learning_rate": 1e-3, "Health/diverged_worlds": 0.0}
 EVALUATED = {"Evaluation/track_percentage": 0.5, "Evaluation/falls_per_minute": 1.5, "Curriculum/mixing_pd": 0.75}
 
 TRAINING = """
@@ -32,14 +32,15 @@ import sys, time
 from legged_torque.learning.training_display import TrainingDisplay
 from legged_torque.utils.display import warn
 from legged_torque.utils.interrupt import StopRequest
-numbers = {"kl": 0.0123, "skipped_updates": 1.0, "noise": 0.5, "learning_rate": 1e-3, "Health/diverged_worlds": 2.0}
+numbers = {"kl": 0.0123, "skipped_updates": 1.0, "action_std": 0.5, "learning_rate": 1e-3}
+numbers |= {"Health/diverged_worlds": 2.0, "Train/mean_reward": 1.25, "Train/mean_episode_length": 4.5}
 numbers |= {"Curriculum/weight_of_a_reward_with_a_long_name": 0.25, "Curriculum/mixing_of_a_long_name": 0.75}
 with TrainingDisplay("a1_torque: 9 worlds on CPU", "/logs/" + "[b]" * 40, 20, 0, 9) as display:
     with StopRequest(display.notify) as stop:
         warn("something is not as it should be")
         for i in range(1, 21):
             tracked = {"Evaluation/track_percentage": i / 40, "Evaluation/falls_per_minute": 1.5} if i % 2 else {}
-            display.add_iteration(i, 9 * i, numbers | {"reward": 1.25, "length": 4.5} | tracked)
+            display.add_iteration(i, 9 * i, numbers | tracked)
             print("ready" if i == 2 else "", end="\\n" if i == 2 else "", flush=True)
             time.sleep(0.06)
             if stop.requested:

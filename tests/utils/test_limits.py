@@ -7,7 +7,7 @@ import pytest
 from support.settings import COMBINATIONS, TASKS, error_of, flatten, get, get_cfgs
 
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.config import Section, check_section, section_keys, set_by_path, to_dict
+from legged_torque.utils.config import Section, section_keys, set_by_path, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import Count, Interval, Limits, Positive, check_value, describe, types_of
 
@@ -91,12 +91,12 @@ def test_a_variants_own_settings():
     class Other(Variant):
         rate = -1.0
 
-    check_section(Variant())
-    assert error_of(check_section, Other(), "variant") == "variant.rate must be greater than 0, not -1.0"
+    Variant().check()
+    assert error_of(Other().check, "variant") == "variant.rate must be greater than 0, not -1.0"
     for name, value in {"number": 0, "kind": "c", "sizes": {"x": 3.0}, "limits": [1, 0], "rate": None}.items():
         changed = Variant()
         setattr(changed, name, value)
-        assert error_of(check_section, changed).startswith((f"{name} must be ", f"unknown {name} "))
+        assert error_of(changed.check).startswith((f"{name} must be ", f"unknown {name} "))
 
 
 def test_a_type_that_is_not_known():
@@ -105,7 +105,7 @@ def test_a_type_that_is_not_known():
     class Variant(Section):
         length: "Length" = 1.0  # noqa: F821
 
-    assert error_of(check_section, Variant()).endswith("Variant is not known: name 'Length' is not defined")
+    assert error_of(Variant().check).endswith("Variant is not known: name 'Length' is not defined")
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from legged_torque.utils.paths import portable_path, without_machine
+from legged_torque.utils.files import portable_path, without_machine
 
 
 def test_portable_path(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ import yaml
 from support.settings import get_cfgs
 
 from legged_torque.envs import task_registry
-from legged_torque.utils import rendering, runs
+from legged_torque.utils import devices, runs
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.math import quat_rotate_inverse
 from legged_torque.utils.options import Options, apply_options
@@ -57,8 +57,8 @@ def test_choice_of_the_renderer(asked, installed, gpu, chosen, monkeypatch):
     """What the user asks for if it is installed; else EGL on a GPU, Mesa without; else none, and a line says why."""
     monkeypatch.setenv("MUJOCO_GL", asked or "")
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so" if name in installed else None)
-    monkeypatch.setattr(rendering, "Path", lambda path: SimpleNamespace(exists=lambda: gpu))
-    reason = rendering.choose_offscreen_renderer()
+    monkeypatch.setattr(devices, "Path", lambda path: SimpleNamespace(exists=lambda: gpu))
+    reason = devices.choose_offscreen_renderer()
     assert os.environ["MUJOCO_GL"] == (chosen or "disable")
     if chosen:
         assert reason is None

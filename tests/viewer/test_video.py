@@ -15,31 +15,28 @@ pytest.importorskip("PIL", reason="Pillow is not installed: pip install -e .[vid
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from legged_torque.utils.errors import UserError
 from legged_torque.viewer import video
-from legged_torque.viewer.arrows import add_velocities
-from legged_torque.viewer.video import Moment, TaskRecorder, add_overlay, write_video
+from legged_torque.viewer.mujoco_scene import add_velocities
+from legged_torque.viewer.video import Moment, TaskRecorder, VideoRecorder, add_text
 
 XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
 
 DRAW = """
 import sys
 from pathlib import Path
-from legged_torque.utils.rendering import choose_offscreen_renderer
+from legged_torque.utils.devices import choose_offscreen_renderer
 reason = choose_offscreen_renderer()
 if reason:
     sys.exit("no renderer: " + reason)
 import mujoco, numpy as np
-from legged_torque.viewer.video import Moment, write_video
-from legged_torque.utils.errors import UserError
+from legged_torque.viewer.video import Moment, VideoRecorder
 model = mujoco.MjModel.from_xml_path(sys.argv[1])
 qpos = model.key_qpos[0] if model.nkey else model.qpos0
-moments = [Moment(qpos, np.array([0.5, i, 0.0]), np.zeros(3)) for i in range(int(sys.argv[3]))]
-try:
-    write_video(Path(sys.argv[2]), model, 1, [moments] * 5, 0.02)
-except UserError as error:
-    if "the renderer does not start" not in str(error):
-        raise
-    sys.exit("no renderer: " + str(error))
+recorder, frames = VideoRecorder(model, 1, 0.02), []
+recorder.steps = 5 * [[Moment(qpos, np.array([0.5, i, 0.0]), np.zeros(3)) for i in range(int(sys.argv[3]))]]
+recorder.write(Path(sys.argv[2]), lambda *frame: frames.append(frame))
+assert frames == [(1, 3), (2, 3), (3, 3)], frames
 """
 
 
@@ -78,8 +75,8 @@ def test_frames(tmp_path, robots, width, height):
 def test_overlay_is_readable(gray):
     """Text is bright on dark whatever is behind it, and only the corner changes."""
     image = np.full((270, 480, 3), gray, np.uint8)
-    rows = video._table(1.0, moment())
-    result = add_overlay(image, rows)
+    rows = video.velocity_rows(1.0, moment())
+    result = add_text(image, rows)
     assert (image == gray).all() and result.shape == image.shape and result.dtype == np.uint8
     ys, xs = np.nonzero((result != gray).any(axis=2))
     assert xs.min() > 0 and xs.max() < 0.5 * 480 and ys.min() > 0 and ys.max() < 0.4 * 270
@@ -87,27 +84,16 @@ def test_overlay_is_readable(gray):
     assert np.median(box) < 90 and box.max() > 240
 
 
-@pytest.mark.parametrize("write", [lambda time, what: video._table(time, what), lambda time, what: video._line(what)])
-def test_overlay_shows_numbers(write):
-    """Another command or velocity is another picture."""
-    image = np.full((360, 640, 3), 100, np.uint8)
-    moments = [moment(), moment(command=(0.5, 0.5, 0.0)), moment(velocity=(0.9, 0.4, 0.0))]
-    pictures = [add_overlay(image, write(1.0, what)).tobytes() for what in moments]
-    assert len({*pictures, image.tobytes()}) == 4
-
-
 def test_numbers():
     """Time, command and velocity with two digits, without the flicker of a negative zero."""
-    words = [row for _, row in video._table(3.14159, moment())]
+    words = [row for _, row in video.velocity_rows(3.14159, moment())]
     assert words[0] == ["3.14 s", "v_x", "v_y", "yaw"]
     assert words[1:3] == [["command", "+0.50", "-0.25", "+0.00"], ["actual", "+0.30", "+0.40", "+0.00"]]
-    assert [row for _, row in video._line(moment())] == [["command", "0.56 m/s"], ["actual", "0.50 m/s"]]
+    assert [row for _, row in video.speed_rows(moment())] == [["command", "0.56 m/s"], ["actual", "0.50 m/s"]]
 
 
-def test_recorded_worlds(make_task, monkeypatch):
+def test_recorded_worlds(make_task):
     """One world is the fastest one, more are the first ones; what is kept is the task's state."""
-    saved = []
-    monkeypatch.setattr(video, "write_video", lambda *args: saved.append(args))
     task = make_task("a1_torque", num_envs=5)
     task.reset()
     task.commands[:] = 0.1
@@ -118,10 +104,8 @@ def test_recorded_worlds(make_task, monkeypatch):
             recorder.add_step()
         task.commands[:, 0] = 0.2  # the robot of the video stays the same
     for recorder, worlds in ((one, [3]), (four, [0, 1, 2, 3])):
-        recorder.save(Path("out.mp4"), None)
-        file, model, trunk, steps, control_step, ground = saved[-1]
-        assert (file, model.body(trunk).name, control_step, ground) == (Path("out.mp4"), "trunk", task.dt, None)
-        for number, moments in enumerate(steps):
+        assert recorder.model.body(recorder.trunk).name == "trunk"
+        for number, moments in enumerate(recorder.steps):
             assert len(moments) == len(worlds)
             for world, kept in zip(worlds, moments, strict=True):
                 np.testing.assert_array_equal(kept.qpos, task.sim.qpos[world].double().numpy())
@@ -131,7 +115,7 @@ def test_recorded_worlds(make_task, monkeypatch):
 
 
 def test_arrows_of_velocities():
-    """They point where the trunk, turned to the left by a quarter, is told to go and goes; 0 has none."""
+    """Commanded and actual velocity of a trunk that is turned to the left by a quarter; 0 has none."""
     body = "<body pos='0 0 1'><freejoint/><geom size='0.1'/></body>"
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     data, scene = mujoco.MjData(model), mujoco.MjvScene(model, 10)
@@ -147,8 +131,8 @@ def test_arrows_of_velocities():
 def test_missing_extra(monkeypatch, tmp_path):
     """Without an encoder the extra is named."""
     monkeypatch.setitem(sys.modules, "imageio", None)
-    with pytest.raises(video.UserError, match=r"videos need the extra: pip install 'legged_torque\[video\]'"):
-        write_video(tmp_path / "out.mp4", None, 1, [[moment()]], 0.02)
+    with pytest.raises(UserError, match=r"videos need the extra: pip install 'legged_torque\[video\]'"):
+        VideoRecorder(None, 1, 0.02).write(tmp_path / "out.mp4")
 
 
 def test_videos_in_tensorboard(tmp_path):

@@ -14,7 +14,7 @@ from legged_torque.envs.base.robot_checks import engine_notes, floor_problems, f
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching
 from legged_torque.sim.robot_file import model_problems, spec_problems, use_plain_motors
 from legged_torque.terrain.terrain import Terrain
-from legged_torque.utils.errors import UserError, collect_errors, unknown_name
+from legged_torque.utils.errors import UserError, collect_errors, refuse, unknown_name
 from legged_torque.utils.mjcf import (
     drawing_notes,
     exclude_self_collisions,
@@ -23,7 +23,6 @@ from legged_torque.utils.mjcf import (
     read_spec,
     self_pairs,
 )
-from legged_torque.utils.problems import refuse
 
 
 @dataclass

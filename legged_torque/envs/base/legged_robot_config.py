@@ -11,6 +11,7 @@ from legged_torque.envs.base.older_runs import RENAMED, converted, is_older
 from legged_torque.learning.settings import Activation, TrainingCfg
 from legged_torque.motors.config import DelayCfg, IdealCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import (
     Count,
     Fraction,
@@ -37,6 +38,12 @@ class LinearChange(Section):
     end: float = 1.0  # value from t_end on
     t_start: Number = 0  # [total steps]
     t_end: Number = 1  # [total steps]
+
+    def check(self, path: str = "") -> None:
+        """Refuse values that are not allowed, and a change backwards in time."""
+        super().check(path)
+        if self.t_start > self.t_end:
+            raise UserError(f"{path}.t_start must be at most its t_end, {self.t_end}, not {self.t_start}")
 
 
 class LeggedRobotCfg(BaseConfig):

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LinearChange
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.terrain.layout import Layout
-from legged_torque.utils.config import Section, check_section, section_keys
 from legged_torque.utils.errors import UserError, unknown_name
 
 
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     """Raise a UserError that names the first setting of a task that makes no sense, alone or with others."""
-    check_section(cfg)
-    _check_changes(cfg)
+    cfg.check()
     for pair in cfg.asset.mirrored_legs:
         if len(pair) != 2:
             raise UserError(f"asset.mirrored_legs must be pairs [right, left], not {pair}")
@@ -45,13 +43,3 @@ def _check_map(cfg: LeggedRobotCfg) -> None:
         if farthest > settings.border_size:
             most = f"at most terrain.border_size, {settings.border_size}, either way"
             raise UserError(f"terrain.{name} must be {most}, not {farthest}")
-
-
-def _check_changes(section: Section, path: str = "") -> None:
-    """Refuse values that change backwards in time."""
-    for key in section_keys(section):
-        value, dotted = getattr(section, key), f"{path}{key}"
-        if isinstance(value, LinearChange) and value.t_start > value.t_end:
-            raise UserError(f"{dotted}.t_start must be at most its t_end, {value.t_end}, not {value.t_start}")
-        if isinstance(value, Section):
-            _check_changes(value, f"{dotted}.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import zip_longest
 from typing import Any
 
 import torch
@@ -54,9 +55,9 @@ class TorchPPO(PPO):
         annealing_start: float = 1.0,
         **kwargs,
     ) -> None:
-        """Create the algorithm; arguments are rsl_rl's, the bound of the adaptive learning rate, and :meth:`anneal`'s.
+        """Create the algorithm; arguments are rsl_rl's, a bound of the adaptive rate, and a share of the training.
 
-        A UserError names a setting that is not supported.
+        See :meth:`set_progress` for ``annealing_start``. A UserError names a setting that is not supported.
         """
         if optimizer not in ("adam", "adamw"):  # of these torch can skip a step on the device
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
@@ -118,17 +119,26 @@ class TorchPPO(PPO):
         return True
 
     def set_progress(self, iteration: int, num_iterations: int) -> None:
-        """Prepare the update of an iteration: warm-up of the critic, and annealing."""
-        self.learn_actor(iteration >= self.warm_up_iterations)
-        self.anneal(iteration / num_iterations)
+        """Prepare the update of an iteration: the critic learns alone at first, and the last updates are small.
+
+        After the share ``annealing_start`` of the training, the weight of the entropy and the desired KL divergence
+        fall linearly to 0. The adaptive learning rate follows the latter; a fixed learning rate falls itself.
+        """
+        self.actor_learns.fill_(float(iteration >= self.warm_up_iterations))
+        left = min(1.0, (1.0 - iteration / num_iterations) / max(1.0 - self.annealing_start, 1e-9))
+        self.entropy_weight.fill_(left * self.entropy_coef)
+        if self.schedule == "adaptive":
+            self.kl_target.fill_(left * self.desired_kl)
+        else:
+            self.learning_rate.fill_(left * self._first_rate)
 
     def policy(self) -> MLPModel:
         """Return the actor."""
         return self.get_policy()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what :meth:`save` does."""
-        return self.save()
+        """Return what rsl_rl saves, each tensor in memory of its own."""
+        return tree_map(lambda value: value.clone() if isinstance(value, Tensor) else value, self.save())
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load all parts of a :meth:`state_dict`."""
@@ -139,23 +149,6 @@ class TorchPPO(PPO):
         self.update_graph.reset()
 
     # ---- rsl_rl's methods --------------------------------------------------------------------------------------------
-
-    def learn_actor(self, enabled: bool) -> None:
-        """Choose whether the next updates train the policy too, or the value function alone."""
-        self.actor_learns.fill_(float(enabled))
-
-    def anneal(self, progress: float) -> None:
-        """Make the next update smaller, after this share of the training.
-
-        From the share ``annealing_start`` on, the weight of the entropy and the desired KL divergence fall linearly to
-        0. The adaptive learning rate follows the latter; a fixed learning rate falls itself.
-        """
-        left = min(1.0, (1.0 - progress) / max(1.0 - self.annealing_start, 1e-9))
-        self.entropy_weight.fill_(left * self.entropy_coef)
-        if self.schedule == "adaptive":
-            self.kl_target.fill_(left * self.desired_kl)
-        else:
-            self.learning_rate.fill_(left * self._first_rate)
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions and keep the transition, with a copy of observations that a task may overwrite in its step."""
@@ -175,7 +168,7 @@ class TorchPPO(PPO):
             :class:`~legged_torque.learning.protocols.Learner`.
         """
         self.losses.zero_()
-        before = flattened(self.tensors())
+        before = [tensor.clone() for tensor in self.tensors()]
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(self.batch_size * self.num_mini_batches, device=self.device)
             for indices in order.split(self.batch_size):
@@ -183,24 +176,21 @@ class TorchPPO(PPO):
                 self.update_graph()
         self._update_normalization()
         self.storage.clear()
-        is_finite = torch.isfinite(flattened(self.tensors())).all().float()
-        numbers = torch.cat([self.losses, is_finite.unsqueeze(0)])
+        is_finite = torch.cat([tensor.flatten() for tensor in self.tensors()]).isfinite().all()
+        numbers = torch.cat([self.losses, is_finite.float().unsqueeze(0)])
         if self.is_multi_gpu:
             distributed.average([numbers])
         *values, share_finite = numbers.tolist()  # the only time that the host waits
         losses = dict(zip(LOSS_NAMES, values, strict=True))
         num_updates = self.num_learning_epochs * self.num_mini_batches
         if share_finite < 1.0:  # in any process
-            self._restore(before)
+            for tensor, old in zip_longest(self.tensors(), before):
+                tensor.zero_() if old is None else tensor.copy_(old)  # there are no moments before the first step
             losses = dict.fromkeys(LOSS_NAMES, 0.0) | {"skipped_updates": float(num_updates)}
         updates = num_updates - losses["skipped_updates"]
         means = {name: loss if name == "skipped_updates" else loss / max(updates, 1) for name, loss in losses.items()}
         policy = {"learning_rate": self.learning_rate.item(), "action_std": self.action_std().mean().item()}
         return {**means, **policy, "all_skipped": updates <= 0}
-
-    def save(self) -> dict:
-        """Return what rsl_rl saves, each tensor in memory of its own."""
-        return tree_map(lambda value: value.clone() if isinstance(value, Tensor) else value, super().save())
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Load as rsl_rl does, and keep the learning rate the tensor that it was."""
@@ -220,13 +210,6 @@ class TorchPPO(PPO):
         """Return the weights, and moments and counters of the optimizer, which exist from its first step on."""
         kept = [value for entry in self.optimizer.state.values() for value in entry.values()]
         return [*(parameter.data for parameter in self._parameters), *kept]
-
-    def _restore(self, before: Tensor) -> None:
-        """Undo an update; ``before`` are the flattened numbers of :meth:`tensors` before it."""
-        state = self.tensors()
-        before = torch.cat([before, before.new_zeros(sum(map(torch.numel, state)) - len(before))])  # as they start
-        for tensor, numbers in zip(state, before.split([tensor.numel() for tensor in state]), strict=True):
-            tensor.copy_(numbers.view_as(tensor))
 
     def _update_normalization(self) -> None:
         """Let models that normalize observations learn from the rollout; graphs need the tensors to stay the same."""
@@ -273,7 +256,12 @@ class TorchPPO(PPO):
         loss.backward()
         if self.is_multi_gpu:
             distributed.average([*(parameter.grad for parameter in self._parameters if parameter.grad is not None), kl])
-        self._adapt_learning_rate(kl)
+        if self.schedule == "adaptive":
+            lower = kl > 2.0 * self.kl_target
+            higher = (kl < 0.5 * self.kl_target) & (kl > 0.0)
+            factor = torch.where(lower, 1.0 / 1.5, torch.where(higher, 1.5, 1.0))
+            factor = torch.where(self.actor_learns.bool(), factor, 1.0)  # a fixed policy has no divergence
+            self.learning_rate.mul_(factor).clamp_(*self.learning_rates)
         models = (self.actor, self.critic)  # each is clipped by itself
         norms = torch.stack([nn.utils.clip_grad_norm_(m.parameters(), self.max_grad_norm) for m in models])
         gradient_norm = torch.linalg.vector_norm(norms)
@@ -302,17 +290,3 @@ class TorchPPO(PPO):
             old_actions_log_prob=pick(storage.actions_log_prob),
             old_distribution_params=tuple(pick(params) for params in storage.distribution_params),
         )
-
-    def _adapt_learning_rate(self, kl: Tensor) -> None:
-        """Adapt the learning rate to the mean KL divergence, if it is adaptive."""
-        if self.schedule == "adaptive":
-            lower = kl > 2.0 * self.kl_target
-            higher = (kl < 0.5 * self.kl_target) & (kl > 0.0)
-            factor = torch.where(lower, 1.0 / 1.5, torch.where(higher, 1.5, 1.0))
-            factor = torch.where(self.actor_learns.bool(), factor, 1.0)  # a fixed policy has no divergence
-            self.learning_rate.mul_(factor).clamp_(*self.learning_rates)
-
-
-def flattened(tensors: list[Tensor]) -> Tensor:
-    """Return the numbers of several tensors behind each other."""
-    return torch.cat([tensor.flatten() for tensor in tensors])

@@ -8,8 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from legged_torque.utils.errors import refuse
 from legged_torque.utils.mjcf import body_chains, self_pairs, why_no_motor
-from legged_torque.utils.problems import refuse
 
 MAX_BRANCHES = 16  # threads of a world must fit into half a warp
 _SELF_KINDS = [mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX]

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from legged_torque.learning.ppo.triton.networks import Block, Columns, Layer, Network, aligned
 
@@ -40,21 +41,14 @@ class Parameters:
         dtype: torch.dtype,
     ) -> None:
         """Move the parameters of both modules into one piece; ``std_parameter`` is that of the actions' deviations."""
-        self.modules = (actor, critic)
-        parameters = [*actor.parameters(), *critic.parameters()]
-        device = parameters[0].device
-        self.flat = torch.cat([parameter.detach().flatten() for parameter in parameters])
+        self._parameters = [*actor.parameters(), *critic.parameters()]
+        self.flat = parameters_to_vector(self._parameters).detach()
+        vector_to_parameters(self.flat, self._parameters)
         self.actor_size = sum(parameter.numel() for parameter in actor.parameters())
-        self._start = {}
-        start = 0
-        for parameter in parameters:
-            self._start[id(parameter)] = start
-            parameter.data = self.flat[start : start + parameter.numel()].view_as(parameter)
-            start += parameter.numel()
-        source = torch.full((start,), -1, dtype=torch.int32)
-        destination = [start + number for number in range(NUMBERS)]
-        first = self.start(std_parameter)
-        destination += range(first, first + std_parameter.numel())
+        device, size = self.flat.device, len(self.flat)
+        source = torch.full((size,), -1, dtype=torch.int32)
+        first = std_parameter.storage_offset()
+        destination = [*range(size, size + NUMBERS), *range(first, first + std_parameter.numel())]
         self.place: dict[Layer, int] = {}  # of a layer's weights
         self.sum_column: dict[Columns, int] = {}  # of the sums of gradients by what a layer writes
         self.room = 0
@@ -63,27 +57,22 @@ class Parameters:
             height = aligned(layer.target.size)
             self.place[layer] = self.room
             rows = torch.arange(linear.out_features).unsqueeze(1)
-            first = self.start(linear.weight)
+            first = linear.weight.storage_offset()
             index = self.room + rows * layer.input_width + layer.input_columns()
             source[first : first + index.numel()] = index.flatten().to(source.dtype)
             self.room += height * layer.input_width
             self.sum_column[layer.target] = len(destination)
-            first = self.start(linear.bias)
+            first = linear.bias.storage_offset()
             destination += [*range(first, first + linear.out_features), *[-1] * (height - linear.out_features)]
         beyond = TILE * max(layer.input_width for layer in layers)  # that a tile may read
         self.weights = torch.zeros(self.room + beyond, dtype=dtype, device=device)
         self.source = source.to(device)
         self.destination = torch.tensor(destination, dtype=torch.int32, device=device)
 
-    def start(self, parameter: nn.Parameter) -> int:
-        """Return where a parameter of the modules begins among all of them."""
-        return self._start[id(parameter)]
-
     def views(self, flat: Tensor) -> list[Tensor]:
         """Return what belongs to each parameter in a tensor like ``flat``."""
-        parameters = [parameter for module in self.modules for parameter in module.parameters()]
-        starts = [self.start(parameter) for parameter in parameters]
-        return [flat[at : at + p.numel()].view_as(p) for at, p in zip(starts, parameters, strict=True)]
+        parts = flat[: len(self.flat)].split([parameter.numel() for parameter in self._parameters])
+        return [part.view_as(parameter) for part, parameter in zip(parts, self._parameters, strict=True)]
 
 
 class Workspace:
@@ -129,7 +118,7 @@ class Workspace:
         for layer in layers:
             source, target = layer.sources[0], layer.target
             weights = self._parameters.place[layer]
-            bias = self._parameters.start(layer.linear.bias)
+            bias = int(layer.linear.bias.storage_offset())
             for first in range(0, aligned(target.size), TILE):
                 output = -1 if layer.first_output is None else layer.first_output + first
                 read = [self.place(source), source.block.width, layer.input_width]

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from legged_torque.envs import task_registry
-from legged_torque.utils.args import Parser, add_build_args, options_of
-from legged_torque.utils.cli import check_output, slow_imports
+from legged_torque.utils import cli
 from legged_torque.utils.plotting import load_pyplot, save_figure
 from legged_torque.utils.task_registry import set_seed
 
@@ -45,18 +44,18 @@ class Panel:
 
 def plot_randomization() -> None:
     """Read the command line, build a task, and draw a panel per random parameter."""
-    parser = Parser(
+    parser = cli.Parser(
         "Draw the random numbers of a task: ``python scripts/plot.py randomization --out distributions.png``.\n\n"
         "Builds 2000 worlds of a1_position with --perturbation low, by default, and reads the numbers that physics and "
         "controller use, in the units of the simulation. Of several joints, the first one is shown."
     )
-    add_build_args(parser)
+    cli.add_options(parser, *cli.SETTINGS, "num_envs")
     parser.set_defaults(task="a1_position", perturbation="low", num_envs=2000)
     parser.add_argument("--out", type=Path, required=True, help="picture to write (png, svg, pdf)")
     args = parser.parse_args()
-    check_output(args.out)
-    options = options_of(args)
-    with slow_imports():
+    cli.check_output(args.out)
+    options = cli.options_of(args)
+    with cli.slow_imports():
         env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
         from legged_torque.envs.base.legged_robot import LeggedRobot
     set_seed(train_cfg.seed)

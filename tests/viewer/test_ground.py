@@ -9,9 +9,8 @@ import torch
 from support.ground import make_ground, rays
 
 from legged_torque.terrain.colors import NEUTRAL, color_of
-from legged_torque.viewer.framing import size_of
 from legged_torque.viewer.ground import CLEARANCE, Ground, drawn_model, patches
-from legged_torque.viewer.video import DISTANCE, Camera
+from legged_torque.viewer.mujoco_scene import DISTANCE, Camera, size_of, smoothed
 
 XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
 KINDS = {"stairs_up": 0.25, "rough_slope": 0.25, "stepping_stones": 0.25, "pits": 0.25}
@@ -40,6 +39,8 @@ def test_surface(terrain, ground):
     errors = np.abs(found - terrain.map.height(torch.from_numpy(points)).numpy())
     assert errors.max() < 0.01 and np.quantile(errors, 0.8) < 1e-5
     assert len(ground.faces) < 0.2 * 2 * terrain.map.heights.size
+    outside = np.array([99.0, -99.0])  # as at the edge
+    assert ground.height(outside) == terrain.map.heights[-1, 0]
 
 
 @pytest.mark.parametrize("kind", range(4))
@@ -55,11 +56,9 @@ def test_patches(terrain, kind):
     covered = np.zeros((heights.shape[0] - 1, heights.shape[1] - 1), int)
     for first_row, last_row, first_col, last_col in found:
         covered[first_row:last_row, first_col:last_col] += 1
-        corners = heights[[first_row, last_row]][:, [first_col, last_col]].astype(float)
-        shares = np.linspace(0.0, 1.0, last_col - first_col + 1)
-        for row, (start, end) in zip((first_row, last_row), corners, strict=True):
+        for row in (first_row, last_row):
             line = heights[row, first_col : last_col + 1]
-            np.testing.assert_allclose(line, start + shares * (end - start), atol=2e-3)
+            np.testing.assert_allclose(line, np.linspace(line[0], line[-1], len(line)), atol=2e-3)
     assert (covered == 1).all()
     if kind == 0:
         assert len(found) == 3 * 2
@@ -75,13 +74,6 @@ def test_picture(terrain, ground):
             assert tuple(picture[tuple((place * pixels).astype(int))]) == color_of(kind)
     assert tuple(picture[5, 5]) == NEUTRAL and color_of("my own") not in map(color_of, KINDS)
     assert ground.tile_text(1, 3) == "pits, level 1 (difficulty 0.50)"
-
-
-def test_heights(terrain, ground):
-    """Heights at samples are those of the map; outside they are those of the edge."""
-    points = np.array([[-7.0 + 0.05 * 20, 3.0], [99.0, -99.0]])
-    expected = [float(terrain.map.heights[20, round((3.0 + 13.0) / 0.05)]), float(terrain.map.heights[-1, 0])]
-    np.testing.assert_allclose(ground.height(points), expected)
 
 
 @pytest.mark.parametrize("azimuth", np.radians([0.0, 50.0, 90.0, 180.0, 300.0]))
@@ -115,24 +107,9 @@ def test_camera_sees_robots_of_every_size(robot, top, size):
     assert -0.9 * half < feet < 0.0 < head < 0.9 * half and head - feet > 0.4 * half
 
 
-def test_camera_follows_smoothly():
-    """A step lifts the camera little by little; a robot that starts anew is seen at once."""
-    levels = [0.0, 0.2, 0.2, 2.0]
-
-    class Steps(Ground):
-        """Level ground that rises from frame to frame."""
-
-        frame = 0
-
-        def __init__(self):
-            """Need no map."""
-
-        def height(self, points):
-            """Return the level of this frame everywhere."""
-            return np.full(points.shape[:-1], levels[self.frame])
-
-    steps = Steps()
-    camera, seen = Camera(steps, 1.0), []
-    for steps.frame in range(len(levels)):
-        seen.append(camera.look_at(np.zeros(3)).lookat[2] - 0.25)
-    assert seen[0] == 0.0 < seen[1] < seen[2] < 0.1 and seen[3] == pytest.approx(2.0)
+def test_cameras_follow_smoothly():
+    """A step lifts a camera little by little; a robot that starts anew is seen at once."""
+    heights = [None]
+    for ground in (0.0, 0.2, 0.2, 2.0):
+        heights.append(smoothed(heights[-1], ground))
+    assert heights[1] == 0.0 < heights[2] < heights[3] < 0.1 and heights[4] == 2.0

@@ -7,8 +7,8 @@ import torch
 from support.ground import ground_cfg, make_ground
 from support.settings import error_of
 
+from legged_torque.envs.base.crossing import Grounds, cross
 from legged_torque.envs.robots.a1 import A1Cfg
-from legged_torque.learning.crossing import Grounds, cross
 from legged_torque.terrain import make_terrain
 from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.tiles import TILES

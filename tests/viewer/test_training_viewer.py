@@ -1,16 +1,17 @@
-"""What is seen beside a training: real processes, of a script that stands in for play.py."""
+"""The page and the videos of a running training: real processes, of a script that stands in for play.py."""
 
 import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from support.clock import wait_for
 
 from legged_torque.utils.errors import UserError
-from legged_torque.viewer import beside
+from legged_torque.viewer import training_viewer
+from legged_torque.viewer.training_viewer import TrainingViewer
 
 PLAY = """
 import json, os, sys, time
@@ -33,28 +34,29 @@ def run(tmp_path, monkeypatch):
     """A folder of a run, and the script that is started in place of play.py."""
     (tmp_path / "scripts").mkdir()
     (tmp_path / "scripts" / "play.py").write_text(PLAY)
-    monkeypatch.setattr(beside, "SCRIPTS_DIR", tmp_path / "scripts")
-    monkeypatch.setattr(beside, "EXTRAS", {"viewer": (), "video": ()})
+    monkeypatch.setattr(training_viewer, "SCRIPTS_DIR", tmp_path / "scripts")
+    monkeypatch.setattr(training_viewer, "EXTRAS", {"viewer": (), "video": ()})
     monkeypatch.setenv("RANK", "0")
     (tmp_path / "run").mkdir()
     return tmp_path / "run"
 
 
-def wait_for(file):
-    """Wait until there is a file, and return its text."""
-    end = time.monotonic() + 30.0
-    while not (file.exists() and file.read_text()):
-        assert time.monotonic() < end, f"there is no {file}"
-        time.sleep(0.02)
-    return file.read_text()
+def text_of(file):
+    """Wait until something has been written to a file, and return it."""
+    return wait_for(lambda: file.exists() and file.read_text())
+
+
+def show(viewer, run, *numbers):
+    """Show checkpoints of a run."""
+    for number in numbers:
+        viewer.show(["--task=a1_torque"], run / f"model_{number}.pt")
 
 
 def test_page(run, capsys):
     """It is served from the first checkpoint on, once, without the GPU and torchrun's variables, until the end."""
-    shown = beside.Beside(has_page=True, video_interval=0)
-    for number in (0, 50):
-        shown.show(["--task=a1_torque"], run / f"model_{number}.pt")
-    process = int(wait_for(run / "page"))
+    shown = TrainingViewer(has_page=True, video_interval=0)
+    show(shown, run, 0, 50)
+    process = int(text_of(run / "page"))
     text = (run / "page.log").read_text()
     assert text.count("load_run") == 1 and f'"port": "{shown.page.rpartition(":")[2]}"' in text
     assert '"RANK": null' in text and '"CUDA_VISIBLE_DEVICES": ""' in text and '"device": "cpu"' in text
@@ -68,69 +70,59 @@ def test_page(run, capsys):
 KILLED = """
 import os, signal, sys, time
 from pathlib import Path
-from legged_torque.viewer import beside
+from legged_torque.viewer import training_viewer
 run = Path(sys.argv[1])
-beside.SCRIPTS_DIR = run.parent / "scripts"
-beside.start([f"--load_run={run}", "--port=1"], run / "page.log")
+training_viewer.SCRIPTS_DIR = run.parent / "scripts"
+training_viewer.start([f"--load_run={run}", "--port=1"], run / "page.log")
 while not ((run / "page").exists() and (run / "page").read_text()):
     time.sleep(0.02)
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process that its parent is gone")
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux signals the end of a parent")
 def test_killed_training(run):
     """Nothing stays of a training that is killed and cannot end its page."""
     training = subprocess.run([sys.executable, "-c", KILLED, str(run)], check=False)
     assert training.returncode == -signal.SIGKILL
-    status, end = Path("/proc", wait_for(run / "page"), "stat"), time.monotonic() + 10.0
-    while status.exists() and status.read_text().split()[2] != "Z":
-        assert time.monotonic() < end, "the page is still there"
-        time.sleep(0.02)
+    status = Path("/proc", text_of(run / "page"), "stat")
+    wait_for(lambda: not status.exists() or status.read_text().split()[2] == "Z")
 
 
 @pytest.mark.parametrize(("outcome", "warnings"), [("well", 0), ("badly", 1)])
 def test_videos(run, capsys, outcome, warnings):
-    """They are those of the next checkpoints after each interval, one at a time; what is missing is told."""
-    shown = beside.Beside(has_page=False, video_interval=100)
-    for number in (0, 50, 100, 150):  # the video of the first one is not done yet
-        shown.show(["--task=a1_torque"], run / f"model_{number}.pt")
+    """They are those of the next checkpoints after each interval, one at a time; a missing one is reported."""
+    shown = TrainingViewer(has_page=False, video_interval=100)
+    show(shown, run, 0, 50, 100, 150)  # the video of the first one is not done yet
     (run / "go").write_text("well")
     shown._video.wait(30.0)
     (run / "go").write_text(outcome)
-    for number in (200, 250):
-        shown.show(["--task=a1_torque"], run / f"model_{number}.pt")
+    show(shown, run, 200, 250)
     shown.close(is_waiting=True)
     made = {path.name for path in (run / "videos").iterdir()}
     assert made == {"model_0.log", "model_0.mp4", "model_200.log"} | ({"model_200.mp4"} if outcome == "well" else set())
     assert capsys.readouterr().err.count("Warning: there is no video of model_200") == warnings
 
 
-def test_what_cannot_be_started(run, capsys):
-    """It is told, and the training goes on."""
-    shown = beside.Beside(has_page=True, video_interval=0)
+def test_a_page_that_cannot_start_or_ends(run, capsys):
+    """Each gives one warning, and the training goes on."""
+    shown = TrainingViewer(has_page=True, video_interval=0)
     (run / "page.log").mkdir()  # where a file should be
-    shown.show(["--task=a1_torque"], run / "model_0.pt")
-    shown.close(is_waiting=True)
-    assert "Warning: nothing is shown of model_0: " in capsys.readouterr().err
-
-
-def test_a_page_that_ends(run, capsys):
-    """It is told once."""
-    shown = beside.Beside(has_page=True, video_interval=0)
-    shown.show(["--task=a1_torque"], run / "model_0.pt")
-    os.kill(int(wait_for(run / "page")), signal.SIGKILL)
+    show(shown, run, 0)
+    (run / "page.log").rmdir()
+    show(shown, run, 50)
+    os.kill(int(text_of(run / "page")), signal.SIGKILL)
     shown._page.wait()
-    for number in (50, 100):
-        shown.show(["--task=a1_torque"], run / f"model_{number}.pt")
+    show(shown, run, 100, 150)
     shown.close(is_waiting=True)
-    assert capsys.readouterr().err.count("Warning: the page has ended; ") == 1
+    error = capsys.readouterr().err
+    assert error.count("Warning: nothing is shown of model_0: ") == error.count("Warning: the page has ended; ") == 1
 
 
 def test_interrupted_training_does_not_wait(run):
     """The video that is being made is given up."""
-    shown = beside.Beside(has_page=False, video_interval=1)
-    shown.show(["--task=a1_torque"], run / "model_0.pt")
+    shown = TrainingViewer(has_page=False, video_interval=1)
+    show(shown, run, 0)
     shown.close(is_waiting=False)
     assert shown._video.poll() is not None
 
@@ -138,15 +130,7 @@ def test_interrupted_training_does_not_wait(run):
 @pytest.mark.parametrize(("words", "extra"), [((True, 0), "viewer"), ((False, 5), "video")])
 def test_missing_extra(monkeypatch, words, extra):
     """It is named before anything is trained."""
-    monkeypatch.setattr(beside, "EXTRAS", {"viewer": ("no_such_package",), "video": ("no_such_package",)})
+    monkeypatch.setattr(training_viewer, "EXTRAS", {"viewer": ("no_such_package",), "video": ("no_such_package",)})
     with pytest.raises(UserError, match=rf"pip install 'legged_torque\[{extra}\]' \(no_such_package is missing\)"):
-        beside.Beside(*words)
-    beside.Beside(False, 0)
-
-
-def test_nothing_is_started_without_a_wish(run):
-    """Neither page nor videos."""
-    shown = beside.Beside(False, 0)
-    shown.show(["--task=a1_torque"], run / "model_0.pt")
-    shown.close(is_waiting=True)
-    assert not list(run.iterdir()) and shown.page == ""
+        TrainingViewer(*words)
+    assert TrainingViewer(False, 0).page == ""

@@ -18,8 +18,7 @@ from legged_torque.utils.cli import check_output
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import held
-from legged_torque.utils.runs import with_present_names
-from legged_torque.utils.task_registry import all_experiments_dir
+from legged_torque.utils.runs import PRETRAINED, with_present_names
 
 SPACES = {
     "env": (
@@ -41,7 +40,6 @@ SPACES = {
 """Settings of task and training that a pre-trained policy must share, as far as there are such settings."""
 OF_TRAINING = ("file", "critic_warmup_iterations")
 """Settings of ``pretraining`` about a training that starts from the policy, not about the making of the policy."""
-PRETRAINED = "pretrained"  # folder of pre-trained policies, in that of all experiments
 STANDARD_DEVIATION = "distribution."
 """Start of the names of parameters that are not taken over: a training has its own setting of exploration."""
 
@@ -50,7 +48,7 @@ def pretrained_file(task: str, train_cfg: Any, log_root: str | None = None) -> P
     """Return where a task's pre-trained policy is kept: ``pretraining.file``, or in the folder of all experiments."""
     if train_cfg.pretraining.file:
         return Path(train_cfg.pretraining.file)
-    return all_experiments_dir(log_root) / PRETRAINED / f"{task}.pt"
+    return Path(log_root or "logs") / PRETRAINED / f"{task}.pt"
 
 
 def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> None:

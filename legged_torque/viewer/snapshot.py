@@ -1,0 +1,108 @@
+"""A running task in the host's memory, read once after each control step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.sensors.height_scan import HeightScan
+from legged_torque.terrain.rough import RoughGround
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A task after one control step. Without another word, values are those of the followed world."""
+
+    time: float  # simulated time since the session's start [s]
+    world: int  # the followed world
+    qpos: np.ndarray  # positions of all worlds, as sim.qpos; (num_envs, nq)
+    commands: np.ndarray  # commands of all worlds during the step [m/s, m/s, rad/s]; (num_envs, 3)
+    velocities: np.ndarray  # actual v_x, v_y and yaw rates of all worlds in the trunks' frames; (num_envs, 3)
+    falls: int  # number of worlds whose episode ended other than by its time
+    age: int  # control steps of the episode
+    torques: np.ndarray  # applied in the last physics step [N m]; (num_dof,)
+    torque_parts: np.ndarray  # the same by weighted action term, see WatchedRobot; (terms, num_dof)
+    targets: np.ndarray  # joint positions wanted by PD control [rad]; (num_dof,), empty without PD control
+    rewards: np.ndarray  # weighted reward terms of this step, per second; (terms,)
+    feet: np.ndarray  # 1 for each foot on the ground, else 0; (feet,)
+    forces: np.ndarray  # of the ground on the collision geoms, in the world [N]; (geoms, 3)
+    tile: tuple[int, int] | None  # level and column of the tile; None on a plane
+    scan: np.ndarray  # points of the height scan on the ground [m]; (points, 3), empty on a plane
+
+
+class WatchedRobot(LeggedRobot):
+    """A task that records what viewers show; made by :func:`watched`.
+
+    Attributes:
+        torque_parts: Torques of each weighted action term, with its weight and the motors' strength, but before the
+            limits [N m]; NaN for terms without a law. Shape: (terms, num_envs, num_dof).
+    """
+
+    def _init_state(self) -> None:
+        """Allocate the parts, and prepare the height scan."""
+        super()._init_state()
+        self._watched_scan = HeightScan(self.cfg.terrain, self.state)
+        self.torque_parts = torch.zeros(len(weighted_terms(self)), *self.dof_pos.shape, device=self.device)
+
+    def _compute_torques(self, actions: Tensor) -> Tensor:
+        """Return the task's torques and record their parts."""
+        parts = iter(self.torque_parts)
+        for term, own in zip(self.control_law.terms, actions.split(self.num_dof, dim=1), strict=True):
+            if term.weight is not None:
+                torques = term.torques(own.contiguous(), self.dof_pos, self.dof_vel) if term.law else own * torch.nan
+                next(parts).copy_(term.weight * torques * self.motors.strength)
+        return super()._compute_torques(actions)
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+        """Keep what a control step overwrites, and make one."""
+        self._watched_before = self.commands.clone(), self.episode_sums.clone()
+        return super().step(actions)
+
+    def snapshot(self, time: float, world: int) -> Snapshot:
+        """Return the result of the last step; for the arguments see :class:`Snapshot`."""
+        commands, sums = self._watched_before
+        rewards = self.episode_sums - torch.where(self.reset_buf, 0.0, sums)
+        tile, scan = None, commands[:0]
+        if isinstance(self.terrain, RoughGround):
+            tile = int(self.terrain.levels[world]), int(self.terrain.columns[world])
+            scan = self._watched_scan.points()[world]
+            scan[:, 2] = self.terrain.height(scan)
+        tensors = {
+            "qpos": self.sim.qpos,
+            "commands": commands,
+            "velocities": self.state.planar_velocity(),
+            "torques": self.torques[world],
+            "torque_parts": self.torque_parts[:, world],
+            "targets": self._position_targets()[world],
+            "rewards": rewards[:, world] / self.dt,
+            "feet": self.feet_contact[world],
+            "forces": self.sim.contact_force[world],
+            "scan": scan,
+        }
+        arrays = {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}
+        falls, age = int((self.reset_buf & ~self.time_out_buf).sum()), int(self.episode_length_buf[world])
+        return Snapshot(time, world, falls=falls, age=age, tile=tile, **arrays)
+
+    def _position_targets(self) -> Tensor:
+        """Return the joint positions wanted by PD control, see :class:`Snapshot`. Shape: (num_envs, num_dof or 0)."""
+        for place, term in enumerate(self.control_law.terms):
+            if term.name == "position_residual":
+                actions = self.actions[:, place * self.num_dof :][:, : self.num_dof]
+                return self.control.default_dof_pos + self.control.joint_offset + term.scale * actions
+        return self.actions[:, :0]
+
+
+def watched(task_class: type[LeggedRobot]) -> type[WatchedRobot]:
+    """Return a subclass of a task class that behaves the same and records what viewers show."""
+    return cast(type[WatchedRobot], type(task_class.__name__, (WatchedRobot, task_class), {}))
+
+
+def weighted_terms(task: LeggedRobot) -> dict[str, Tensor]:
+    """Return the weights of the action terms that have one, by name. Writing to them changes the task."""
+    return {term.name: term.weight for term in task.control_law.terms if term.weight is not None}

@@ -1,0 +1,87 @@
+"""MuJoCo's own window, and messages where it or the page cannot be shown."""
+
+import argparse
+import contextlib
+import runpy
+import sys
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from support.sessions import new_session
+
+from legged_torque import SCRIPTS_DIR
+from legged_torque.utils.errors import UserError
+from legged_torque.viewer import native
+from legged_torque.viewer.ground import drawn_task
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A session of torque control."""
+    return new_session(tmp_path_factory.mktemp("run"), "a1_torque")
+
+
+def test_keys(session):
+    """They change commands within the limits of the training, push, pause and reset."""
+    keyboard = native.Keyboard(session)
+    for key, count in ((265, 3), (264, 1), (44, 15), (46, 1), (263, 2), (262, 3)):
+        for _ in range(count):
+            keyboard.press(key)
+    session.tick()
+    assert session.command == pytest.approx((0.2, 0.9, -0.1))
+    for key in "0PA":  # A means nothing
+        keyboard.press(ord(key))
+    session.tick()
+    assert session.command == (0.0, 0.0, 0.0) and "pushed" in session.message.text
+    keyboard.press(ord(" "))
+    keyboard.press(ord("R"))
+    session.tick()
+    assert session.is_paused and session.message.text == "reset"
+    keyboard.press(ord(" "))
+    session.tick()
+    assert not session.is_paused
+
+
+def test_what_is_drawn(session):
+    """The state of the first world, its commanded velocity as an arrow, and both velocities as numbers."""
+    model, _ = drawn_task(session.task)
+    data, texts = mujoco.MjData(model), []
+    window = SimpleNamespace(
+        lock=contextlib.nullcontext,
+        opt=mujoco.MjvOption(),
+        user_scn=mujoco.MjvScene(model, 10),
+        set_texts=texts.append,
+        sync=lambda: None,
+    )
+    session.set_command((0.5, 0.0, 0.0))
+    session.tick()
+    native.draw(session, window, model, data, 1.0, None)
+    np.testing.assert_array_equal(data.qpos, session.snapshot.qpos[0])
+    arrow = window.user_scn.geoms[0]
+    assert arrow.type == mujoco.mjtGeom.mjGEOM_ARROW and arrow.rgba[1] > arrow.rgba[2]
+    _, _, names, values = texts[0]
+    rows = dict(zip(names.split("\n"), values.split("\n"), strict=True))
+    assert rows["v_x [m/s]"].startswith("+0.50 ") and rows["model_0"].endswith(" x real time")
+
+
+def test_no_display(monkeypatch):
+    """Without a screen, the page is recommended."""
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(UserError, match="needs a screen; --viewer web works without one"):
+        native.check_display("--viewer web")
+
+
+def test_missing_extra(monkeypatch):
+    """Without the page's extra, one line names it."""
+    monkeypatch.setenv("MUJOCO_GL", "disable")  # given back afterwards: play.py chooses another one
+    monkeypatch.setitem(sys.modules, "viser", None)
+    for name in [name for name in sys.modules if name.startswith("legged_torque.viewer.")]:
+        monkeypatch.delitem(sys.modules, name)
+    play = runpy.run_path(str(SCRIPTS_DIR / "play.py"))
+    args = argparse.Namespace(viewer="web", task="a1_torque", host="127.0.0.1", port=8080)
+    with pytest.raises(UserError, match=r"pip install 'legged_torque\[viewer\]'"):
+        play["import_viewer"](args)

@@ -1,0 +1,340 @@
+"""A live session: requests take effect between steps, and mistakes do no harm."""
+
+import math
+import shutil
+import threading
+
+import numpy as np
+import pytest
+import torch
+from support.clock import Clock
+from support.sessions import new_session
+from support.tilted import tilted
+
+from legged_torque.viewer.session import AS_LOADED, FASTEST, SCAN_INTERVAL, SLOWEST
+
+NUM_ENVS = 2
+STEPS = (10_000_000, 20_000_000)  # of the checkpoints 0 and 1
+
+
+@pytest.fixture
+def make_session(tmp_path):
+    """Factory of sessions, each with a folder and a clock of its own."""
+
+    def make(name="a1_torque_multihead", steps=STEPS, **settings):
+        clock = Clock()
+        return new_session(
+            tmp_path / f"{name}_{len(steps)}", name, NUM_ENVS, steps=steps, clock=clock, **settings
+        ), clock
+
+    return make
+
+
+def ticks(session, count=1):
+    """Carry out requests and step some times."""
+    for _ in range(count):
+        session.tick()
+
+
+def actor_weights(session):
+    """All numbers of the policy in one row."""
+    return torch.cat([weight.flatten() for weight in session._runner.alg.actor.state_dict().values()])
+
+
+def test_steps(make_session):
+    """Each tick is one control step, and the snapshot is the task's state."""
+    session, _ = make_session()
+    assert session.snapshot is None and session.checkpoints == (0, 1)
+    assert (session.checkpoint, session.trained_steps) == (1, 20_000_000)
+    ticks(session, 3)
+    snapshot, task = session.snapshot, session.task
+    assert session.sim_time == pytest.approx(3 * task.dt)
+    np.testing.assert_array_equal(snapshot.qpos, task.sim.qpos.numpy())
+    np.testing.assert_array_equal(snapshot.torques, task.torques[0].numpy())
+    np.testing.assert_array_equal(snapshot.velocities[:, :2], task.base_lin_vel[:, :2].numpy())
+    assert [one.time for one in session.history] == pytest.approx([task.dt, 2 * task.dt, 3 * task.dt])
+    assert session.history[-1] is snapshot and snapshot.world == 0
+    assert int(task.total_steps) == 20_000_000  # curricula stay where they were
+    before = task.episode_sums.clone()
+    session.tick()
+    expected = (task.episode_sums - before)[:, 0] / task.dt
+    np.testing.assert_allclose(session.snapshot.rewards, expected.numpy(), rtol=1e-4, atol=1e-6)
+    session.follow_world(7)  # the last one there is
+    session.tick()
+    assert session.world == NUM_ENVS - 1 and len(session.history) == 1
+    np.testing.assert_array_equal(session.snapshot.torques, task.torques[-1].numpy())
+
+
+def test_rewards_of_a_last_step(make_session):
+    """Where an episode ends, the terms are still those of the step, weighted and per second."""
+    session, _ = make_session("a1_torque", **{"env.episode_length_s": 0.06})
+    ticks(session, 3)
+    assert session.task.episode_length_buf[0] == 0 and session.snapshot.falls == 0
+    total = session.task.rew_buf[0].item() / session.task.dt
+    assert session.snapshot.rewards.sum() == pytest.approx(total, rel=1e-4)
+
+
+def test_command(make_session):
+    """A command holds in all worlds, through resets, until commands are drawn again."""
+    session, _ = make_session(**{"commands.resampling_probability": 0.5})
+    session.set_command((0.5, -0.25, 0.75))
+    assert session.command is None  # only requested
+    ticks(session, 2)
+    session.reset()
+    ticks(session, 2)
+    assert session.command == (0.5, -0.25, 0.75) and not session.requests
+    np.testing.assert_array_equal(session.snapshot.commands, [[0.5, -0.25, 0.75]] * NUM_ENVS)
+    session.set_command(None)
+    ticks(session, 4)
+    drawn = session.task.commands
+    assert drawn.abs().max() <= 1.0 and len(drawn.unique()) == 3 * NUM_ENVS
+
+
+@pytest.mark.parametrize(("angle", "expected"), [(0.0, 0.4), (math.pi / 2, 0.4 + math.pi / 2)])
+def test_push(make_session, angle, expected):
+    """A push adds a velocity along the trunk's heading, to which it has been turned before it was tilted."""
+    session, _ = make_session()
+    session.set_paused(True)
+    session.tick()
+    session.task.base_quat.copy_(torch.from_numpy(tilted(yaw=0.4)))
+    before = session.task.sim.qvel.clone()
+    session.push(angle, 1.5)
+    ticks(session, 2)
+    change = session.task.sim.qvel - before
+    assert change[:, 2:].abs().max() == 0.0
+    direction = torch.tensor([math.cos(expected), math.sin(expected)])
+    torch.testing.assert_close(change[:, :2], 1.5 * direction.expand(NUM_ENVS, 2), atol=1e-5, rtol=0.0)
+
+
+def test_pause_and_reset(make_session):
+    """While paused nothing moves and requests still count; a reset starts episodes in all worlds."""
+    session, _ = make_session()
+    session.tick()
+    session.set_paused(True)
+    qpos, sim_time = session.task.sim.qpos.clone(), session.sim_time
+    ticks(session, 3)
+    assert session.is_paused and session.sim_time == sim_time and torch.equal(session.task.sim.qpos, qpos)
+    session.reset()
+    session.tick()
+    torch.testing.assert_close(session.task.base_pos[:, 2], torch.full((NUM_ENVS,), 0.4))
+    assert session.task.episode_length_buf.tolist() == [0] * NUM_ENVS
+    session.set_paused(False)
+    session.tick()
+    assert session.sim_time > sim_time
+
+
+def test_mixing(make_session):
+    """Weights can be set and given back to the curriculum, and stay set in a rebuilt task."""
+    session, _ = make_session()
+    trained = session.task.mixing.clone()
+    assert session.mixing == pytest.approx({"position_residual": trained[0].item(), "torque": 1.0})
+    assert 0.0 < trained[0] < 1.0
+    session.set_mixing((0.25, 0.5))
+    session.tick()
+    assert session.task.mixing.tolist() == [0.25, 0.5] and session.is_mixing_set
+    session.set_perturbation("low")
+    session.load_checkpoint(0)
+    session.tick()
+    assert session.task.mixing.tolist() == [0.25, 0.5] and list(session.mixing.values()) == [0.25, 0.5]
+    session.set_mixing(None)
+    session.tick()
+    assert session.task.mixing[0] > trained[0] and not session.is_mixing_set  # checkpoint 0 is an earlier one
+
+
+def test_companion(make_session):
+    """Another policy walks with the first one: step by step, under its command, pushed and reset with it."""
+    session, _ = make_session("a1_torque", **{"commands.resampling_probability": 0.5})
+    other = session.companion = make_session("a1_position")[0]
+    assert session.mixing == {}
+    for count in range(1, 7):
+        session.tick()
+        np.testing.assert_array_equal(other.snapshot.commands[0], session.snapshot.commands[0])
+        assert other.sim_time == session.sim_time and int(other.task.episode_length_buf[0]) == count
+    session.set_paused(True)
+    ticks(session, 2)
+    assert other.sim_time == session.sim_time
+    before = other.task.sim.qvel[0, :2].clone()
+    session.set_paused(False)
+    session.push(0.0, 5.0)
+    session.tick()
+    assert (other.task.sim.qvel[0, :2] - before).norm() > 3.0
+    session.reset()
+    session.tick()
+    assert int(other.task.episode_length_buf[0]) == 1
+    other.load_checkpoint(0)
+    session.tick()
+    assert other.checkpoint == 0 and session.checkpoint == 1
+
+
+def test_checkpoints(make_session, tmp_path):
+    """Another checkpoint acts after a switch, while the robots walk on and curricula follow it; new ones are found."""
+    session, clock = make_session()
+    ticks(session, 2)
+    before = actor_weights(session)
+    session.load_checkpoint(0)
+    session.tick()
+    assert (session.checkpoint, session.trained_steps) == (0, 10_000_000) and "model_0" in session.message.text
+    assert not torch.equal(actor_weights(session), before)
+    assert session.task.episode_length_buf.min() == 3  # no reset
+    session.load_checkpoint(1)
+    session.tick()
+    assert torch.equal(actor_weights(session), before)
+    make_session(steps=(0, 0, 30_000_000))
+    shutil.copy(tmp_path / "a1_torque_multihead_3" / "model_2.pt", tmp_path / "a1_torque_multihead_2")
+    session.tick()
+    assert session.checkpoints == (0, 1)  # it does not look all the time
+    clock.now += SCAN_INTERVAL
+    session.tick()
+    assert session.checkpoints == (0, 1, 2) and session.checkpoint == 1
+    session.follow_newest(True)
+    ticks(session, 2)
+    assert (session.checkpoint, session.trained_steps) == (2, 30_000_000)
+
+
+@pytest.mark.parametrize("content", ["text", "half", "other task", "gone"])
+def test_broken_checkpoint(make_session, tmp_path, content):
+    """A checkpoint that cannot be loaded is reported in one line, and the old one acts on."""
+    session, clock = make_session()
+    file = tmp_path / "a1_torque_multihead_2" / "model_3.pt"
+    if content == "text":
+        file.write_bytes(b"no checkpoint\n")
+    elif content == "half":
+        good = file.with_stem("model_1").read_bytes()
+        file.write_bytes(good[: len(good) // 2])
+    elif content == "other task":
+        make_session("a1_torque")
+        shutil.copy(tmp_path / "a1_torque_2" / "model_1.pt", file)
+    session.tick()
+    weights, steps = actor_weights(session), int(session.task.total_steps)
+    session.load_checkpoint(3)
+    session.tick()
+    text = session.message.text
+    assert session.message.is_error and "model_3.pt" in text and "\n" not in text
+    session.follow_newest(True)
+    messages = []
+    for _ in range(4):
+        clock.now += SCAN_INTERVAL
+        session.tick()
+        messages.append(session.message)
+    assert messages[-1] is messages[1]  # it is tried once, not every second
+    assert session.checkpoint == 1 and torch.equal(actor_weights(session), weights)
+    assert int(session.task.total_steps) == steps
+
+
+def test_perturbation(make_session):
+    """The task is rebuilt with the preset, with command and counters kept; a wrong name changes nothing."""
+    session, _ = make_session()
+    old = session.task
+    assert session.perturbations()[0] == AS_LOADED and "high" in session.perturbations()
+    session.set_command((0.5, 0.0, 0.0))
+    session.set_perturbation("high")
+    ticks(session, 2)
+    task = session.task
+    assert task is not old and task.cfg.domain_rand.push_robots and not old.cfg.domain_rand.push_robots
+    assert session.perturbation == "high" and int(task.total_steps) == 20_000_000
+    np.testing.assert_array_equal(session.snapshot.commands, [[0.5, 0.0, 0.0]] * NUM_ENVS)
+    assert len(session.history) == 2
+    session.set_perturbation("hihg")
+    session.tick()
+    assert session.message.is_error and "did you mean 'high'" in session.message.text
+    assert session.task is task and session.perturbation == "high"
+    session.set_perturbation(AS_LOADED)
+    session.tick()
+    assert not session.task.cfg.domain_rand.push_robots and session.perturbation == AS_LOADED
+
+
+def test_tiles(make_session):
+    """A policy that was trained on a plane walks on a tile; only the followed robot moves to another one."""
+    kinds = {"stairs_up": 0.5, "pits": 0.5}
+    session, _ = make_session("a1_torque", ground={"terrain_proportions": kinds, "curriculum": False})
+    ticks(session, 3)
+    ground, snapshot = session.task.terrain, session.snapshot
+    assert snapshot.tile == (0, 0) and ground.levels.tolist() == [0, 1] and ground.columns.tolist() == [0, 1]
+    assert snapshot.scan.shape == (17 * 11, 3)
+    np.testing.assert_allclose(snapshot.scan[:, 2], ground.height(torch.from_numpy(snapshot.scan)).numpy(), atol=1e-5)
+    np.testing.assert_allclose(snapshot.scan[:, :2].mean(axis=0), snapshot.qpos[0, :2], atol=1e-5)
+    other = session.task.sim.qpos[1].clone()
+    session.set_paused(True)
+    session.set_tile(2, 1)
+    session.tick()
+    task = session.task
+    assert ground.levels.tolist() == [2, 1] and ground.columns.tolist() == [1, 1]
+    middle = torch.tensor([6.0, 3.0, -2 / 3 + 0.4])  # of a pit in the last of three rows and the second of two columns
+    torch.testing.assert_close(task.base_pos[0], middle, atol=1e-4, rtol=0.0)
+    assert torch.equal(task.sim.qpos[1], other) and task.episode_length_buf.tolist() == [0, 3]
+    session.set_tile(99, -1)
+    session.set_perturbation("low")
+    session.set_paused(False)
+    ticks(session, 2)
+    assert session.task is not task and session.task.terrain.levels.tolist() == [2, 1]
+    assert session.task.terrain.columns.tolist() == [0, 1] and session.snapshot.tile == (2, 0)
+
+
+def test_no_tiles_on_a_plane(make_session):
+    """There are none to choose, and nothing is scanned."""
+    session, _ = make_session("a1_torque")
+    session.set_tile(0, 0)
+    session.tick()
+    assert session.message.is_error and session.snapshot.tile is None and session.snapshot.scan.shape == (0, 3)
+
+
+def test_requests_from_other_threads(make_session):
+    """Many threads may ask while another one steps; every request is carried out, in that thread."""
+    session, _ = make_session("a1_torque")
+    pushes, push = [], session.task.sim.push
+    session.task.sim.push = lambda *args: (pushes.append(threading.current_thread()), push(*args))
+    stepping = threading.Thread(target=session.run)
+    stepping.start()
+    asking = [threading.Thread(target=lambda: [session.push(0.0, 0.0) for _ in range(10)]) for _ in range(3)]
+    for thread in asking:
+        thread.start()
+    for thread in asking:
+        thread.join()
+    session.set_paused(True)
+    while not session.is_paused:
+        pass
+    session.stop()
+    stepping.join(timeout=10)
+    assert not stepping.is_alive() and pushes == 30 * [stepping]
+
+
+def test_unexpected_errors(make_session, capsys):
+    """A request that fails in a way that nobody has thought of is reported, and the robots walk on."""
+    session, _ = make_session("a1_torque")
+    session.task.sim.push = None
+    session.push(0.0, 1.0)
+    ticks(session, 2)
+    assert session.message.is_error and "TypeError: 'NoneType'" in session.message.text
+    assert len(session.history) == 2 and "Traceback" in capsys.readouterr().err
+
+
+def test_speed(make_session):
+    """The speed stays within its limits, and the clock shows it."""
+    session, clock = make_session("a1_torque")
+    for asked, speed in ((0.5, 0.5), (0.0, SLOWEST), (9.0, FASTEST)):
+        session.set_speed(asked)
+        session.tick()
+        start = clock.now
+        ticks(session, 3)
+        assert session.speed == speed == pytest.approx(3 * session.task.dt / (clock.now - start))
+
+
+@pytest.mark.parametrize("number", [math.nan, -math.inf, 1e30])
+def test_numbers_that_no_slider_sends(make_session, number):
+    """A forged page may send them: they are refused, and nothing changes."""
+    session, _ = make_session()
+    session.set_paused(True)
+    session.tick()
+    mixing, velocities = session.mixing, session.task.sim.qvel.clone()
+    asked = {
+        "a command": lambda: session.set_command((0.1, number, 0.0)),
+        "a push": lambda: session.push(0.0, number),
+        "a speed": lambda: session.set_speed(number),
+        "a weight": lambda: session.set_mixing([0.5, number]),
+    }
+    for what, ask in asked.items():
+        ask()
+        session.tick()
+        assert session.message.text.startswith(what) and session.message.is_error
+    assert (session.command, session.speed, session.mixing, session.is_mixing_set) == (None, 1.0, mixing, False)
+    assert torch.equal(session.task.sim.qvel, velocities) and session.task.commands.isfinite().all()

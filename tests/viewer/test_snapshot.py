@@ -1,0 +1,92 @@
+"""The values that viewers show: parts of torques, contact forces and PD targets, against hand computations."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from legged_torque import resource_path
+from legged_torque.envs import task_registry
+from legged_torque.viewer.snapshot import watched
+
+NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+
+
+def make_watched(make_task, name, **settings):
+    """A watched task of two worlds."""
+    task = make_task(name, num_envs=2, **settings)
+    torch.manual_seed(1)
+    return watched(type(task))(task.cfg, "cpu")
+
+
+@pytest.mark.parametrize(("name", "parts"), [("a1_position", 0), ("a1_torque", 0), ("a1_torque_multihead", 2)])
+def test_torque_parts(make_task, name, parts):
+    """The parts of weighted action terms sum to the torque. Without weights there are none, without PD no targets."""
+    task = make_watched(make_task, name)
+    task.motors.strength.fill_(0.9)
+    for _ in range(3):
+        task.step(torch.randn(2, task.num_actions))
+    snapshot = task.snapshot(0.0, 0)
+    assert snapshot.torque_parts.shape == (parts, 12)
+    assert snapshot.targets.shape == (0 if name == "a1_torque" else 12,)
+    if parts:
+        low, high = task.torque_limits.numpy()
+        pd, direct = snapshot.torque_parts
+        np.testing.assert_allclose(np.clip(pd + direct, low, high), snapshot.torques, rtol=1e-5, atol=1e-5)
+        assert np.any(pd) and np.any(direct)
+        expected = 0.9 * task.mixing[1] * task.torque_scale[0] * task.actions[0, 12:]
+        np.testing.assert_allclose(direct, expected.numpy(), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=NEEDS_GPU)])
+def test_watching_changes_nothing(device):
+    """A watched task does what the task does, and its parts are right in a CUDA graph too.
+
+    On a CPU the bits are the same; on a GPU torch computes the torques, which the physics kernel rounds otherwise.
+    """
+    task_class = task_registry.get_task_class("a1_torque_multihead")
+    env_cfg, _ = task_registry.get_cfgs("a1_torque_multihead")
+    env_cfg.env.num_envs = 2
+    results = []
+    for made_of in (task_class, watched(task_class)):
+        torch.manual_seed(2)
+        task = made_of(env_cfg, device)
+        for step in range(5):
+            obs = task.step(torch.sin(step + torch.arange(48.0, device=device)).view(2, 24))[0]
+        results.append(obs["critic"])
+    tolerance = 0.0 if device == "cpu" else 1e-3
+    torch.testing.assert_close(*results, rtol=tolerance, atol=tolerance)
+    total = task.torque_parts.sum(dim=0).clamp(*task.torque_limits)
+    torch.testing.assert_close(total, task.torques, rtol=1e-5, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def standing(make_task):
+    """A watched robot that has stood for a second, its snapshots, and its joints before the last step."""
+    task = make_watched(make_task, "a1_position", **{"control.decimation": 1, "sim.dt": 0.005})
+    snapshots = []
+    for step in range(200):
+        before = task.dof_pos[1].clone(), task.dof_vel[1].clone()
+        task.step(torch.full((2, 12), 0.01 * (step % 7)))
+        snapshots.append(task.snapshot(0.0, 1))
+    return task, snapshots, before
+
+
+def test_contact_forces_carry_the_robot(standing):
+    """On average, the ground pushes with the robot's weight, at the feet that are said to touch it."""
+    task, snapshots, _ = standing
+    mean = np.mean([one.forces.sum(axis=0) for one in snapshots[-100:]], axis=0)
+    mass = mujoco.MjModel.from_xml_path(str(resource_path(task.cfg.asset.file))).body_mass.sum()
+    assert mean[2] == pytest.approx(9.81 * mass, rel=0.05)
+    last = snapshots[-1]
+    forces = np.linalg.norm(last.forces[task.feet_indices.numpy()], axis=1)
+    assert last.feet.tolist() == (forces > 0.0).astype(float).tolist() and last.feet.sum() >= 2
+    assert last.age == 200 and last.falls == 0
+
+
+def test_targets_of_pd_control(standing):
+    """The torque of the last physics step is that of a spring to the shown target and a damper."""
+    task, snapshots, (position, velocity) = standing
+    torque = task.p_gains[1] * (torch.from_numpy(snapshots[-1].targets) - position) - task.d_gains[1] * velocity
+    expected = (torque * task.motor_strength[1]).clamp(*task.torque_limits)
+    np.testing.assert_allclose(snapshots[-1].torques, expected.numpy(), atol=1e-3)
