@@ -18,9 +18,9 @@ from legged_torque.learning.multi_head import MultiHeadMLP
 ALIGNMENT = 64  # columns and rows of weights; what a matrix product reads at a time
 
 
-def aligned(size: int) -> int:
-    """Return the next multiple of :data:`ALIGNMENT`."""
-    return -(-size // ALIGNMENT) * ALIGNMENT
+def aligned(size: int, step: int = ALIGNMENT) -> int:
+    """Return the next multiple of a step."""
+    return -(-size // step) * step
 
 
 @dataclass(eq=False)
