@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from legged_torque.learning.ppo.triton.networks import Block, Columns, Layer, Network, aligned
+from legged_torque.learning.ppo.triton.networks import Block, Columns, Layer, aligned
 
 SAMPLES = 128  # of a tile of a matrix product
 TILE = 128  # columns of it
@@ -25,6 +25,7 @@ class Memory:
     Acting uses the first rows of what is there for learning.
 
     Attributes:
+        inputs: The columns of the inputs of the actor and of the critic.
         flat: The parameters, the actor's first; those of the modules are views of them. Shape: (parameters,).
         actor_size: Number of the actor's parameters.
         weights: Weights in the products' precision, each layer's with zeros up to aligned sizes. Shape: (numbers,).
@@ -45,7 +46,7 @@ class Memory:
     def __init__(
         self,
         models: Sequence[nn.Module],
-        networks: Sequence[Network],
+        networks: Sequence[Sequence[Layer]],
         std_parameter: nn.Parameter,
         dtype: torch.dtype,
         num_samples: int,
@@ -56,7 +57,9 @@ class Memory:
         ``std_parameter`` is that of the actions' deviations; ``dtype`` is that of the products.
         """
         self._networks = networks
-        self._layers = [layer for network in networks for layer in network.layers]
+        self._layers = [layer for network in networks for layer in network]
+        self._outputs = [layer.target for layer in self._layers if layer.first_output is not None]
+        self.inputs = [network[0].sources[0] for network in networks]
         self._parameters = [parameter for model in models for parameter in model.parameters()]
         self.flat = parameters_to_vector(self._parameters).detach()
         vector_to_parameters(self.flat, self._parameters)
@@ -73,18 +76,18 @@ class Memory:
         self._places: dict[Block, int] = {}
         end = 0
         written = [layer.target.block for layer in self._layers]
-        for block in dict.fromkeys([*written, *(network.inputs.block for network in networks)]):
+        for block in dict.fromkeys([*written, *(inputs.block for inputs in self.inputs)]):
             self._places[block] = end
             end += block.width * all_rows
         self.values = self.weights.new_zeros(end + TILE)  # a tile may read beyond
-        self.outputs = torch.zeros(all_rows, sum(network.num_outputs for network in networks), device=device)
-        inputs = min(self.place(network.inputs) for network in networks)  # which stand behind all else
-        self.gradients = self.weights.new_zeros(inputs + TILE)
+        self.outputs = torch.zeros(all_rows, sum(target.size for target in self._outputs), device=device)
+        first_input = min(map(self.place, self.inputs))  # which stand behind all else
+        self.gradients = self.weights.new_zeros(first_input + TILE)
         self.partial = torch.zeros(parts, room, device=device)
         self.sums = torch.zeros(self.rows // SAMPLES, len(self.destination), device=device)
         self.forward = [
             (self._table(map(self._forward_tiles, stage)), any(layer.first_output is not None for layer in stage))
-            for stage in stages([network.layers for network in networks])
+            for stage in stages(networks)
         ]
         self.backward = self._backward_tables()
         self.weight_tiles = self._table(map(self._weight_tiles, self._layers))
@@ -104,7 +107,7 @@ class Memory:
         Shape: (3, outputs), int64.
         """
         places = []
-        for target in (target for network in self._networks for target in network.outputs()):
+        for target in self._outputs:
             first, column = self.place(target), self._sum_columns[target]
             places += [(first + i, target.block.width, column + i) for i in range(target.size)]
         return torch.tensor(places, device=self.flat.device).T.contiguous()
@@ -153,10 +156,9 @@ class Memory:
 
     def _backward_tables(self) -> list[Tensor]:
         """Return the tables of all stages for the kernel ``input_gradient``."""
-        inputs = [network.inputs for network in self._networks]
-        there = {layer.target for layer in self._layers if layer.first_output is not None}
+        there = set(self._outputs)
         last = {source: layer for layer in reversed(self._layers) for source in layer.sources}  # to add a gradient
-        backward = [[each for each in reversed(n.layers) if each.sources[0] not in inputs] for n in self._networks]
+        backward = [list(reversed(network[1:])) for network in self._networks]  # nothing needs that of the inputs
         tables = []
         for stage in stages(backward):
             tiles = []

@@ -18,7 +18,7 @@ from torch import Tensor
 from legged_torque.learning.ppo.torch_ppo import TorchPPO
 from legged_torque.learning.ppo.triton import products, samples, steps
 from legged_torque.learning.ppo.triton.memory import NUMBERS, SAMPLES, TILE, Memory
-from legged_torque.learning.ppo.triton.networks import ALIGNMENT, Network, aligned, read_network
+from legged_torque.learning.ppo.triton.networks import ALIGNMENT, Columns, aligned, read_network
 from legged_torque.sim.compiled import keep_kernels
 from legged_torque.utils import distributed
 from legged_torque.utils.progress import torch_compiles
@@ -59,11 +59,10 @@ class TritonPPO(TorchPPO):
         self._models = (actor, critic)
         size = storage.actions.shape[-1]
         networks = (read_network(actor.mlp), read_network(critic.mlp, size))
-        self._networks = [network for network in networks if network]  # has_kernels has found both
         self._std = self._deviation_settings()
         self._num_samples = self.batch_size * (2 if self.symmetry else 1)
         sizes = (self._num_samples, storage.num_envs)
-        self._memory = Memory(self._models, self._networks, self._std[0], self.product_dtype, *sizes)
+        self._memory = Memory(self._models, networks, self._std[0], self.product_dtype, *sizes)
         self._places = self._memory.output_places()
         flat = self._memory.flat
         self._gradient = flat.new_zeros(len(flat) + NUMBERS)
@@ -132,9 +131,9 @@ class TritonPPO(TorchPPO):
     def update_minibatch(self) -> None:
         """Take one gradient step on the samples of ``indices``."""
         memory = self._memory
-        for network, model, maps in zip(self._networks, self._models, self._maps, strict=True):
+        for inputs, model, maps in zip(memory.inputs, self._models, self._maps, strict=True):
             groups = [self.storage.observations[group].flatten(0, 1) for group in model.obs_groups]
-            self._observe(network, groups, memory.rows, maps)
+            self._observe(inputs, groups, memory.rows, maps)
         self._forward(memory.rows)
         self._write_losses()
         for table in memory.backward:
@@ -180,16 +179,16 @@ class TritonPPO(TorchPPO):
     def _run_networks(self, obs: TensorDict) -> None:
         """Compute the outputs of actor and critic in all worlds."""
         rows = aligned(self.storage.num_envs, SAMPLES)
-        for network, model in zip(self._networks, self._models, strict=True):
-            self._observe(network, [obs[group] for group in model.obs_groups], rows, None)
+        for inputs, model in zip(self._memory.inputs, self._models, strict=True):
+            self._observe(inputs, [obs[group] for group in model.obs_groups], rows, None)
         self._forward(rows)
 
-    def _observe(self, network: Network, groups: Sequence[Tensor], num_rows: int, maps: Any) -> None:
+    def _observe(self, inputs: Columns, groups: Sequence[Tensor], num_rows: int, maps: Any) -> None:
         """Write the inputs of a network: groups of observations, with mirror images if there are maps for them."""
         column, memory = 0, self._memory
         for i, group in enumerate(groups):
             order, signs = maps[i] if maps else (group, group)
-            target = (memory.place(network.inputs), network.inputs.block.width, column)
+            target = (memory.place(inputs), inputs.block.width, column)
             counts = (self.batch_size, self._num_samples if maps else len(group), group.shape[1])
             columns = triton.next_power_of_2(group.shape[1])
             rows = max(1, min(samples.ROWS, samples.NUMBERS // columns))
