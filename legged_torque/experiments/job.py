@@ -119,16 +119,15 @@ class Job:
         if status == LOST:
             return f"the machine was lost during {self}"
         if status:
-            return (
-                f"{self} {f'was ended by signal {-status}' if status < 0 else f'has failed with exit status {status}'}"
-            )
+            how = f"was ended by signal {-status}" if status < 0 else f"has failed with exit status {status}"
+            return f"{self} {how}"
         try:
             if self.kind == "training":
                 state = cell_state(self.cell)
-                ended = (
-                    f"after {state.iterations} of {state.total} iterations" if state.total else "without a checkpoint"
-                )
-                return f"training has ended {ended}" if state.step in ("train", "resume") else ""
+                if state.step == "train":
+                    return "training has ended without a checkpoint"
+                so_far = f"after {state.iterations} of {state.total} iterations"
+                return f"training has ended {so_far}" if state.step == "resume" else ""
             part, result = (file(self.state.missing[0]) for file in (self.cell.part_file, self.cell.result_file))
             if not is_json(part):
                 return f"{self} has left no readable '{part}'"
