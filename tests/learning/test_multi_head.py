@@ -1,12 +1,10 @@
-"""The multi-head actor: its architecture counted by hand, its gradients, what it exports and what it saves."""
+"""The multi-head actor: its architecture counted by hand, its output and its gradients."""
 
 from functools import partial
 
 import numpy as np
-import onnx
 import pytest
 import torch
-from onnx.reference import ReferenceEvaluator
 from support.runners import build_runner
 from tensordict import TensorDict
 
@@ -149,27 +147,6 @@ def test_deterministic_output(runner):
         policy(obs, stochastic_output=True)
     assert torch.equal(first, second)
     torch.testing.assert_close(policy.output_mean, first)
-
-
-def test_exported_to_torch_jit(runner, actor, tmp_path):
-    """The scripted file needs no Python class and gives the model's numbers."""
-    runner.export_policy_to_jit(str(tmp_path))
-    exported = torch.jit.load(tmp_path / "policy.pt")
-    obs = make_obs()
-    with torch.no_grad():
-        torch.testing.assert_close(exported(obs["policy"]), actor(obs), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(exported(obs["policy"]).detach(), forward_by_hand(actor, obs), rtol=1e-4, atol=1e-5)
-
-
-def test_exported_to_onnx(runner, actor, tmp_path):
-    """The ONNX file is valid and gives the model's numbers in ONNX's own reference implementation."""
-    runner.export_policy_to_onnx(str(tmp_path))
-    file = tmp_path / "policy.onnx"
-    onnx.checker.check_model(str(file))
-    session = ReferenceEvaluator(str(file))
-    obs = make_obs(3)
-    rows = [session.run(["actions"], {"obs": row.numpy()})[0] for row in obs["policy"].split(1)]
-    np.testing.assert_allclose(np.concatenate(rows), forward_by_hand(actor, obs), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(
