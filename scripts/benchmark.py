@@ -20,6 +20,7 @@ from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError, is_out_of_memory
 from legged_torque.utils.files import without_machine, write_json
+from legged_torque.utils.limits import Count, Number
 from legged_torque.utils.runs import package_versions
 
 if TYPE_CHECKING:
@@ -111,8 +112,7 @@ def parse_args() -> argparse.Namespace:
     help_text = "also run N iterations and compare the first tenth with the last"
     parser.add_argument("--endurance", type=int, default=0, metavar="N", help=help_text)
     args = parser.parse_args()
-    cli.check_at_least(args, 1, "rounds")
-    cli.check_at_least(args, 0, "endurance")
+    cli.check_args(args, rounds=Count, endurance=Number)
     if args.profile and len(args.num_envs or [None]) > 1:
         raise UserError("--profile writes one trace: give one number of worlds")
     if args.learn:

@@ -24,6 +24,7 @@ from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import portable_path, without_machine, write_json
+from legged_torque.utils.limits import Count
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import LoadedRun, set_seed
@@ -106,7 +107,7 @@ def parse_args() -> argparse.Namespace:
     args.num_envs = num_envs if args.num_envs is None else args.num_envs
     args.steps = steps if args.steps is None else args.steps
     args.level = args.level or GROUNDS["levels"]
-    cli.check_at_least(args, 1, "steps")
+    cli.check_args(args, steps=Count)
     return args
 
 

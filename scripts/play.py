@@ -15,13 +15,14 @@ import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from legged_torque.envs import task_registry
 from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer, resolve_device
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.limits import Count, Limits
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.options import Options
 from legged_torque.utils.runs import load_config
@@ -97,9 +98,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--host", default="127.0.0.1", help=hint)
     parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
     args = parser.parse_args()
-    cli.check_at_least(args, 1, "steps")
-    if not 1 <= args.port <= 65535:
-        raise UserError(f"--port must be from 1 to 65535, not {args.port}")
+    cli.check_args(args, steps=Count, port=Annotated[int, Limits(1, 65535)])
     choose_worlds(args)
     check_agent(args)
     if args.level and not args.terrain:

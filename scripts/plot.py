@@ -20,7 +20,7 @@ FIGURES = {
     "curves": "legged_torque.paper.plot:plot_curves",
     "pretraining": "legged_torque.paper.plot:plot_pretraining",
     "randomization": "legged_torque.paper.randomization_picture:plot_randomization",
-    "terrain": "legged_torque.terrain.picture:plot_terrain",
+    "terrain": "legged_torque.paper.terrain_picture:plot_terrain",
 }
 """Functions ("module:name") by figure: each parses its own command line, ``sys.argv``, and draws."""
 

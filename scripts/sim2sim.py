@@ -19,6 +19,7 @@ from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_json
+from legged_torque.utils.limits import Count, NotNegative, Number, Share
 
 if TYPE_CHECKING:
     from legged_torque.deploy.policy import Policy
@@ -49,16 +50,13 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
     args = parser.parse_args()
-    cli.check_at_least(args, 1, "steps", "robots")
-    cli.check_at_least(args, 0, "seed", "push_velocity")
+    cli.check_args(args, steps=Count, robots=Count, seed=Number, push_velocity=NotNegative, push_probability=Share)
     if args.level and not args.terrain:
         raise UserError("--level needs --terrain: the kinds of rough ground")
     if args.push_probability is not None and not args.push_velocity:
         raise UserError("--push_probability needs --push_velocity")
     if args.push_probability is None:
         args.push_probability = 0.002 if args.push_velocity else 0.0
-    if not 0.0 <= args.push_probability <= 1.0:
-        raise UserError(f"--push_probability must be from 0 to 1, not {args.push_probability}")
     for file in filter(None, (args.json, args.video)):
         cli.check_output(file)
     return args

@@ -24,6 +24,7 @@ from legged_torque.utils import cli, distributed
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.devices import busy_cores_note, device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
+from legged_torque.utils.limits import Number
 from legged_torque.utils.options import DEFAULT_PRESET, Options
 from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, package_versions
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
@@ -44,7 +45,7 @@ def main() -> None:
     hint = "iterations from one short video of the policy to the next, made beside the training; default: no videos"
     parser.add_argument("--video_interval", type=int, default=0, metavar="N", help=hint)
     args = parser.parse_args()
-    cli.check_at_least(args, 0, "video_interval")
+    cli.check_args(args, video_interval=Number)
     options = cli.options_of(args)
     if args.list:
         print("\n".join(task_registry.names()))

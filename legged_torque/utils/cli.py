@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 from legged_torque import SCRIPTS_DIR
 from legged_torque.utils.devices import disable_renderer
 from legged_torque.utils.errors import TrainingError, UserError, is_out_of_memory, unknown_name
-from legged_torque.utils.limits import describe, types_of
+from legged_torque.utils.limits import check_value, describe, types_of
 from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import task_registry
 
@@ -211,14 +211,11 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
     sys.exit(status)
 
 
-def check_at_least(args: object, lowest: int, *names: str) -> None:
-    """Raise a UserError if one of the named arguments is lower, NaN, infinite or too large to count."""
-    for name in names:
-        value = getattr(args, name)
-        if not value >= lowest:
-            raise UserError(f"--{name} must be at least {lowest}, not {value}")
-        if value >= 2**31:
-            raise UserError(f"--{name} is too large: {value}")
+def check_args(args: object, **hints: Any) -> None:
+    """Raise a UserError if an argument does not have the type ``hints[name]``, with its bounds; None has any."""
+    for name, hint in hints.items():
+        if getattr(args, name) is not None:
+            check_value(f"--{name}", getattr(args, name), hint)
 
 
 def finite(text: str) -> float:
