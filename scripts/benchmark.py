@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.benchmark.baseline import Baseline
+from legged_torque.benchmark.learning_time import time_training
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils import cli
@@ -67,7 +68,6 @@ def main() -> None:
             sizes.append(task_registry.get_cfgs(args.task, options))
             check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
         device = resolve_device(args.device)
-        from legged_torque.benchmark.learning_time import time_training
         from legged_torque.benchmark.measure import MemoryMeter
     for file in filter(None, (args.json, args.profile)):
         cli.check_output(file)
@@ -87,8 +87,7 @@ def main() -> None:
         rows.append(row)
         print_row(row, args.profile)
         if args.learn and "error" not in row:
-            row["learn"] = time_training(training_command(args, row["num_envs"]))
-            print_learning(row["learn"])
+            row["learn"] = learn(args, row["num_envs"])
         if args.json:
             write_json(args.json, result | {"rows": rows})
     if baseline:
@@ -138,10 +137,14 @@ def measure_size(args: argparse.Namespace, cfgs: tuple, memory: MemoryMeter) -> 
     return row | {"left_memory_mib": memory.used()}
 
 
-def training_command(args: argparse.Namespace, num_envs: int) -> list[str]:
-    """Return the command that trains with the same options."""
+def learn(args: argparse.Namespace, num_envs: int) -> dict[str, Any]:
+    """Run train.py with the same options, print its wall clock and return it."""
     words = [*cli.option_words(args, *cli.SETTINGS, "preset"), f"--num_envs={num_envs}"]
-    return [sys.executable, str(SCRIPTS_DIR / "train.py"), *words]
+    times = time_training([sys.executable, str(SCRIPTS_DIR / "train.py"), *words])
+    print(LEARNING.format(**times))
+    for point in times["reached"]:
+        print((REACHED if point["steps"] else NOT_REACHED).format(**point), flush=True)
+    return times
 
 
 def print_row(row: dict[str, Any], trace: Path) -> None:
@@ -152,13 +155,6 @@ def print_row(row: dict[str, Any], trace: Path) -> None:
         print(ENDURANCE.format(**row["endurance"]))
     if "profile" in row:
         print(*row["profile"], f"The trace is in {trace}; Warp's kernels show on a GPU only.", sep="\n")
-
-
-def print_learning(times: dict[str, Any]) -> None:
-    """Print the wall clock of a training."""
-    print(LEARNING.format(**times))
-    for point in times["reached"]:
-        print((REACHED if point["steps"] else NOT_REACHED).format(**point), flush=True)
 
 
 def print_comparison(file: Path, baseline: Baseline, rows: list[dict[str, Any]]) -> None:

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
     from legged_torque.envs.base.crossing import Grounds
     from legged_torque.envs.base.legged_robot import LeggedRobot
-    from legged_torque.envs.base.metrics import CommandBreakdown
 
 WORLDS, STEPS = 16, 2000  # of one checkpoint, where robots do not cross tiles
 CURVE_WORLDS, CURVE_STEPS = 256, 1000  # of each of all checkpoints
@@ -78,7 +77,12 @@ def main() -> None:
     else:
         measured = walk(run, env, runner, args.steps, bool(args.command))
     if args.json:
-        write_json(args.json, without_machine(circumstances(args, run, env, runner) | measured))
+        kept, device = "as in training", device_name(env.device)
+        result = {"task": args.task, "run": portable_path(run.folder), "checkpoint": run.checkpoint.name}
+        result |= {"steps": runner.logger.tot_timesteps, "perturbation": args.perturbation or kept}
+        result |= {"ranges": args.ranges or kept, "command": args.command, "num_envs": env.num_envs}
+        result |= {"seed": args.seed, "device": device, "versions": package_versions()}
+        write_json(args.json, without_machine(result | measured))
 
 
 def parse_args() -> argparse.Namespace:
@@ -121,11 +125,12 @@ def walk(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, num_steps: in
     print(f"{run.checkpoint}, after {trained:,} steps of training, {env.num_envs} worlds x {num_steps} steps:")
     for name, estimate in metrics.items():
         print(f"  {name:<18} {estimate.mean:10.4f} +- {estimate.standard_error:.4f} {UNITS[name]}")
-    if is_fixed:
-        for name, parts in breakdown.table().items():
-            print(f"  error of {name:<12}", *(f"{part['error']:7.3f}" for part in parts))
-    else:
-        print_breakdown(breakdown)
+    if not is_fixed:
+        print(f"  {'command':<12} {'from':>6} {'to':>6} {'share':>6} {'tracking':>9} {'error':>7}")
+    line = "  {:<12} {from:>6.2f} {to:>6.2f} {share:>6.2f} {track_percentage:>9.3f} {error:>7.3f}"
+    for name, parts in breakdown.table().items():
+        for part in parts:
+            print(("  error of {:<12} {error:7.3f}" if is_fixed else line).format(name, **part))
     shown = {name: asdict(estimate) for name, estimate in metrics.items()}
     return {"num_steps": num_steps, "metrics": shown, "by_command": breakdown.table()}
 
@@ -148,15 +153,6 @@ def measure_all(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runn
     return result | {"trained_env": run.config["env"], "points": points}
 
 
-def print_breakdown(breakdown: CommandBreakdown) -> None:
-    """Print a line per part of each command's range."""
-    print(f"  {'command':<12} {'from':>6} {'to':>6} {'share':>6} {'tracking':>9} {'error':>7}")
-    for name, parts in breakdown.table().items():
-        for part in parts:
-            line = "  {:<12} {from:>6.2f} {to:>6.2f} {share:>6.2f} {track_percentage:>9.3f} {error:>7.3f}"
-            print(line.format(name, **part))
-
-
 def cross_tiles(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, grounds: Grounds) -> dict[str, Any]:
     """Let a policy try to cross tiles, print what came out, and return it."""
     from legged_torque.envs.base.crossing import cross
@@ -172,16 +168,6 @@ def cross_tiles(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, ground
         place = f"  {result.kind:<18} {result.level:>6g} {result.worlds:>6}"
         print(f"{place} {shares[0]:>16} {shares[1]:>16} {tracking:>9.3f} {cost:>6.2f}")
     return {"time_limit": time_limit, "grounds": [asdict(result) for result in results]}
-
-
-def circumstances(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner) -> dict[str, Any]:
-    """Return what was measured, and how."""
-    kept = "as in training"
-    result = {"task": args.task, "run": portable_path(run.folder), "checkpoint": run.checkpoint.name}
-    result |= {"steps": runner.logger.tot_timesteps, "perturbation": args.perturbation or kept}
-    result |= {"ranges": args.ranges or kept, "command": args.command}
-    result |= {"num_envs": env.num_envs, "seed": args.seed}
-    return result | {"device": device_name(env.device), "versions": package_versions()}
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ def main() -> None:
         "machine": [platform.platform(), f"{os.cpu_count()} cores, threads of torch: {torch.get_num_threads()}"],
         "GPU": gpus(driver()),
         "caches": caches(),
-        "extras": extras(installed_requirements()),
+        "extras": extras(),
         "rendering": [
             f"videos: {no_renderer or os.environ['MUJOCO_GL']}",
             f"MuJoCo's window: {' '.join(no_window) or 'ok'}",
@@ -96,17 +96,11 @@ def size_of(folder: Path) -> int:
     return sum(file.lstat().st_size for file in files if os.path.lexists(file))
 
 
-def installed_requirements() -> list[Requirement] | None:
-    """Return the requirements of the installed package, with its extras; None if it is not installed."""
-    try:
-        return [Requirement(text) for text in importlib.metadata.requires("legged_torque") or []]
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def extras(requirements: list[Requirement] | None) -> list[str]:
+def extras() -> list[str]:
     """Return for each extra whether all that it needs is there, or what is missing and the command that installs it."""
-    if requirements is None:
+    try:
+        requirements = [Requirement(text) for text in importlib.metadata.requires("legged_torque") or []]
+    except importlib.metadata.PackageNotFoundError:
         return ["unknown, as the package is not installed: pip install -e ."]
     lines = []
     for extra, purpose in PURPOSES.items():

@@ -12,7 +12,6 @@ import argparse
 import contextlib
 import importlib.metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from legged_torque import resource_path
 from legged_torque.utils import cli
@@ -20,10 +19,6 @@ from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_json
 from legged_torque.utils.limits import Count, NotNegative, Number, Share
-
-if TYPE_CHECKING:
-    from legged_torque.deploy.policy import Policy
-    from legged_torque.utils.metrics import Estimate
 
 
 def parse_args() -> argparse.Namespace:
@@ -103,19 +98,13 @@ def main() -> None:
     for name, value in metrics.items():
         print(f"  {name:<18} {value.mean:10.4f} +- {value.standard_error:.4f} {UNITS[name]}")
     if args.json:
-        write_results(args, policy, notes, metrics)
+        result = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
+        result |= {"task": policy.description["task"], "training": training, "notes": notes}
+        result["versions"] = {name: importlib.metadata.version(name) for name in ("mujoco", "numpy")}
+        result["metrics"] = {name: vars(estimate) for name, estimate in metrics.items()}
+        write_json(args.json, result)  # in which null stands for values that were not measured
     if recorder:
         recorder.save(args.video, no_renderer)
-
-
-def write_results(args: argparse.Namespace, policy: Policy, notes: list[str], metrics: dict[str, Estimate]) -> None:
-    """Write arguments and results; null stands for values that were not measured."""
-    result = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
-    result["task"], result["training"] = policy.description["task"], policy.description["training"]
-    result["notes"] = notes
-    result["versions"] = {name: importlib.metadata.version(name) for name in ("mujoco", "numpy")}
-    result["metrics"] = {name: vars(estimate) for name, estimate in metrics.items()}
-    write_json(args.json, result)
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ def main() -> None:
     parser.add_argument("--video_interval", type=int, default=0, metavar="N", help=hint)
     args = parser.parse_args()
     cli.check_args(args, video_interval=Number)
-    options = cli.options_of(args)
+    options, is_first = cli.options_of(args), distributed.rank() == 0
     if args.list:
         print("\n".join(task_registry.names()))
         return
@@ -62,7 +62,7 @@ def main() -> None:
         env_cfg, train_cfg = run.env_cfg, run.train_cfg
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
         options.max_iterations = options.max_iterations or run.config.get("max_iterations")
-        if distributed.rank() == 0:
+        if is_first:
             print(f"Resuming from {run.checkpoint}, after {run.iterations} iterations.")
     elif options.load_run or options.checkpoint is not None:
         raise UserError("--load_run and --checkpoint need --resume")
@@ -70,11 +70,10 @@ def main() -> None:
         with cli.slow_imports():
             env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     folder = experiment_dir(train_cfg, options.log_root)
-    if distributed.rank() == 0:  # the others write nothing
+    if is_first:  # the others write nothing
         cli.check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)
     with cli.slow_imports():
         from legged_torque.utils.progress import CompileProgress
-    is_first = distributed.rank() == 0
     viewer = TrainingViewer(is_first and args.viewer == "web", args.video_interval if is_first else 0)
     set_seed(train_cfg.seed)
     with CompileProgress() if is_first else contextlib.nullcontext():  # one line for all processes
