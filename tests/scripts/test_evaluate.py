@@ -121,10 +121,8 @@ MISTAKES = {
     "--level 0.5": "--level needs --terrain",
     "--terrain flat --level 0 --set terrain.measure_heights=true": "does not fit this task",
     "--perturbation=hihg": "unknown perturbation 'hihg'; did you mean 'high'?",
-    "--checkpoint=7": "unknown checkpoint '7'; allowed: 0, 1, 2, 3",
     "--steps=0": "--steps must be at least 1, not 0",
     "--command 1 0": "argument --command: expected 3 arguments",
-    "--step=5": "unknown option '--step=5'; did you mean '--steps'?",
 }
 
 

@@ -268,12 +268,6 @@ def test_levels_stay_in_evaluations():
     assert torch.equal(ground.levels, before)
 
 
-def test_levels_are_kept_for_a_resume():
-    """They are the state of the ground; columns and map follow from the settings."""
-    ground = make_ground(7)
-    assert ground.state_dict() == {"levels": ground.levels}
-
-
 # ---- in a task ------------------------------------------------------------------------------------------------------
 
 

@@ -133,16 +133,3 @@ def test_misspelt_names_are_refused(text):
     with pytest.raises(UserError) as error:
         exec(f"class V(Both):\n{lines}", globals())  # the only way to write a class from a table
     assert MISTAKES[text] in str(error.value) and "\n" not in str(error.value)
-
-
-def test_instances_do_not_share():
-    """Changing a configuration changes neither its class nor another instance."""
-
-    class Listed(Base):
-        class rewards:
-            names: list[str] = ["a"]
-
-    first, second = Listed(), Listed()
-    first.rewards.names.append("b")
-    first.control.stiffness = 0.0
-    assert second.rewards.names == Listed.rewards.names == ["a"] and second.control.stiffness == 1.0

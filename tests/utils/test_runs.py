@@ -83,6 +83,7 @@ def test_config_file_round_trip(task, tmp_path):
     words = ["--preset=paper", "--set=rewards.scales.torques=-1e-7", "--set=actor.hidden_dims=[8, 4]", "--run_name=7"]
     env_cfg, train_cfg = get_cfgs(*words, task=task)
     runs.save_config(tmp_path / "run", {"task": task, "env": to_dict(env_cfg), "train": to_dict(train_cfg)})
+    assert "!!" not in (tmp_path / "run" / "config.yaml").read_text()  # any program reads it
     config = runs.load_config(tmp_path / "run")
     loaded = get_cfgs(task=task, run_config=config)
     for new, old in zip(loaded, (env_cfg, train_cfg), strict=True):

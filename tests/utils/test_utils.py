@@ -7,11 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-import yaml
-from support.settings import get_cfgs
 
 from legged_torque.envs import task_registry
-from legged_torque.utils import devices, runs
+from legged_torque.utils import devices
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.math import quat_rotate_inverse
 from legged_torque.utils.options import Options, apply_options
@@ -65,14 +63,6 @@ def test_choice_of_the_renderer(asked, installed, gpu, chosen, monkeypatch):
     else:
         assert "is not installed" in reason and "apt-get install libosmesa6" in reason and "\n" not in reason
         assert asked is None or asked in reason
-
-
-def test_yaml_needs_no_tags(tmp_path):
-    """The configuration file is plain YAML that any program reads."""
-    env_cfg, train_cfg = get_cfgs("--run_name=x")
-    runs.save_config(tmp_path, {"task": "a1_position", "env": to_dict(env_cfg), "train": to_dict(train_cfg)})
-    text = (tmp_path / "config.yaml").read_text()
-    assert "!!" not in text and yaml.safe_load(text)["train"]["runner"]["run_name"] == "x"
 
 
 def test_options_that_are_not_given_change_nothing():
