@@ -98,7 +98,7 @@ def parse_args() -> argparse.Namespace:
         straight on, 0.6 0 0 unless it is given"""
     parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
     hint = "difficulties of rough ground, 0 to 1; default: the ten of training, 0 to 0.9"
-    parser.add_argument("--level", nargs="+", type=cli.finite, help=hint)
+    parser.add_argument("--level", nargs="+", type=float, help=hint)
     parser.add_argument("--json", type=Path, help="file to write")
     args = parser.parse_args()
     if args.all_checkpoints and (args.terrain or args.checkpoint is not None):
@@ -111,7 +111,7 @@ def parse_args() -> argparse.Namespace:
     args.num_envs = num_envs if args.num_envs is None else args.num_envs
     args.steps = steps if args.steps is None else args.steps
     args.level = args.level or GROUNDS["levels"]
-    cli.check_args(args, steps=Count)
+    cli.check_args(args, steps=Count, command=list[float])
     return args
 
 

@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("file", type=Path, help="MJCF or URDF; its meshes are used if they are near it")
     parser.add_argument("--name", default="", help="name of the robot; default: that of the file")
     parser.add_argument("--out", type=Path, help="folder for both files; default: where the library keeps its robots")
-    parser.add_argument("--torque_limit", type=cli.finite, help="[N m] of all joints; default: those of the file")
+    parser.add_argument("--torque_limit", type=float, help="[N m] of all joints; default: those of the file")
     parser.add_argument("--check", action="store_true", help="hold the nominal pose for 5 s and draw a picture of it")
     parser.add_argument("--force", action="store_true", help="write over files that exist")
     args = parser.parse_args()

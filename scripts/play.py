@@ -87,7 +87,7 @@ def parse_args() -> argparse.Namespace:
     hint = "kinds of rough ground, or all: a column of tiles of each; default: the ground of the training"
     parser.add_argument("--terrain", nargs="+", metavar="KIND", default=[], help=hint)
     hint = "difficulties of rough ground, 0 to 1: a row of tiles of each; default: those of the training"
-    parser.add_argument("--level", nargs="+", type=cli.finite, default=[], help=hint)
+    parser.add_argument("--level", nargs="+", type=float, default=[], help=hint)
     parser.add_argument("--video", type=Path, help="mp4 to write; default: in the run's folder")
     parser.add_argument("--no_video", action="store_true", help="print metrics alone")
     parser.add_argument("--grid", type=int, help="number of robots in the video: 1, 4, 9, 16 or 25; default: 1")
@@ -100,7 +100,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--host", default="127.0.0.1", help=hint)
     parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
     args = parser.parse_args()
-    cli.check_args(args, steps=Count, port=Annotated[int, Limits(1, 65535)])
+    cli.check_args(args, steps=Count, command=list[float], port=Annotated[int, Limits(1, 65535)])
     check_combinations(args)
     args.grid = args.grid or 1
     if args.num_envs is None:

@@ -30,22 +30,22 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--robots", type=int, default=16, help="robots, one after another; default: %(default)s")
     cli.add_command_arg(parser)
     hint = "largest velocity of a push per axis [m/s]; default: none"
-    parser.add_argument("--push_velocity", type=cli.finite, default=0.0, help=hint)
-    parser.add_argument(
-        "--push_probability", type=cli.finite, help="probability of a push per control step; default: 0.002"
-    )
+    parser.add_argument("--push_velocity", type=float, default=0.0, help=hint)
+    hint = "probability of a push per control step; default: 0.002"
+    parser.add_argument("--push_probability", type=float, help=hint)
     parser.add_argument("--seed", type=int, default=1, help="random seed; default: %(default)s")
     hint = "kinds of rough ground, or all; each robot starts on one of their tiles; default: the ground of training"
     parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
     hint = "difficulties of rough ground, 0 to 1; default: those of training"
-    parser.add_argument("--level", nargs="+", type=cli.finite, default=(), help=hint)
+    parser.add_argument("--level", nargs="+", type=float, default=(), help=hint)
     hint = "with height fields: corrected to those of training, or MuJoCo's own; default: %(default)s"
     parser.add_argument("--contacts", choices=("training", "mujoco"), default="training", help=hint)
     parser.add_argument("--video", type=Path, help="mp4 of the first robot")
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
     args = parser.parse_args()
-    cli.check_args(args, steps=Count, robots=Count, seed=Number, push_velocity=NotNegative, push_probability=Share)
+    cli.check_args(args, steps=Count, robots=Count, seed=Number, command=list[float])
+    cli.check_args(args, push_velocity=NotNegative, push_probability=Share)
     if args.level and not args.terrain:
         raise UserError("--level needs --terrain: the kinds of rough ground")
     if args.push_probability is not None and not args.push_velocity:

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import dataclasses
 import gc
-import math
 import os
 import re
 import shutil
@@ -233,17 +232,10 @@ def check_args(args: object, **hints: Any) -> None:
             check_value(f"--{name}", getattr(args, name), hint)
 
 
-def finite(text: str) -> float:
-    """Return the number that an argument gives, as its ``type``; NaN and infinity are refused."""
-    if not math.isfinite(float(text)):
-        raise argparse.ArgumentTypeError(f"it must be finite, not {text}")
-    return float(text)
-
-
 def add_command_arg(parser: Parser) -> None:
     """Add a fixed command of the robots."""
     hint = "fixed command: forwards, to the left [m/s], yaw rate [rad/s]; default: drawn as in training"
-    parser.add_argument("--command", type=finite, nargs=3, metavar=("X", "Y", "YAW"), help=hint)
+    parser.add_argument("--command", type=float, nargs=3, metavar=("X", "Y", "YAW"), help=hint)
 
 
 def check_output(file: Path) -> None:

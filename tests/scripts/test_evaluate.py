@@ -113,7 +113,7 @@ MISTAKES = {
     "--terrain stairs_pu": "unknown kind of terrain 'stairs_pu'; did you mean 'stairs_up'?",
     "--terrain flat --level 0.5 1.01": "a level must be from 0 to 1, not 1.01",
     "--terrain flat --level -0.1": "a level must be from 0 to 1, not -0.1",
-    "--terrain flat --level nan": "argument --level: it must be finite, not nan",
+    "--terrain flat --level nan": "a level must be from 0 to 1, not nan",
     "--terrain flat --level": "argument --level: expected at least one argument",
     "--terrain flat --command 0 0 0": "the command must have a speed of 0.1 m/s or more and a yaw rate of 0, not 0 0 0",
     "--terrain flat --command 1 0 0.5": "a yaw rate of 0, not 1 0 0.5",

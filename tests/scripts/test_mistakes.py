@@ -94,6 +94,7 @@ def test_mistakes_when_training(root, words, message):
         ("evaluate.py", "--load_run=2026", "unknown run '2026'"),
         ("evaluate.py", "--json=/dev", "cannot write '/dev': it is a folder"),
         ("evaluate.py", "--json=/proc/x", "cannot write '/proc/x'"),
+        ("evaluate.py", "--command nan 0 0", "--command[0] must be finite, at most 1e+09 either way, not nan"),
         ("evaluate.py", "--steps=1 --json=/dev/full", "cannot write '/dev/full': No space left on device"),
         ("export.py", "--num_envs=0", "num_envs must be from 1"),
         ("export.py", "--out=/dev/null", "cannot write '/dev/null/policy.yaml'"),
