@@ -116,11 +116,6 @@ def test_number_of_processes_that_is_none(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_values_of_several_lines(tmp_path):
-    """The line of a mistake is one even if a name in it has two."""
-    assert_told_in_one_line(run_here("train.py", "--task=a\nb", root=tmp_path), "unknown task 'a")
-
-
 def test_answers_need_nothing_heavy(tmp_path):
     """Help of every script, lists, and mistakes that settings show come before anything that takes long to import."""
     answers = {

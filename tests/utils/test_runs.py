@@ -100,10 +100,8 @@ def test_config_file_round_trip(task, tmp_path):
     ("text", "message"),
     [
         ("task: [a1", "is not valid YAML"),
-        ("task: a1\n\tenv: 3", "is not valid YAML"),
         ("\x00\x01", "is not valid YAML"),
         ("", "lacks the entries task, env and train"),
-        ("just words", "lacks the entries task, env and train"),
         ("- task\n- env\n- train", "lacks the entries task, env and train"),
         ("task: a1_position\nenv: {}", "lacks the entries task, env and train"),
         (None, "has no config.yaml"),
