@@ -147,7 +147,7 @@ def show(args: argparse.Namespace, run: LoadedRun) -> None:
 
 
 def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
-    """Return the run of ``--compare``; a UserError if its robot cannot walk beside that of another run."""
+    """Return the run of ``--compare``; a UserError if its robot cannot walk next to that of another run."""
     task = load_config(Path(args.compare))["task"]
     options = Options(task, args.device, num_envs=1, load_run=args.compare, perturbation=args.perturbation)
     options.ranges, options.set = args.ranges, args.set

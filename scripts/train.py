@@ -126,7 +126,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
             print(f"{what}: {cli.script_command(script)} {run_words(options, runner.log_dir)}")
     runner.close()
     if runner.stopped_by:
-        sys.exit(128 + runner.stopped_by)  # as shells tell it: 130 after Ctrl-C
+        sys.exit(128 + runner.stopped_by)  # as in shells: 130 after Ctrl-C
 
 
 def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: Any, total: int, page: str) -> None:

@@ -102,7 +102,7 @@ def test_mistakes_when_training(root, words, message):
     ],
 )
 def test_mistakes_after_training(root, script, words, message):
-    """The other scripts tell mistakes in the same way."""
+    """The other scripts report mistakes in the same way."""
     before = contents(root)
     result = run_here(script, "--task=a1_position", "--device=cpu", *words.split(), root=root)
     assert_told_in_one_line(result, message)

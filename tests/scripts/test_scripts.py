@@ -1,4 +1,4 @@
-"""The scripts as a user runs them: mistakes are told in one line, and training, stopping, resuming and playing fit."""
+"""The scripts as a user runs them: mistakes in one line; training, stopping, resuming and playing fit together."""
 
 import json
 import math

@@ -128,7 +128,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize("text", MISTAKES)
 def test_misspelt_names_are_refused(text):
-    """A name that no base has is told with the nearest one, before anything is built."""
+    """A name that no base has is reported with the nearest one, before anything is built."""
     lines = "\n".join(f" {line}" for line in text.splitlines())
     with pytest.raises(UserError) as error:
         exec(f"class V(Both):\n{lines}", globals())  # the only way to write a class from a table

@@ -171,7 +171,7 @@ def limited_write(file, most):
 
 
 def test_a_full_disk(tmp_path):
-    """It is told by its name, and the file stays what it was."""
+    """It is reported by its name, and the file stays what it was."""
     (tmp_path / "file").write_bytes(b"old")
     line = limited_write(tmp_path / "file", 50_000)
     assert line == f"cannot write '{tmp_path / 'file'}': File too large"
