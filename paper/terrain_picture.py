@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from legged_torque.paper.plotting import load_pyplot, save_figure
 from legged_torque.terrain.colors import color_of
 from legged_torque.terrain.tiles import TILES, Grid
 from legged_torque.utils import cli
 from legged_torque.utils.limits import Number, Share
-from legged_torque.utils.plotting import load_pyplot, save_figure
 
 _COLUMNS = 4
 _REACH = (-4.0, 4.0)  # of a tile along each axis [m]
