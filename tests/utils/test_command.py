@@ -7,7 +7,7 @@ import sys
 
 import pytest
 import torch
-from support.command import command
+from support.command import command, complete
 from support.scripts import ROOT, assert_told_in_one_line, run_here
 from support.settings import error_of, get_cfgs, parse
 
@@ -32,16 +32,6 @@ def test_command_without_a_script():
     told = dict(re.findall(r"^  (\w+) +(\S.*)$", output.partition("commands:")[2], flags=re.MULTILINE))
     assert sorted(told) == SCRIPTS and told["train"] == "Train a policy" and next(iter(told)) == "train"
     assert_told_in_one_line(command("trian"), "unknown command 'trian'; did you mean 'train'?")
-
-
-def complete(line, env):
-    """What a shell offers after a line."""
-    pytest.importorskip("argcomplete")
-    variables = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
-    variables |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(env), "_ARGCOMPLETE_SHELL": "bash"}
-    status, _, error = command(env=variables)
-    assert status == 0, error
-    return env.read_text().split()
 
 
 def test_completion(tmp_path):

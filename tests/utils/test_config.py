@@ -9,7 +9,6 @@ from support.settings import TASKS, error_of, flatten, get, get_cfgs, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import section_keys, set_by_path, to_dict
-from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 from legged_torque.utils.task_registry import num_iterations
 
@@ -94,13 +93,6 @@ def test_set_by_path():
     assert cfg.rewards.scales.base_height == -30.0
     assert "env.num_envs must be an integer, not 2.5" in error_of(set_by_path, cfg, "env.num_envs", 2.5)
     assert "did you mean 'rewards.scales.torques'" in error_of(set_by_path, cfg, "rewards.scales", {"torque": 1})
-
-
-@pytest.mark.parametrize("device", [None, "auto", "cpu"])
-def test_devices(device):
-    """The CPU is taken where it is asked for, and where there is nothing else."""
-    best = "cuda:0" if torch.cuda.is_available() else "cpu"
-    assert resolve_device(device) == ("cpu" if device == "cpu" else best)
 
 
 # ---- presets and precedence ------------------------------------------------------------------------------------------
