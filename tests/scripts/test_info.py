@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import runpy
+import subprocess
 
 import numpy as np
 import pytest
@@ -48,6 +49,9 @@ def test_missing_extras(info, monkeypatch):
 def test_gpus_that_cannot_be_used(info, monkeypatch):
     """A driver with a torch for the CPU is reported."""
     monkeypatch.setattr(torch.version, "cuda", None)
-    lines = info["gpus"](["NVIDIA H200, 580.1, 143771 MiB"])
+    done = subprocess.CompletedProcess([], 0, "NVIDIA H200, 580.1, 143771 MiB\n")
+    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: done)
+    lines = info["gpus"]()
     assert lines[0].startswith("NVIDIA H200, 580.1") and "install one for CUDA to use the GPU" in lines[1]
-    assert info["gpus"]([]) == ["none with a driver of NVIDIA", "torch is a build for the CPU"]
+    done.stdout = ""
+    assert info["gpus"]() == ["none with a driver of NVIDIA", "torch is a build for the CPU"]
