@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.benchmark.baseline import Baseline
-from legged_torque.benchmark.learning_time import time_training
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils import cli
@@ -139,6 +138,8 @@ def measure_size(args: argparse.Namespace, cfgs: tuple, memory: MemoryMeter) -> 
 
 def learn(args: argparse.Namespace, num_envs: int) -> dict[str, Any]:
     """Run train.py with the same options, print its wall clock and return it."""
+    from legged_torque.benchmark.measure import time_training
+
     words = [*cli.option_words(args, *cli.SETTINGS, "preset"), f"--num_envs={num_envs}"]
     times = time_training([sys.executable, str(SCRIPTS_DIR / "train.py"), *words])
     print(LEARNING.format(**times))

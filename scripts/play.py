@@ -94,7 +94,7 @@ def parse_args() -> argparse.Namespace:
     hint = """none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's
         window; default: %(default)s"""
     parser.add_argument("--viewer", choices=NUM_ENVS, default="none", help=hint)
-    hint = "folder of a run whose policy walks beside the followed robot, under the same command (--viewer web)"
+    hint = "folder of a run whose policy walks next to the followed robot, under the same command (--viewer web)"
     parser.add_argument("--compare", metavar="RUN", help=hint)
     hint = "address of the page; default: %(default)s, this machine alone; others need the printed token"
     parser.add_argument("--host", default="127.0.0.1", help=hint)

@@ -25,9 +25,10 @@ from legged_torque import resource_path
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.sim.engine import Engine
 from legged_torque.sim.height_map import HeightMap
 from legged_torque.sim.model import FLOOR, build_model
-from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.sim.registry import ENGINES, make_engine
 from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.limits import Count
@@ -49,7 +50,7 @@ Pose = Callable[[mujoco.MjModel, mujoco.MjData], bool]
 """Poses a model for a state, and returns whether it is comparable then, as :meth:`PlanePerFoot.pose`."""
 
 
-def copy_state(sim: Simulator) -> PhysicsState:
+def copy_state(sim: Engine) -> PhysicsState:
     """Return a copy of the arrays that the next physics step depends on."""
     return {name: getattr(sim, name).clone() for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
 
@@ -214,7 +215,7 @@ class Accuracy:
     iterations: float  # mean of the solver's
 
 
-def measure_accuracy(sim: Simulator, state: PhysicsState, expected: np.ndarray, comparable: np.ndarray) -> Accuracy:
+def measure_accuracy(sim: Engine, state: PhysicsState, expected: np.ndarray, comparable: np.ndarray) -> Accuracy:
     """Compare one step of a simulator with as many worlds with a :func:`reference_step`; not finite is wrong."""
     for name, values in state.items():
         getattr(sim, name).copy_(values)
@@ -228,7 +229,7 @@ def measure_accuracy(sim: Simulator, state: PhysicsState, expected: np.ndarray, 
         rms=float(np.sqrt(np.mean(error**2))),
         wrong=float((error.max(axis=1) > TOLERANCE).mean()),
         left_out=float(1.0 - comparable.mean()),
-        iterations=float(sim.data.solver_niter.numpy().mean()),
+        iterations=float(sim.solver_niter.float().mean()),
     )
 
 
@@ -333,10 +334,10 @@ def main() -> None:
     set_seed(args.seed)
     env, walking_states = walk(run, options, args.steps)
     limits, ground, sims, pose = (env.cfg.sim.solver_iterations, env.cfg.sim.ls_iterations), env.terrain.map, {}, None
-    for engine in ENGINES:
-        height_map = ground if engine == "fused" else None
+    for name, engine in ENGINES.items():
+        height_map = ground if "height_map" in engine.capabilities else None
         model = open_motors(load_asset(env.cfg, None if height_map else env.terrain).mj_model)
-        sims[engine] = Simulator(model, args.worlds, env.device, engine, *limits, height_map=height_map)
+        sims[name] = make_engine(name, model, args.worlds, env.device, *limits, height_map)
     if ground:
         spec = read_spec(resource_path(env.cfg.asset.file), env.dof_names)
         planes = PlanePerFoot(spec, env.foot_names, ground)
@@ -349,11 +350,11 @@ def main() -> None:
     for kind in ON_ANY_GROUND if ground else KINDS:
         states = make_states(kind, model, walking_states, args.worlds, args.seed)
         expected = reference_step(model, states, pose)
-        for engine, sim in sims.items():
+        for name, sim in sims.items():
             row = measure_accuracy(sim, states, *expected)
             errors = " | ".join(f"{value:7.1e}" for value in (row.median, row.p999, row.max))
             shares = f"{row.wrong:7.2%} | {row.left_out:8.2%} | {row.iterations:10.1f}"
-            print(f"{kind:<21} | {engine:<11} | {errors} | {shares}", flush=True)
+            print(f"{kind:<21} | {name:<11} | {errors} | {shares}", flush=True)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,9 @@ import numpy as np
 import torch
 
 from legged_torque import RESOURCES_DIR
+from legged_torque.sim.engine import Engine
 from legged_torque.sim.model import build_model, collision_geoms
-from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.sim.registry import ENGINES, make_engine
 from legged_torque.utils import cli
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.limits import Count
@@ -43,7 +44,7 @@ def run(model: mujoco.MjModel, engine: str, count: int, device: str, seed: int =
         "not recovered": after how many the world itself differed by a bit once it was reset.
     """
     rng = np.random.default_rng(seed)
-    sims = [Simulator(model, WORLDS, device, engine) for _ in range(2)]
+    sims = [make_engine(engine, model, WORLDS, device) for _ in range(2)]
     everyone = torch.ones(WORLDS, dtype=torch.bool, device=device)
     bent = torch.tensor(model.jnt_range[1:].mean(axis=1), dtype=torch.float32, device=device)
     counts = {"injections": 0, "leaked": 0, "not recovered": 0}
@@ -82,7 +83,7 @@ def run(model: mujoco.MjModel, engine: str, count: int, device: str, seed: int =
     return counts
 
 
-def _same(sims: list[Simulator], worlds: torch.Tensor) -> bool:
+def _same(sims: list[Engine], worlds: torch.Tensor) -> bool:
     """Return whether some worlds are the same in both simulators, to the last bit, and finite."""
     pairs = [[getattr(sim, name)[worlds] for sim in sims] for name in _STATE]
     return all(torch.equal(a, b) and bool(torch.isfinite(a).all()) for a, b in pairs)

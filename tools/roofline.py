@@ -30,8 +30,8 @@ from torch import Tensor, nn
 from legged_torque.benchmark.measure import WARM_UP, build, seconds_per_call, time_iterations, time_physics
 from legged_torque.envs import task_registry
 from legged_torque.learning.ppo import OnDevicePPO
-from legged_torque.sim.fused.tables import FUSED_FIELDS, unread_columns
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.engine import Engine
+from legged_torque.sim.fused.model import unread_columns
 from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError
@@ -65,7 +65,7 @@ def measure_peaks(device: str, dtype: str) -> Peaks:
     return Peaks(2 * size**3 / product, 2 * count / copy)
 
 
-def work(alg: OnDevicePPO, sim: Simulator, decimation: int) -> dict[str, Any]:
+def work(alg: OnDevicePPO, sim: Engine, decimation: int) -> dict[str, Any]:
     """Return what an update and the physics of a control step need: "update_flop", "update_bytes", "physics_bytes".
 
     "update_dtype" is the kind of numbers that an update multiplies.
@@ -130,14 +130,11 @@ def actor_passes(alg: OnDevicePPO) -> int:
     return images(alg) + (2 if alg.symmetry and alg.symmetry.use_mirror_loss else 0)
 
 
-def physics_bytes(sim: Simulator, decimation: int) -> int:
+def physics_bytes(sim: Engine, decimation: int) -> int:
     """Return the bytes that the physics of a control step reads and writes if each step does so once, see above."""
-    state = sum(map(_bytes, (sim.qpos, sim.qvel, sim.qacc_warmstart)))
-    own = 0  # of the fields that differ from world to world, what the fused step reads
-    for name in FUSED_FIELDS:
-        field = sim.field(name)
-        if 1 < len(field) == sim.num_envs:
-            own += _bytes(field[:, unread_columns(name) :])
+    carried = sim.state_dict()
+    state = sum(_bytes(carried[name]) for name in ("qpos", "qvel", "qacc_warmstart"))
+    own = sum(_bytes(field[:, unread_columns(name) :]) for name, field in sim.fields.items())  # read by each world
     sensors = _bytes(sim.contact_found) + _bytes(sim.contact_force)
     return decimation * (2 * state + _bytes(sim.ctrl) + own) + sensors
 

@@ -1,4 +1,4 @@
-"""The batched MuJoCo Warp simulator. It knows nothing of rewards or learning."""
+"""Physics engines for batches of worlds, CUDA graphs and random parameters. Knows nothing of rewards or learning."""
 
 import warp as wp
 

@@ -1,4 +1,4 @@
-"""Replaying a function as one CUDA graph, with torch and Warp on the same stream."""
+"""Replay of a function as one CUDA graph, with torch and Warp on the same stream."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import torch
 import warp as wp
 
 MAX_CAPTURED_STEPS = 64
-"""Longer sequences of control steps replay step by step: capturing them would take minutes and gigabytes."""
+"""Longer sequences of control steps replay step by step: their capture would take minutes and gigabytes."""
 
 _STREAMS: dict[str, tuple[torch.cuda.Stream, wp.Stream]] = {}
 
 
 def prepare_device(device: str) -> None:
-    """Initialize Warp and make one stream current for both torch and Warp, on which everything runs and is captured.
+    """Initialize Warp, and make one stream current for torch and Warp, on which everything runs and is captured.
 
-    A CUDA graph cannot be captured on the default stream, and Warp knows a stream only as long as the object lives that
-    wraps it: therefore one pair per device, kept for the life of the process. "cpu" has no streams.
+    A CUDA graph cannot be captured on the default stream, and Warp forgets a stream with the object that wraps it.
+    Hence one pair of streams per device is kept for the life of the process. "cpu" has no streams.
     """
     if torch.device(device).type != "cuda":
-        with _silent_stderr():  # on a machine without a GPU, Warp's native code complains that it finds no driver
+        with _silent_stderr():  # on a machine without a GPU, Warp's native code reports that there is no driver
             wp.init()
         return
     wp.init()
@@ -38,7 +38,7 @@ def prepare_device(device: str) -> None:
 
 @contextlib.contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """Drop what native code writes to standard error."""
+    """Drop the output of native code to standard error."""
     kept = os.dup(2)
     with open(os.devnull, "wb") as nothing:
         os.dup2(nothing.fileno(), 2)
@@ -50,19 +50,19 @@ def _silent_stderr() -> Iterator[None]:
 
 
 def is_capturing(device: str) -> bool:
-    """Return whether work on the device is being captured into a graph rather than run."""
+    """Return whether work on the device is captured into a graph and does not run."""
     return torch.device(device).type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
 class CudaGraph:
-    """A function without arguments that is run once, then captured, then replayed.
+    """A function without arguments that runs once, is then captured, and then replayed.
 
-    The function must read and write tensors of fixed address and shape and never wait for the host. Its first call
-    runs it as it is, which compiles kernels and allocates what is allocated once; the second captures it. On the CPU,
-    and while another graph is being captured, every call runs it as it is.
+    The function must read and write tensors of fixed address and shape and never wait for the host. The first call runs
+    it eagerly, which compiles kernels and makes one-time allocations; the second call captures it. On the CPU, and
+    during the capture of another graph, every call runs it eagerly.
 
     Attributes:
-        enabled: Whether to capture and replay; if not, every call runs the function as it is.
+        enabled: Whether to capture and replay; otherwise every call runs the function eagerly.
     """
 
     def __init__(self, function: Callable[[], None], device: str, enabled: bool = True) -> None:
@@ -73,7 +73,7 @@ class CudaGraph:
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> None:
-        """Do what the function does."""
+        """Run, capture or replay the function."""
         if not self.enabled or not self._is_cuda or self._calls == 0 or is_capturing(self._device):
             self._calls += 1
             self._function()
@@ -82,7 +82,7 @@ class CudaGraph:
         self._graph.replay()
 
     def reset(self) -> None:
-        """Give the graph back; the next call runs the function as it is, the one after captures anew."""
+        """Free the graph; the next call runs the function eagerly, the one after captures it anew."""
         self._calls, self._graph = 0, None
 
     def _capture(self) -> torch.cuda.CUDAGraph:

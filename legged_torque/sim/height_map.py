@@ -1,4 +1,4 @@
-"""What :class:`~legged_torque.sim.simulator.Simulator` needs of ground that is not a plane."""
+"""The interface of ground that is not a plane, for engines with the capability "height_map"."""
 
 from typing import Protocol
 

@@ -1,23 +1,23 @@
-"""The kernels of simulator and randomization: one thread per world, or per number of a world."""
+"""Kernels of resets, random events, random parameters and health: one thread per world, or per number of a world."""
 
 import warp as wp
 
-MAX_POSITION = 1e4  # largest position [m, rad] of a world that is still believed
-MAX_VELOCITY = 1e4  # largest velocity [m/s, rad/s] of a world that is still believed
-MAX_ACCELERATION = 1e10  # largest acceleration [m/s^2, rad/s^2] of a world that is still believed
+MAX_POSITION = 1e4  # largest position [m, rad] of a world that has not diverged
+MAX_VELOCITY = 1e4  # largest velocity [m/s, rad/s]
+MAX_ACCELERATION = 1e10  # largest acceleration [m/s^2, rad/s^2]
 MAX_FLOAT = 3.4028234663852886e38  # largest float32
-COLUMNS_PER_THREAD = 8  # that ``mend`` looks at, so that a thread waits for many numbers at a time
+COLUMNS_PER_THREAD = 8  # of replace_non_finite, so that a thread waits for many numbers at a time
 
 Mask, Integers, Numbers = wp.array(dtype=wp.bool), wp.array(dtype=wp.int32), wp.array(dtype=wp.float32)
 Rows = wp.array2d(dtype=wp.float32)
-"""Types of arguments: which worlds; integers and other numbers; several numbers per world."""
+"""Types of arguments: a mask of worlds; one integer or number per world; several numbers per world."""
 
 
 @wp.kernel(enable_backward=False)
 def reset_worlds(
     mask: Mask, reference_pose: Numbers, qpos: Rows, qvel: Rows, qacc_warmstart: Rows, ctrl: Rows, sensordata: Rows
 ):
-    """Write everything that a world carries from one step to the next."""
+    """Reset the state of one world."""
     world = wp.tid()
     if mask[world]:
         for i in range(qpos.shape[1]):
@@ -50,17 +50,9 @@ def push_trunk(qvel: Rows, world: int, velocity: wp.vec3, add: bool):
 
 
 @wp.kernel(enable_backward=False)
-def push(mask: Mask, velocity: Rows, add: Mask, qvel: Rows):
-    """Push the trunk of one world."""
-    world = wp.tid()
-    if mask[world]:
-        push_trunk(qvel, world, wp.vec3(velocity[world, 0], velocity[world, 1], velocity[world, 2]), add[world])
-
-
-@wp.kernel(enable_backward=False)
 def flag_diverged(qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverged: Mask, overflow_seen: Integers):
-    """Check one position, velocity and acceleration of a world; comparisons are written so that NaN fails them."""
-    world, i = wp.tid()  # neighbours in memory are read together
+    """Check one position, velocity and acceleration of a world; the comparisons are false for NaN."""
+    world, i = wp.tid()  # so that neighbours in memory are read together
     if not wp.abs(qpos[world, i]) <= wp.static(MAX_POSITION):
         diverged[world] = True
     if i < qvel.shape[1]:
@@ -91,7 +83,7 @@ def draw_commands(mask: Mask, seeds: Integers, low: Numbers, span: Numbers, comm
 
 
 @wp.kernel(enable_backward=False)
-def happen(
+def apply_random_events(
     # In:
     is_new: Mask,
     seeds: Integers,
@@ -108,7 +100,10 @@ def happen(
     qpos: Rows,
     qvel: Rows,
 ):
-    """Let happen in one world what is due, by the chances of commands, parameters, pushes, and of pushes that add."""
+    """Apply the random events of one world: its initial orientation, a command, new parameters, a push.
+
+    ``chances`` are those of new commands, of new parameters, of pushes, and of a push to add its velocity.
+    """
     world = wp.tid()
     random = wp.rand_init(seeds[world], 0)
     drawn = wp.vec4(wp.randf(random), wp.randf(random), wp.randf(random), wp.randf(random))
@@ -127,13 +122,13 @@ def happen(
 
 @wp.struct
 class Row:
-    """How one column is drawn, where it is kept, and how its value is brought to [-1, 1]."""
+    """One random number: its distribution, its place in memory, and how it is scaled to [-1, 1]."""
 
     address: wp.uint64  # of the first world's number
     stride: wp.uint64  # from world to world [bytes]
-    draw: wp.int32  # number of the random numbers that it takes
-    column_draw: wp.int32  # of the random number for the column's own factor, -1 without
-    place: wp.int32  # in the values, -1 without
+    draw: wp.int32  # index of its random stream
+    column_draw: wp.int32  # index of the stream of the column's own factor, -1 without
+    place: wp.int32  # column of the listed values, -1 without
     base: wp.float32
     weight: wp.float32
     offset_low: wp.float32
@@ -152,7 +147,7 @@ class Row:
 
 @wp.kernel(enable_backward=False)
 def draw(mask: Mask, seeds: Integers, rows: wp.array(dtype=Row), values: Rows):
-    """Write one number of one world."""
+    """Draw one number of one world."""
     world, column = wp.tid()
     if mask[world]:
         row = rows[column]
@@ -172,22 +167,22 @@ def draw(mask: Mask, seeds: Integers, rows: wp.array(dtype=Row), values: Rows):
 
 @wp.struct
 class Column:
-    """One number of every world, wherever it is in memory."""
+    """One number of every world, anywhere in memory."""
 
     address: wp.uint64  # of the first world's
     stride: wp.uint64  # from world to world [bytes]
-    tensor: wp.int32  # which tensor it belongs to
-    healthy: wp.float32  # what takes its place
+    tensor: wp.int32  # index of its tensor
+    healthy: wp.float32  # its replacement
 
 
 @wp.func
 def number_of(column: Column, world: int) -> Numbers:
-    """Return one number of a world, as an array of it."""
+    """Return one number of a world, as an array of length 1."""
     return wp.array(ptr=column.address + wp.uint64(world) * column.stride, shape=(1,), dtype=wp.float32)
 
 
 @wp.kernel(enable_backward=False)
-def mend(
+def replace_non_finite(
     columns: wp.array(dtype=Column),
     excused: Mask,
     diverged: Mask,
@@ -195,12 +190,12 @@ def mend(
     found: wp.array2d(dtype=wp.int32),
     counts: Integers,
 ):
-    """Replace numbers of one world that are not finite; mark the world, and count their tensors unless excused."""
+    """Replace numbers of one world that are not finite; mark the world, and count the tensors unless it is excused."""
     world, part = wp.tid()
     parts = (columns.shape[0] + wp.static(COLUMNS_PER_THREAD - 1)) // wp.static(COLUMNS_PER_THREAD)
     bad = int(0)
     for i in range(wp.static(COLUMNS_PER_THREAD)):  # nothing is written here, so that no load waits for another
-        column = wp.min(i * parts + part, columns.shape[0] - 1)  # neighbours in memory are read together
+        column = wp.min(i * parts + part, columns.shape[0] - 1)  # so that neighbours in memory are read together
         number = number_of(columns[column], world)
         bad += wp.where(wp.abs(number[0]) <= wp.static(MAX_FLOAT), 0, 1)  # faster than isfinite
     if bad == 0:

@@ -1,4 +1,4 @@
-"""From a robot's MJCF file to the model that is simulated."""
+"""The simulated model of a robot's MJCF file, and the sizes of MuJoCo Warp's buffers for it."""
 
 from __future__ import annotations
 
@@ -29,11 +29,10 @@ def indices_matching(names: list[str], parts: list[str], kind: str = "collision 
 
 
 def build_model(spec: mujoco.MjSpec, contact_geoms: list[str]) -> mujoco.MjModel:
-    """Compile the model to simulate: without what is only there to be seen, and with contact sensors.
+    """Compile the model to simulate, without visuals and with contact sensors.
 
-    Bodies without joints become part of what they are fixed to, unless something refers to them. The contacts of each
-    of ``contact_geoms``, with the floor or other parts of the robot, are sensed, by a sensor each, in this order. They
-    are the only sensors of the model.
+    Bodies without joints are merged into their parents, unless something refers to them. Each of ``contact_geoms`` has
+    a sensor of its contacts with the floor and other parts of the robot, in this order. The model has no other sensors.
     """
     spec.compiler.discardvisual = spec.compiler.fusestatic = True
     for sensor in list(spec.sensors):
@@ -43,18 +42,18 @@ def build_model(spec: mujoco.MjSpec, contact_geoms: list[str]) -> mujoco.MjModel
             name=f"{name}_contact",
             type=mujoco.mjtSensor.mjSENS_CONTACT,
             reftype=mujoco.mjtObj.mjOBJ_GEOM,
-            refname=name,  # the second geom, since the force is the one that the first exerts on it, whichever that is
+            refname=name,  # as the second geom: the force is the one that the first geom exerts on it
             intprm=[_DATASPEC, _REDUCE_NETFORCE, 1],
         )
     return spec.compile()
 
 
 def use_known_options(model: mujoco.MjModel) -> None:
-    """Replace the options that MuJoCo Warp refuses although they change no motion: flags and the solver's method."""
+    """Replace options that MuJoCo Warp refuses although they change no motion: some flags, and the PGS solver."""
     model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE | mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_FWDINV)
     if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
-        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON  # which finds the same minimum
+        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON  # finds the same minimum
 
 
 def max_contacts(model: mujoco.MjModel) -> int:
@@ -71,14 +70,13 @@ def max_contacts(model: mujoco.MjModel) -> int:
 _EQUALITY_ROWS = {int(mujoco.mjtEq.mjEQ_CONNECT): 3, int(mujoco.mjtEq.mjEQ_WELD): 6}  # others have one
 
 
-def max_constraints(model: mujoco.MjModel, contacts: int, any_friction: bool = False) -> int:
+def max_constraints(model: mujoco.MjModel, contacts: int) -> int:
     """Return the most constraint rows that one world can have (pyramidal friction cones).
 
-    With ``any_friction``, worlds may have dry friction in joints where the model has none.
+    Every joint may have dry friction in some world.
     """
     rows_per_contact = 2 * (int(model.geom_condim.max()) - 1)
-    friction = model.nv if any_friction else int((model.dof_frictionloss > 0).sum())
-    friction += int((model.tendon_frictionloss > 0).sum())
+    friction = model.nv + int((model.tendon_frictionloss > 0).sum())
     equalities = sum(_EQUALITY_ROWS.get(int(kind), 1) for kind in model.eq_type)
     return (
         contacts * rows_per_contact + friction + int(model.jnt_limited.sum() + model.tendon_limited.sum()) + equalities

@@ -1,4 +1,4 @@
-"""Launching a kernel over worlds on all cores: Warp itself runs a kernel on one core of a CPU."""
+"""Launch of a kernel over worlds on all cores of a CPU, of which Warp itself uses one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 MIN_WORLDS = 8
-"""Fewest worlds of a thread: with fewer, handing them over takes as long as their physics."""
+"""Least number of worlds of a thread: with fewer, the hand-over takes as long as their physics."""
 
 
 def launch_worlds(
@@ -20,9 +20,9 @@ def launch_worlds(
 ) -> None:
     """Launch a kernel whose first dimension are worlds, on a CPU with as many threads as torch uses.
 
-    The kernel's first argument is the number of the first world, which it adds to that of its thread; ``inputs`` are
-    the others. No world may read what the kernel writes of another one: then the result is the same, to the bit, for
-    any number of threads. Returns when the kernel has ended, on a GPU when it is enqueued.
+    The kernel's first argument is the index of the first world, which it adds to that of its thread; ``inputs`` are the
+    other arguments. No world may read what the kernel writes for another one, so that the result is the same to the bit
+    for any number of threads. Returns when the kernel has ended, on a GPU when it is enqueued.
     """
     num_worlds, *rest = dim
     parts = min(torch.get_num_threads(), num_worlds // MIN_WORLDS) if device.is_cpu else 1
@@ -42,5 +42,5 @@ def launch_worlds(
 
 @functools.cache
 def _threads(number: int) -> ThreadPoolExecutor:
-    """Return threads that wait for work, as long as the process lives."""
+    """Return threads that live as long as the process."""
     return ThreadPoolExecutor(number, thread_name_prefix="worlds")

@@ -53,17 +53,6 @@ class RandomParameter:
         return 1 if is_one else len(self.columns)
 
 
-_NUMBERS_PER_BODY = {"body_mass": 1, "body_inertia": 3, "body_ipos": 3, "body_iquat": 4, "body_pos": 3, "body_quat": 4}
-"""Fields of the model on which the inverse weights of legs depend, apart from armatures."""
-_TRUNK = 1  # the trunk's body
-
-
-def changes_legs(parameters: Sequence[RandomParameter]) -> bool:
-    """Return whether masses or places of bodies other than the trunk are drawn, see ``Engine.vary_legs``."""
-    widths = [(_NUMBERS_PER_BODY.get(str(parameter.field)), parameter) for parameter in parameters]
-    return any(width and any(i // width != _TRUNK for i in parameter.columns) for width, parameter in widths)
-
-
 class Randomization:
     """Draws all parameters of the worlds in a mask in one kernel, from one seed per world.
 
@@ -80,16 +69,16 @@ class Randomization:
     def __init__(
         self,
         parameters: Sequence[RandomParameter],
-        model_field: Callable[[str], Tensor],
+        model_field: Callable[[str, Sequence[int]], Tensor],
         num_envs: int,
         device: str,
         keep_probability: float = 0.0,
     ) -> None:
         """Prepare the tables; nothing is drawn yet.
 
-        ``model_field`` returns a field of the model by its name, with a row per world. Parameters that may keep their
-        own values do so in a share of draws, ``keep_probability``. A UserError if a parameter is not float32, has not
-        two axes, or can fall below what it may be.
+        ``model_field`` returns a field of the model to change some columns, see :meth:`Engine.field`. Parameters that
+        may keep their own values do so in a share of draws, ``keep_probability``. A UserError if a parameter is not
+        float32, has not two axes, or can fall below what it may be.
         """
         self.parameters, self.fields = list(parameters), dict[str, Tensor]()
         self.sizes: dict[str, int] = {}
@@ -99,7 +88,9 @@ class Randomization:
         num_draws = 1  # number 0 decides what is kept
         for parameter in parameters:
             is_of_model = isinstance(parameter.field, str)
-            field = model_field(parameter.field).flatten(1) if isinstance(parameter.field, str) else parameter.field
+            field = parameter.field
+            if isinstance(field, str):
+                field = model_field(field, parameter.columns).flatten(1)
             check_value(f"random parameter '{parameter.name}'", parameter.draw, Draw)
             check_field(parameter, field)
             self.fields[str(parameter.field) if is_of_model else parameter.name] = field

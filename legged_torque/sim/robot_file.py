@@ -25,7 +25,7 @@ def spec_problems(spec: mujoco.MjSpec) -> Iterator[str]:
     unnamed = [geom for geom in spec.geoms if not geom.name and (geom.contype or geom.conaffinity)]
     bodies = dict.fromkeys(f"'{geom.parent.name}'" for geom in unnamed)
     if unnamed:
-        yield f"geoms that collide need names, by which settings know them; those of {', '.join(bodies)} have none"
+        yield f"geoms that collide need names, by which settings refer to them; those of {', '.join(bodies)} have none"
 
 
 def model_problems(model: mujoco.MjModel) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""The layout of tiles of rough ground, and the map of their heights."""
+"""The layout of tiles of rough ground, and their map."""
 
 from __future__ import annotations
 

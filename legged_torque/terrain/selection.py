@@ -1,4 +1,4 @@
-"""The choice of kinds and levels of rough ground for watching and measuring a policy."""
+"""Kinds and levels of rough ground for watching and measuring a policy."""
 
 from __future__ import annotations
 

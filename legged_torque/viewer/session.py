@@ -210,8 +210,8 @@ class Session:
         """Add a horizontal velocity [m/s] to every trunk, in a direction from its heading to its left [rad]."""
         check_numbers("a push", angle, speed)
         push = self.task.base_pos.new_tensor([speed * math.cos(angle), speed * math.sin(angle), 0.0])
-        everywhere = torch.ones_like(self.task.reset_buf)
-        self.task.sim.push(everywhere, quat_rotate_yaw(self.task.base_quat, push), everywhere)
+        push = push.expand(self.task.num_envs, 3)
+        self.task.sim.qvel[:, :3] += quat_rotate_yaw(self.task.base_quat, push)
         if self.companion:
             self.companion.push(angle, speed)
         self.message = Message(f"pushed with {speed:.1f} m/s")

@@ -92,10 +92,10 @@ def test_bad_history(make_task, healthy, name):
 @pytest.mark.parametrize("name", MODEL_FIELDS)
 def test_bad_model(make_task, healthy, name):
     """Parameters of the robot and the ground come back, those that are never drawn too."""
-    broken = break_buffer(lambda task: task.sim.field(name).flatten(1), math.nan)
+    broken = break_buffer(lambda task: task.sim.fields[name].flatten(1), math.nan)
     run = Run(make_task, break_state=broken, **RANDOM)
     check(run, healthy[0][1], [1])
-    assert torch.isfinite(run.task.sim.field(name)).all()
+    assert torch.isfinite(run.task.sim.fields[name]).all()
     assert names_of(run.task) == {f"buffer '{name}'": 1}
 
 

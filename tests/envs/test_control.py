@@ -101,7 +101,7 @@ def test_torques_are_clipped(make_task, name):
     signs[1] *= -1
     task.step(1e4 * signs)
     np.testing.assert_array_equal(task.torques, TORQUE_LIMIT * signs[:, :12])
-    np.testing.assert_array_equal(task.sim.data.ctrl.numpy(), TORQUE_LIMIT * signs[:, :12])
+    np.testing.assert_array_equal(task.sim.ctrl.numpy(), TORQUE_LIMIT * signs[:, :12])
 
 
 def test_actions_are_clipped(make_task):

@@ -1,4 +1,4 @@
-"""What the policy and the critic of each task see."""
+"""Observations of the policy and the critic of each task."""
 
 import math
 

@@ -11,7 +11,7 @@ from support.settings import error_of, get_cfgs
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.paper.randomization_picture import initial_state
-from legged_torque.sim.randomization import Randomization, RandomParameter, changes_legs
+from legged_torque.sim.randomization import Randomization, RandomParameter
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
 
@@ -116,7 +116,7 @@ def test_derived_constants(make_task):
     check_constants(task.sim)
     before = {name: task.sim.field(name).clone() for name in (*FIELDS, "body_invweight0", "dof_invweight0")}
     mask = torch.tensor([True, False, True, False, False, False])
-    task.events.happen(mask)
+    task.events.apply(mask)
     for name, old in before.items():
         new = task.sim.field(name)
         assert torch.equal(new[~mask], old[~mask]), name
@@ -355,19 +355,3 @@ def test_what_the_kernel_cannot_write_is_refused():
     shared = Randomization([RandomParameter("shared", torch.ones(1, 2), [0], {})], {}.get, 3, "cpu")
     with pytest.raises(UserError, match="without a row per world: shared"):
         shared.draw(torch.ones(3, dtype=torch.bool))
-
-
-@pytest.mark.parametrize(
-    ("field", "columns", "changes"),
-    [
-        ("body_mass", [1], False),
-        ("body_mass", [1, 2], True),
-        ("body_ipos", [3, 4, 5], False),
-        ("body_ipos", [6], True),
-        ("dof_armature", [7], False),
-        (torch.ones(1, 9), [7], False),
-    ],
-)
-def test_changes_of_legs(field, columns, changes):
-    """Masses and places of bodies tell whether legs vary, those of the trunk aside."""
-    assert changes_legs([RandomParameter("drawn", field, columns, {})]) == changes

@@ -26,7 +26,7 @@ from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.held_pose import standing_note
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.sim.model import build_model
-from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.sim.registry import ENGINES, make_engine
 from legged_torque.utils.mjcf import read_spec, robot_notes
 from legged_torque.viewer.ground import drawn_model
 
@@ -59,7 +59,7 @@ def test_motors_in_another_order(changed, engine):
     cfg = cfg_of(file)
     asset = load_asset(cfg)
     assert asset.dof_names == list(POSE)
-    sim = Simulator(asset.mj_model, 1, "cpu", engine, 100, 50)
+    sim = make_engine(engine, asset.mj_model, 1, "cpu", 100, 50)
     reference = mujoco.MjModel.from_xml_path(file)
     assert [reference.actuator(i).name for i in range(12)] != [asset.mj_model.actuator(i).name for i in range(12)]
     data = mujoco.MjData(reference)
@@ -170,7 +170,7 @@ def test_servos_are_refused(changed, make_task, engine):
     advice = "a servo, whose control is a target: import_robot.py reads it as a motor (FL_hip, FL_thigh)"
     assert f"make a <motor> with a forcerange of what is {advice}" in told
     model = build_model(read_spec(file), [])
-    assert "reads it as a motor (FL_hip, FL_thigh)" in error_of(Simulator, model, 1, "cpu", engine)
+    assert "reads it as a motor (FL_hip, FL_thigh)" in error_of(make_engine, engine, model, 1)
 
 
 # --------------------------------------------------------------------------------------------------- what is refused
@@ -208,7 +208,7 @@ REFUSED = {
     ),
     "unnamed geom": (
         [setting(".//geom[@name='RL_calf']", name=None)],
-        "need names, by which settings know them; those of 'RL_calf'",
+        "need names, by which settings refer to them; those of 'RL_calf'",
     ),
     "no floor": ([setting(".//geom[@name='floor']", name="ground")], "it must have a geom 'floor' in its worldbody"),
     "no free joint": ([remove(".//freejoint")], "must have one body with a free joint, the trunk, not 0"),

@@ -123,7 +123,7 @@ def tasks():
 def test_holding(tasks, name):
     """Robots held at their nominal pose for half a second do not fall; feet of several geoms are one foot each."""
     task = tasks(name)
-    assert task.sim.is_fused and not task.symmetry.problem
+    assert task.sim.name == "fused" and not task.symmetry.problem
     assert task.feet_contact.shape == (4, len(PUBLISHED[name]["legs"]))
     task.reset()
     for _ in range(25):

@@ -1,4 +1,4 @@
-"""What the task keeps from step to step, and its log."""
+"""State that a task keeps from step to step, and its log."""
 
 import mujoco
 import numpy as np

@@ -6,7 +6,7 @@ import torch
 from support.fused import random, step_mujoco
 from support.on_device import make_env, make_robot, make_sim, results, sim_of, step
 
-from legged_torque.sim.simulator import ENGINES
+from legged_torque.sim.registry import ENGINES
 
 WORLDS = 200
 

@@ -30,12 +30,12 @@ def test_unlike_legs_under_applied_forces(device, crab):
     model, states = crab
     count = len(states["qpos"])
     wrenches, forces = random((count, model.nbody, 6), -5.0, 5.0, 1), random((count, model.nv), -3.0, 3.0, 2)
-    sim = make_sim(model, count, device, applied_forces=True)
+    sim = make_sim(model, count, device)
     without = step_mujoco(model, states)
     for of_bodies, of_joints in ((wrenches, forces), (wrenches, 0.0 * forces), (0.0 * wrenches, forces)):
         put(sim, states)
-        sim.xfrc_applied.copy_(torch.tensor(of_bodies))
-        sim.qfrc_applied.copy_(torch.tensor(of_joints))
+        for applied, values in zip(sim.applied_forces(), (of_bodies, of_joints), strict=True):
+            applied.copy_(torch.tensor(values))
         sim.step()
         velocities, data = [], mujoco.MjData(model)
         for world in range(count):
@@ -50,11 +50,17 @@ def test_unlike_legs_under_applied_forces(device, crab):
         assert (np.abs(velocities - without[0]).max(axis=1) > 0.05).all()
 
 
+def with_forces(sim):
+    """An engine whose kernel reads applied forces."""
+    sim.applied_forces()
+    return sim
+
+
 def test_worlds_do_not_see_each_other(device, crab):
     """With idle threads, too, the first worlds of many move to the bit as they do alone."""
     model, states = crab
-    together = step(make_sim(model, len(states["qpos"]), device, applied_forces=True), states)
+    together = step(with_forces(make_sim(model, len(states["qpos"]), device)), states)
     for number in (1, 7):
         few = {name: values[:number] for name, values in states.items()}
-        for ours, theirs in zip(step(make_sim(model, number, device, applied_forces=True), few), together, strict=True):
+        for ours, theirs in zip(step(with_forces(make_sim(model, number, device)), few), together, strict=True):
             np.testing.assert_array_equal(ours, theirs[:number])

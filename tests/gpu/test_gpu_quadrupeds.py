@@ -85,8 +85,7 @@ def test_worlds_with_parameters_of_their_own(device, a1):
     model, states = a1
     count = 24
     states = {name: values[:count] for name, values in states.items()}
-    sim, mask = make_sim(model, count, device, per_world=list(OWN)), torch.arange(count, device=device) % 2 == 0
-    sim.vary_legs()
+    sim, mask = make_sim(model, count, device), torch.arange(count, device=device) % 2 == 0
     for i, (name, (how, low, high)) in enumerate(OWN.items()):
         field = sim.field(name)
         drawn = torch.tensor(random(tuple(field.shape), low, high, i), dtype=torch.float32, device=device)

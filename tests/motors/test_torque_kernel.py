@@ -16,7 +16,8 @@ from support.settings import torques_in_torch
 from legged_torque.envs.base.actions import PdControl, pd_torque
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.robots.a1 import A1Cfg
-from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.sim.registry import ENGINES, make_engine
+from legged_torque.utils.errors import UserError
 
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "contact_found", "contact_force")
 
@@ -57,7 +58,7 @@ def spring(springs: Springs, world: int, motor: int, step: int, pos: float, vel:
 def test_simulator_drives():
     """A law of the position, the speed and the step acts as by hand in MuJoCo; motors are not in the joints' order."""
     model = compiled(make_walker())
-    sim = Simulator(model, 6, "cpu", "fused", 100, 50)
+    sim = make_engine("fused", model, 6, "cpu", 100, 50)
     stiffness, target = np.array([2.0, 0.0, 7.0, 3.0, 5.0], np.float32), random((6, model.nu), -0.5, 0.5)
     sim.qpos[:, 2] = torch.linspace(0.15, 0.4, 6)
     sim.qvel.copy_(torch.tensor(random((6, model.nv), -2.0, 2.0)))
@@ -83,8 +84,8 @@ def test_simulator_drives():
 
 def test_only_the_fused_engine_drives():
     """The other one says so."""
-    sim = Simulator(compiled(make_walker()), 1, "cpu", "mujoco_warp")
-    with pytest.raises(ValueError, match="only the fused engine"):
+    sim = make_engine("mujoco_warp", compiled(make_walker()), 1)
+    with pytest.raises(UserError, match="'mujoco_warp' lacks the capability 'torques_in_kernel'"):
         sim.drive(1, spring, Springs())
 
 

@@ -21,7 +21,7 @@ from support.fused import (
     step_mujoco,
 )
 
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.registry import make_engine
 
 # --------------------------------------------------------------------------------------------------- one step
 
@@ -44,7 +44,7 @@ def test_matches_plain_mujoco(robot, heights):
 def test_standing():
     """Robots that PD control lets stand up and stay, each with its own angles, end where MuJoCo's do."""
     model = compiled(make_a1())
-    sim, home = Simulator(model, 4, "cpu", "fused", 100, 50), model.key_qpos[0]
+    sim, home = make_engine("fused", model, 4, "cpu", 100, 50), model.key_qpos[0]
     references = [mujoco.MjData(model) for _ in range(4)]
     for world, data in enumerate(references):
         yaw = world / 2.0
@@ -67,7 +67,7 @@ def test_conservation_in_the_air():
     """Without friction, damping and limits, energy and momenta of tumbling robots drift no more than MuJoCo's."""
     model = compiled(make_a1())
     model.dof_frictionloss[:], model.jnt_range[:] = 0.0, (-100.0, 100.0)
-    sim = Simulator(model, 8, "cpu", "fused", 100, 50)
+    sim = make_engine("fused", model, 8, "cpu", 100, 50)
     sim.qpos.copy_(torch.tensor(model.key_qpos[0]))
     sim.qpos[:, 2] = 5.0
     sim.qvel.copy_(torch.tensor(random((8, 18), -3.0, 3.0)))
@@ -133,7 +133,7 @@ def test_every_iteration_helps():
     states["qacc_warmstart"][:] = 1e3 * random(states["qvel"].shape, -1.0, 1.0)
     costs = []
     for iterations in range(1, 12):
-        sim = Simulator(model, 60, "cpu", "fused", iterations, 50)
+        sim = make_engine("fused", model, 60, "cpu", iterations, 50)
         put(sim, states)
         sim.step()
         costs.append(solver_costs(model, states, sim.qacc_warmstart))
@@ -155,7 +155,7 @@ def test_warm_start_does_not_matter(scale):
 def test_contacts_are_expected():
     """Robots that stand or slide on their feet need about two iterations, since the pushing rows are guessed."""
     model = compiled(make_a1())
-    sim, home = Simulator(model, 40, "cpu"), torch.tensor(model.key_qpos[0])
+    sim, home = make_engine("fused", model, 40, "cpu"), torch.tensor(model.key_qpos[0])
     sim.qpos.copy_(home)
     sim.qpos[:, 7:] += torch.tensor(random((40, 12), -0.1, 0.1))
     for step in range(100):
@@ -163,7 +163,7 @@ def test_contacts_are_expected():
         if step == 90:
             sim.qvel[20:, :2] += 1.0
         sim.step()
-    iterations = sim.data.solver_niter.numpy()
+    iterations = sim.solver_niter.numpy()
     assert sim.contact_found.any(dim=1).all() and iterations.mean() < 3.0 and iterations.max() < 8
 
 
@@ -173,7 +173,7 @@ def test_bad_numbers_stay_in_their_world(field, value):
     """A world with a number that is none, or absurd, leaves the others bitwise alone, and can be reset."""
     model = compiled(make_a1())
     states = draw_states(model, 4)
-    sims = [Simulator(model, 4, "cpu", "fused") for _ in range(2)]
+    sims = [make_engine("fused", model, 4, "cpu") for _ in range(2)]
     for sim in sims:
         put(sim, states)
     getattr(sims[0], field)[1, -1] = value

@@ -1,13 +1,10 @@
 """Parameters of the fused step, one after another, against plain MuJoCo."""
 
 import mujoco
-import mujoco_warp as mjw
 import numpy as np
 import pytest
 import torch
-import warp as wp
 from support.fused import (
-    FIELDS,
     assert_alike,
     compiled,
     draw_states,
@@ -18,8 +15,7 @@ from support.fused import (
     step_mujoco,
 )
 
-from legged_torque.sim.fused.step import FusedStep
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.registry import make_engine
 from legged_torque.terrain.height_map import HeightMap
 from legged_torque.utils.errors import UserError
 
@@ -126,42 +122,10 @@ def test_slippery_floors(friction):
     assert np.median(error) < 1e-4 * change and error.max() < 0.1 * change
 
 
-def test_parameters_per_world():
-    """Worlds with arrays of their own move as MuJoCo's models with these numbers; writing them acts at once."""
-    model = compiled(make_a1())
-    states = {name: values.repeat(3, axis=0) for name, values in draw_states(model, 1, (0.1, 0.15)).items()}
-    assert step_mujoco(model, states)[2].sum() > 6
-    warp_model = mjw.put_model(model)
-    tables = {
-        "dof_damping": random((3, 18), 0.0, 2.0) * (np.arange(18) > 5),
-        "body_mass": random((3, 14), 0.5, 5.0),
-        "geom_friction": random((3, 18, 3), 0.2, 1.0),
-        "dof_armature": random((3, 18), 0.01, 0.05) * (np.arange(18) > 5),
-    }
-    for name, values in tables.items():
-        dtype = wp.vec3 if name == "geom_friction" else wp.float32
-        setattr(warp_model, name, wp.array(values, dtype=dtype, device="cpu"))
-    data = mjw.make_data(model, nworld=3)
-    step = FusedStep(model, warp_model, data)
-    for _ in range(2):
-        for field in FIELDS:
-            wp.to_torch(getattr(data, field)).copy_(torch.tensor(states[field]))
-        step(True)
-        for world in range(3):
-            for name, values in tables.items():
-                getattr(model, name)[:] = values[world]
-            expected = step_mujoco(model, states)[0][world]
-            np.testing.assert_allclose(data.qvel.numpy()[world], expected, rtol=0, atol=1e-3)
-        assert np.abs(np.diff(data.qvel.numpy(), axis=0)).max(axis=1).min() > 0.1
-        tables["dof_damping"] *= 0.5
-        wp.to_torch(warp_model.dof_damping).mul_(0.5)
-
-
 def test_derived_constants_of_unlike_legs():
     """Inverse weights of a robot whose branches have unlike numbers of joints are those of mj_setConst."""
     model = compiled(make_crab())
-    sim = Simulator(model, 2, "cpu", per_world=["body_mass", "dof_armature"])
-    sim.vary_legs()
+    sim = make_engine("fused", model, 2, "cpu")
     sim.field("body_mass")[1, 1:] *= torch.tensor(random(model.nbody - 1, 0.5, 2.0))
     sim.field("dof_armature")[1, 6:] += torch.tensor(random(model.nv - 6, 0.0, 0.1))
     sim.update_constants(torch.tensor([True, True]))
@@ -177,7 +141,7 @@ def test_derived_constants_on_a_hfield():
     spec = make_a1()
     HeightMap(np.random.default_rng(0).uniform(size=(4, 5)), 1.0, (-2.0, -2.0), "cpu").add_to(spec, "floor")
     model = compiled(spec)
-    sim = Simulator(model, 2, "cpu", "mujoco_warp", per_world=["body_mass"])
+    sim = make_engine("mujoco_warp", model, 2, "cpu")
     sim.field("body_mass")[1, 1] *= 1.7
     sim.update_constants(torch.tensor([False, True]))
     before = model.body_invweight0.copy()
@@ -186,4 +150,4 @@ def test_derived_constants_on_a_hfield():
     for found, exact in zip(sim.field("body_invweight0"), (before, model.body_invweight0), strict=True):
         np.testing.assert_allclose(found, exact, rtol=2e-5)
     with pytest.raises(UserError, match="it needs one plane"):
-        Simulator(model, 1, "cpu")
+        make_engine("fused", model, 1, "cpu")

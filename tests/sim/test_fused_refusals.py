@@ -1,16 +1,18 @@
-"""What the fused step does not simulate, and refuses by name."""
+"""Models that the fused step refuses by name."""
 
 import mujoco
 import numpy as np
 import pytest
 from support.fused import assert_alike, compiled, draw_states, make_a1, put, step_fused, step_mujoco
+from support.settings import error_of
 
 from legged_torque import RESOURCES_DIR
-from legged_torque.envs.base.domain_rand import of_model
-from legged_torque.envs.base.robot_checks import engine_notes
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.sim.fused.tree import read_tree
-from legged_torque.sim.model import build_model, max_constraints
-from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.sim.model import max_constraints
+from legged_torque.sim.randomization import RandomParameter
+from legged_torque.sim.registry import make_engine
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import read_spec
 
@@ -88,7 +90,7 @@ REFUSED = [
     (f"spec.geom('floor').contype = 0; spec.worldbody.add_geom({SPHERE}, condim=3)", "it needs one plane"),
     ("spec.geom('floor').surfacevel = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]", "surfaces move or stick"),
     ("spec.geom('FR_foot').adhesion = 10.0", "surfaces move or stick"),
-    ("branch(spec.worldbody)", "something beside the trunk hangs on the world"),
+    ("branch(spec.worldbody)", "something besides the trunk hangs on the world"),
     ("for _ in range(13): branch(spec.body('trunk'))", "it has 17 legs, not 1 to 16"),
     ("spec.geom('FR_foot').solref = (-500, 0.7)", "a solref mixes its two formats"),
     ("spec.joint('FR_calf_joint').solref_limit = (0.02, -1)", "a solref mixes its two formats"),
@@ -166,13 +168,13 @@ def test_solver_of_the_file():
 
 def test_engine_that_is_slower():
     """Who takes MuJoCo Warp's own step is told how much slower it is, and whether it had to be."""
-    assert list(engine_notes(compiled(make_a1()), "fused")) == []
-    assert "which can simulate this robot" in next(engine_notes(compiled(make_a1()), "mujoco_warp"))
+    assert not make_engine("fused", compiled(make_a1()), 1).notes
+    assert "which can simulate this robot" in make_engine("mujoco_warp", compiled(make_a1()), 1).notes[0]
     spec = make_a1()
     for key in list(spec.keys):
         spec.delete(key)
     branch(spec.body("FL_thigh"))
-    (note,) = engine_notes(compiled(spec), "mujoco_warp")
+    (note,) = make_engine("mujoco_warp", compiled(spec), 1).notes
     assert note.startswith("sim.engine 'mujoco_warp' steps worlds, about 30 times slower than 'fused'")
     assert note.endswith("which cannot simulate this robot: body 'FL_thigh' branches")
 
@@ -191,37 +193,16 @@ def test_rows_of_closed_loops():
     assert rows == 10 == max_constraints(model, 0) - max_constraints(compiled(make_a1()), 0)
 
 
-@pytest.mark.parametrize("name", ["geom_margin", "jnt_margin", "body_gravcomp", "actuator_gainprm", "geom_gap"])
-def test_fields_that_are_not_read(name):
-    """Fields that the fused step does not read cannot be had per world; MuJoCo Warp's step takes them."""
-    model = compiled(make_a1())
-    with pytest.raises(UserError, match=f"does not read '{name}' per world"):
-        Simulator(model, 2, "cpu", per_world=["body_mass", name])
-    Simulator(model, 2, "cpu", engine="mujoco_warp", per_world=[name])
-    with pytest.raises(UserError, match="body_mass"):
-        Simulator(model, 2, "cpu", per_world=["body_mas"])
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("name", ["dof_damping", "dof_armature", "dof_frictionloss", "jnt_stiffness"])
-def test_the_free_joint_is_not_read(engine, name):
-    """Random parameters of the trunk's free joint are refused where they would not act; those of hinges are not."""
-    sim = Simulator(compiled(make_a1()), 2, "cpu", engine, per_world=[name])
-    last_of_trunk = 0 if name == "jnt_stiffness" else 5
-    sim.check_columns(name, [last_of_trunk + 1])
-    if engine == "fused":
-        with pytest.raises(UserError, match=f"does not read '{name}' of the trunk's free joint"):
-            sim.check_columns(name, [last_of_trunk + 1, last_of_trunk])
-    else:
-        sim.check_columns(name, [last_of_trunk])
-
-
-def test_random_parameters_of_the_free_joint(make_task):
+def test_random_parameters_of_the_free_joint():
     """A task cannot draw what would not act."""
-    task = make_task("a1_torque", 2, **{"domain_rand.randomize_parameters": True})
-    assert of_model(task, "damping of hinges", "dof_damping", [6]).model_field == "dof_damping"
-    with pytest.raises(UserError, match="does not read 'dof_damping' of the trunk's free joint"):
-        of_model(task, "damping of the trunk", "dof_damping", [0])
+
+    class Robot(LeggedRobot):
+        def random_parameters(self):
+            return [*super().random_parameters(), RandomParameter("sway", "dof_damping", [6, 0], {"add": [0.0, 1.0]})]
+
+    cfg = A1Cfg()
+    cfg.env.num_envs, cfg.domain_rand.randomize_parameters = 2, True
+    assert "does not read 'dof_damping' of the trunk's free joint" in error_of(Robot, cfg)
 
 
 def test_tolerance():
@@ -230,20 +211,8 @@ def test_tolerance():
     states, counts = draw_states(model, 30, seed=8), []
     for tolerance in (1e-8, 1e9):
         model.opt.tolerance = tolerance
-        sim = Simulator(model, 30, "cpu")
+        sim = make_engine("fused", model, 30, "cpu")
         put(sim, states)
         sim.step()
-        counts.append(sim.data.solver_niter.numpy().copy())
+        counts.append(sim.solver_niter.numpy().copy())
     assert counts[0].max() > 4 and counts[1].max() <= 2
-
-
-def test_engines_by_name():
-    """A robot that is refused can be simulated with the other engine, and there is no third one."""
-    spec = read_spec(A1)
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    model = build_model(spec, [])
-    with pytest.raises(UserError, match="the friction cone must be pyramidal"):
-        Simulator(model, 1, "cpu")
-    Simulator(model, 1, "cpu", engine="mujoco_warp")
-    with pytest.raises(UserError, match="fuse"):
-        Simulator(model, 1, "cpu", engine="fuse")

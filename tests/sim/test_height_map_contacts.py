@@ -1,154 +1,12 @@
-"""Contacts of the fused step with a height map: against planes of plain MuJoCo, and what must hold on any ground."""
+"""Contacts of the fused step with a height map, against planes of plain MuJoCo."""
 
 import functools
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
 import pytest
-import torch
-import warp as wp
-from support.fused import assert_alike, compiled, draw_states, invariants, make_a1, put, step_mujoco
-
-from legged_torque.envs import task_registry
-from legged_torque.sim.fused.surface import Surface, Touch, make_surface, touch_map
-from legged_torque.sim.simulator import Simulator
-from legged_torque.terrain.rough import RoughGround
-from legged_torque.utils.errors import UserError
-
-BALL = """<mujoco><compiler angle="radian" autolimits="true"/>
-<option cone="pyramidal" integrator="implicitfast" impratio="1" timestep="0.005"/>
-<worldbody>{floors}<body name="trunk" pos="0 0 1"><freejoint/>
- <geom name="ball" type="{kind}" size="{size}" mass="2" contype="1" conaffinity="15" condim="3" friction="1e-5"/>{fill}
- <body><joint axis="1 0 0" range="-9 9" damping="0.01"/><inertial pos="0 0 0" mass="0.01" diaginertia="1e-3 1e-3 1e-3"/>
- </body></body></worldbody></mujoco>"""
-# Tiny spheres in the middle make up for the points of other kinds, so that one kernel simulates all of them:
-POINTS = {"sphere": 1, "capsule": 2, "box": 8, "cylinder": 16}
-FILL = '<geom size="1e-3" mass="0" contype="1" conaffinity="15" condim="3"/>'
-FLAT = '<geom name="floor" type="plane" size="0 0 1" contype="15" conaffinity="1" friction="{friction}"/>'
-
-
-class Map(NamedTuple):
-    """Heights as the simulator takes them."""
-
-    heights: np.ndarray
-    horizontal_scale: float
-    corner: tuple[float, float]
-
-
-def make_map(height, scale=0.05, cells=60):
-    """The map of a function of x and y around the origin."""
-    axis = (np.arange(cells + 1) - 0.5 * cells) * scale
-    return Map(height(*np.meshgrid(axis, axis, indexing="ij")).astype(np.float32), scale, (axis[0], axis[0]))
-
-
-def tilted(slope, yaw):
-    """A plane's slopes along x and y, its unit normal, and a quaternion (w, x, y, z) that turns z to it."""
-    along = slope * np.array([np.cos(yaw), np.sin(yaw)])
-    normal = np.array([-along[0], -along[1], 1.0]) / np.sqrt(1.0 + slope**2)
-    quat = np.array([1.0 + normal[2], -normal[1], normal[0], 0.0])
-    return along, normal, quat / np.linalg.norm(quat)
-
-
-def ball(friction=1e-5, kind="sphere", size="0.1", planes=()):
-    """A ball with a needless leg on a flat floor, or on planes posed by quaternions through the origin."""
-    posed = "".join(
-        f'<geom type="plane" size="0 0 1" quat="{" ".join(map(str, quat))}" contype="15" conaffinity="1" '
-        f'friction="{friction}"/>'
-        for quat in planes
-    )
-    floors = posed or FLAT.format(friction=friction)
-    fill = FILL * max(0, 8 - POINTS[kind])
-    spec = mujoco.MjSpec.from_string(BALL.format(floors=floors, kind=kind, size=size, fill=fill))
-    if not planes:
-        return compiled(spec)
-    model = spec.compile()
-    model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
-    return model
-
-
-def simulate(model, height_map, places, velocities=0.0, steps=0):
-    """A simulator with a trunk at each of some places, after some steps."""
-    sim = Simulator(model, len(places), "cpu", "fused", 50, 30, height_map=height_map)
-    sim.qpos[:, :3] = torch.tensor(np.array(places))
-    sim.qvel[:, :3] = torch.as_tensor(velocities)
-    for _ in range(steps):
-        sim.step()
-    return sim
-
-
-# --------------------------------------------------------------------------------------------------- the surface
-
-
-@wp.kernel(enable_backward=False)
-def touch_all(
-    surface: Surface, centre: wp.array(dtype=wp.vec3), radius: wp.array(dtype=float), touch: wp.array(dtype=Touch)
-):
-    """Touch a map with spheres."""
-    i = wp.tid()
-    touch[i] = touch_map(surface, centre[i], radius[i])
-
-
-def touches(height_map, centres, radii):
-    """Where spheres touch a map."""
-    with wp.ScopedDevice("cpu"):
-        out = wp.empty(len(centres), dtype=Touch)
-        places, sizes = wp.array(centres, dtype=wp.vec3), wp.array(radii, dtype=float)
-        wp.launch(touch_all, len(centres), [make_surface(height_map), places, sizes, out])
-    return out.numpy()
-
-
-def samples(height_map, per_cell=40):
-    """Many points of a map's triangles, exact heights of both halves of all cells. Shape: (points, 3)."""
-    heights, scale, corner = height_map
-    x, y = (values.ravel() for values in np.meshgrid(*[np.linspace(0.0, 1.0, per_cell + 1)] * 2, indexing="ij"))
-    points = []
-    for i, j in np.ndindex(heights.shape[0] - 1, heights.shape[1] - 1):
-        a, b, c, d = heights[i, j], heights[i + 1, j], heights[i, j + 1], heights[i + 1, j + 1]
-        z = np.where(x >= y, a + (b - a) * x + (d - b) * y, a + (c - a) * y + (d - c) * x)
-        points.append(np.stack([corner[0] + scale * (i + x), corner[1] + scale * (j + y), z], axis=1))
-    return np.concatenate(points)
-
-
-def test_nearest_point_of_rough_ground():
-    """Distance and normal of spheres and points above and below random ground are those to its nearest point."""
-    rng = np.random.default_rng(0)
-    height_map = Map(rng.uniform(-0.03, 0.05, (9, 8)).astype(np.float32), 0.05, (-0.3, 0.2))
-    centres = np.stack([rng.uniform(*limits, 300) for limits in ((-0.25, 0.05), (0.25, 0.5), (-0.04, 0.09))], axis=1)
-    radii = np.where(rng.random(300) < 0.3, 0.0, rng.uniform(0.01, 0.06, 300))
-    touch, ground = touches(height_map, centres, radii), samples(height_map)
-    for centre, radius, found in zip(centres, radii, touch, strict=True):
-        apart = np.linalg.norm(ground - centre, axis=1)
-        nearest, under = ground[apart.argmin()], ground[np.linalg.norm((ground - centre)[:, :2], axis=1).argmin()]
-        side = np.sign(centre[2] - under[2])
-        dist = side * apart.min() - radius
-        if found["count"] == 0:
-            assert dist > -5e-4
-            continue
-        assert abs(found["dist"][0] - dist) < 1e-3
-        np.testing.assert_allclose(apart.min() * found["first"], side * (centre - nearest), rtol=0, atol=2e-3)
-    assert 0.2 < (touch["count"] == 0).mean() < 0.6 and (touch["count"] == 2).any()
-
-
-@pytest.mark.parametrize("slope", [0.0, 0.3, 1.0, 3.0])
-def test_triangles_of_a_plane_are_one_plane(slope):
-    """Spheres and points near a triangulated plane touch it with its normal, once, wherever they are."""
-    along, normal, _ = tilted(slope, 0.4)
-    rng = np.random.default_rng(1)
-    height_map = make_map(lambda x, y: along[0] * x + along[1] * y, cells=20)
-    radii, dist = rng.choice([0.0, 0.02, 0.1], 2000), rng.uniform(-0.03, 0.005, 2000)
-    places = rng.uniform(-0.3, 0.3, (2000, 2))
-    places[:700] = np.round(places[:700] / 0.05) * 0.05  # above samples, and then above edges
-    places[700:1000, 0] = np.round(places[700:1000, 0] / 0.05) * 0.05
-    centres = np.column_stack([places, places @ along]) + (radii + dist)[:, None] * normal
-    touch = touches(height_map, centres, radii)
-    np.testing.assert_array_equal(touch["count"], np.where(dist < 0.0, 1, 0))
-    touching = touch["count"] == 1
-    np.testing.assert_allclose(touch["dist"][touching, 0], dist[touching], rtol=0, atol=1e-6)
-    np.testing.assert_allclose(touch["first"][touching], np.tile(normal, (touching.sum(), 1)), rtol=0, atol=2e-6)
-
-
-# --------------------------------------------------------------------------------------------------- against MuJoCo
+from support.fused import assert_alike, compiled, draw_states, make_a1, step_fused, step_mujoco
+from support.maps import ball, make_map, simulate, tilted
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.5])
@@ -169,18 +27,11 @@ def test_a_plane_as_a_map(slope):
         kept.append((data.geom_xpos[boxes] @ normal > 0.0).all())
     states = {field: values[kept] for field, values in states.items()}
     height_map = make_map(lambda x, y: along[0] * x + along[1] * y)
-    sims = [
-        Simulator(model, len(states["qpos"]), "cpu", "fused", 100, 50, height_map=ground)
-        for ground in (height_map, None)
-    ]
-    for sim in sims:
-        put(sim, states)
-        sim.step()
-    results = [(sim.qvel, sim.qpos, sim.contact_found, sim.contact_force) for sim in sims]
-    assert (results[0][2].sum(dim=1) > 0).sum() > 30
-    assert_alike(posed, states, [result.double().numpy() for result in results[0]], step_mujoco(posed, states))
+    on_map, on_plane = (step_fused(model, states, height_map=ground) for ground in (height_map, None))
+    assert (on_map[2].sum(axis=1) > 0).sum() > 30
+    assert_alike(posed, states, on_map, step_mujoco(posed, states))
     if slope == 0.0:
-        assert all(torch.equal(*pair) for pair in zip(*results, strict=True))
+        assert all(np.array_equal(*pair) for pair in zip(on_map, on_plane, strict=True))
 
 
 def on_facets(height_map, num):
@@ -251,13 +102,11 @@ def test_slopes_under_each_foot():
     rng = np.random.default_rng(2)
     height_map = make_map(lambda x, y: rng.uniform(-0.08, 0.08, x.shape), scale=0.4, cells=8)
     model, states, results = on_facets(height_map, 60)
-    sim = Simulator(model, 60, "cpu", "fused", 100, 50, height_map=height_map)
-    put(sim, states)
-    sim.step()
+    found = step_fused(model, states, height_map=height_map)
     counts = np.array([count for _, count in results])
-    np.testing.assert_array_equal(sim.contact_found.sum(dim=1).numpy(), counts)
+    np.testing.assert_array_equal(found[2].sum(axis=1), counts)
     assert np.mean(counts > 1) > 0.1
-    np.testing.assert_allclose(sim.qvel.numpy(), [qvel for qvel, _ in results], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(found[0], [qvel for qvel, _ in results], rtol=0, atol=1e-4)
 
 
 def test_sliding_over_triangles():
@@ -301,40 +150,6 @@ def test_rest_in_a_groove():
         assert data.ncon == 2 and abs(force[0] - by_hand[contact]) < 0.02 * weight
 
 
-# --------------------------------------------------------------------------------------------------- any ground
-
-
-def stairs(x, y):
-    """Steps of 0.15 m every 0.3 m, whose risers are one cell deep."""
-    return 0.15 * np.floor(x / 0.3 + 1e-6)
-
-
-def pits(x, y):
-    """Pits of 0.3 m by 0.3 m, 0.4 m deep."""
-    return np.where((np.floor(x / 0.3 + 1e-6) + np.floor(y / 0.3 + 1e-6)) % 2 == 0, 0.0, -0.4)
-
-
-def rough(x, y):
-    """Heights drawn for each sample."""
-    return np.random.default_rng(5).uniform(-0.1, 0.1, x.shape)
-
-
-def heights_under(height_map, points):
-    """Heights of the ground under points. Shape: (..., 3) to (...)."""
-    heights, scale, corner = height_map
-    places = np.clip((points[..., :2] - corner) / scale, 0.0, np.array(heights.shape) - 1.0)
-    i, j = np.clip(np.floor(places).astype(int), 0, np.array(heights.shape) - 2).reshape(-1, 2).T
-    i, j = (index.reshape(points.shape[:-1]) for index in (i, j))
-    x, y = places[..., 0] - i, places[..., 1] - j
-    a, b, c, d = heights[i, j], heights[i + 1, j], heights[i, j + 1], heights[i + 1, j + 1]
-    return np.where(x >= y, a + (b - a) * x + (d - b) * y, a + (c - a) * y + (d - c) * x)
-
-
-def circle_point(radius, eighth):
-    """A point of a circle around the origin."""
-    return radius * np.cos(np.pi / 4 * eighth), radius * np.sin(np.pi / 4 * eighth)
-
-
 def test_cylinders_on_a_level_map():
     """Cylinders that lean on one of their points, or lie on two, move on a level map as plain MuJoCo's on a plane."""
     model, rng = ball(0.6, "cylinder", "0.06 0.05"), np.random.default_rng(3)
@@ -346,11 +161,7 @@ def test_cylinders_on_a_level_map():
         qpos[2] = 0.06 * np.sin(angle) + 0.05 * abs(np.cos(angle)) - rng.uniform(-0.001, 0.004)
     expected = step_mujoco(model, states)
     assert set(expected[2][:, 0]) == {0, 1, 2}
-    sim = Simulator(model, 80, "cpu", "fused", 100, 50, height_map=make_map(lambda x, y: 0.0 * x))
-    put(sim, states)
-    sim.step()
-    found = (sim.qvel, sim.qpos, sim.contact_found, sim.contact_force)
-    assert_alike(model, states, [values.double().numpy() for values in found], expected)
+    assert_alike(model, states, step_fused(model, states, height_map=make_map(lambda x, y: 0.0 * x)), expected)
 
 
 def about_axis(angle, axis):
@@ -363,79 +174,3 @@ def quat_product(a, b):
     out = np.zeros(4)
     mujoco.mju_mulQuat(out, a, b)
     return out
-
-
-@pytest.mark.parametrize("ground", [stairs, pits, rough])
-@pytest.mark.parametrize(
-    ("kind", "size"),
-    [("sphere", "0.02"), ("capsule", "0.03 0.1"), ("cylinder", "0.06 0.05"), ("box", "0.1 0.06 0.04")],
-)
-def test_nothing_falls_through(kind, size, ground):
-    """What hits stairs, pits and rough ground at 5 m/s, straight or aslant, comes to lie on it and wins no energy."""
-    rng = np.random.default_rng(4)
-    height_map, model = make_map(ground), ball(0.5, kind, size)
-    places = np.column_stack([rng.uniform(-1.0, 1.0, (100, 2)), np.full(100, 1.2)])
-    velocities = np.column_stack([rng.uniform(-3.0, 3.0, (100, 2)), np.full(100, -5.0)])
-    velocities[:30, :2] = 0.0
-    sim = simulate(model, height_map, places, velocities)
-    sim.qvel[:, 3:6] = torch.tensor(rng.normal(0.0, 3.0, (100, 3)))
-    data, start = mujoco.MjData(model), None
-    sizes = model.geom("ball").size
-    half = {"sphere": np.zeros(3), "box": sizes}.get(kind, sizes[1] * np.array([0.0, 0.0, 1.0]))
-    corners = half * np.array(list(np.ndindex(2, 2, 2))) * 2.0 - half
-    if kind == "cylinder":
-        corners = np.array([(*circle_point(sizes[0], i), z) for i in range(8) for z in (-sizes[1], sizes[1])])
-    for _ in range(9):
-        energies, points = [], []
-        for data.qpos[:], data.qvel[:] in zip(sim.qpos, sim.qvel, strict=True):
-            energies.append(invariants(model, data)[0])
-            points.append(data.geom("ball").xpos + corners @ data.geom("ball").xmat.reshape(3, 3).T)
-        start = start or energies
-        assert (np.array(energies) < np.array(start) + 0.01).all()
-        for _ in range(50):
-            sim.step()
-    above = np.array(points)[..., 2] - heights_under(height_map, np.array(points))
-    assert above.min() > (-0.02 if kind in ("box", "cylinder") else 0.0)  # under a riser's edge: 5 mm from its face
-    assert np.mean(above.min(axis=1) < 0.1) > 0.9
-
-
-def test_beyond_the_border():
-    """Outside of the map the ground goes on as high as its border."""
-    height_map = make_map(lambda x, y: np.where(x > 0.0, 0.2, 0.0) + 0.0 * y, cells=20)
-    sim = simulate(ball(0.5), height_map, [[3.0, 0.1, 0.5], [-3.0, 40.0, 0.5], [0.2, -0.5, 0.5]], steps=300)
-    np.testing.assert_allclose(sim.qpos[:, 2], [0.3, 0.1, 0.3], rtol=0, atol=0.01)
-    assert (sim.contact_found == 1.0).all()
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -1e30])
-def test_bad_numbers_stay_in_their_world(value):
-    """A world with a place that is none, or absurd, leaves the others bitwise alone."""
-    places = np.random.default_rng(6).uniform(-1.0, 1.0, (6, 3))
-    sims = [simulate(ball(0.5), make_map(rough), places) for _ in range(2)]
-    for axis in range(3):
-        sims[1].qpos[axis, axis] = value
-    for sim in sims:
-        for _ in range(50):
-            sim.step()
-    assert torch.equal(sims[0].qpos[3:], sims[1].qpos[3:]) and torch.isfinite(sims[0].qpos).all()
-
-
-def test_refused():
-    """Heights are the world's: a floor that is or goes elsewhere cannot be a map; other engines have their own way."""
-    spec, height_map = make_a1(), make_map(rough)
-    with pytest.raises(ValueError, match="hfield"):
-        Simulator(compiled(spec), 1, "cpu", "mujoco_warp", height_map=height_map)
-    sim = Simulator(compiled(spec), 2, "cpu", per_world=["geom_pos"], height_map=height_map)
-    sim.check_columns("geom_pos", [2 + 3 * sim.mj_model.geom("FR_foot").id])
-    with pytest.raises(UserError, match="does not read 'geom_pos' of the floor"):
-        sim.check_columns("geom_pos", [2 + 3 * sim.mj_model.geom("floor").id])
-    spec.geom("floor").pos = [0.0, 0.0, 0.1]
-    with pytest.raises(UserError, match="its floor is not at the origin"):
-        Simulator(compiled(spec), 1, "cpu", height_map=height_map)
-
-
-def test_a_gpu_without_room(monkeypatch):
-    """A map that does not fit a GPU's memory is refused before it is made: three times 2601 x 4201 float32 here."""
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (2**20, 2**30))
-    with pytest.raises(UserError, match="needs 135 MiB, and cuda:0 has 1 left"):
-        RoughGround.build(task_registry.get_cfgs("a1_position")[0].terrain, 1, "cuda:0")

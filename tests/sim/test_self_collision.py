@@ -9,9 +9,9 @@ from support.settings import error_of
 
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.sim.fused.self_contact import MAX_SELF_CONTACTS
+from legged_torque.sim.fused.collision_self import MAX_SELF_CONTACTS
 from legged_torque.sim.model import build_model, collision_geoms
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.registry import make_engine
 from legged_torque.utils.mjcf import self_pairs
 
 GEOM = mujoco.mjtGeom
@@ -141,7 +141,7 @@ def test_too_many_contacts_are_told():
     """Of more contacts than there is room for the first ones count, and a warning says so."""
     for number, warning in ((1, None), (MAX_SELF_CONTACTS + 1, "NARROWPHASE")):
         model = compiled(add_beads(number))
-        sim = Simulator(model, 8, "cpu", "fused", 100, 50)
+        sim = make_engine("fused", model, 8, "cpu", 100, 50)
         put(sim, draw_states(model, 8, seed=1))
         sim.step()
         sim.flag_diverged()

@@ -1,4 +1,4 @@
-"""What two trainings have done in an iteration, compared to the bit, and gradients of kernels against autograd."""
+"""Two trainings compared to the bit, and gradients of kernels against autograd."""
 
 import torch
 from support.on_device import make_runner

@@ -6,8 +6,8 @@ import torch
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.sim.model import build_model
-from legged_torque.sim.simulator import Simulator
-from legged_torque.utils.mjcf import read_spec
+from legged_torque.sim.registry import make_engine
+from legged_torque.utils.mjcf import colliding_pairs, read_spec
 
 FIELDS = ("qpos", "qvel", "ctrl", "qacc_warmstart")
 
@@ -142,14 +142,32 @@ def step_mujoco(model, states):
 
 
 def put(sim, states):
-    """Write states into the simulator's worlds."""
-    for field in FIELDS:
-        getattr(sim, field).copy_(torch.tensor(states[field]))
+    """Write states into an engine's worlds."""
+    for field, values in states.items():
+        if field != "qacc_warmstart" or hasattr(sim, field):
+            getattr(sim, field).copy_(torch.tensor(values))
 
 
-def step_fused(model, states, iterations=100, ls_iterations=50):
+SELF_SCRATCH = {"poses", "found", "residual", "pushing", "change", "geoms", "normal", "jacobian", "joints", "matrix"}
+
+
+def spoil(sim):
+    """Fill outputs and scratch of the fused step with infinities, so that a value which it does not write is found."""
+    contacts, selves = sim._scratch.contacts, sim._scratch.selves
+    for tensor in (sim.contact_found, sim.contact_force):
+        tensor[:, np.isin(sim.mj_model.sensor_refid, colliding_pairs(sim.mj_model))] = np.inf
+    arrays = [sim._state.qacc_warmstart, sim._state.solver_niter]
+    arrays += [getattr(contacts, name) for name in ("found", "residual", "pushing", "change")]
+    arrays += [contacts.normal] if sim._on_map else []
+    arrays += [getattr(selves, name) for name in SELF_SCRATCH] if sim._layout.self_kinds else []
+    for array in (*arrays, sim._scratch.branch):
+        array.numpy().reshape(-1).view(np.float32).fill(np.inf)
+
+
+def step_fused(model, states, iterations=100, ls_iterations=50, height_map=None):
     """The same after one fused step."""
-    sim = Simulator(model, len(states["qpos"]), "cpu", "fused", iterations, ls_iterations)
+    sim = make_engine("fused", model, len(states["qpos"]), "cpu", iterations, ls_iterations, height_map)
+    spoil(sim)
     put(sim, states)
     sim.step()
     return [tensor.double().numpy() for tensor in (sim.qvel, sim.qpos, sim.contact_found, sim.contact_force)]

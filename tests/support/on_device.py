@@ -10,7 +10,7 @@ from support.settings import parse
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.envs import task_registry
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.registry import make_engine
 from legged_torque.utils.mjcf import read_spec
 from legged_torque.utils.task_registry import set_seed
 
@@ -24,8 +24,8 @@ def make_robot(name, edit=None):
 
 
 def make_sim(model, num, device, engine="fused", **settings):
-    """A simulator whose solver converges."""
-    return Simulator(model, num, device, engine, 100, 50, **settings)
+    """An engine whose solver converges."""
+    return make_engine(engine, model, num, device, 100, 50, **settings)
 
 
 def results(sim):

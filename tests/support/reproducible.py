@@ -10,7 +10,7 @@ from support.scripts import ROOT
 from legged_torque.utils.runs import find_checkpoint
 
 TIMES = ("seconds",)
-"""What may differ between equal trainings, by name."""
+"""Names of numbers that may differ between equal trainings."""
 
 
 def start(folder, *words):

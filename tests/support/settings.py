@@ -1,4 +1,4 @@
-"""What the tests of settings share."""
+"""Helpers of tests of settings."""
 
 import pytest
 

@@ -10,7 +10,7 @@ from support.fused import compiled, make_a1
 from support.scripts import SMALL, run_here
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.sim.registry import ENGINES, make_engine
 from legged_torque.terrain.height_map import HeightMap
 from tools.accuracy import (
     KINDS,
@@ -32,7 +32,7 @@ def start():
     """A robot with open motors, a simulator, and states of robots that tread on the spot."""
     model = open_motors(compiled(make_a1()))
     model.opt.tolerance = 1e-8  # MuJoCo's default
-    sim, home = Simulator(model, WORLDS, "cpu", "fused", *SETTINGS), torch.tensor(model.key_qpos[0])
+    sim, home = make_engine("fused", model, WORLDS, "cpu", *SETTINGS), torch.tensor(model.key_qpos[0])
     sim.qpos.copy_(home)
     phases = torch.linspace(0.0, 6.0, WORLDS)[:, None] + torch.tensor([0.0, 3.1, 3.1, 0.0]).repeat_interleave(3)
     for step in range(60):
@@ -80,7 +80,7 @@ def test_slopes_do_not_creep(friction, impratio, impedance):
     home = model.key_qpos[0].copy()
     feet = [i for i in range(model.ngeom) if model.geom(i).name.endswith("foot")]
     data, other = mujoco.MjData(model), mujoco.MjData(model)
-    sim = Simulator(model, 1, "cpu", "fused", *SETTINGS)
+    sim = make_engine("fused", model, 1, "cpu", *SETTINGS)
     data.qpos[:] = home
     sim.qpos[0] = torch.tensor(home)
     places: list = []

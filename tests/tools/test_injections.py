@@ -5,7 +5,8 @@ import torch
 from support.fused import compiled, make_a1
 from support.scripts import run_here
 
-from legged_torque.sim.simulator import ENGINES, Simulator
+from legged_torque.sim.registry import ENGINES, make_engine
+from legged_torque.sim.warp_engine import WarpEngine
 from tools import injections
 
 
@@ -18,18 +19,18 @@ def test_bad_numbers_stay_in_their_world(engine):
 
 def test_what_is_counted(monkeypatch):
     """Without resets nothing recovers: the counts are no constants."""
-    monkeypatch.setattr(Simulator, "reset", lambda self, mask: None)
+    monkeypatch.setattr(WarpEngine, "reset", lambda self, mask: None)
     counts = injections.run(compiled(make_a1()), "fused", 6, "cpu")
     assert counts["not recovered"] > 0
 
 
 def test_stale_constraint_rows_are_cleared():
     """A bad joint angle spoils rows of MuJoCo Warp's Jacobian, of which none is left after a reset."""
-    sim = Simulator(compiled(make_a1()), 2, "cpu", "mujoco_warp")
+    sim = make_engine("mujoco_warp", compiled(make_a1()), 2, "cpu")
     sim.qpos[:, 2] = 0.1
     sim.qpos[1, -1] = float("nan")
     sim.step()
-    jacobian = sim.data.efc.J.numpy
+    jacobian = sim.state_dict()["efc.J"].numpy
     assert torch.isnan(torch.tensor(jacobian()[1])).any()
     sim.reset(torch.tensor([False, True]))
     assert (jacobian()[1] == 0.0).all() and (jacobian()[0] != 0.0).any()

@@ -1,4 +1,4 @@
-"""A process of several that torchrun has started, or should have, tested alone."""
+"""Processes that torchrun has started, or should have, without the others."""
 
 import pytest
 import torch
@@ -43,7 +43,7 @@ def test_length_of_a_training(second_of_two):
 
 
 def test_processes_that_torchrun_has_not_started(second_of_two):
-    """A stray WORLD_SIZE is reported in one line."""
+    """A stray WORLD_SIZE is told in one line."""
     second_of_two.delenv("MASTER_ADDR", raising=False)
     assert error_of(distributed.join, "cpu").startswith("WORLD_SIZE is 2, but torchrun has not started this process")
 
@@ -62,7 +62,7 @@ def test_processes_that_do_not_meet(second_of_two):
 
 
 def test_processes_with_other_settings(second_of_two):
-    """The first setting that differs is reported."""
+    """The first setting that differs is told."""
     second_of_two.setattr(distributed, "gather", lambda mine: [mine, {**mine, "env.env.num_envs": 3}])
     line = error_of(distributed.check_same, {"task": "t", "env.env.num_envs": 2})
     assert line.endswith("must have the same settings: env.env.num_envs is 3 in process 1, but 2 in the first one")

@@ -11,6 +11,7 @@ from support.clock import Clock
 from support.sessions import new_session
 from support.tilted import tilted
 
+from legged_torque.viewer import session as session_module
 from legged_torque.viewer.session import AS_LOADED, FASTEST, SCAN_INTERVAL, SLOWEST
 
 NUM_ENVS = 2
@@ -278,11 +279,16 @@ def test_no_tiles_on_a_plane(make_session):
     assert session.message.is_error and session.snapshot.tile is None and session.snapshot.scan.shape == (0, 3)
 
 
-def test_requests_from_other_threads(make_session):
+def test_requests_from_other_threads(make_session, monkeypatch):
     """Many threads may ask while another one steps; every request is carried out, in that thread."""
     session, _ = make_session("a1_torque")
-    pushes, push = [], session.task.sim.push
-    session.task.sim.push = lambda *args: (pushes.append(threading.current_thread()), push(*args))
+    pushes, rotate = [], session_module.quat_rotate_yaw
+
+    def watched(*args):
+        pushes.append(threading.current_thread())
+        return rotate(*args)
+
+    monkeypatch.setattr(session_module, "quat_rotate_yaw", watched)
     stepping = threading.Thread(target=session.run)
     stepping.start()
     asking = [threading.Thread(target=lambda: [session.push(0.0, 0.0) for _ in range(10)]) for _ in range(3)]
@@ -298,10 +304,10 @@ def test_requests_from_other_threads(make_session):
     assert not stepping.is_alive() and pushes == 30 * [stepping]
 
 
-def test_unexpected_errors(make_session, capsys):
+def test_unexpected_errors(make_session, monkeypatch, capsys):
     """A request that fails in a way that nobody has thought of is reported, and the robots walk on."""
     session, _ = make_session("a1_torque")
-    session.task.sim.push = None
+    monkeypatch.setattr(session_module, "quat_rotate_yaw", None)
     session.push(0.0, 1.0)
     ticks(session, 2)
     assert session.message.is_error and "TypeError: 'NoneType'" in session.message.text

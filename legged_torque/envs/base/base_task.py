@@ -17,8 +17,8 @@ from torch import Tensor
 from legged_torque.envs.base.evaluation import WalkingEvaluation
 from legged_torque.envs.base.state import RobotState
 from legged_torque.sim.compiled import compiled
+from legged_torque.sim.engine import Engine
 from legged_torque.sim.graph import CudaGraph
-from legged_torque.sim.simulator import Simulator
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.buffers import copy_state
 from legged_torque.utils.config import flat, to_dict
@@ -41,7 +41,7 @@ class BaseTask(VecEnv):
         keep_final_observations: Whether "final_observations" of the extras are computed, see :meth:`step`.
     """
 
-    sim: Simulator
+    sim: Engine
     terrain: Terrain
     state: RobotState
     obs_buf: TensorDict
@@ -95,7 +95,7 @@ class BaseTask(VecEnv):
     def reset(self, world: int | None = None) -> TensorDict:
         """Start a new episode in every world, or in a single one, and return the observations.
 
-        A single one is for viewers: the others are observed once more, and random events may happen there.
+        A single one is for viewers: the others are observed once more, and random events may occur there.
         """
         self.state.reset_buf.fill_(world is None)
         if world is not None:

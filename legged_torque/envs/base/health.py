@@ -36,6 +36,6 @@ def watched(
     return [
         *(Watched("buffer", name, numbers) for name, numbers in per_world.items()),
         *(Watched("observation", name, numbers) for name, numbers in observations.by_term().items()),
-        Watched("buffer", "torques", state.torques, is_result=True),
-        *(Watched("reward term", name, numbers, is_result=True) for name, numbers in terms),
+        Watched("buffer", "torques", state.torques, is_derived=True),
+        *(Watched("reward term", name, numbers, is_derived=True) for name, numbers in terms),
     ]

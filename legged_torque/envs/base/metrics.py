@@ -1,4 +1,4 @@
-"""How well a policy walks in a task, and how well at which commands."""
+"""Metrics of a walking policy, in all and by command."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.envs.base.state import RobotState
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.engine import Engine
 from legged_torque.utils import metrics
 from legged_torque.utils.display import Counter
 
@@ -23,7 +23,7 @@ class WalkingTask(Protocol):
     """What is measured of a task; see :class:`~legged_torque.envs.base.legged_robot.LeggedRobot`."""
 
     cfg: Any
-    sim: Simulator
+    sim: Engine
     state: RobotState
     num_envs: int
     device: str

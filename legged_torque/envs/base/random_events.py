@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,8 +13,8 @@ from torch import Tensor
 from legged_torque.envs.base.commands import UniformCommands
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim import kernels
+from legged_torque.sim.engine import Engine, shared_field
 from legged_torque.sim.randomization import Randomization, RandomParameter
-from legged_torque.sim.simulator import Simulator
 
 PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one, times ``push_set_factor``
 
@@ -30,7 +31,7 @@ class RandomEvents:
     def __init__(
         self,
         cfg: LeggedRobotCfg,
-        sim: Simulator,
+        sim: Engine,
         commands: UniformCommands,
         init_angles: Tensor,
         initial_state: Sequence[RandomParameter],
@@ -41,14 +42,15 @@ class RandomEvents:
         self._sim, self._commands, self.init_angles = sim, commands, init_angles
         device, n = sim.device, sim.num_envs
         self._new_parameters = torch.zeros(n, dtype=torch.bool, device=device)
-        self.initial_state = Randomization(initial_state, sim.field, n, device)
-        self.parameters = Randomization(parameters, sim.field, n, device, settings.keep_probability)
+        model_field = sim.field if settings.randomize_parameters else functools.partial(shared_field, sim)
+        self.initial_state = Randomization(initial_state, model_field, n, device)
+        self.parameters = Randomization(parameters, model_field, n, device, settings.keep_probability)
         self._seeds = torch.zeros(3, n, dtype=torch.int32, device=device)
         self.initial_state.seeds, self.parameters.seeds = self._seeds[1:]
         chances = [cfg.commands.resampling_probability, settings.resampling_probability]
         self._chances = wp.vec4(*chances, settings.push_probability * settings.push_robots, PUSH_ADDED)
 
-    def happen(self, is_new: Tensor) -> None:
+    def apply(self, is_new: Tensor) -> None:
         """Begin episodes: draw states and delays, and clear what the simulator kept, in the worlds of ``is_new``.
 
         There, and where chance says so, draw commands and parameters; push where chance says so. Shape: (num_envs,),
@@ -57,16 +59,16 @@ class RandomEvents:
         self._seeds.random_()
         self._sim.reset(is_new)
         self.initial_state.draw(is_new)
-        commands, data, settings = self._commands, self._sim.data, self._settings
+        commands, sim, settings = self._commands, self._sim, self._settings
         pushes = (wp.vec2(*settings.push_velocity), settings.push_set_factor)
         new, seeds = map(wp.from_torch, (is_new, self._seeds[0]))
         read = map(wp.from_torch, (self.init_angles, commands.low, commands.span))
         written = map(wp.from_torch, (self._new_parameters, commands.values, commands.headings))
-        arguments = [new, seeds, self._chances, *pushes, *read, *written, data.qpos, data.qvel]
-        wp.launch(kernels.happen, self._sim.num_envs, arguments, device=seeds.device)
+        arguments = [new, seeds, self._chances, *pushes, *read, *written, *map(wp.from_torch, (sim.qpos, sim.qvel))]
+        wp.launch(kernels.apply_random_events, sim.num_envs, arguments, device=seeds.device)
         if settings.randomize_parameters:
             self.parameters.draw(self._new_parameters)
-            self._sim.update_constants(self._new_parameters)
+            sim.update_constants(self._new_parameters)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the drawn parameters, and the tensors in which they are kept; those of the model the simulator has."""

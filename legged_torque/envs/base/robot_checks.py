@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 from torch import Tensor
 
-from legged_torque.sim.fused.tree import SLOWER, reasons_against
 from legged_torque.sim.model import FLOOR
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.mirroring import Mirroring
@@ -37,14 +36,6 @@ def foot_notes(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
             yield f"{has}; asset.foot_name chooses {', '.join(feet)}"
 
 
-def engine_notes(model: mujoco.MjModel, engine: str) -> Iterator[str]:
-    """Yield how much slower the engine is than the fused step, and why the latter cannot simulate the robot."""
-    if engine == "mujoco_warp":
-        reasons = "; ".join(reasons_against(model))
-        why = f"which cannot simulate this robot: {reasons}" if reasons else "which can simulate this robot"
-        yield f"sim.engine 'mujoco_warp' steps worlds, {SLOWER} than 'fused', {why}"
-
-
 def floor_problems(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
     """Yield feet that fall through the ground with every engine."""
     kinds, floor = (model.geom_contype, model.geom_conaffinity), model.geom(FLOOR).id
@@ -68,7 +59,7 @@ def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, fo
         missed = np.linalg.norm(own - image, axis=1)
         if missed.max() > MIRROR_TOLERANCE:
             worst = foot_names[int(missed.argmax())]
-            return f"mirrored angles put '{worst}' {missed.max():.3g} m beside the mirror image of its counterpart"
+            return f"mirrored angles put '{worst}' {missed.max():.3g} m away from the mirror image of its counterpart"
     return ""
 
 

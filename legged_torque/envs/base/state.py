@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from legged_torque.sim.simulator import Simulator
+from legged_torque.sim.engine import Engine
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.buffers import Buffers
 from legged_torque.utils.math import quat_rotate_inverse
@@ -46,7 +46,7 @@ class RobotState(Buffers):
     """
 
     def __init__(
-        self, sim: Simulator, ground: Terrain, feet: Sequence[int], foot_of: Sequence[int], num_actions: int, dt: float
+        self, sim: Engine, ground: Terrain, feet: Sequence[int], foot_of: Sequence[int], num_actions: int, dt: float
     ) -> None:
         """Allocate what the simulator does not have.
 

@@ -1,4 +1,4 @@
-"""What the kernels calculate with: quaternions, small matrices, and sums over the threads of one world."""
+"""Quaternions, small matrices, and sums over the threads of one world."""
 
 import warp as wp
 
@@ -7,14 +7,14 @@ from legged_torque.sim.fused.types import AnyColumns, AnyMatrix, AnyVector
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    const unsigned first = (threadIdx.x & 31u) & ~(unsigned(lanes) - 1u);
-    const unsigned mask = ((1u << lanes) - 1u) << first;
-    for (int offset = lanes / 2; offset > 0; offset /= 2) value += __shfl_xor_sync(mask, value, offset);
+    const unsigned first = (threadIdx.x & 31u) & ~(unsigned(threads) - 1u);
+    const unsigned mask = ((1u << threads) - 1u) << first;
+    for (int offset = threads / 2; offset > 0; offset /= 2) value += __shfl_xor_sync(mask, value, offset);
 #endif
     return value;
 """)
-def group_sum(value: float, lanes: int) -> float:
-    """Return the sum of a value over the ``lanes`` threads that share a world, the same to the last bit in each.
+def group_sum(value: float, threads: int) -> float:
+    """Return the sum of a value over the ``threads`` threads that share a world, the same to the last bit in each.
 
     On a CPU a world has one thread, and the sum is the value.
     """
@@ -23,28 +23,28 @@ def group_sum(value: float, lanes: int) -> float:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    const unsigned first = (threadIdx.x & 31u) & ~(unsigned(lanes) - 1u);
-    __syncwarp(((1u << lanes) - 1u) << first);
+    const unsigned first = (threadIdx.x & 31u) & ~(unsigned(threads) - 1u);
+    __syncwarp(((1u << threads) - 1u) << first);
 #endif
 """)
-def sync_group(lanes: int):
-    """Let the threads of a world wait for each other, and see what the others have written to memory."""
+def sync_group(threads: int):
+    """Synchronize the threads of a world, with their writes to memory."""
     ...
 
 
 @wp.func
-def group_sum3(value: wp.vec3, lanes: int) -> wp.vec3:
+def group_sum3(value: wp.vec3, threads: int) -> wp.vec3:
     """Return the sum of a vector over the threads of a world."""
-    return wp.vec3(group_sum(value[0], lanes), group_sum(value[1], lanes), group_sum(value[2], lanes))
+    return wp.vec3(group_sum(value[0], threads), group_sum(value[1], threads), group_sum(value[2], threads))
 
 
 @wp.func
-def group_sum33(value: wp.mat33, lanes: int) -> wp.mat33:
+def group_sum33(value: wp.mat33, threads: int) -> wp.mat33:
     """Return the sum of a matrix over the threads of a world."""
     result = wp.mat33()
     for i in range(3):
         for j in range(3):
-            result[i, j] = group_sum(value[i, j], lanes)
+            result[i, j] = group_sum(value[i, j], threads)
     return result
 
 
@@ -55,15 +55,15 @@ def symmetric(diagonal: wp.vec3, rest: wp.vec3) -> wp.mat33:
 
 
 @wp.func
-def group_sum33_symmetric(value: wp.mat33, lanes: int) -> wp.mat33:
+def group_sum33_symmetric(value: wp.mat33, threads: int) -> wp.mat33:
     """Return the sum of a symmetric matrix over the threads of a world."""
-    rest = group_sum3(wp.vec3(value[0, 1], value[0, 2], value[1, 2]), lanes)
-    return symmetric(group_sum3(wp.get_diag(value), lanes), rest)
+    rest = group_sum3(wp.vec3(value[0, 1], value[0, 2], value[1, 2]), threads)
+    return symmetric(group_sum3(wp.get_diag(value), threads), rest)
 
 
 @wp.func
 def quat_multiply(a: wp.quat, b: wp.quat) -> wp.quat:
-    """Return the product of two quaternions (w, x, y, z), the order of MuJoCo's that Warp's functions do not share."""
+    """Return the product of two quaternions (w, x, y, z), in MuJoCo's order, not Warp's."""
     return wp.quat(
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -119,7 +119,7 @@ def with_column(m: AnyColumns, j: int, v: wp.vec3):
 #endif
 """)
 def inverse_sqrt(value: float) -> float:
-    """Return one over the square root: on a GPU one instruction instead of two that wait for each other."""
+    """Return one over the square root, a single instruction on a GPU."""
     ...
 
 

@@ -1,28 +1,29 @@
-"""What MuJoCo's ``mj_setConst`` derives from masses: inverse weights, recomputed in the worlds whose masses changed."""
+"""MuJoCo's ``mj_setConst``: inverse weights, recomputed in worlds whose masses have changed."""
 
 import functools
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
+from torch import Tensor
 
-from legged_torque.sim.fused.branches import Layout, joint_counter
+from legged_torque.sim.fused.layout import Layout, branches_of
 from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, forward_solve
+from legged_torque.sim.fused.model import Model, State, dof, make_model, of_world, row
 from legged_torque.sim.fused.smooth import Pose, add_bodies, body_dynamics, links_maker, make_equations, make_trunk
 from legged_torque.sim.fused.solver import assemble_damping, eliminate
-from legged_torque.sim.fused.tables import Tables, Worlds, dof, make_tables, of_world, row
 from legged_torque.sim.fused.tree import FLOORS, read_tree
 from legged_torque.sim.fused.trunk import TrunkSystem, trunk_matrix, whole_inertia
 from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types, mat66, vec6
-from legged_torque.sim.per_world import expand
 
 KINDS = 3  # inverse weights per body: of its translation, of its rotation, of its joint
 ROWS = 3  # rows of Jacobians per inverse weight, their mean: one per axis; the joint's is the same three times
 
 
 class DerivedConstants:
-    """Keeps ``body_invweight0`` and ``dof_invweight0`` of every world in step with its other parameters.
+    """Recomputes ``body_invweight0`` and ``dof_invweight0`` of worlds from their other parameters.
 
     They scale the softness of contacts, limits and dry friction, and follow from masses, inertias and armatures in the
     model's reference pose. Worlds are expected to differ in their trunks and armatures only: branches without armatures
@@ -30,41 +31,41 @@ class DerivedConstants:
     """
 
     def __init__(self, mj_model: mujoco.MjModel, model: mjw.Model, num_envs: int) -> None:
-        """Prepare; gives every world its own row of both fields of ``model``, the one on the device.
+        """Prepare, while worlds are alike in ``model``, in which both fields have a row per world.
 
         A UserError if the robot's structure is not a trunk with branches.
         """
         tree = read_tree(mj_model, FLOORS)
         self._device = model.qpos0.device
-        for name in ("body_invweight0", "dof_invweight0"):
-            expand(model, name, num_envs)
         self._layout = layout = Layout.of(tree, self._device.is_cuda, on_map=False)
         self._measure, self._derive = make_measure(layout), make_derive(layout)
-        self._dim = (num_envs, (layout.depth + 1) * KINDS * layout.lanes)
+        self._dim = (num_envs, (layout.depth + 1) * KINDS * layout.threads)
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, mj_model.qpos0[3:7])
         self._rotation = wp.mat33(rotation)
         self._reference_pose = mj_model.qpos0
         self._branches_vary = False
         with wp.ScopedDevice(self._device):
-            self._tables = make_tables(mj_model, model, tree)
+            self.model = make_model(mj_model, model, tree)
         self._measure_worlds(1)
 
     def vary_branches(self) -> None:
-        """Expect that worlds differ in their branches as well, from the next :meth:`update` on."""
-        self._branches_vary = True
-        self._measure_worlds(self._dim[0])
+        """Take differences between the worlds' branches into account, from the next :meth:`update` on."""
+        if not self._branches_vary:
+            self._branches_vary = True
+            self._measure_worlds(self._dim[0])
 
-    def update(self, mask: wp.array) -> None:
-        """Recompute the constants in the worlds of ``mask``. Shape: (num_envs,), bool."""
+    def update(self, worlds: Tensor) -> None:
+        """Recompute the constants in some worlds. Shape: (num_envs,), bool."""
+        mask: Any = wp.from_torch(worlds)
         if self._branches_vary:
             self._measure_branches(mask)
-        inputs = [self._tables, mask, self._rotation, self._measured, self._coms, ROWS]
-        outputs = [self._tables.body_invweight0, self._tables.dof_invweight0]
+        inputs = [self.model, mask, self._rotation, self._measured, self._coms, ROWS]
+        outputs = [self.model.body_invweight0, self.model.dof_invweight0]
         wp.launch(self._derive, self._dim, inputs, outputs, device=self._device)
 
     def _measure_worlds(self, num_worlds: int) -> None:
-        """Allocate and measure the branches of all worlds, or of one for all."""
+        """Measure the branches of all worlds, or of one that stands for all."""
         branches, depth, *_ = self._layout
         with wp.ScopedDevice(self._device):
             self._measured = wp.zeros((num_worlds, branches), dtype=branch_types(depth).Smooth)
@@ -75,7 +76,7 @@ class DerivedConstants:
 
     def _measure_branches(self, mask: wp.array) -> None:
         """Measure the branches of some worlds in the reference pose."""
-        inputs, outputs = [self._tables, mask, self._qpos, self._rest], [self._measured, self._coms]
+        inputs, outputs = [self.model, mask, self._qpos, self._rest], [self._measured, self._coms]
         wp.launch(self._measure, self._measured.shape, inputs, outputs, device=self._device)
 
 
@@ -140,24 +141,24 @@ def write_weight(
 
 
 @wp.func
-def branch_at_rest(branch: AnyBranch, tables: Tables, world: int, b: int, joints: int):
-    """Return a branch, given its inertia matrix without armatures, with the matrix with them factorized."""
+def branch_at_rest(branch: AnyBranch, model: Model, world: int, b: int, joints: int):
+    """Return a branch, with its inertia matrix without armatures, with the factor of the matrix with them."""
     for j in range(len(branch.acc)):
         if j < joints:
-            branch.smooth.mass[j, j] += of_world(tables.dof_armature, world, dof(tables.branch_joint[b, j]))
+            branch.smooth.mass[j, j] += of_world(model.dof_armature, world, dof(model.branch_joint[b, j]))
     return assemble_damping(branch, 0.0)
 
 
 @functools.cache
 def make_measure(layout: Layout) -> wp.Kernel:
     """Return the kernel that measures branches."""
-    depth, num_joints = layout.depth, joint_counter(layout)
+    depth, num_joints = layout.depth, branches_of(layout).num_joints
     Smooth, make_links = branch_types(depth).Smooth, links_maker(depth)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def measure_branches(
         # Model:
-        tables: Tables,
+        model: Model,
         # In:
         mask: wp.array(dtype=wp.bool),
         qpos: wp.array2d(dtype=float),
@@ -170,20 +171,20 @@ def make_measure(layout: Layout) -> wp.Kernel:
         world, b = wp.tid()
         if not mask[world]:
             return
-        worlds = Worlds()
-        worlds.ctrl = rest
-        worlds.qpos = qpos
-        worlds.qvel = rest
+        state = State()
+        state.ctrl = rest
+        state.qpos = qpos
+        state.qvel = rest
         poses = wp.zeros(shape=wp.static(depth + 1), dtype=Pose)
-        trunk = make_trunk(tables, worlds, world)
-        joints = num_joints(tables, b)
-        branch, links = make_links(tables, worlds, world, b, joints, trunk, poses)
-        branch = make_equations(branch, links, tables, world, b, joints, trunk.rot)
+        trunk = make_trunk(model, state, world)
+        joints = num_joints(model, b)
+        branch, links = make_links(model, state, world, b, joints, trunk, poses)
+        branch = make_equations(branch, links, model, world, b, joints, trunk.rot)
         for j in range(wp.static(depth)):
             if j < joints:
-                joint = tables.branch_joint[b, j]
-                branch.smooth.mass[j, j] -= of_world(tables.dof_armature, world, dof(joint))
-                ipos = of_world(tables.body_ipos, world, joint + 1)
+                joint = model.branch_joint[b, j]
+                branch.smooth.mass[j, j] -= of_world(model.dof_armature, world, dof(joint))
+                ipos = of_world(model.body_ipos, world, joint + 1)
                 coms[world, b, j] = poses[j + 1].pos + poses[j + 1].rot * ipos
         measured[world, b] = branch.smooth
 
@@ -201,13 +202,13 @@ def make_derive(layout: Layout) -> wp.Kernel:
     threads per body of a branch and kind of weight, which all factorize its equations and then take their own rows.
     All of them run the same loop, which is short, since code that runs once must first be fetched.
     """
-    branches, depth, _, lanes, _, alike, *_ = layout
-    per_lane, num_joints, (Branch, _, Smooth) = layout.per_lane, joint_counter(layout), branch_types(depth)
+    branches, depth, _, threads, _, alike, *_ = layout
+    per_thread, num_joints, (Branch, _, Smooth) = layout.per_thread, branches_of(layout).num_joints, branch_types(depth)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def derive_constants(
         # Model:
-        tables: Tables,
+        model: Model,
         # In:
         mask: wp.array(dtype=wp.bool),
         rot: wp.mat33,
@@ -218,42 +219,42 @@ def make_derive(layout: Layout) -> wp.Kernel:
         body_invweight0: wp.array2d(dtype=wp.vec2),
         dof_invweight0: wp.array2d(dtype=float),
     ):
-        world, thread = wp.tid()
+        world, number = wp.tid()
         if not mask[world]:
             return
-        group = thread // wp.static(lanes)
-        lane = thread - group * wp.static(lanes)
+        group = number // wp.static(threads)
+        thread = number - group * wp.static(threads)
         body_depth = group // wp.static(KINDS)
         kind = group - body_depth * wp.static(KINDS)
         still = Pose()
         still.rot = rot
         trunk = Trunk()
         trunk.rot = rot
-        trunk.body = body_dynamics(tables, world, 1, still, wp.vec3(0.0), wp.vec3(0.0))
+        trunk.body = body_dynamics(model, world, 1, still, wp.vec3(0.0), wp.vec3(0.0))
         total = Body()
         system = TrunkSystem()
         branch = Branch()
-        for i in range(wp.static(per_lane)):
-            b = lane + i * wp.static(lanes)
+        for i in range(wp.static(per_thread)):
+            b = thread + i * wp.static(threads)
             if b < wp.static(branches):
                 branch.smooth = measured[row(world, measured.shape[0]), b]
-                branch = branch_at_rest(branch, tables, world, b, num_joints(tables, b))
+                branch = branch_at_rest(branch, model, world, b, num_joints(model, b))
                 system = eliminate(branch, system, TrunkSystem())
                 total = add_bodies(total, branch.smooth.total)
-        whole = whole_inertia(trunk, total, wp.static(lanes))
-        trunk_factor = cholesky(trunk_matrix(whole, system, wp.static(lanes)))
-        for i in range(wp.static(per_lane)):
-            b = lane + i * wp.static(lanes)
+        whole = whole_inertia(trunk, total, wp.static(threads))
+        trunk_factor = cholesky(trunk_matrix(whole, system, wp.static(threads)))
+        for i in range(wp.static(per_thread)):
+            b = thread + i * wp.static(threads)
             if b < wp.static(branches):
-                joints = num_joints(tables, b)
-                if wp.static(per_lane > 1):  # a CPU's thread has several branches, of which it kept the last one
+                joints = num_joints(model, b)
+                if wp.static(per_thread > 1):  # a CPU's thread has several branches, of which it kept the last one
                     branch.smooth = measured[row(world, measured.shape[0]), b]
-                    branch = branch_at_rest(branch, tables, world, b, joints)
+                    branch = branch_at_rest(branch, model, world, b, joints)
                 if wp.static(alike) or body_depth <= joints:
                     body = int(1)
-                    com = rot * of_world(tables.body_ipos, world, 1)
+                    com = rot * of_world(model.body_ipos, world, 1)
                     if body_depth > 0:
-                        body = tables.branch_joint[b, body_depth - 1] + 1
+                        body = model.branch_joint[b, body_depth - 1] + 1
                         com = coms[row(world, coms.shape[0]), b, body_depth - 1]
                     weight = inverse_weight(branch, trunk_factor, rot, com, body_depth, kind, rows)
                     write_weight(weight, kind, world, body, body_invweight0, dof_invweight0)

@@ -9,13 +9,13 @@ import functools
 import warp as wp
 
 from legged_torque.sim.fused.math import column, quat_multiply, quat_rotation, quat_to_matrix, symmetric, with_column
-from legged_torque.sim.fused.tables import Tables, Worlds, dof, of_world, qadr, row
+from legged_torque.sim.fused.model import Model, State, dof, of_world, qadr, row
 from legged_torque.sim.fused.types import AnyBranch, AnyLinks, Body, Trunk, branch_types
 
 
 @wp.struct
 class Pose:
-    """Where a body is, from the trunk's origin, and how it moves, at the trunk's origin; both in world axes."""
+    """Position of a body from the trunk's origin, orientation, and velocity at the trunk's origin, in world axes."""
 
     pos: wp.vec3
     rot: wp.mat33
@@ -27,14 +27,14 @@ Poses = wp.array(dtype=Pose)  # of the trunk and of each body of a branch, by de
 
 
 @wp.func
-def body_dynamics(tables: Tables, world: int, body: int, pose: Pose, ang_acc: wp.vec3, lin_acc: wp.vec3) -> Body:
+def body_dynamics(model: Model, world: int, body: int, pose: Pose, ang_acc: wp.vec3, lin_acc: wp.vec3) -> Body:
     """Return a body's inertia and wrench (Newton-Euler) from its pose, velocity and acceleration."""
     rot, ang, lin = pose.rot, pose.ang_vel, pose.lin_vel
     out = Body()
-    out.mass = of_world(tables.body_mass, world, body)
-    com = pose.pos + rot * of_world(tables.body_ipos, world, body)
-    principal = rot * quat_to_matrix(of_world(tables.body_iquat, world, body))
-    diagonal = of_world(tables.body_inertia, world, body)
+    out.mass = of_world(model.body_mass, world, body)
+    com = pose.pos + rot * of_world(model.body_ipos, world, body)
+    principal = rot * quat_to_matrix(of_world(model.body_iquat, world, body))
+    diagonal = of_world(model.body_inertia, world, body)
     out.moment = out.mass * com
     out.inertia = principal * wp.diag(diagonal) * wp.transpose(principal)
     out.inertia += out.mass * (wp.dot(com, com) * wp.identity(n=3, dtype=float) - wp.outer(com, com))
@@ -68,55 +68,55 @@ def trunk_pose(trunk: Trunk) -> Pose:
 
 
 @wp.func
-def trunk_acc(tables: Tables, world: int, trunk: Trunk) -> wp.vec3:
-    """Return the linear acceleration to start from at the trunk's origin: gravity's, and that of turning axes."""
-    return wp.cross(trunk.lin_vel, trunk.ang_vel) - tables.gravity[row(world, tables.gravity.shape[0])]
+def trunk_acc(model: Model, world: int, trunk: Trunk) -> wp.vec3:
+    """Return the linear acceleration at the trunk's origin without forces: gravity, and that of rotating axes."""
+    return wp.cross(trunk.lin_vel, trunk.ang_vel) - model.gravity[row(world, model.gravity.shape[0])]
 
 
 @wp.func
-def make_trunk(tables: Tables, worlds: Worlds, world: int) -> Trunk:
+def make_trunk(model: Model, state: State, world: int) -> Trunk:
     """Return the trunk's state, inertia and wrench, without its branches."""
-    qpos, qvel = worlds.qpos, worlds.qvel
+    qpos, qvel = state.qpos, state.qvel
     trunk = Trunk()
     trunk.pos = wp.vec3(qpos[world, 0], qpos[world, 1], qpos[world, 2])
     trunk.quat = wp.normalize(wp.quat(qpos[world, 3], qpos[world, 4], qpos[world, 5], qpos[world, 6]))
     trunk.rot = quat_to_matrix(trunk.quat)
     trunk.lin_vel = wp.vec3(qvel[world, 0], qvel[world, 1], qvel[world, 2])
     trunk.ang_vel = trunk.rot * wp.vec3(qvel[world, 3], qvel[world, 4], qvel[world, 5])
-    acc = trunk_acc(tables, world, trunk)
-    trunk.body = body_dynamics(tables, world, 1, trunk_pose(trunk), wp.vec3(0.0), acc)
+    acc = trunk_acc(model, world, trunk)
+    trunk.body = body_dynamics(model, world, 1, trunk_pose(trunk), wp.vec3(0.0), acc)
     return trunk
 
 
 @wp.func
 def joint_force(
-    tables: Tables, world: int, b: int, j: int, pos: float, vel: float, ctrl: wp.array2d(dtype=float)
+    model: Model, world: int, b: int, j: int, pos: float, vel: float, ctrl: wp.array2d(dtype=float)
 ) -> float:
     """Return the torque of a joint's motor, spring and damper."""
-    joint = tables.branch_joint[b, j]
-    spring = of_world(tables.qpos_spring, world, qadr(joint))
-    force = of_world(tables.jnt_stiffness, world, joint) * (spring - pos)
-    force -= of_world(tables.dof_damping, world, dof(joint)) * vel
-    motor = tables.branch_actuator[b, j]
+    joint = model.branch_joint[b, j]
+    spring = of_world(model.qpos_spring, world, qadr(joint))
+    force = of_world(model.jnt_stiffness, world, joint) * (spring - pos)
+    force -= of_world(model.dof_damping, world, dof(joint)) * vel
+    motor = model.branch_actuator[b, j]
     if motor >= 0:
-        ctrl_range = of_world(tables.actuator_ctrlrange, world, motor)
-        force_range = of_world(tables.actuator_forcerange, world, motor)
-        gear = of_world(tables.actuator_gear, world, motor)[0]
+        ctrl_range = of_world(model.actuator_ctrlrange, world, motor)
+        force_range = of_world(model.actuator_forcerange, world, motor)
+        gear = of_world(model.actuator_gear, world, motor)[0]
         torque = wp.clamp(ctrl[world, motor], ctrl_range[0], ctrl_range[1])
         force += gear * wp.clamp(torque, force_range[0], force_range[1])
     return force
 
 
 @wp.func
-def turn_hinge(tables: Tables, world: int, joint: int, angle: float, pos: wp.vec3, quat: wp.quat):
-    """Return position and orientation of the body behind a hinge, given its parent's, and its anchor and axis."""
+def turn_hinge(model: Model, world: int, joint: int, angle: float, pos: wp.vec3, quat: wp.quat):
+    """Return position and orientation of the body behind a hinge from its parent's, and the anchor and axis."""
     body = joint + 1
-    origin = pos + quat_to_matrix(quat) * of_world(tables.body_pos, world, body)
-    unturned = quat_multiply(quat, of_world(tables.body_quat, world, body))
-    local_anchor = of_world(tables.jnt_pos, world, joint)
-    local_axis = of_world(tables.jnt_axis, world, joint)
+    origin = pos + quat_to_matrix(quat) * of_world(model.body_pos, world, body)
+    unturned = quat_multiply(quat, of_world(model.body_quat, world, body))
+    local_anchor = of_world(model.jnt_pos, world, joint)
+    local_axis = of_world(model.jnt_axis, world, joint)
     anchor = origin + quat_to_matrix(unturned) * local_anchor
-    turned = angle - of_world(tables.qpos0, world, qadr(joint))
+    turned = angle - of_world(model.qpos0, world, qadr(joint))
     out = quat_multiply(unturned, quat_rotation(local_axis, turned))
     rot = quat_to_matrix(out)
     return anchor - rot * local_anchor, out, anchor, rot * local_axis
@@ -124,26 +124,26 @@ def turn_hinge(tables: Tables, world: int, joint: int, angle: float, pos: wp.vec
 
 @functools.cache
 def links_maker(n: int) -> wp.Function:
-    """Return ``make_links`` for branches of ``n`` joints; a function for any number would get a copy of the poses."""
+    """Return ``make_links`` for branches of ``n`` joints; a generic function would copy the poses."""
     Branch, Links, _ = branch_types(n)
 
     @wp.func
-    def make_links(tables: Tables, worlds: Worlds, world: int, b: int, joints: int, trunk: Trunk, poses: Poses):
-        """Return a branch with its joints, and its bodies; fill their poses. Places of no joint stay zero."""
+    def make_links(model: Model, state: State, world: int, b: int, joints: int, trunk: Trunk, poses: Poses):
+        """Return a branch with its joints, and its bodies, and write their poses. Entries without a joint stay zero."""
         branch = Branch()
         links = Links()
         pose = trunk_pose(trunk)
         quat, ang, lin = 1.0 * trunk.quat, 1.0 * trunk.ang_vel, 1.0 * trunk.lin_vel  # values, not references
         pos = wp.vec3(0.0)
         ang_acc = wp.vec3(0.0)
-        lin_acc = trunk_acc(tables, world, trunk)
+        lin_acc = trunk_acc(model, world, trunk)
         poses[0] = pose
         for j in range(wp.static(n)):
             if j < joints:
-                joint = tables.branch_joint[b, j]
-                angle = worlds.qpos[world, qadr(joint)]
-                vel = worlds.qvel[world, dof(joint)]
-                pos, quat, anchor, axis = turn_hinge(tables, world, joint, angle, pos, quat)
+                joint = model.branch_joint[b, j]
+                angle = state.qpos[world, qadr(joint)]
+                vel = state.qvel[world, dof(joint)]
+                pos, quat, anchor, axis = turn_hinge(model, world, joint, angle, pos, quat)
                 lever = wp.cross(anchor, axis)
                 ang_acc += wp.cross(ang, axis) * vel
                 lin_acc += (wp.cross(ang, lever) + wp.cross(lin, axis)) * vel
@@ -154,7 +154,7 @@ def links_maker(n: int) -> wp.Function:
                 pose.ang_vel = ang
                 pose.lin_vel = lin
                 poses[j + 1] = pose
-                body = body_dynamics(tables, world, joint + 1, pose, ang_acc, lin_acc)
+                body = body_dynamics(model, world, joint + 1, pose, ang_acc, lin_acc)
                 links.mass[j] = body.mass
                 links.moment = with_column(links.moment, j, body.moment)
                 links.inertia_diagonal = with_column(links.inertia_diagonal, j, wp.get_diag(body.inertia))
@@ -164,18 +164,18 @@ def links_maker(n: int) -> wp.Function:
                 links.torque = with_column(links.torque, j, body.torque)
                 branch.smooth.axis = with_column(branch.smooth.axis, j, axis)
                 branch.smooth.lever = with_column(branch.smooth.lever, j, lever)
-                branch.smooth.force[j] = joint_force(tables, world, b, j, angle, vel, worlds.ctrl)
-                branch.smooth.damping[j] = of_world(tables.dof_damping, world, dof(joint))
+                branch.smooth.force[j] = joint_force(model, world, b, j, angle, vel, state.ctrl)
+                branch.smooth.damping[j] = of_world(model.dof_damping, world, dof(joint))
         return branch, links
 
     return make_links
 
 
 @wp.func
-def make_equations(branch: AnyBranch, links: AnyLinks, tables: Tables, world: int, b: int, joints: int, rot: wp.mat33):
-    """Return a branch with its equations of motion, added up from its last body to its first.
+def make_equations(branch: AnyBranch, links: AnyLinks, model: Model, world: int, b: int, joints: int, rot: wp.mat33):
+    """Return a branch with its equations of motion, summed from its last body to its first.
 
-    Places of no joint get an equation of their own, whose solution is zero.
+    Entries without a joint get an equation of their own, whose solution is zero.
     """
     smooth = branch.smooth
     total = Body()
@@ -198,7 +198,7 @@ def make_equations(branch: AnyBranch, links: AnyLinks, tables: Tables, world: in
         smooth.mass_lin = with_column(smooth.mass_lin, j, force)
         smooth.mass_ang = with_column(smooth.mass_ang, j, wp.transpose(rot) * torque)
         if j < joints:
-            smooth.mass[j, j] += of_world(tables.dof_armature, world, dof(tables.branch_joint[b, j]))
+            smooth.mass[j, j] += of_world(model.dof_armature, world, dof(model.branch_joint[b, j]))
         else:
             smooth.mass[j, j] = 1.0
     smooth.total = total

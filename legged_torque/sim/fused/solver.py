@@ -4,19 +4,21 @@ The solver minimizes, over accelerations a, the cost 1/2 (a - a_0)^T M (a - a_0)
 accelerations without constraints. Branches are coupled through the trunk only, so the Newton system has the shape of
 an arrow: each branch is eliminated by itself, which leaves six equations for the trunk.
 
-Here is what concerns one branch, in the order of an iteration; ``branches`` loops over those of a thread.
+This file has the functions of one branch, in the order of an iteration; ``newton`` loops over the branches of a thread.
 """
 
 import warp as wp
 
-from legged_torque.sim.fused.constraint import friction_force, friction_state, row_force
-from legged_torque.sim.fused.contact import (
+from legged_torque.sim.fused.collision import contact_normal
+from legged_torque.sim.fused.constraint import (
     Contact,
     contact_force,
-    contact_normal,
     contact_stiffness,
     expected_rows,
+    friction_force,
+    friction_state,
     pushing_rows,
+    row_force,
     row_values,
 )
 from legged_torque.sim.fused.math import cholesky, cholesky_solve, column, forward_solve, with_column
@@ -49,10 +51,10 @@ def contact_rows_times(
 
 @wp.func
 def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: AnyContacts):
-    """Return a branch with the residuals of the accelerations that it starts from.
+    """Return a branch with the residuals of the accelerations at the start.
 
-    Contacts push with the rows that are expected to, whatever these accelerations are. It is a better start than those
-    that push there, since small changes of velocities turn the signs of stiff rows.
+    Contacts push with the rows that are expected to push, whatever these accelerations are. That is a better start than
+    the rows that push there, since small changes of velocities turn the signs of stiff rows.
     """
     branch.residuals = joint_rows_times(branch, branch.acc)
     branch.residuals.friction = branch.residuals.friction - branch.rows.friction_reference
@@ -67,9 +69,9 @@ def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: An
 
 @wp.func
 def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: AnyContacts):
-    """Return a branch with gradient and Hessian of the cost, not factored yet, and what its contacts add for the trunk.
+    """Return a branch with gradient and Hessian of the cost, not factored yet, and its contacts' terms for the trunk.
 
-    Those with the ground, that is; see ``self_rows`` for others.
+    Only contacts with the ground count here; ``constraint_self`` has the others.
     """
     add = TrunkSystem()
     hessian = 1.0 * branch.smooth.mass
@@ -144,7 +146,7 @@ def solve_rows(factor: AnyMatrix, c: AnyColumns):
 
 @wp.func
 def eliminate(branch: AnyBranch, system: TrunkSystem, add: TrunkSystem) -> TrunkSystem:
-    """Add to the trunk's equations what is left there of a branch's (Schur complement) and of its contacts."""
+    """Add the Schur complement of a branch, and the terms of its contacts, to the trunk's equations."""
     gradient = forward_solve(branch.factor, branch.gradient)
     lin, ang = solve_rows(branch.factor, branch.coupling_lin), solve_rows(branch.factor, branch.coupling_ang)
     system.rhs_lin = system.rhs_lin + lin * gradient - branch.trunk_gradient_lin
@@ -157,7 +159,7 @@ def eliminate(branch: AnyBranch, system: TrunkSystem, add: TrunkSystem) -> Trunk
 
 @wp.func
 def add_whole(branch: AnyBranch, system: TrunkSystem, add: TrunkSystem) -> TrunkSystem:
-    """Add to the trunk's equations what a branch and its contacts add to them before anything is eliminated."""
+    """Add the terms of a branch and its contacts to the trunk's equations, before anything is eliminated."""
     system.rhs_lin = system.rhs_lin - branch.trunk_gradient_lin
     system.rhs_ang = system.rhs_ang - branch.trunk_gradient_ang
     system.lin = system.lin + add.lin
@@ -175,7 +177,7 @@ def branch_step(branch: AnyBranch, trunk_step: TrunkMotion):
 
 
 @wp.func
-def turn_to(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts: AnyContacts):
+def along_step(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts: AnyContacts):
     """Return a branch with the changes of its residuals along its step, and the slope of its rows' cost along it."""
     branch.change = joint_rows_times(branch, branch.step)
     slope = float(0.0)
@@ -195,7 +197,7 @@ def turn_to(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts:
 
 @wp.func
 def add_contact_slopes(slopes: wp.vec2, contacts: AnyContacts, k: int, alpha: float) -> wp.vec2:
-    """Return first and second derivative of the rows' cost along the step with those of a contact's rows."""
+    """Return first and second derivative of the rows' cost along the step, with those of a contact's rows added."""
     mass = contacts.found[k].mass
     along = contacts.change[k]
     values = contacts.residual[k] + alpha * along

@@ -1,4 +1,4 @@
-"""The surface of a height map, two triangles per cell, and where a sphere touches it."""
+"""The surface of a height map, two triangles per cell, and its contacts with a sphere."""
 
 import math
 
@@ -9,12 +9,11 @@ from legged_torque.sim.fused.math import inverse_sqrt
 from legged_torque.sim.height_map import HeightMap
 
 NEAR, FAR = 0.05, 0.2
-"""Spheres up to the first size, and geoms up to the second [m], that are high enough above the ground are known to be
-so from one number."""
+"""A sphere up to the first size, or a geom up to the second [m], is known to be clear of the ground from one number."""
 BLOCK = wp.constant(2)
-"""Cells along a side of what shares such a number for geoms."""
+"""Cells along a side of a block that shares such a number for geoms."""
 MAX_REACH = wp.constant(0.2)
-"""How far around the centre of a sphere that is below the surface the way out is looked for [m]."""
+"""Range in which the shortest way out is searched for a sphere whose centre is below the surface [m]."""
 ALIKE = wp.constant(0.999)
 """Faces whose normals have this cosine, 2.6 degrees, are one face: a sphere never touches both."""
 ON_EDGE = wp.constant(1.0e-5)
@@ -22,12 +21,12 @@ ON_EDGE = wp.constant(1.0e-5)
 MIN_DISTANCE = wp.constant(1.0e-6)
 """A direction over a shorter way [m] is lost in float32."""
 FAR_AWAY = wp.constant(1.0e10)
-"""Squared distance of what has not been found [m^2]."""
+"""Squared distance of a feature that has not been found [m^2]."""
 
 
 @wp.struct
 class Surface:
-    """Heights on a square grid, continued at the borders with the heights there."""
+    """Heights on a square grid, extended beyond the borders at the same heights."""
 
     heights: wp.array(dtype=wp.float32)  # in the world [m], row by row; rows along x, columns along y
     shape: wp.vec2i  # rows and columns
@@ -35,9 +34,9 @@ class Surface:
     density: wp.float32  # cells per metre
     corner: wp.vec2  # x and y of the first height [m]
     ceiling: wp.array2d(dtype=wp.float32)  # the greatest height near each cell [m]. Shape: (rows - 1, cols - 1)
-    near: wp.float32  # how far around a cell that is [m]
+    near: wp.float32  # radius of that neighbourhood [m]
     far_ceiling: wp.array2d(dtype=wp.float32)  # the greatest height in a wider neighbourhood of each block of cells [m]
-    far: wp.float32  # how far around a block that is [m]
+    far: wp.float32  # radius of that neighbourhood [m]
 
 
 def make_surface(height_map: HeightMap) -> Surface:
@@ -68,10 +67,10 @@ def _greatest(heights: np.ndarray, side: int, around: int) -> np.ndarray:
 
 
 @wp.struct
-class Touch:
-    """The point of the surface that is nearest to the centre of a sphere, and a second one in a concave edge."""
+class SphereContacts:
+    """Contacts of a sphere: the nearest point of the surface, and a second one in a concave edge."""
 
-    count: wp.int32  # how many of the two touch
+    count: wp.int32  # 0, 1 or 2
     dist: wp.vec2  # distances between the surface and the sphere [m], negative where they overlap
     first: wp.vec3  # unit normals, towards the sphere
     second: wp.vec3
@@ -79,7 +78,7 @@ class Touch:
 
 @wp.struct
 class Patch:
-    """Nine samples of a map, the corners of four cells, as seen from the centre of a sphere."""
+    """Nine samples of a map, the corners of four cells, relative to the centre of a sphere."""
 
     x: wp.float32  # of the first row
     y: wp.vec3  # of the three columns
@@ -91,9 +90,9 @@ class Patch:
 
 @wp.struct
 class Face:
-    """A triangle as seen from the centre of a sphere."""
+    """A triangle relative to the centre of a sphere."""
 
-    falls: wp.vec2  # how much it falls along x and y, per metre
+    falls: wp.vec2  # descent along x and y, per metre
     upright: wp.float32  # its upward unit normal is this times (falls, 1)
     dist: wp.float32  # of the centre above its plane [m]
     is_inside: wp.bool  # whether the point of its plane that is nearest to the centre is inside of it
@@ -101,14 +100,14 @@ class Face:
 
 @wp.struct
 class Nearest:
-    """What is nearest to the centre of a sphere, as far as the surface has been looked at."""
+    """The nearest face and edge to the centre of a sphere, among those seen so far."""
 
     face: Face  # of the triangles, where it is inside of one
     face_sq: wp.float32  # its squared distance
     edge: wp.vec3  # of the edges, the point from the centre
     edge_sq: wp.float32  # its squared distance
     above: wp.float32  # how far the centre is above the surface, vertically [m]
-    num_faces: wp.int32  # how many triangles the sphere touches inside of them
+    num_faces: wp.int32  # number of triangles that the sphere touches inside of them
 
 
 @wp.func
@@ -126,8 +125,8 @@ def place_on_map(surface: Surface, centre: wp.vec3, radius: float) -> wp.vec3:
 
 
 @wp.func
-def see_row(surface: Surface, i: int, j: int) -> wp.vec3:
-    """Return the heights of three samples from (i, j) on."""
+def load_row(surface: Surface, i: int, j: int) -> wp.vec3:
+    """Return the heights of three samples of a row from (i, j) on."""
     first = wp.clamp(i, 0, surface.shape[0] - 1) * surface.shape[1]
     out = wp.vec3()
     for b in range(3):
@@ -136,16 +135,16 @@ def see_row(surface: Surface, i: int, j: int) -> wp.vec3:
 
 
 @wp.func
-def see_patch(surface: Surface, place: wp.vec3, i: int, j: int) -> Patch:
-    """Return the four cells between samples (i, j) and (i + 2, j + 2) as seen from a place on the map."""
+def load_patch(surface: Surface, place: wp.vec3, i: int, j: int) -> Patch:
+    """Return the four cells between samples (i, j) and (i + 2, j + 2), relative to a place on the map."""
     patch = Patch()
     patch.x = float(i) * surface.scale - place[0]
     patch.z = place[2]
     y = float(j) * surface.scale - place[1]
     patch.y = wp.vec3(y, y + surface.scale, y + 2.0 * surface.scale)
-    patch.first = see_row(surface, i, j)
-    patch.second = see_row(surface, i + 1, j)
-    patch.third = see_row(surface, i + 2, j)
+    patch.first = load_row(surface, i, j)
+    patch.second = load_row(surface, i + 1, j)
+    patch.third = load_row(surface, i + 2, j)
     return patch
 
 
@@ -159,7 +158,7 @@ def next_row(patch: Patch, scale: float) -> Patch:
 
 
 @wp.func
-def see_face(surface: Surface, patch: Patch, b: int, half: int) -> Face:
+def make_face(surface: Surface, patch: Patch, b: int, half: int) -> Face:
     """Return one of the two triangles of a cell of a patch's first two rows.
 
     The diagonal runs from a cell's corner (0, 0) to (1, 1); the half 0 has the corner (1, 0).
@@ -186,8 +185,8 @@ def normal_of(face: Face) -> wp.vec3:
 
 
 @wp.func
-def look_at_face(face: Face, radius: float, best: Nearest) -> Nearest:
-    """Return what is nearest when a triangle is known, without its edges."""
+def nearest_on_face(face: Face, radius: float, best: Nearest) -> Nearest:
+    """Update the nearest features with a triangle, without its edges."""
     away_sq = wp.where(face.is_inside, face.dist * face.dist, FAR_AWAY)
     if away_sq < best.face_sq:
         best.face_sq = away_sq
@@ -197,8 +196,8 @@ def look_at_face(face: Face, radius: float, best: Nearest) -> Nearest:
 
 
 @wp.func
-def look_at_edge(start: wp.vec3, edge: wp.vec3, best: Nearest) -> Nearest:
-    """Return what is nearest when an edge between two samples is known."""
+def nearest_on_edge(start: wp.vec3, edge: wp.vec3, best: Nearest) -> Nearest:
+    """Update the nearest features with an edge between two samples."""
     point = start + wp.clamp(-wp.dot(start, edge) / wp.length_sq(edge), 0.0, 1.0) * edge
     away_sq = wp.length_sq(point)
     if away_sq < best.edge_sq:
@@ -208,24 +207,24 @@ def look_at_edge(start: wp.vec3, edge: wp.vec3, best: Nearest) -> Nearest:
 
 
 @wp.func
-def look_at_row(surface: Surface, patch: Patch, radius: float, best: Nearest) -> Nearest:
-    """Return what is nearest when the two cells of a patch's first two rows are known.
+def nearest_on_cells(surface: Surface, patch: Patch, radius: float, best: Nearest) -> Nearest:
+    """Update the nearest features with the two cells of a patch's first two rows.
 
-    Of each cell three edges: the other two are its neighbours'.
+    A cell has three edges here: the other two belong to its neighbours.
     """
     for b in range(2):
         for half in range(2):
-            best = look_at_face(see_face(surface, patch, b, half), radius, best)
+            best = nearest_on_face(make_face(surface, patch, b, half), radius, best)
         start, z = wp.vec3(patch.x, patch.y[b], patch.first[b] - patch.z), patch.first[b]
-        best = look_at_edge(start, wp.vec3(surface.scale, 0.0, patch.second[b] - z), best)
-        best = look_at_edge(start, wp.vec3(0.0, surface.scale, patch.first[b + 1] - z), best)
-        best = look_at_edge(start, wp.vec3(surface.scale, surface.scale, patch.second[b + 1] - z), best)
+        best = nearest_on_edge(start, wp.vec3(surface.scale, 0.0, patch.second[b] - z), best)
+        best = nearest_on_edge(start, wp.vec3(0.0, surface.scale, patch.first[b + 1] - z), best)
+        best = nearest_on_edge(start, wp.vec3(surface.scale, surface.scale, patch.second[b + 1] - z), best)
     return best
 
 
 @wp.func
 def height_above(surface: Surface, patch: Patch) -> float:
-    """Return how far the centre of a sphere is above the surface, vertically, if it is over the patch [m]."""
+    """Return the vertical height of a sphere's centre above the surface, if it is over the patch [m]."""
     if patch.x + surface.scale <= 0.0:
         patch = next_row(patch, surface.scale)
     is_second = patch.y[1] <= 0.0
@@ -240,7 +239,7 @@ def height_above(surface: Surface, patch: Patch) -> float:
 
 @wp.func
 def distance_sq_to_patch(patch: Patch, scale: float) -> float:
-    """Return the squared distance from the centre to a patch, filled up to its highest sample."""
+    """Return the squared distance from the centre to the box below a patch's highest sample."""
     top = wp.max(wp.max(wp.max(patch.first), wp.max(patch.second)), wp.max(patch.third))
     x, y = wp.max(patch.x, -patch.x - 2.0 * scale), wp.max(patch.y[0], -patch.y[2])
     return wp.length_sq(wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(patch.z - top, 0.0)))
@@ -267,10 +266,10 @@ def make_window(surface: Surface, place: wp.vec3, reach: float) -> Window:
 
 
 @wp.func
-def find_nearest(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
-    """Return what is nearest to the centre of a sphere.
+def nearest_point(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
+    """Return the nearest features to the centre of a sphere.
 
-    The way out of the ground is as long as the centre is below it, vertically, or shorter.
+    The shortest way out of the ground is not longer than the vertical one.
     """
     best = Nearest()
     best.face_sq = FAR_AWAY
@@ -279,7 +278,7 @@ def find_nearest(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
     i, j = window.first[0], window.first[1]
     is_first = bool(True)
     while i <= window.last[0]:
-        patch = see_patch(surface, place, i, j)
+        patch = load_patch(surface, place, i, j)
         reach = float(0.0)
         if is_first:
             best.above = height_above(surface, patch)
@@ -287,7 +286,7 @@ def find_nearest(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
         most_sq = wp.max(radius * radius, wp.min(best.face_sq, best.edge_sq))
         rows = wp.where(distance_sq_to_patch(patch, surface.scale) <= (1.0 + ON_EDGE) * most_sq, 2, 0)
         while rows > 0:  # not unrolled: a thread waits for instructions longer than it works on them
-            best = look_at_row(surface, patch, radius, best)
+            best = nearest_on_cells(surface, patch, radius, best)
             patch = next_row(patch, surface.scale)
             rows -= 1
         is_first = False
@@ -304,21 +303,21 @@ def find_nearest(surface: Surface, place: wp.vec3, radius: float) -> Nearest:
 
 @wp.func
 def second_face(surface: Surface, place: wp.vec3, radius: float, point: wp.vec3, normal: wp.vec3) -> Face:
-    """Return the deepest other face that a sphere touches at a concave edge, given where it touches the surface.
+    """Return the deepest other face that a sphere touches at a concave edge, besides a point with a normal.
 
-    Both points are in front of the other's face. One at the distance of the radius if there is none.
+    Each of the two points is in front of the other's face. If there is none, the result has the radius as distance.
     """
     best = Face()
     best.dist = radius
     window = make_window(surface, place, radius)
     for i in range(window.first[0], window.last[0] + 1, 2):
         for j in range(window.first[1], window.last[1] + 1, 2):
-            patch = see_patch(surface, place, i, j)
+            patch = load_patch(surface, place, i, j)
             rows = int(2)
             while rows > 0:
                 for b in range(2):
                     for half in range(2):
-                        other = see_face(surface, patch, b, half)
+                        other = make_face(surface, patch, b, half)
                         other_normal = normal_of(other)
                         way = -other.dist * other_normal - point
                         is_concave = wp.min(wp.dot(way, normal), -wp.dot(way, other_normal)) > 10.0 * MIN_DISTANCE
@@ -332,9 +331,9 @@ def second_face(surface: Surface, place: wp.vec3, radius: float, point: wp.vec3,
 
 @wp.func
 def is_clear(surface: Surface, centre: wp.vec3, lowest: float, radius: float) -> bool:
-    """Return whether what is within a radius along x and y of a point is above all that is near.
+    """Return whether a body within a radius along x and y of a point is known to be above the ground.
 
-    ``lowest`` is the height of its lowest point. That is all that most points and geoms need to know.
+    ``lowest`` is the height of its lowest point. Most points and geoms need no other test.
     """
     i = int(wp.clamp((centre[0] - surface.corner[0]) * surface.density, 0.0, float(surface.ceiling.shape[0] - 1)))
     j = int(wp.clamp((centre[1] - surface.corner[1]) * surface.density, 0.0, float(surface.ceiling.shape[1] - 1)))
@@ -347,15 +346,15 @@ def is_clear(surface: Surface, centre: wp.vec3, lowest: float, radius: float) ->
 
 
 @wp.func
-def touch_map(surface: Surface, centre: wp.vec3, radius: float) -> Touch:
-    """Return where a sphere touches the surface.
+def sphere_map(surface: Surface, centre: wp.vec3, radius: float) -> SphereContacts:
+    """Return the contacts of a sphere with the surface.
 
-    The nearest point of the whole surface is one of a face, or of an edge or vertex that sticks out: edges between
-    triangles of one plane are never felt. Of a sphere whose centre is below the surface it is the shortest way out.
+    The nearest point of the whole surface is on a face, or on an edge or vertex that sticks out: edges between
+    triangles of one plane have no effect. For a centre below the surface it is the shortest way out.
     """
-    out = Touch()
+    out = SphereContacts()
     place = place_on_map(surface, centre, radius)
-    nearest = find_nearest(surface, place, radius)
+    nearest = nearest_point(surface, place, radius)
     away = wp.sqrt(nearest.edge_sq)
     is_face = wp.sqrt(nearest.face_sq) < away + MIN_DISTANCE  # of equals the face: it has the better normal
     out.first = normal_of(nearest.face)

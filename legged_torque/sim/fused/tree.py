@@ -1,4 +1,4 @@
-"""The structure of a robot, if it is one that the fused step can simulate."""
+"""The structure of a robot, and the reasons why the fused step cannot simulate it."""
 
 import math
 from collections.abc import Sequence
@@ -25,18 +25,18 @@ _GEOM_POINTS = {
     mujoco.mjtGeom.mjGEOM_CYLINDER: (_LOWEST_ON_CIRCLES, 0.0),
     mujoco.mjtGeom.mjGEOM_BOX: (_BOX_CORNERS, 0.0),
 }
-"""Where a geom can touch the ground: points in units of its half sizes, and how many radii it is thick around them.
+"""Points where a geom can touch the ground, in units of its half sizes, and the radius around them in first sizes.
 
-Those of a cylinder stand in axes that are turned about its own, see :func:`~.contact.turn_cylinder`: the lowest points
-of both end circles, and two more of the lower circle, which make a triangle. On a height map such points could turn
-into walls: there it has points all around its end circles that turn with it.
+The points of a cylinder are in a frame that is turned about its axis, see :func:`~.collision.turn_cylinder`: the lowest
+points of both end circles, and two more of the lower circle, which make a triangle. On a height map such points could
+turn into walls: there, points all around the end circles turn with the cylinder.
 """
 
 SLOWER = "about 30 times slower"  # on an H200, see docs/performance.md
 REFUSED = "sim.engine 'fused' cannot simulate this robot"
 ADVICE = f"use sim.engine = 'mujoco_warp', {SLOWER}, without randomize_parameters"
 FLOORS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-"""What robots stand on; the fused step knows planes only, its height maps are none of the model's geoms."""
+"""Types of floors. The fused step has planes; its height maps are no geoms of the model."""
 
 
 @dataclass
@@ -58,9 +58,9 @@ class Tree:
 
 
 def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:1], on_map: bool = False) -> Tree:
-    """Return the structure of a robot on a floor of one of some types, which may stand for a height map.
+    """Return the structure of a robot on a floor of one of some types, with points for a height map if ``on_map``.
 
-    A UserError, which tells all of it, if it has something that the fused step does not simulate.
+    A UserError lists everything that the fused step does not simulate.
     """
     refuse(reasons_against(model, floors), REFUSED, ADVICE)
     chains = body_chains(model)
@@ -85,7 +85,7 @@ def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:
 
 
 def reasons_against(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS) -> list[str]:
-    """Return why the fused step cannot simulate a robot on a floor of one of some types, nothing if it can."""
+    """Return the reasons why the fused step cannot simulate a robot on a floor of one of some types."""
     reasons = [*_of_bodies(model), *_of_contacts(model, floors), *_of_motors(model), *_of_options(model)]
     chains = body_chains(model)
     branching = np.flatnonzero(np.bincount(model.body_parentid[2:]) > 1)
@@ -109,14 +109,14 @@ def places_of_geoms(model: mujoco.MjModel, tree: Tree) -> np.ndarray:
 
 
 def check_map(model: mujoco.MjModel) -> None:
-    """Raise a UserError if the floor of an accepted robot cannot become a height map, whose heights are the world's."""
+    """Raise a UserError if the floor of an accepted robot is not at the origin, where a height map needs it."""
     floor = find_floor(model)
     posed = model.geom_pos[floor].any() or not np.array_equal(model.geom_quat[floor], (1.0, 0.0, 0.0, 0.0))
     refuse(["its floor is not at the origin, where a height map needs it"] if posed else [], REFUSED, ADVICE)
 
 
 def _of(part: Any, chosen: np.ndarray) -> str:
-    """Return the names of chosen parts of a model, of many the first three, given how to get one by its number."""
+    """Return the names of the chosen bodies or geoms of a model, or the first three of many."""
     names = [f"'{part(i).name}'" for i in np.flatnonzero(chosen)]
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
@@ -130,7 +130,7 @@ _HARMLESS_DISABLED = ("midphase", "nativeccd", "multiccd", "island", "autoreset"
 _HARMLESS_ENABLED = ("energy", "fwdinv", "invdiscrete", "multiccd")
 """Flags that change no motion of a robot without equalities and convex collisions; a minimum has no warm start."""
 _INTEGRATORS = (mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtIntegrator.mjINT_EULER)
-"""Those are the same where all that depends on velocities is linear damping of joints."""
+"""Both are the same if linear damping of joints is the only force that depends on velocities."""
 
 
 def _names(flags: Any, values: int, harmless: Sequence[str]) -> list[str]:
@@ -140,7 +140,7 @@ def _names(flags: Any, values: int, harmless: Sequence[str]) -> list[str]:
 
 
 def _of_options(model: mujoco.MjModel) -> list[str]:
-    """Return which options and other parts of the model the fused step does not simulate."""
+    """Return options and other parts of the model that the fused step does not simulate."""
     option = model.opt
     disabled = _names(mujoco.mjtDisableBit, option.disableflags, _HARMLESS_DISABLED)
     if option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
@@ -164,7 +164,7 @@ def _of_options(model: mujoco.MjModel) -> list[str]:
 
 
 def _plain_pairs(model: mujoco.MjModel) -> bool:
-    """Return whether each <pair> is of two parts of the robot and feels as a pair of geoms may."""
+    """Return whether each <pair> is of two parts of the robot, with parameters that contacts of geoms can have."""
     grounded = (model.geom_bodyid[[model.pair_geom1, model.pair_geom2]] == 0).any()
     odd = _any_of(model, "pair_margin", "pair_gap", "pair_solreffriction", "pair_adhesion") or grounded
     same = (model.pair_friction[:, 0] == model.pair_friction[:, 1]).all()
@@ -177,7 +177,7 @@ def _mixed(solrefs: np.ndarray) -> np.ndarray:
 
 
 def _of_bodies(model: mujoco.MjModel) -> list[str]:
-    """Return what the fused step does not simulate of bodies and joints."""
+    """Return properties of bodies and joints that the fused step does not simulate."""
     hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
     is_free = model.njnt > 0 and model.jnt_type[0] == free and model.jnt_bodyid[0] == 1
     has_hinge = (model.body_jntnum == 1) & (np.append(model.jnt_type, -1)[model.body_jntadr] == hinge)
@@ -189,7 +189,7 @@ def _of_bodies(model: mujoco.MjModel) -> list[str]:
         {
             "its trunk is not free": is_free,
             f"each body but the trunk must have one hinge joint, unlike {_of(model.body, odd)}": not odd.any(),
-            "something beside the trunk hangs on the world": not (model.body_parentid[2:] == 0).any(),
+            "something besides the trunk hangs on the world": not (model.body_parentid[2:] == 0).any(),
             "bodies are compensated for gravity": not model.body_gravcomp.any(),
             "joint limits have margins": not model.jnt_margin.any(),
             "joints limit the forces of their actuators": not model.jnt_actfrclimited.any(),
@@ -200,7 +200,7 @@ def _of_bodies(model: mujoco.MjModel) -> list[str]:
 
 
 def _of_contacts(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom]) -> list[str]:
-    """Return what the fused step does not simulate of the floor and of what collides with it."""
+    """Return properties of the floor and of colliding geoms that the fused step does not simulate."""
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     floor = np.flatnonzero(np.isin(model.geom_type, floors) & collides)
     robot = collides & (model.geom_bodyid > 0)
@@ -248,7 +248,7 @@ def _excluded(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _of_motors(model: mujoco.MjModel) -> list[str]:
-    """Return what the fused step does not simulate of the actuators: all but a plain motor per hinge at most."""
+    """Return properties of actuators that the fused step does not simulate: it has at most a plain motor per hinge."""
     plain = not any(why_no_motor(model, actuator) for actuator in range(model.nu))
     joints = model.actuator_trnid[:, 0]
     return _broken(
@@ -260,5 +260,5 @@ def _of_motors(model: mujoco.MjModel) -> list[str]:
 
 
 def _any_of(model: mujoco.MjModel, *names: str) -> bool:
-    """Return whether a field is not all zero; older versions of MuJoCo lack some."""
+    """Return whether a field is not all zero; older versions of MuJoCo lack some fields."""
     return any(getattr(model, name, np.zeros(0)).any() for name in names)

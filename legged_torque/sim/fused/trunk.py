@@ -1,4 +1,4 @@
-"""The trunk's six equations, which are left when all branches are eliminated."""
+"""The six equations of the trunk that remain when all branches are eliminated."""
 
 import warp as wp
 
@@ -10,6 +10,7 @@ from legged_torque.sim.fused.math import (
     group_sum33,
     group_sum33_symmetric,
 )
+from legged_torque.sim.fused.model import State
 from legged_torque.sim.fused.types import Body, Trunk, mat66, vec6
 
 
@@ -44,30 +45,40 @@ class TrunkSystem:
 
 
 @wp.func
-def whole_inertia(trunk: Trunk, branches: Body, lanes: int) -> WholeBody:
-    """Return the inertia of the trunk with its branches, given the sum over the branches of this thread; no bias."""
+def warm_start(state: State, world: int) -> TrunkMotion:
+    """Return the trunk's accelerations at the start of the solver."""
+    qacc = state.qacc_warmstart
+    out = TrunkMotion()
+    out.lin = wp.vec3(qacc[world, 0], qacc[world, 1], qacc[world, 2])
+    out.ang = wp.vec3(qacc[world, 3], qacc[world, 4], qacc[world, 5])
+    return out
+
+
+@wp.func
+def whole_inertia(trunk: Trunk, branches: Body, threads: int) -> WholeBody:
+    """Return the inertia of the trunk with its branches, from the sum over the branches of this thread; no bias."""
     out = WholeBody()
-    moment = trunk.body.moment + group_sum3(branches.moment, lanes)
-    inertia = trunk.body.inertia + group_sum33_symmetric(branches.inertia, lanes)
-    out.mass = trunk.body.mass + group_sum(branches.mass, lanes)
+    moment = trunk.body.moment + group_sum3(branches.moment, threads)
+    inertia = trunk.body.inertia + group_sum33_symmetric(branches.inertia, threads)
+    out.mass = trunk.body.mass + group_sum(branches.mass, threads)
     out.coupling = -wp.skew(moment) * trunk.rot
     out.rotation = wp.transpose(trunk.rot) * inertia * trunk.rot
     return out
 
 
 @wp.func
-def whole_body(trunk: Trunk, branches: Body, lanes: int) -> WholeBody:
-    """Return the equations of the trunk with its branches, given the sum over the branches of this thread."""
-    out = whole_inertia(trunk, branches, lanes)
-    torque = trunk.body.torque + group_sum3(branches.torque, lanes)
-    out.bias_lin = trunk.body.force + group_sum3(branches.force, lanes)
+def whole_body(trunk: Trunk, branches: Body, threads: int) -> WholeBody:
+    """Return the equations of the trunk with its branches, from the sum over the branches of this thread."""
+    out = whole_inertia(trunk, branches, threads)
+    torque = trunk.body.torque + group_sum3(branches.torque, threads)
+    out.bias_lin = trunk.body.force + group_sum3(branches.force, threads)
     out.bias_ang = wp.transpose(trunk.rot) * torque
     return out
 
 
 @wp.func
 def trunk_residual(whole: WholeBody, acc: TrunkMotion) -> TrunkMotion:
-    """Return M a + bias of the trunk, without what accelerations of the branches add."""
+    """Return M a + bias of the trunk, without the terms of the branches' accelerations."""
     out = TrunkMotion()
     out.lin = whole.mass * acc.lin + whole.coupling * acc.ang + whole.bias_lin
     out.ang = wp.transpose(whole.coupling) * acc.lin + whole.rotation * acc.ang + whole.bias_ang
@@ -76,18 +87,18 @@ def trunk_residual(whole: WholeBody, acc: TrunkMotion) -> TrunkMotion:
 
 @wp.func
 def trunk_slopes(whole: WholeBody, residual: TrunkMotion, step: TrunkMotion) -> wp.vec3:
-    """Return the trunk's slope of the cost along a step, the same for its smooth part, and its curvature."""
+    """Return the slope of the trunk's cost along a step, the same of its smooth part, and the curvature."""
     slope = wp.dot(step.lin, residual.lin) + wp.dot(step.ang, residual.ang)
     curvature = whole.mass * wp.dot(step.lin, step.lin) + 2.0 * wp.dot(step.lin, whole.coupling * step.ang)
     return wp.vec3(slope, slope, curvature + wp.dot(step.ang, whole.rotation * step.ang))
 
 
 @wp.func
-def trunk_matrix(whole: WholeBody, branches: TrunkSystem, lanes: int) -> mat66:
-    """Return the matrix of the trunk's equations, given what the branches of this thread add."""
-    lin = group_sum33_symmetric(branches.lin, lanes) + whole.mass * wp.identity(n=3, dtype=float)
-    coupling = group_sum33(branches.coupling, lanes) + whole.coupling
-    ang = group_sum33_symmetric(branches.ang, lanes) + whole.rotation
+def trunk_matrix(whole: WholeBody, branches: TrunkSystem, threads: int) -> mat66:
+    """Return the matrix of the trunk's equations, from the terms of this thread's branches."""
+    lin = group_sum33_symmetric(branches.lin, threads) + whole.mass * wp.identity(n=3, dtype=float)
+    coupling = group_sum33(branches.coupling, threads) + whole.coupling
+    ang = group_sum33_symmetric(branches.ang, threads) + whole.rotation
     a = mat66()
     for i in range(3):
         for j in range(3):
@@ -99,11 +110,11 @@ def trunk_matrix(whole: WholeBody, branches: TrunkSystem, lanes: int) -> mat66:
 
 
 @wp.func
-def solve_trunk(whole: WholeBody, residual: TrunkMotion, branches: TrunkSystem, lanes: int) -> TrunkMotion:
-    """Return the trunk's Newton step, given what the branches of this thread add."""
-    lin = group_sum3(branches.rhs_lin, lanes) - residual.lin
-    ang = group_sum3(branches.rhs_ang, lanes) - residual.ang
-    factor = cholesky(trunk_matrix(whole, branches, lanes))
+def solve_trunk(whole: WholeBody, residual: TrunkMotion, branches: TrunkSystem, threads: int) -> TrunkMotion:
+    """Return the trunk's Newton step, from the terms of this thread's branches."""
+    lin = group_sum3(branches.rhs_lin, threads) - residual.lin
+    ang = group_sum3(branches.rhs_ang, threads) - residual.ang
+    factor = cholesky(trunk_matrix(whole, branches, threads))
     x = cholesky_solve(factor, vec6(lin[0], lin[1], lin[2], ang[0], ang[1], ang[2]))
     out = TrunkMotion()
     out.lin = wp.vec3(x[0], x[1], x[2])

@@ -1,7 +1,7 @@
-"""The structs that kernels hold in registers. Those of a branch exist once per number of joints.
+"""Structs that kernels hold in registers; those of a branch exist once per number of joints.
 
-Functions on branches take any of them: their parameters are annotated with the names below, and Warp makes one version
-per number of joints. Loops over ``len(vector)`` are unrolled.
+Functions on branches are generic: their parameters are annotated with the names below, and Warp makes one version per
+number of joints. Loops over ``len(vector)`` are unrolled.
 """
 
 import functools
@@ -12,19 +12,21 @@ import warp as wp
 vec4 = wp.types.vector(length=4, dtype=wp.float32)
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
+vec8 = wp.types.vector(length=8, dtype=wp.float32)
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
+mat83 = wp.types.matrix(shape=(8, 3), dtype=wp.float32)
 
 AnyVector = AnyMatrix = AnyColumns = Any
 """A number per joint of a branch; a square matrix; a vector in space per joint."""
 AnyBranch = AnyLinks = AnyRows = Any
 """``Branch``, ``Links`` and ``JointRows`` of :func:`branch_types`."""
 AnyContacts = Any
-"""``Contacts`` with a plane, ``MapContacts`` with a height map."""
+"""``PlaneContacts`` with a plane, ``MapContacts`` with a height map."""
 
 
 @wp.struct
 class Body:
-    """Inertia of a body and the wrench that gravity and velocities need, about the trunk's origin."""
+    """Inertia of a body, and the wrench that its gravity and velocity require, about the trunk's origin."""
 
     mass: wp.float32
     moment: wp.vec3
@@ -62,7 +64,7 @@ def branch_types(n: int) -> BranchTypes:
 
     @wp.struct
     class Links:
-        """The bodies of a branch; of each what :class:`Body` says."""
+        """The bodies of a branch, each as in :class:`Body`."""
 
         mass: vector
         moment: columns
@@ -73,7 +75,7 @@ def branch_types(n: int) -> BranchTypes:
 
     @wp.struct
     class Smooth:
-        """Equations of motion of a branch without constraints, and what it adds to the trunk's."""
+        """Equations of motion of a branch without constraints, and its terms in the trunk's."""
 
         axis: columns  # of each joint, in the world
         lever: columns  # velocity at the trunk's origin per unit of joint velocity
@@ -104,7 +106,7 @@ def branch_types(n: int) -> BranchTypes:
 
     @wp.struct
     class Branch:
-        """A branch in the solver: its equations, where it is, and where it goes."""
+        """A branch in the solver: its equations, its accelerations, and the solver's step."""
 
         smooth: Smooth
         rows: JointRows

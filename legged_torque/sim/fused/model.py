@@ -1,4 +1,4 @@
-"""What the kernels read and write: a robot's tables, and the worlds' state, in MuJoCo Warp's own arrays."""
+"""The structs Model and State of the kernels, on MuJoCo Warp's own arrays."""
 
 from typing import Any
 
@@ -11,13 +11,13 @@ from legged_torque.sim.fused.tree import Tree, find_floor
 from legged_torque.sim.fused.types import vec5
 
 UNLIMITED = 1e10
-"""Of a range that does not limit: MuJoCo's mjMAXVAL, beyond which it takes a state as diverged."""
+"""Bound of a range that does not limit: MuJoCo's mjMAXVAL, beyond which a state has diverged."""
 MIN_TOLERANCE = 1e-9
-"""Of ``opt.tolerance``: float32 resolves no smaller decrease of the cost."""
+"""Least ``opt.tolerance``: float32 resolves no smaller decrease of the cost."""
 
 
 @wp.struct
-class Tables:
+class Model:
     """A robot: fields of MuJoCo Warp's model, and the structure of its tree.
 
     The model's fields with two axes have one row per world, or one for all; :func:`of_world` reads both.
@@ -61,6 +61,7 @@ class Tables:
     geom_priority: wp.array(dtype=wp.int32)
     # Structure:
     geom_sensor: wp.array(dtype=wp.int32)  # address of the geom's contact sensor, -1 without
+    joint_count: wp.array(dtype=wp.int32)  # (branch)
     branch_joint: wp.array2d(dtype=wp.int32)  # (branch, depth)
     branch_actuator: wp.array2d(dtype=wp.int32)  # (branch, depth), -1 without
     point_geom: wp.array2d(dtype=wp.int32)  # (branch, point)
@@ -73,45 +74,59 @@ class Tables:
     # Options:
     timestep: wp.float32
     impratio: wp.float32
+    iterations: wp.int32  # of the solver, at most
+    ls_iterations: wp.int32  # of its line search, at most
     cost_scale: wp.float32  # from the cost to MuJoCo's units for its decrease
     tolerance: wp.float32  # the solver stops when a step promises less decrease, in these units
-    joint_count: wp.array(dtype=wp.int32)  # (branch)
-
-
-FUSED_FIELDS = [
-    "gravity",
-    *(name for name in Tables.vars if name in mjw.Model.__annotations__ and Tables.vars[name].type.ndim == 2),
-]
-"""Fields of MuJoCo Warp's model that may differ from world to world."""
 
 
 def unread_columns(name: str) -> int:
-    """Return how many of the first entries of a world's part of a field are the free joint's, which nobody reads."""
+    """Return how many of the first entries of a field belong to the free joint, and are never read."""
     return {"dof_": 6, "jnt_": 1, "qpos": 7}.get(name[:4], 0)
 
 
 @wp.struct
-class Worlds:
-    """The state of the worlds: fields of MuJoCo Warp's data, one row per world."""
+class State:
+    """The worlds: fields of MuJoCo Warp's data, one row per world."""
 
+    # In, or out with a law for torques:
     ctrl: wp.array2d(dtype=wp.float32)
+    # In and out:
     qpos: wp.array2d(dtype=wp.float32)
     qvel: wp.array2d(dtype=wp.float32)
     qacc_warmstart: wp.array2d(dtype=wp.float32)
+    # Out:
     sensordata: wp.array2d(dtype=wp.float32)
-    xfrc_applied: wp.array2d(dtype=wp.spatial_vector)  # read only by kernels that are made for it, like the next one
+    solver_niter: wp.array(dtype=wp.int32)
+    # In, for kernels with forces that a user applies:
+    xfrc_applied: wp.array2d(dtype=wp.spatial_vector)
     qfrc_applied: wp.array2d(dtype=wp.float32)
 
 
 @wp.func
+def local_copy(data: State) -> State:
+    """Return the same arrays: with a copy of a kernel's argument, a GPU computes addresses once."""
+    return State(
+        data.ctrl,
+        data.qpos,
+        data.qvel,
+        data.qacc_warmstart,
+        data.sensordata,
+        data.solver_niter,
+        data.xfrc_applied,
+        data.qfrc_applied,
+    )
+
+
+@wp.func
 def row(world: int, rows: int) -> int:
-    """Return a world's row in a table that has one row per world or one for all."""
+    """Return the row of a world in a table with one row per world or one for all."""
     return wp.where(rows == 1, 0, world)
 
 
 @wp.func
 def of_world(field: wp.array2d(dtype=Any), world: int, i: int):
-    """Return what a world has in column ``i`` of a field of the model."""
+    """Return column ``i`` of a world's row of a field of the model."""
     return field[row(world, field.shape[0]), i]
 
 
@@ -123,7 +138,7 @@ def dof(joint: int) -> int:
 
 @wp.func
 def qadr(joint: int) -> int:
-    """Return the place of a hinge's angle in ``qpos``; joint 0 has seven numbers."""
+    """Return the index of a hinge's angle in ``qpos``; joint 0 has seven numbers."""
     return joint + 6
 
 
@@ -132,42 +147,43 @@ _RANGES = {
     "actuator_ctrlrange": "actuator_ctrllimited",
     "actuator_forcerange": "actuator_forcelimited",
 }
-"""Fields that are ranges, and those that say which of them limit."""
+"""Fields that are ranges, and the flags that switch them on."""
 
 
-def make_tables(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Tables:
-    """Return a robot's tables on the current device; parameters stay those of MuJoCo Warp's model, not copies.
+def make_model(mj_model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> Model:
+    """Return a robot's model on the current device. Its parameters are the arrays of MuJoCo Warp's model, not copies.
 
-    There, ranges that do not limit become so wide that they do not.
+    Ranges there that do not limit become infinitely wide.
     """
     for name, limited in _RANGES.items():
         ranges = getattr(warp_model, name).numpy()
-        ranges[:, getattr(model, limited) == 0] = -UNLIMITED, UNLIMITED
+        ranges[:, getattr(mj_model, limited) == 0] = -UNLIMITED, UNLIMITED
         getattr(warp_model, name).assign(ranges)
-    tables = Tables()
-    for name in Tables.vars:
+    model = Model()
+    for name in Model.vars:
         if hasattr(warp_model, name):
-            setattr(tables, name, getattr(warp_model, name))
-    tables.gravity = warp_model.opt.gravity
-    tables.floor = find_floor(model)
-    tables.timestep = model.opt.timestep
-    tables.impratio = model.opt.impratio
-    tables.cost_scale = 1.0 / (model.stat.meaninertia * model.nv)
-    tables.tolerance = max(model.opt.tolerance, MIN_TOLERANCE)
-    sensors = np.full(model.ngeom, -1, np.int32)
-    sensors[model.sensor_refid] = model.sensor_adr
-    tables.geom_sensor = wp.array(sensors, dtype=wp.int32)
-    actuator_of = {int(model.actuator_trnid[i, 0]): i for i in range(model.nu)}
-    tables.joint_count = wp.array((tree.joints >= 0).sum(axis=1), dtype=wp.int32)
-    tables.branch_joint = wp.array(tree.joints, dtype=wp.int32)
-    tables.branch_actuator = wp.array(np.vectorize(lambda j: actuator_of.get(j, -1))(tree.joints), dtype=wp.int32)
+            setattr(model, name, getattr(warp_model, name))
+    model.gravity = warp_model.opt.gravity
+    model.floor = find_floor(mj_model)
+    model.timestep = mj_model.opt.timestep
+    model.impratio = mj_model.opt.impratio
+    model.iterations, model.ls_iterations = mj_model.opt.iterations, mj_model.opt.ls_iterations
+    model.cost_scale = 1.0 / (mj_model.stat.meaninertia * mj_model.nv)
+    model.tolerance = max(mj_model.opt.tolerance, MIN_TOLERANCE)
+    sensors = np.full(mj_model.ngeom, -1, np.int32)
+    sensors[mj_model.sensor_refid] = mj_model.sensor_adr
+    model.geom_sensor = wp.array(sensors, dtype=wp.int32)
+    actuator_of = {int(mj_model.actuator_trnid[i, 0]): i for i in range(mj_model.nu)}
+    model.joint_count = wp.array((tree.joints >= 0).sum(axis=1), dtype=wp.int32)
+    model.branch_joint = wp.array(tree.joints, dtype=wp.int32)
+    model.branch_actuator = wp.array(np.vectorize(lambda j: actuator_of.get(j, -1))(tree.joints), dtype=wp.int32)
     padded = [points + [(0, 0, (0.0, 0.0, 0.0), 0.0)] * (tree.most_points - len(points)) for points in tree.points]
     columns = (("geom", wp.int32), ("depth", wp.int32), ("offset", wp.vec3), ("radius", wp.float32))
     for place, (name, dtype) in enumerate(columns):
         values = [[point[place] for point in points] for points in padded]
-        setattr(tables, f"point_{name}", wp.array(values, dtype=dtype))
+        setattr(model, f"point_{name}", wp.array(values, dtype=dtype))
     geoms = [[point[0] for point in points] for points in tree.points]
     after = [[i + 1 + row[i + 1 :].count(geom) for i, geom in enumerate(row)] for row in geoms]
-    tables.point_next = wp.array([row + [0] * (tree.most_points - len(row)) for row in after], dtype=wp.int32)
-    tables.point_count = wp.array([len(points) for points in tree.points], dtype=wp.int32)
-    return tables
+    model.point_next = wp.array([row + [0] * (tree.most_points - len(row)) for row in after], dtype=wp.int32)
+    model.point_count = wp.array([len(points) for points in tree.points], dtype=wp.int32)
+    return model

@@ -1,46 +1,46 @@
-"""What contacts between parts of a robot do in the solver.
+"""Constraint rows of contacts between parts of a robot.
 
-Such a contact does not act on the trunk's six equations, since both its bodies move along with the trunk. One within a
-branch, or with the trunk, adds to the branch's own block of the Hessian. One between two branches couples their blocks,
-so that branches cannot be eliminated one by one: then a world's whole system is factored, all its threads together.
+Such a contact does not act on the trunk's six equations, since both its bodies move along with the trunk. Within one
+branch, or with the trunk, it adds to the branch's block of the Hessian. Between two branches it couples their blocks,
+so that they cannot be eliminated one by one: then all threads of the world factor its whole system together.
 """
 
 import functools
 
 import warp as wp
 
-from legged_torque.sim.fused.contact import contact_force, contact_stiffness, expected_rows, row_values
-from legged_torque.sim.fused.math import column, inverse_sqrt, sync_group
-from legged_torque.sim.fused.self_contact import SelfContacts
+from legged_torque.sim.fused.collision_self import SelfContacts
+from legged_torque.sim.fused.constraint import contact_force, contact_stiffness, expected_rows, row_values
+from legged_torque.sim.fused.math import column, group_sum3, inverse_sqrt, sync_group
+from legged_torque.sim.fused.model import Model
 from legged_torque.sim.fused.smooth import Poses
-from legged_torque.sim.fused.tables import Tables
-from legged_torque.sim.fused.trunk import TrunkMotion
-from legged_torque.sim.fused.types import AnyBranch, AnyVector, mat66, vec4
+from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem, WholeBody, trunk_matrix
+from legged_torque.sim.fused.types import AnyBranch, AnyVector, vec4
 
 
 @wp.func
-def place_of(tables: Tables, b: int, j: int) -> int:
-    """Return the number of a branch's joint among all hinges."""
-    return tables.branch_joint[b, j] - 1
+def place_of(model: Model, b: int, j: int) -> int:
+    """Return the index of a branch's joint among all hinges."""
+    return model.branch_joint[b, j] - 1
 
 
 @wp.func
-def keep_poses(selves: SelfContacts, world: int, b: int, poses: Poses):
-    """Show the poses of a branch to the other threads of its world."""
+def show_poses(selves: SelfContacts, world: int, b: int, poses: Poses):
+    """Write the poses of a branch for the other threads of its world."""
     for d in range(poses.shape[0]):
         selves.poses[world, b, d] = poses[d]
 
 
 @wp.func
-def keep_joints(tables: Tables, selves: SelfContacts, world: int, b: int, joints: int, values: AnyVector):
-    """Show the accelerations of a branch's joints, or their step, to the other threads of its world."""
+def show_joints(model: Model, selves: SelfContacts, world: int, b: int, joints: int, values: AnyVector):
+    """Write the accelerations of a branch's joints, or their step, for the other threads of its world."""
     for j in range(len(values)):
         if j < joints:
-            selves.joints[world, place_of(tables, b, j)] = values[j]
+            selves.joints[world, place_of(model, b, j)] = values[j]
 
 
 @wp.func
-def keep_columns(tables: Tables, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
+def show_columns(model: Model, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
     """Write the columns of a branch's joints in the Jacobians of all contacts of its world."""
     for k in range(selves.first, selves.end):
         geoms = selves.geoms[k]
@@ -50,12 +50,12 @@ def keep_columns(tables: Tables, selves: SelfContacts, world: int, b: int, joint
                 motion = column(branch.smooth.lever, j) + wp.cross(column(branch.smooth.axis, j), selves.found[k].pos)
                 sign = wp.where(second[0] == b and j < second[1], 1.0, 0.0)
                 sign -= wp.where(first[0] == b and j < first[1], 1.0, 0.0)
-                selves.jacobian[k, place_of(tables, b, j)] = sign * motion
+                selves.jacobian[k, place_of(model, b, j)] = sign * motion
 
 
 @wp.func
 def rows_times_joints(selves: SelfContacts, world: int, k: int) -> vec4:
-    """Return J a of a contact's rows, of the accelerations or the step that all branches have shown."""
+    """Return J a of a contact's rows, for the accelerations or the step that all branches have written."""
     motion = wp.vec3(0.0)
     for c in range(selves.joints.shape[1]):
         motion += selves.joints[world, c] * selves.jacobian[k, c]
@@ -63,18 +63,18 @@ def rows_times_joints(selves: SelfContacts, world: int, k: int) -> vec4:
 
 
 @wp.func
-def start_rows(selves: SelfContacts, world: int, lane: int, lanes: int):
-    """Write the residuals of a thread's contacts at the start, and which rows are expected to push."""
-    for k in range(selves.first + lane, selves.end, lanes):
+def start_rows(selves: SelfContacts, world: int, thread: int, threads: int):
+    """Write the residuals of a thread's contacts at the start, and the rows that are expected to push."""
+    for k in range(selves.first + thread, selves.end, threads):
         selves.residual[k] = rows_times_joints(selves, world, k) - selves.found[k].reference
         selves.pushing[k] = expected_rows(selves.found[k])
 
 
 @wp.func
-def turn_rows(selves: SelfContacts, world: int, lane: int, lanes: int) -> float:
-    """Write the changes of the residuals of a thread's contacts along the step; return the slope of their cost."""
+def along_step(selves: SelfContacts, world: int, thread: int, threads: int) -> float:
+    """Write the changes of the residuals of a thread's contacts along the step, and return the slope of their cost."""
     slope = float(0.0)
-    for k in range(selves.first + lane, selves.end, lanes):
+    for k in range(selves.first + thread, selves.end, threads):
         selves.change[k] = rows_times_joints(selves, world, k)
         pushing = wp.cw_mul(selves.pushing[k], selves.residual[k])
         slope += selves.found[k].mass * wp.dot(pushing, selves.change[k])
@@ -83,7 +83,7 @@ def turn_rows(selves: SelfContacts, world: int, lane: int, lanes: int) -> float:
 
 @wp.func
 def with_coupling(selves: SelfContacts) -> SelfContacts:
-    """Return a world's contacts with whether one between two branches pushes."""
+    """Return a world's contacts, marked as coupled if one between two branches pushes."""
     selves.coupled = False
     for k in range(selves.first, selves.end):
         geoms = selves.geoms[k]
@@ -94,24 +94,24 @@ def with_coupling(selves: SelfContacts) -> SelfContacts:
 
 
 @wp.func
-def push_branch(tables: Tables, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
-    """Return a branch with what the contacts add to its gradient and to its block of the Hessian."""
+def push_branch(model: Model, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
+    """Return a branch with the contacts' terms in its gradient and its block of the Hessian."""
     for k in range(selves.first, selves.end):
         force = contact_force(selves.found[k], selves.normal[k], selves.residual[k], selves.pushing[k])
         stiffness = contact_stiffness(selves.found[k], selves.normal[k], selves.pushing[k])
         for j in range(len(branch.acc)):
             if j < joints:
-                motion = selves.jacobian[k, place_of(tables, b, j)]
+                motion = selves.jacobian[k, place_of(model, b, j)]
                 branch.gradient[j] -= wp.dot(motion, force)
                 pushed = stiffness * motion
                 for i in range(len(branch.acc)):
                     if i < joints:
-                        branch.factor[i, j] += wp.dot(selves.jacobian[k, place_of(tables, b, i)], pushed)
+                        branch.factor[i, j] += wp.dot(selves.jacobian[k, place_of(model, b, i)], pushed)
     return branch
 
 
 @wp.func
-def keep_equations(tables: Tables, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
+def show_equations(model: Model, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
     """Write a branch's equations into the whole system: its rows, its columns in the trunk's, its right-hand side.
 
     The system has the joints first, then the trunk's translation and rotation; its last row is the right-hand side.
@@ -119,7 +119,7 @@ def keep_equations(tables: Tables, selves: SelfContacts, world: int, b: int, joi
     size = selves.matrix.shape[2]
     for j in range(len(branch.acc)):
         if j < joints:
-            row = place_of(tables, b, j)
+            row = place_of(model, b, j)
             for c in range(size - 6):
                 selves.matrix[world, row, c] = 0.0
             for k in range(selves.first, selves.end):
@@ -129,7 +129,7 @@ def keep_equations(tables: Tables, selves: SelfContacts, world: int, b: int, joi
                     selves.matrix[world, row, c] = selves.matrix[world, row, c] + wp.dot(pushed, selves.jacobian[k, c])
             for i in range(len(branch.acc)):
                 if i < joints:
-                    selves.matrix[world, row, place_of(tables, b, i)] = branch.factor[j, i]
+                    selves.matrix[world, row, place_of(model, b, i)] = branch.factor[j, i]
             for r in range(3):
                 selves.matrix[world, size - 6 + r, row] = branch.coupling_lin[r, j]
                 selves.matrix[world, size - 3 + r, row] = branch.coupling_ang[r, j]
@@ -137,58 +137,59 @@ def keep_equations(tables: Tables, selves: SelfContacts, world: int, b: int, joi
 
 
 @wp.func
-def keep_trunk_equations(selves: SelfContacts, world: int, a: mat66, lin: wp.vec3, ang: wp.vec3):
-    """Write the trunk's equations into the whole system, given its right-hand sides."""
-    size = selves.matrix.shape[2]
-    for i in range(6):
-        for j in range(6):
-            selves.matrix[world, size - 6 + i, size - 6 + j] = a[i, j]
-    for i in range(3):
-        selves.matrix[world, size, size - 6 + i] = lin[i]
-        selves.matrix[world, size, size - 3 + i] = ang[i]
-
-
-@wp.func
-def coupled_step(tables: Tables, selves: SelfContacts, world: int, b: int, joints: int, step: AnyVector):
-    """Return a branch's part of the step from the solution of the whole system."""
+def coupled_step(model: Model, selves: SelfContacts, world: int, b: int, joints: int, step: AnyVector):
+    """Return a branch's part of the solution of the whole system."""
     for j in range(len(step)):
         if j < joints:
-            step[j] = selves.matrix[world, selves.matrix.shape[2], place_of(tables, b, j)]
+            step[j] = selves.matrix[world, selves.matrix.shape[2], place_of(model, b, j)]
     return step
 
 
 @functools.cache
-def system_solver(lanes: int) -> wp.Function:
+def system_solver(threads: int) -> wp.Function:
     """Return ``solve_system`` for a number of threads per world."""
 
     @wp.func
-    def solve_system(selves: SelfContacts, world: int, lane: int) -> TrunkMotion:
-        """Solve a world's whole system by its Cholesky factor; return the trunk's step and leave it in the last row.
+    def solve_system(
+        selves: SelfContacts, world: int, thread: int, whole: WholeBody, residual: TrunkMotion, added: TrunkSystem
+    ) -> TrunkMotion:
+        """Solve a world's whole system by its Cholesky factor; return the trunk's step and leave all in the last row.
 
-        A thread has every so many rows. The diagonal keeps the pivots, which are squares of the factor's.
+        ``added`` is what the branches add to the trunk's equations. Each thread has every so many rows. The diagonal
+        keeps the pivots, which are squares of the factor's.
         """
         size = selves.matrix.shape[2]
+        lin = group_sum3(added.rhs_lin, wp.static(threads)) - residual.lin
+        ang = group_sum3(added.rhs_ang, wp.static(threads)) - residual.ang
+        of_trunk = trunk_matrix(whole, added, wp.static(threads))
+        if thread == 0:
+            for i in range(6):
+                for j in range(6):
+                    selves.matrix[world, size - 6 + i, size - 6 + j] = of_trunk[i, j]
+            for i in range(3):
+                selves.matrix[world, size, size - 6 + i] = lin[i]
+                selves.matrix[world, size, size - 3 + i] = ang[i]
         for c in range(size):
-            sync_group(wp.static(lanes))
+            sync_group(wp.static(threads))
             inverse = inverse_sqrt(wp.max(selves.matrix[world, c, c], 1.0e-12))
-            for r in range(c + 1 + lane, size + 1, wp.static(lanes)):
+            for r in range(c + 1 + thread, size + 1, wp.static(threads)):
                 selves.matrix[world, r, c] = inverse * selves.matrix[world, r, c]
-            sync_group(wp.static(lanes))
-            for r in range(c + 1 + lane, size + 1, wp.static(lanes)):
+            sync_group(wp.static(threads))
+            for r in range(c + 1 + thread, size + 1, wp.static(threads)):
                 scaled = selves.matrix[world, r, c]
                 for q in range(c + 1, wp.min(r + 1, size)):
                     selves.matrix[world, r, q] = selves.matrix[world, r, q] - scaled * selves.matrix[world, q, c]
         for reverse in range(size):
             c = size - 1 - reverse
-            sync_group(wp.static(lanes))
+            sync_group(wp.static(threads))
             inverse = inverse_sqrt(wp.max(selves.matrix[world, c, c], 1.0e-12))
             x = inverse * selves.matrix[world, size, c]
-            sync_group(wp.static(lanes))
-            for r in range(lane, c, wp.static(lanes)):
+            sync_group(wp.static(threads))
+            for r in range(thread, c, wp.static(threads)):
                 selves.matrix[world, size, r] = selves.matrix[world, size, r] - x * selves.matrix[world, c, r]
-            if lane == 0:
+            if thread == 0:
                 selves.matrix[world, size, c] = x
-        sync_group(wp.static(lanes))
+        sync_group(wp.static(threads))
         step = TrunkMotion()
         for r in range(3):
             step.lin[r] = selves.matrix[world, size, size - 6 + r]

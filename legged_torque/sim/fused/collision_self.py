@@ -1,0 +1,239 @@
+"""Collision between parts of a robot; ``constraint_self`` has its effect in the solver."""
+
+import functools
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from legged_torque.sim.fused.collision import BOX, CAPSULE, contact_tangent
+from legged_torque.sim.fused.collision_primitive import (
+    PairContacts,
+    Shape,
+    box_box,
+    capsule_box,
+    capsule_capsule,
+    sphere_box,
+    sphere_capsule,
+    sphere_sphere,
+)
+from legged_torque.sim.fused.constraint import Contact, ContactParams, contact_params, with_rows
+from legged_torque.sim.fused.math import group_sum, quat_to_matrix
+from legged_torque.sim.fused.model import Model, of_world
+from legged_torque.sim.fused.smooth import Pose
+from legged_torque.sim.fused.tree import Tree, places_of_geoms
+from legged_torque.sim.fused.types import vec4, vec5
+from legged_torque.utils.mjcf import self_pairs
+
+MAX_SELF_CONTACTS = wp.constant(24)
+"""Most contacts of a world between parts of its robot. Further ones are dropped and reported in ``overflow``."""
+SPHERE = wp.constant(2)
+"""MuJoCo's mjGEOM_SPHERE."""
+OVERFLOW = wp.constant(int(mjw.OverflowType.NARROWPHASE))
+
+
+@wp.struct
+class SelfContacts:
+    """The pairs of geoms that may touch, and the contacts between them."""
+
+    # Model:
+    pair: wp.array(dtype=wp.vec2i)  # its geoms, first that of the simpler type
+    named: wp.array(dtype=wp.int32)  # of each pair: number of the MJCF's <pair>, -1 of others
+    pair_friction: wp.array2d(dtype=vec5)  # of each <pair>, fields of MuJoCo Warp's model
+    pair_solref: wp.array2d(dtype=wp.vec2)
+    pair_solimp: wp.array2d(dtype=vec5)
+    geom_place: wp.array(dtype=wp.vec2i)  # of each geom: branch, and depth of its body; 0 is the trunk
+    airborne: wp.array(dtype=wp.int32)  # addresses of the sensors of those geoms that the ground lets through
+    # Scratch:
+    poses: wp.array3d(dtype=Pose)  # (world, branch, depth)
+    found: wp.array(dtype=Contact)  # MAX_SELF_CONTACTS for each world; the next three as in PlaneContacts
+    residual: wp.array(dtype=vec4)
+    pushing: wp.array(dtype=vec4)
+    change: wp.array(dtype=vec4)
+    geoms: wp.array(dtype=wp.vec2i)  # of each contact
+    normal: wp.array(dtype=wp.vec3)  # of each contact, from the first geom to the second
+    jacobian: wp.array2d(dtype=wp.vec3)  # (contact, joint): motion of the second body less that of the first
+    joints: wp.array2d(dtype=wp.float32)  # (world, joint): accelerations, or a step
+    matrix: wp.array3d(dtype=wp.float32)  # (world, row, column): the whole Newton system, see ``constraint_self``
+    # Out:
+    overflow: wp.array(dtype=wp.int32)  # MuJoCo Warp's, of each world
+    # A thread's own:
+    first: wp.int32  # contacts of its world, from the first one on
+    end: wp.int32
+    coupled: wp.bool  # whether a contact between two branches pushes
+
+
+def ordered_pairs(model: mujoco.MjModel) -> np.ndarray:
+    """Return the pairs of geoms that may touch on a robot, in MuJoCo's order: the simpler type first. Shape: (n, 2)."""
+    pairs = self_pairs(model)
+    return np.take_along_axis(pairs, model.geom_type[pairs].argsort(axis=1, kind="stable"), axis=1)
+
+
+def pair_kinds(model: mujoco.MjModel) -> tuple[tuple[int, int], ...]:
+    """Return the pairs of types of these geoms, each once."""
+    return tuple(sorted({(int(a), int(b)) for a, b in model.geom_type[ordered_pairs(model)]}))
+
+
+def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree, data: mjw.Data) -> SelfContacts:
+    """Return the pairs of a robot and room for their contacts, on the current device."""
+    (branches, depth), worlds, joints = tree.joints.shape, data.nworld, model.nv - 6
+    out = SelfContacts()
+    out.pair = wp.array(ordered_pairs(model), dtype=wp.vec2i)
+    named = {frozenset(pair): i for i, pair in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))}
+    out.named = wp.array([named.get(frozenset(pair), -1) for pair in ordered_pairs(model).tolist()], dtype=wp.int32)
+    for name in ("pair_friction", "pair_solref", "pair_solimp"):
+        setattr(out, name, getattr(warp_model, name))
+    on_ground = [point[0] for points in tree.points for point in points]
+    airborne = np.setdiff1d(ordered_pairs(model), on_ground)
+    out.airborne = wp.array(model.sensor_adr[np.isin(model.sensor_refid, airborne)], dtype=wp.int32)
+    out.geom_place = wp.array(places_of_geoms(model, tree), dtype=wp.vec2i)
+    out.poses = wp.empty((worlds, branches, depth + 1), dtype=Pose)
+    room = worlds * MAX_SELF_CONTACTS
+    out.found, out.geoms, out.normal = (wp.empty(room, dtype=dtype) for dtype in (Contact, wp.vec2i, wp.vec3))
+    out.residual, out.pushing, out.change = (wp.empty(room, dtype=vec4) for _ in range(3))
+    out.jacobian = wp.empty((room, joints), dtype=wp.vec3)
+    out.joints = wp.empty((worlds, joints), dtype=wp.float32)
+    out.matrix = wp.empty((worlds, model.nv + 1, model.nv), dtype=wp.float32)
+    out.overflow = data.overflow
+    return out
+
+
+@wp.func
+def pose_of(selves: SelfContacts, world: int, geom: int) -> Pose:
+    """Return the pose of a geom's body."""
+    place = selves.geom_place[geom]
+    return selves.poses[world, place[0], place[1]]
+
+
+@wp.func
+def middle_of(model: Model, selves: SelfContacts, world: int, geom: int) -> wp.vec3:
+    """Return the position of a geom from the trunk's origin."""
+    pose = pose_of(selves, world, geom)
+    return pose.pos + pose.rot * of_world(model.geom_pos, world, geom)
+
+
+@wp.func
+def shape_of(model: Model, selves: SelfContacts, world: int, geom: int) -> Shape:
+    """Return a geom in the world."""
+    rot = pose_of(selves, world, geom).rot * quat_to_matrix(of_world(model.geom_quat, world, geom))
+    return Shape(middle_of(model, selves, world, geom), rot, of_world(model.geom_size, world, geom))
+
+
+@wp.func
+def reach_of(model: Model, world: int, geom: int) -> float:
+    """Return the radius of a sphere around a geom [m]."""
+    size = of_world(model.geom_size, world, geom)
+    reach = size[0]
+    if model.geom_type[geom] == CAPSULE:
+        reach = size[0] + size[1]
+    if model.geom_type[geom] == BOX:
+        reach = wp.length(size)
+    return reach
+
+
+@wp.func
+def are_near(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
+    """Return whether spheres around two geoms overlap."""
+    apart = middle_of(model, selves, world, geoms[1]) - middle_of(model, selves, world, geoms[0])
+    reach = reach_of(model, world, geoms[0]) + reach_of(model, world, geoms[1])
+    return wp.length_sq(apart) <= reach * reach
+
+
+@wp.func
+def collide_nothing(types: wp.vec2i, a: Shape, b: Shape) -> PairContacts:
+    """Return no contact."""
+    return PairContacts()
+
+
+_COLLIDE = {
+    (SPHERE, SPHERE): sphere_sphere,
+    (SPHERE, CAPSULE): sphere_capsule,
+    (SPHERE, BOX): sphere_box,
+    (CAPSULE, CAPSULE): capsule_capsule,
+    (CAPSULE, BOX): capsule_box,
+    (BOX, BOX): box_box,
+}
+
+
+@functools.cache
+def collider(kinds: tuple[tuple[int, int], ...]) -> wp.Function:
+    """Return the function that collides geoms of some pairs of types: a kernel has no code for others."""
+    if not kinds:
+        return collide_nothing
+    first, second = kinds[0]
+    collide, collide_others = _COLLIDE[kinds[0]], collider(kinds[1:])
+
+    @wp.func
+    def collide_shapes(types: wp.vec2i, a: Shape, b: Shape) -> PairContacts:
+        """Return the contacts of two geoms of these types, as MuJoCo finds them."""
+        if types[0] == wp.static(first) and types[1] == wp.static(second):
+            return collide(a, b)
+        return collide_others(types, a, b)
+
+    return collide_shapes
+
+
+@wp.func
+def make_self_contact(
+    model: Model, selves: SelfContacts, world: int, pair: int, dist: float, pos: wp.vec3, normal: wp.vec3
+) -> Contact:
+    """Return a contact of a pair at a place [m], of a negative distance [m], with a normal to the second geom."""
+    geoms = selves.pair[pair]
+    contact = Contact()
+    contact.pos = pos
+    contact.tangent = contact_tangent(normal, wp.vec3(0.0), False)
+    first, second = pose_of(selves, world, geoms[0]), pose_of(selves, world, geoms[1])
+    velocity = second.lin_vel - first.lin_vel + wp.cross(second.ang_vel - first.ang_vel, pos)
+    params = contact_params(model, world, geoms[0], geoms[1])
+    named = selves.named[pair]
+    if named >= 0:
+        friction = of_world(selves.pair_friction, world, named)[0]
+        solref, solimp = of_world(selves.pair_solref, world, named), of_world(selves.pair_solimp, world, named)
+        params = ContactParams(friction, solref, solimp)
+    return with_rows(model, world, geoms, params, dist, velocity, normal, contact)
+
+
+@functools.cache
+def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.Function:
+    """Return ``find_self_contacts`` for pairs of some types of geoms and a number of threads per world."""
+    collide_shapes = collider(kinds)
+
+    @wp.func
+    def find_self_contacts(model: Model, selves: SelfContacts, world: int, thread: int) -> SelfContacts:
+        """Write a world's contacts between parts of the robot, in the order of the pairs, and return their range.
+
+        Each thread collides one pair at a time, after all poses have been written.
+        """
+        selves.first = world * MAX_SELF_CONTACTS
+        last = selves.first + MAX_SELF_CONTACTS
+        end = selves.first + 0
+        for start in range(0, selves.pair.shape[0], wp.static(threads)):
+            touch = PairContacts()
+            geoms = wp.vec2i(0, 0)
+            if start + thread < selves.pair.shape[0]:
+                geoms = selves.pair[start + thread]
+                if are_near(model, selves, world, geoms):
+                    types = wp.vec2i(model.geom_type[geoms[0]], model.geom_type[geoms[1]])
+                    a, b = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
+                    touch = collide_shapes(types, a, b)
+            new = int(group_sum(float(touch.count), wp.static(threads)))
+            if new > 0:
+                place = end + 0
+                for other in range(wp.static(threads - 1)):  # threads before this one write first
+                    found = group_sum(wp.where(thread == other, float(touch.count), 0.0), wp.static(threads))
+                    place += wp.where(other < thread, int(found), 0)
+                for i in range(touch.count):
+                    if place + i < last:
+                        selves.geoms[place + i] = geoms
+                        selves.normal[place + i] = touch.normal[i]
+                        selves.found[place + i] = make_self_contact(
+                            model, selves, world, start + thread, touch.dist[i], touch.pos[i], touch.normal[i]
+                        )
+                end += new
+        if end > last and thread == 0:
+            selves.overflow[world] = selves.overflow[world] | OVERFLOW
+        selves.end = wp.min(end, last)
+        return selves
+
+    return find_self_contacts

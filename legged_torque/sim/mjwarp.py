@@ -1,0 +1,47 @@
+"""The engine "mujoco_warp": MuJoCo Warp's own step, for any robot that it can simulate."""
+
+from __future__ import annotations
+
+import mujoco
+import mujoco_warp as mjw
+import warp as wp
+
+from legged_torque.sim.fused.tree import SLOWER, reasons_against
+from legged_torque.sim.model import max_constraints, max_contacts
+from legged_torque.sim.warp_engine import WarpEngine
+
+_NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+
+
+class MuJoCoWarpEngine(WarpEngine):
+    """Steps worlds by some hundred kernels. A step without sensing sets the contact sensors to zero."""
+
+    name = "mujoco_warp"
+    capabilities = frozenset({"self_collision", "applied_forces", "per_world"})
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        device: str,
+        solver_iterations: int = 30,
+        ls_iterations: int = 20,
+    ) -> None:
+        """Build the worlds; a UserError if MuJoCo Warp cannot simulate this robot."""
+        contacts = max_contacts(model)
+        rows = max_constraints(model, contacts)
+        super().__init__(model, num_envs, device, solver_iterations, ls_iterations, contacts, rows)
+        reasons = "; ".join(reasons_against(model))
+        why = f"which cannot simulate this robot: {reasons}" if reasons else "which can simulate this robot"
+        self.notes = [f"sim.engine 'mujoco_warp' steps worlds, {SLOWER} than 'fused', {why}"]
+        # Rows of constraints that are not in use: the solver multiplies them by zero, so that a NaN would stay.
+        self._carried = {"efc.J": wp.to_torch(self._data.efc.J), "efc.force": wp.to_torch(self._data.efc.force)}
+        self._flags = self._model.opt.disableflags
+        if self._wp_device.is_cuda:
+            self._model.opt.graph_conditional = False  # unrolled solver iterations are faster than a device loop
+
+    def step(self, sense: bool = True) -> None:
+        """Advance every world by one physics step; ``sense`` decides whether to write the contact sensors."""
+        self._model.opt.disableflags = self._flags if sense else self._flags | _NO_SENSORS
+        with wp.ScopedDevice(self._wp_device):
+            mjw.step(self._model, self._data)

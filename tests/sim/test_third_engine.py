@@ -1,0 +1,145 @@
+"""A physics engine of a user's, in one file: plain MuJoCo on a CPU, one world after another."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from support.engine_suite import EngineSuite
+from support.fused import compiled, make_a1
+from support.scripts import assert_told_in_one_line, run_here
+
+from legged_torque.sim.engine import Engine, copy_tensors
+from legged_torque.sim.registry import ENGINES
+from legged_torque.terrain.height_grid import HeightGrid
+
+STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl")
+
+
+class PlainMuJoCo(Engine):
+    """``mj_step`` in double precision; states are kept as float32."""
+
+    name = "mujoco"
+    capabilities = frozenset({"self_collision"})
+
+    def __init__(self, model, num_envs, device, solver_iterations=30, ls_iterations=20):
+        """Build the worlds."""
+        self.mj_model, self.num_envs, self.device = model, num_envs, device
+        model.opt.iterations, model.opt.ls_iterations = solver_iterations, ls_iterations
+        self._data = mujoco.MjData(model)
+        self._reference = torch.tensor(model.qpos0, dtype=torch.float32)
+        self.qpos = self._reference.repeat(num_envs, 1)
+        self.qvel, self.qacc_warmstart = torch.zeros(2, num_envs, model.nv)
+        self.ctrl, self._sensors = torch.zeros(num_envs, model.nu), torch.zeros(num_envs, model.nsensor, 4)
+        self.contact_found, self.contact_force = self._sensors[:, :, 0], self._sensors[:, :, 1:]
+        self.diverged = torch.zeros(num_envs, dtype=torch.bool)
+
+    def step(self, sense=True):
+        """Step one world after another; one that is not finite stays as it is."""
+        for world in range(self.num_envs):
+            state = [getattr(self, name)[world] for name in STATE]
+            if not all(values.isfinite().all() and values.abs().max() < 1e10 for values in state):
+                continue
+            mujoco.mj_resetData(self.mj_model, self._data)
+            for name, values in zip(STATE, state, strict=True):
+                getattr(self._data, name)[:] = values
+            mujoco.mj_step(self.mj_model, self._data)
+            for name, values in zip(STATE[:3], state, strict=False):
+                values.copy_(torch.tensor(getattr(self._data, name)))
+            self._sensors[world] = torch.tensor(self._data.sensordata.reshape(-1, 4))
+
+    def reset(self, mask):
+        """Put worlds back."""
+        self.qpos[mask] = self._reference
+        for tensor in (self.qvel, self.qacc_warmstart, self.ctrl, self._sensors):
+            tensor[mask] = 0.0
+
+    def clear_diverged(self):
+        """Forget."""
+        self.diverged.zero_()
+
+    def flag_diverged(self):
+        """Look at all numbers."""
+        state = torch.cat([self.qpos, self.qvel], dim=1)
+        self.diverged |= ~(state.abs() <= 1e4).all(dim=1) | ~(self.qacc_warmstart.abs() <= 1e10).all(dim=1)
+
+    def check_buffers(self):
+        """Nothing is limited."""
+        return
+
+    def state_dict(self):
+        """Return what worlds carry."""
+        names = (*STATE, "contact_found", "contact_force", "diverged")
+        return {name: getattr(self, name) for name in names}
+
+    def load_state_dict(self, state):
+        """Go on from it."""
+        copy_tensors(state, self.state_dict())
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    """What the user's file does when it is imported."""
+    monkeypatch.setitem(ENGINES, "mujoco", PlainMuJoCo)
+
+
+class TestPlainMuJoCo(EngineSuite):
+    """It is the truth, up to float32."""
+
+    engine, tolerance = "mujoco", 1e-3
+
+
+WORDS = ["--task=a1_multihead", "--device=cpu", "--num_envs=3", "--logger=none", "--set=sim.engine=mujoco"]
+WORDS += ["--set=runner.num_steps_per_env=4", "--set=algorithm.num_mini_batches=2", "--set=evaluation.interval=0"]
+
+
+def test_training(tmp_path):
+    """A task trains on it without a change in the package."""
+    status, _, error = run_here("train.py", *WORDS, "--max_iterations=2", root=tmp_path)
+    assert status == 0, error
+    assert len(list(tmp_path.glob("logs/*/*/model_2.pt"))) == 1
+
+
+def test_a_task_moves_as_mujoco(make_task):
+    """A control step is as many calls of ``mj_step``, under the torques of the task."""
+    task = make_task("a1_multihead", 2, **{"sim.engine": "mujoco"})
+    data = mujoco.MjData(task.sim.mj_model)
+    start = {name: values.clone() for name, values in task.sim.state_dict().items()}
+    torques, step = [], task.sim.step
+
+    def noted_step(sense):
+        torques.append(task.torques[1].clone())
+        step(sense)
+
+    task.sim.step = noted_step
+    task.step(torch.randn(2, task.num_actions))
+    for name in STATE:
+        getattr(data, name)[:] = start[name][1]
+    for torque in torques:
+        data.ctrl[:] = torque
+        mujoco.mj_step(task.sim.mj_model, data)
+    assert len(torques) == task.cfg.control.decimation
+    np.testing.assert_allclose(task.sim.qpos[1], data.qpos, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(task.sim.qvel[1], data.qvel, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("--set=domain_rand.randomize_parameters=True", "'per_world', which domain_rand.randomize_parameters needs"),
+        ("--set=sim.engine=mujoko", "did you mean 'mujoco'? allowed: fused, mujoco, mujoco_warp"),
+    ],
+)
+def test_refusals(tmp_path, change, message):
+    """What a task needs and the engine lacks is one line."""
+    assert_told_in_one_line(run_here("train.py", *WORDS, change, root=tmp_path), message)
+
+
+def test_rough_ground():
+    """Without the capability for maps, the ground is a hfield of the model, as for MuJoCo Warp."""
+    spec = make_a1()
+    HeightGrid(np.zeros((40, 40)), 0.1, (-2.0, -2.0)).add_to(spec, "floor")
+    sim = PlainMuJoCo(compiled(spec), 1, "cpu")
+    sim.qpos[0] = torch.tensor(sim.mj_model.key_qpos[0])
+    for _ in range(40):
+        sim.step()
+    assert sim.contact_found.any()
