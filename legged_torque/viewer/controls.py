@@ -5,29 +5,29 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
+from importlib.resources import files
 from typing import Any
 
 import viser
+from viser._messages import RunJavascriptMessage
 
 from legged_torque.viewer.ground import Ground
-from legged_torque.viewer.scene import View
 from legged_torque.viewer.session import FASTEST, SLOWEST, Command, Session
-from legged_torque.viewer.steering import add_steering
 
 PUSHES = {"from behind": 0.0, "from the right": 90.0, "from the front": 180.0, "from the left": -90.0}
 """Directions of pushes from the robot's heading to its left [degrees]."""
 STEP = 0.05  # of the sliders of commands [m/s, rad/s] and weights
-KEYS = '<div style="font-size:12px;padding:0 12px">or hold W A S D, arrows, or a gamepad\'s sticks</div>'
+KEYS = '<div class="lt-keys">or hold W A S D, arrows, or a gamepad\'s sticks</div>'
 COMMANDS = {"x [m/s]": "forward", "y [m/s]": "to the left", "yaw [rad/s]": "turning to the left"}
 VIEW = {
-    "follow": ("camera follows", "keeps the followed robot in view"),
-    "others": ("all worlds", "draw the other worlds too"),
-    "contacts": ("contacts", "points and forces, 1 m for 500 N"),
-    "collision": ("collision geoms", "what touches the ground in the simulator"),
-    "ghost": ("ghost", "where the commands of the last second lead"),
-    "scan": ("height scan", "where the ground is measured"),
+    "follow": ("camera follows", True, "keeps the followed robot in view"),
+    "others": ("all worlds", True, "draw the other worlds too"),
+    "contacts": ("contacts", True, "points and forces, 1 m for 500 N"),
+    "collision": ("collision geoms", False, "what touches the ground in the simulator"),
+    "ghost": ("ghost", False, "where the commands of the last second lead"),
+    "scan": ("height scan", True, "where the ground is measured"),
 }
-"""Labels and hints of the fields of :class:`~legged_torque.viewer.scene.View`."""
+"""What is drawn, by name: label, whether it is at first, hint."""
 
 
 class Controls:
@@ -37,32 +37,42 @@ class Controls:
         status: Text above the controls.
     """
 
-    def __init__(self, gui: viser.GuiApi, session: Session, view: View, ground: Ground | None) -> None:
+    def __init__(self, gui: viser.GuiApi, session: Session, ground: Ground | None) -> None:
         """Build the panel; a ground of None is a plane."""
         self._gui, self._session = gui, session
-        self._shown: list[tuple[viser.GuiInputHandle, Callable[[], Any]]] = []  # controls and their values
-        self._checkpoints: list[tuple[viser.GuiDropdownHandle, Session]] = []
+        self._shown: list[tuple[Any, str, Callable[[], Any]]] = []  # controls, attributes of theirs, and their values
         self.status = gui.add_html("")
         with gui.add_folder("Command"):
             self._add_command()
         with gui.add_folder("Time"):
-            self._add_time()
+            self._bind(gui.add_checkbox("pause", False), lambda: session.is_paused, session.set_paused)
+            speed = gui.add_slider("speed [x]", SLOWEST, FASTEST, 0.1, FASTEST, hint="1 is real time")
+            self._bind(speed, lambda: session.pacer.speed, session.set_speed)
+            reset = gui.add_button("Reset", icon=viser.Icon.ROTATE, hint="a new episode in every world")
+            reset.on_click(lambda event: session.reset())
         with gui.add_folder("Push"):
-            self._add_push()
+            direction = gui.add_dropdown("push", tuple(PUSHES), hint="in the robot's frame")
+            hint = "added to the trunk's velocity at once"
+            strength = gui.add_slider("strength [m/s]", 0.1, 2.0, 0.1, 0.8, hint=hint)
+            push = gui.add_button("Push", icon=viser.Icon.ARROW_BIG_RIGHT)
+            push.on_click(lambda event: session.push(math.radians(PUSHES[direction.value]), strength.value))
         with gui.add_folder("Run"):
             self._add_run()
         if session.mixing:
             with gui.add_folder("Mixing weights"):
-                self._add_mixing()
+                automatic = gui.add_checkbox("as in training", True, hint="the weights at this point of the training")
+                sliders = [gui.add_slider(name.replace("_", " "), 0.0, 1.0, STEP, 0.0) for name in session.mixing]
+                values = (lambda: list(session.mixing.values()), automatic, lambda: not session.is_mixing_set)
+                self._bind_sliders(sliders, *values, session.set_mixing)
         if ground:
             with gui.add_folder("Tile"):
                 self._add_tile(ground)
         with gui.add_folder("View"):
-            self._add_view(view, is_rough=ground is not None)
+            self._add_view(is_rough=ground is not None)
 
     def _bind(self, control: viser.GuiInputHandle, value: Callable[[], Any], request: Callable[[Any], None]) -> None:
         """Show a value of the session in a control, and request what users choose."""
-        self._shown.append((control, value))
+        self._shown.append((control, "value", value))
         control.on_update(lambda event: request(control.value) if event.client else None)  # a user has changed it
 
     def _bind_sliders(
@@ -104,24 +114,15 @@ class Controls:
         self._bind_sliders(sliders, command, random, lambda: session.command is None, session.set_command)
         gui.add_html(KEYS)
         gui.add_button("Stand still", icon=viser.Icon.HAND_STOP).on_click(lambda event: steer((0.0, 0.0, 0.0)))
-        add_steering(gui, steer)
+        field = gui.add_vector3("steering", (0.0, 0.0, 0.0), visible=False)  # set by held keys and a gamepad
 
-    def _add_time(self) -> None:
-        """Add pause, speed and reset."""
-        gui, session = self._gui, self._session
-        self._bind(gui.add_checkbox("pause", False), lambda: session.is_paused, session.set_paused)
-        speed = gui.add_slider("speed [x]", SLOWEST, FASTEST, 0.1, FASTEST, hint="1 is real time")
-        self._bind(speed, lambda: session.speed, session.set_speed)
-        reset = gui.add_button("Reset", icon=viser.Icon.ROTATE, hint="a new episode in every world")
-        reset.on_click(lambda event: session.reset())
+        @field.on_update
+        async def changed(event: viser.GuiEvent) -> None:  # viser calls coroutines in the order of the changes
+            if all(abs(share) <= 1.0 for share in field.value):
+                steer(field.value)
 
-    def _add_push(self) -> None:
-        """Add pushes."""
-        direction = self._gui.add_dropdown("push", tuple(PUSHES), hint="in the robot's frame")
-        hint = "added to the trunk's velocity at once"
-        speed = self._gui.add_slider("strength [m/s]", 0.1, 2.0, 0.1, 0.8, hint=hint)
-        push = self._gui.add_button("Push", icon=viser.Icon.ARROW_BIG_RIGHT)
-        push.on_click(lambda event: self._session.push(math.radians(PUSHES[direction.value]), speed.value))
+        script = files("legged_torque.viewer").joinpath("page.js").read_text().replace("FIELD", field._impl.uuid)
+        gui._websock_interface.queue_message(RunJavascriptMessage(script))  # as viser itself does for Plotly
 
     def _add_run(self) -> None:
         """Add checkpoints and perturbations."""
@@ -138,21 +139,16 @@ class Controls:
     def _add_checkpoint(self, label: str, session: Session) -> None:
         """Add the choice of a session's checkpoint."""
         control = self._gui.add_dropdown(label, (str(session.checkpoint),), hint="iterations of the training")
-        self._checkpoints.append((control, session))
+
+        def options() -> tuple[str, ...]:
+            return tuple(map(str, sorted({*session.checkpoints, session.checkpoint})))
 
         def choose(value: str) -> None:
             session.follow_newest(False)
             session.load_checkpoint(int(value))
 
+        self._shown.append((control, "options", options))
         self._bind(control, lambda: str(session.checkpoint), choose)
-
-    def _add_mixing(self) -> None:
-        """Add the weights of action terms."""
-        gui, session = self._gui, self._session
-        automatic = gui.add_checkbox("as in training", True, hint="the weights at this point of the training")
-        sliders = [gui.add_slider(name.replace("_", " "), 0.0, 1.0, STEP, 0.0) for name in session.mixing]
-        values = (lambda: list(session.mixing.values()), automatic, lambda: not session.is_mixing_set)
-        self._bind_sliders(sliders, *values, session.set_mixing)
 
     def _add_tile(self, ground: Ground) -> None:
         """Add the tile of the followed robot."""
@@ -170,28 +166,29 @@ class Controls:
         self._bind(kind, lambda: kinds[tile()[1]], move)
         self._bind(level, lambda: tile()[0], move)
 
-    def _add_view(self, view: View, is_rough: bool) -> None:
+    def _add_view(self, is_rough: bool) -> None:
         """Add the followed world and what is drawn."""
-        session, num_envs = self._session, self._session.task.num_envs
+        gui, session, num_envs = self._gui, self._session, self._session.task.num_envs
         if num_envs > 1:
-            world = self._gui.add_dropdown("world", tuple(map(str, range(num_envs))), hint="for camera and plots")
+            world = gui.add_dropdown("world", tuple(map(str, range(num_envs))), hint="for camera and plots")
             self._bind(world, lambda: str(session.world), lambda value: session.follow_world(int(value)))
-        for name, (label, hint) in VIEW.items():
-            if {"others": num_envs > 1, "scan": is_rough}.get(name, True):
-                box = self._gui.add_checkbox(label, getattr(view, name), hint=hint)
-                box.on_update(lambda event, name=name: setattr(view, name, event.target.value))
+        is_needed = {"others": num_envs > 1, "scan": is_rough}
+        self._boxes = {
+            name: gui.add_checkbox(label, is_on, hint=hint, visible=is_needed.get(name, True))
+            for name, (label, is_on, hint) in VIEW.items()
+        }
+
+    def drawn(self) -> set[str]:
+        """Return the names in :data:`VIEW` of what users want to see."""
+        return {name for name, box in self._boxes.items() if box.value}
 
     def update(self) -> None:
         """Show the session's values, unless a choice has not been carried out yet."""
-        for dropdown, session in self._checkpoints:
-            names = tuple(map(str, sorted({*session.checkpoints, session.checkpoint})))
-            if names != tuple(dropdown.options):
-                dropdown.options = names
-        if any(session.requests for _, session in self._checkpoints):
+        if any(session and session.requests for session in (self._session, self._session.companion)):
             return
-        for control, value in self._shown:
+        for control, attribute, value in self._shown:
             now = value()
             if isinstance(control, viser.GuiSliderHandle):
                 now = round(min(max(now, control.min), control.max), 2)
-            if control.value != now:  # each change is a message to the browsers
-                control.value = now
+            if getattr(control, attribute) != now:  # each change is a message to the browsers
+                setattr(control, attribute, now)

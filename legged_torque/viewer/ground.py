@@ -7,19 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 
-from legged_torque import resource_path
 from legged_torque.terrain.colors import NEUTRAL, color_of
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.mjcf import loading, read_spec
-
-if TYPE_CHECKING:
-    from legged_torque.envs.base.legged_robot import LeggedRobot
 
 RESOLUTION, MAX_PIXELS = 32.0, 4096  # of the picture: pixels per metre, and limit along a side
 SHADES = (1.0, 0.94, 0.85)  # brightness of a tile, of lines on it that are 1 m apart, and of its edges
@@ -111,13 +106,6 @@ class Ground:
         floor = planes[0] if planes else spec.worldbody.add_geom()
         floor.type, floor.meshname, floor.material = mujoco.mjtGeom.mjGEOM_MESH, "ground", "ground"
         floor.pos, floor.quat, floor.contype, floor.conaffinity = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], 0, 0
-
-
-def drawn_task(task: LeggedRobot) -> tuple[mujoco.MjModel, Ground | None]:
-    """Return the model of a task's robot and ground for drawing, and the ground; None if it is a plane."""
-    terrain: Any = task.terrain  # rough ground if it has a map
-    ground = Ground(terrain.layout, terrain.map) if terrain.map else None
-    return drawn_model(resource_path(task.cfg.asset.file), ground, task.dof_names), ground
 
 
 def drawn_model(robot: Path, ground: Ground | None, joints: Sequence[str] = ()) -> mujoco.MjModel:

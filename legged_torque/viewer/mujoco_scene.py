@@ -1,11 +1,17 @@
-"""Cameras and arrows in scenes of MuJoCo, scaled to the size of the robot. Needs neither torch nor Warp."""
+"""Robots, cameras and arrows in scenes of MuJoCo, scaled to the size of the robot. Needs neither torch nor Warp."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 
-from legged_torque.viewer.ground import Ground
+from legged_torque import resource_path
+from legged_torque.viewer.ground import Ground, drawn_model
+
+if TYPE_CHECKING:
+    from legged_torque.envs.base.legged_robot import LeggedRobot
 
 TRUNK = 1  # body of the trunk in the MJCF of a task
 A1_HEIGHT = 0.485  # from the feet of the A1 to its top at zero joint angles [m]
@@ -65,23 +71,48 @@ class Camera:
         return camera
 
 
-def add_velocities(
-    scene: mujoco.MjvScene, data: mujoco.MjData, trunk: int, command: np.ndarray, velocity: np.ndarray, size: float
-) -> None:
-    """Draw commanded and actual velocity above a robot of a :func:`size_of`.
+class Drawing:
+    """A robot on its ground, as MuJoCo draws it.
 
-    ``command`` and ``velocity`` begin with v_x and v_y in the frame of the body ``trunk`` [m/s]; what follows is not
-    drawn.
+    Attributes:
+        model: For drawing, with visual geoms.
+        data: The robot's present state.
+        ground: None is a plane.
+        trunk: Body that cameras follow.
+        size: See :func:`size_of`.
     """
-    kind, rotation = mujoco.mjtGeom.mjGEOM_ARROW, data.xmat[trunk].reshape(3, 3)
-    for vector, color, height in (
-        (command, COMMAND_COLOR, COMMAND_HEIGHT),
-        (velocity, VELOCITY_COLOR, VELOCITY_HEIGHT),
-    ):
-        if np.hypot(*vector[:2]) < MIN_SPEED or scene.ngeom >= scene.maxgeom:
-            continue
-        start = data.xpos[trunk] + [0.0, 0.0, size * height]
-        geom = scene.geoms[scene.ngeom]
-        mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(color, np.float32))
-        mujoco.mjv_connector(geom, kind, ARROW_RADIUS, start, start + ARROW_LENGTH * rotation[:, :2] @ vector[:2])
-        scene.ngeom += 1
+
+    def __init__(self, model: mujoco.MjModel, ground: Ground | None = None, trunk: int = TRUNK) -> None:
+        """Start with all joints at zero."""
+        self.model, self.ground, self.trunk = model, ground, trunk
+        self.data, self.size = mujoco.MjData(model), size_of(model)
+
+    @classmethod
+    def of_task(cls, task: LeggedRobot) -> Drawing:
+        """Return the robot of a task on its ground, with the joints in the task's order."""
+        terrain: Any = task.terrain  # rough ground if it has a map
+        ground = Ground(terrain.layout, terrain.map) if terrain.map else None
+        return cls(drawn_model(resource_path(task.cfg.asset.file), ground, task.dof_names), ground)
+
+    def move(self, qpos: np.ndarray) -> None:
+        """Move the robot. Shape: (nq,)."""
+        self.data.qpos[:] = qpos
+        mujoco.mj_forward(self.model, self.data)
+
+    def add_velocities(self, scene: mujoco.MjvScene, command: np.ndarray, velocity: np.ndarray) -> None:
+        """Draw commanded and actual velocity above the robot.
+
+        They begin with v_x and v_y in the trunk's frame [m/s]; what follows is not drawn.
+        """
+        kind, rotation = mujoco.mjtGeom.mjGEOM_ARROW, self.data.xmat[self.trunk].reshape(3, 3)
+        for vector, color, height in (
+            (command, COMMAND_COLOR, COMMAND_HEIGHT),
+            (velocity, VELOCITY_COLOR, VELOCITY_HEIGHT),
+        ):
+            if np.hypot(*vector[:2]) < MIN_SPEED or scene.ngeom >= scene.maxgeom:
+                continue
+            start = self.data.xpos[self.trunk] + [0.0, 0.0, self.size * height]
+            geom = scene.geoms[scene.ngeom]
+            mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(color, np.float32))
+            mujoco.mjv_connector(geom, kind, ARROW_RADIUS, start, start + ARROW_LENGTH * rotation[:, :2] @ vector[:2])
+            scene.ngeom += 1

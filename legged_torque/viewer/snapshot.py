@@ -60,27 +60,25 @@ class WatchedRobot(LeggedRobot):
         return super()._compute_torques(actions)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
-        """Keep what a control step overwrites, and make one."""
-        self._watched_before = self.commands.clone(), self.episode_sums.clone()
+        """Keep the commands, which a control step may draw anew at its end, and make one."""
+        self._commands_before = self.commands.clone()
         return super().step(actions)
 
     def snapshot(self, time: float, world: int) -> Snapshot:
         """Return the result of the last step; for the arguments see :class:`Snapshot`."""
-        commands, sums = self._watched_before
-        rewards = self.episode_sums - torch.where(self.reset_buf, 0.0, sums)
-        tile, scan = None, commands[:0]
+        tile, scan = None, self.commands[:0]
         if isinstance(self.terrain, RoughGround):
             tile = int(self.terrain.levels[world]), int(self.terrain.columns[world])
             scan = self._watched_scan.points()[world]
             scan[:, 2] = self.terrain.height(scan)
         tensors = {
             "qpos": self.sim.qpos,
-            "commands": commands,
+            "commands": self._commands_before,
             "velocities": self.state.planar_velocity(),
             "torques": self.torques[world],
             "torque_parts": self.torque_parts[:, world],
             "targets": self._position_targets()[world],
-            "rewards": rewards[:, world] / self.dt,
+            "rewards": self.rewards.terms[:, world] / self.dt,
             "feet": self.feet_contact[world],
             "forces": self.sim.contact_force[world],
             "scan": scan,

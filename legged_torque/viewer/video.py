@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import math
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -21,8 +19,8 @@ from legged_torque.utils.devices import INSTALL_HINT
 from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_whole
-from legged_torque.viewer.ground import Ground, drawn_model, drawn_task
-from legged_torque.viewer.mujoco_scene import TRUNK, Camera, add_velocities, size_of
+from legged_torque.viewer.ground import Ground, drawn_model
+from legged_torque.viewer.mujoco_scene import Camera, Drawing
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -52,14 +50,13 @@ class VideoRecorder:
     tiles of a grid, row by row.
 
     Attributes:
-        model: One robot with its ground. The size of its off-screen buffer is changed.
-        trunk: Body that the camera follows.
+        drawing: One robot with its ground. The size of its model's off-screen buffer is changed.
         steps: The robots after each control step; their number is a square number.
     """
 
-    def __init__(self, model: mujoco.MjModel, trunk: int, control_step: float, ground: Ground | None = None) -> None:
-        """Start without steps, which last ``control_step`` [s]; cameras stay above the ground. None is a plane."""
-        self.model, self.trunk, self._control_step, self._ground = model, trunk, control_step, ground
+    def __init__(self, drawing: Drawing, control_step: float) -> None:
+        """Start without steps, which last ``control_step`` [s]."""
+        self.drawing, self._control_step = drawing, control_step
         self.steps: list[list[Moment]] = []
 
     def save(self, file: Path, no_renderer: str | None) -> bool:
@@ -68,20 +65,22 @@ class VideoRecorder:
         Returns whether there is one.
         """
         try:
-            if no_renderer:
-                raise UserError(no_renderer)
-            self.write(file)
+            self.write(file, no_renderer)
             print(f"video: {file}")
             return True
         except UserError as error:
             print(f"no video: {error}")
             return False
 
-    def write(self, file: Path, on_frame: Callable[[int, int], None] = lambda number, total: None) -> None:
-        """Write the video; a UserError if there is no renderer or no encoder.
+    def write(
+        self, file: Path, no_renderer: str | None, on_frame: Callable[[int, int], None] = lambda number, total: None
+    ) -> None:
+        """Write the video; a UserError if there is no renderer, for a known reason or another, or no encoder.
 
         ``on_frame`` is called after each frame with its number and the number of all.
         """
+        if no_renderer or not self.steps:
+            raise UserError(no_renderer or "nothing has moved")
         try:
             import imageio
             import imageio_ffmpeg  # noqa: F401
@@ -90,13 +89,13 @@ class VideoRecorder:
             raise UserError("videos need the extra: pip install 'legged_torque[video]'") from None
         side = math.isqrt(len(self.steps[0]))
         width, height = SIZE if side == 1 else (length // side // 2 * 2 for length in GRID_SIZE)  # even, for mp4
-        self.model.vis.global_.offwidth, self.model.vis.global_.offheight = width, height
+        drawing, model = self.drawing, self.drawing.model
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         try:
-            renderer = mujoco.Renderer(self.model, height, width)
+            renderer = mujoco.Renderer(model, height, width)
         except Exception as error:  # whatever the graphics driver raises
             raise UserError(f"the renderer does not start: {error} ({INSTALL_HINT})") from None
-        size, data = size_of(self.model), mujoco.MjData(self.model)
-        cameras = [Camera(self._ground, size) for _ in self.steps[0]]
+        cameras = [Camera(drawing.ground, drawing.size) for _ in self.steps[0]]
         shown = list(enumerate(self.steps, start=1))[::STRIDE]
         with tempfile.TemporaryDirectory() as folder:
             part = Path(folder) / file.name
@@ -105,7 +104,7 @@ class VideoRecorder:
                 for frame, (number, moments) in enumerate(shown, start=1):
                     tiles = []
                     for moment, camera in zip(moments, cameras, strict=True):
-                        image = self._draw(renderer, data, moment, camera, size)
+                        image = self._draw(renderer, moment, camera)
                         rows = speed_rows(moment) if side > 1 else velocity_rows(number * self._control_step, moment)
                         tiles.append(add_text(image, rows))
                     writer.append_data(np.vstack([np.hstack(tiles[i : i + side]) for i in range(0, len(tiles), side)]))
@@ -113,14 +112,12 @@ class VideoRecorder:
                     on_frame(frame, len(shown))
             write_whole(file, part.read_bytes())
 
-    def _draw(
-        self, renderer: mujoco.Renderer, data: mujoco.MjData, moment: Moment, camera: Camera, size: float
-    ) -> np.ndarray:
+    def _draw(self, renderer: mujoco.Renderer, moment: Moment, camera: Camera) -> np.ndarray:
         """Return the image of a robot and the arrows of its velocities. Shape: (height, width, 3)."""
-        data.qpos[:] = moment.qpos
-        mujoco.mj_forward(self.model, data)
-        renderer.update_scene(data, camera.look_at(data.xpos[self.trunk]))
-        add_velocities(renderer.scene, data, self.trunk, moment.command, moment.velocity, size)
+        drawing = self.drawing
+        drawing.move(moment.qpos)
+        renderer.update_scene(drawing.data, camera.look_at(drawing.data.xpos[drawing.trunk]))
+        drawing.add_velocities(renderer.scene, moment.command, moment.velocity)
         return renderer.render()
 
 
@@ -135,7 +132,7 @@ class SimulationRecorder(VideoRecorder):
             layout = Layout(**description["terrain"])
             ground = Ground(layout, HeightGrid(layout.heights(), layout.horizontal_scale, layout.corner))
             model = drawn_model(robot.file, ground)
-        super().__init__(model, robot.trunk, 1.0 / description["timing"]["control_frequency"], ground)
+        super().__init__(Drawing(model, ground, robot.trunk), 1.0 / description["timing"]["control_frequency"])
         self._simulation = simulation
 
     def add_step(self) -> None:
@@ -149,8 +146,7 @@ class TaskRecorder(VideoRecorder):
 
     def __init__(self, task: LeggedRobot, num_worlds: int = 1) -> None:
         """Prepare to record the first worlds of a task; a single one is that with the fastest command at the start."""
-        model, ground = drawn_task(task)
-        super().__init__(model, TRUNK, task.dt, ground)
+        super().__init__(Drawing.of_task(task), task.dt)
         self._task = task
         self._worlds = list(range(num_worlds)) if num_worlds > 1 else []
 
@@ -165,22 +161,17 @@ class TaskRecorder(VideoRecorder):
 
 def show_in_tensorboard(video: Path, iterations: int) -> None:
     """Add a video as a gif to the images of a run in tensorboard, as events in the video's folder."""
-    import imageio
-    from PIL import Image
-    from tensorboard.compat.proto.event_pb2 import Event
+    import imageio.v3
     from tensorboard.compat.proto.summary_pb2 import Summary
-    from tensorboard.summary.writer.event_file_writer import EventFileWriter
+    from torch.utils.tensorboard.writer import FileWriter
 
-    reader: Any = imageio.get_reader(video)
-    with reader:
-        duration = 1000.0 * STRIDE / reader.get_meta_data()["fps"]  # of a frame of the gif [ms]
-        images = [Image.fromarray(frame[::2, ::2]) for number, frame in enumerate(reader) if number % STRIDE == 0]
-    gif = io.BytesIO()
-    images[0].save(gif, "GIF", save_all=True, append_images=images[1:], duration=duration, loop=0)
-    size = {"width": images[0].width, "height": images[0].height, "colorspace": 3}
-    value = Summary.Value(tag="video", image=Summary.Image(**size, encoded_image_string=gif.getvalue()))
-    writer = EventFileWriter(str(video.parent))
-    writer.add_event(Event(wall_time=time.time(), step=iterations, summary=Summary(value=[value])))
+    frames = imageio.v3.imread(video, plugin="FFMPEG")[::STRIDE, ::2, ::2]
+    duration = 1000.0 * STRIDE / imageio.v3.immeta(video, plugin="FFMPEG")["fps"]  # of a frame of the gif [ms]
+    gif = imageio.v3.imwrite("<bytes>", frames, extension=".gif", duration=duration, loop=0)
+    size = {"height": frames.shape[1], "width": frames.shape[2], "colorspace": 3}
+    value = Summary.Value(tag="video", image=Summary.Image(**size, encoded_image_string=gif))
+    writer = FileWriter(str(video.parent))
+    writer.add_summary(Summary(value=[value]), iterations)
     writer.close()
 
 

@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import html
+import tempfile
 import threading
 import time
 import traceback
 from collections.abc import Callable
+from pathlib import Path
 
+import viser
+
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.viewer.access import Guard, GuardedServer
 from legged_torque.viewer.controls import Controls
-from legged_torque.viewer.ground import Ground, drawn_task
+from legged_torque.viewer.ground import Ground
+from legged_torque.viewer.mujoco_scene import Drawing
 from legged_torque.viewer.plots import WIDTH, Plots
 from legged_torque.viewer.ports import free_port
-from legged_torque.viewer.poses import commanded_pose
-from legged_torque.viewer.recording import Recording, notify
 from legged_torque.viewer.scene import Scene
 from legged_torque.viewer.session import Session
+from legged_torque.viewer.video import Moment, VideoRecorder
 
 FRAME_INTERVAL = 1.0 / 30.0  # seconds between drawings of the robots
 PLOT_INTERVAL = 0.2  # seconds between drawings of the plots and the status
-RED, COLOR = "#e03131", (47, 125, 246)  # of errors, of controls
+COLOR = (47, 125, 246)  # of controls
+NOTICE_SECONDS = 10.0  # for which notifications are shown
+MAX_SECONDS = 60.0  # of a video
+RECORD, STOP = "Record", "Stop and download"  # labels of the button
 
 
 class Page:
@@ -37,16 +45,18 @@ class Page:
 
     def __init__(self, session: Session, title: str, host: str, port: int, no_renderer: str | None = None) -> None:
         """Serve the page at a port or the next free one; ``no_renderer`` is a reason why no videos can be drawn."""
-        self._session, self.guard = session, Guard(host)
+        self._session, self._no_renderer, self.guard = session, no_renderer, Guard(host)
         self.server = GuardedServer(self.guard, host, free_port(host, port), title)
-        gui, task, companion = self.server.gui, session.task, session.companion
+        gui, drawing = self.server.gui, Drawing.of_task(session.task)
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=COLOR)
-        model, self._ground = drawn_task(task)
-        names = (session.name, companion.name) if companion else ()
-        self._scene = Scene(self.server, model, task.num_envs, task.asset.geom_names, self._ground, names)
-        self.controls = Controls(gui, session, self._scene.view, self._ground)
+        self._ground = drawing.ground
+        self._scene = Scene(self.server, session, drawing)
+        self.controls = Controls(gui, session, drawing.ground)
         self._plots = Plots(gui, session)
-        self._recording = Recording(self.server, session, no_renderer)
+        self._recorder: VideoRecorder | None = None
+        hint = f"up to {MAX_SECONDS:.0f} s of the followed robot"
+        self._record = gui.add_button(RECORD, icon=viser.Icon.VIDEO, hint=hint)
+        self._record.on_click(lambda event: self._start_or_end_recording())
         gui.main_panel.dock_right()
         gui.main_panel.set_width(WIDTH)
         self._errors: dict[str, str] = {}  # of the last drawing, by part of the page
@@ -72,8 +82,8 @@ class Page:
         """Draw until closed; plots, controls and status less often than the robots."""
         next_plots = 0.0
         while not self._closed.wait(FRAME_INTERVAL):
-            self._attempt("scene", self._draw_scene)
-            self._attempt("recording", self._recording.update)
+            self._attempt("scene", lambda: self._scene.update(self.controls.drawn()))
+            self._attempt("recording", self._record_steps)
             if time.perf_counter() >= next_plots:
                 next_plots = time.perf_counter() + PLOT_INTERVAL
                 with self.server.atomic():
@@ -92,26 +102,63 @@ class Page:
                 self._errors[part] = text
                 traceback.print_exc()
 
-    def _draw_scene(self) -> None:
-        """Draw the robots."""
-        session, snapshot = self._session, self._session.snapshot
-        if snapshot:
-            companion = session.companion.snapshot if session.companion else None
-            ghost = commanded_pose(list(session.history) or [snapshot], session.task.dt)
-            self._scene.update(snapshot, session.world, ghost, companion.qpos[0] if companion else None)
-
     def _draw_status(self) -> None:
         """Write the status, and show a new error of the session as a notification, too."""
         message = self._session.message
         self.controls.status.content = status_html(self._session, self._ground, list(self._errors.values()))
         if message.is_error and message is not self._message_shown:
-            notify(self.server, "That did not work", message.text)
+            self._notify("That did not work", message.text)
         self._message_shown = message
+
+    def _notify(self, title: str, text: str) -> None:
+        """Show an error in all browsers."""
+        for client in self.server.get_clients().values():
+            client.add_notification(title, text, color="red", auto_close_seconds=NOTICE_SECONDS)
+
+    # ---- videos of the followed robot --------------------------------------------------------------------------------
+
+    def _start_or_end_recording(self) -> None:
+        """Start, or end and draw in a thread of its own."""
+        if self._recorder:
+            recorder, self._recorder = self._recorder, None
+            threading.Thread(target=self._send_video, args=(recorder,), name="recording", daemon=True).start()
+        else:
+            self._recorded = self._session.sim_time  # time of the last step that has been recorded [s]
+            self._recorder = VideoRecorder(Drawing.of_task(self._session.task), self._session.task.dt)
+            self._record.label = STOP
+
+    def _record_steps(self) -> None:
+        """Record the new steps of the session."""
+        recorder = self._recorder
+        if recorder:
+            for one in (one for one in list(self._session.history) if one.time > self._recorded):
+                recorder.steps.append([Moment(one.qpos[one.world], one.commands[one.world], one.velocities[one.world])])
+                self._recorded = one.time
+            if len(recorder.steps) * self._session.task.dt > MAX_SECONDS:
+                self._start_or_end_recording()
+
+    def _send_video(self, recorder: VideoRecorder) -> None:
+        """Draw a video and send it to the browsers, or show why there is none."""
+        self._record.disabled = True
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / "walking.mp4"
+                recorder.write(file, self._no_renderer, self._show_progress)
+                self.server.send_file_download(file.name, file.read_bytes(), save_immediately=True)
+        except Exception as error:  # the page goes on
+            reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+            self._notify("There is no video", reason)
+        finally:
+            self._record.label, self._record.disabled = RECORD, False
+
+    def _show_progress(self, frame: int, total: int) -> None:
+        """Show in the button how many frames have been drawn."""
+        self._record.label = f"Drawing frame {frame} of {total}"
 
 
 def status_html(session: Session, ground: Ground | None, errors: list[str]) -> str:
     """Return the status line by line: checkpoint, time, companion, tile on rough ground, errors, last message."""
-    running = "paused" if session.is_paused else f"{session.real_time:.2f} x real time"
+    running = "paused" if session.is_paused else f"{session.pacer.rate:.2f} x real time"
     lines = [
         f"<b>model_{session.checkpoint}</b>, after {session.trained_steps / 1e6:,.1f} million steps",
         f"{session.sim_time:.1f} s simulated, {running}, {session.falls} falls",
@@ -120,10 +167,10 @@ def status_html(session: Session, ground: Ground | None, errors: list[str]) -> s
         lines.append(f"companion: <b>{html.escape(other.name)}</b>, model_{other.checkpoint}, {other.falls} falls")
     if ground and session.snapshot and session.snapshot.tile:
         lines.append(ground.tile_text(*session.snapshot.tile))
-    lines += [f'<span style="color:{RED}">{html.escape(error)}</span>' for error in errors]
-    color = RED if session.message.is_error else "inherit"
-    lines.append(f'<span style="color:{color}">{html.escape(session.message.text) or "&nbsp;"}</span>')
-    return f'<div style="font-size:13px;line-height:1.5;padding:4px 12px">{"<br>".join(lines)}</div>'
+    lines += [f'<span class="lt-error">{html.escape(error)}</span>' for error in errors]
+    kind = "lt-error" if session.message.is_error else ""
+    lines.append(f'<span class="{kind}">{html.escape(session.message.text) or "&nbsp;"}</span>')
+    return f'<div class="lt-status">{"<br>".join(lines)}</div>'
 
 
 def watch(session: Session, title: str, host: str, port: int, no_renderer: str | None = None) -> None:

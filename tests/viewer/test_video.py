@@ -17,7 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from legged_torque.utils.errors import UserError
 from legged_torque.viewer import video
-from legged_torque.viewer.mujoco_scene import add_velocities
+from legged_torque.viewer.mujoco_scene import Drawing
 from legged_torque.viewer.video import Moment, TaskRecorder, VideoRecorder, add_text
 
 XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
@@ -30,12 +30,13 @@ reason = choose_offscreen_renderer()
 if reason:
     sys.exit("no renderer: " + reason)
 import mujoco, numpy as np
+from legged_torque.viewer.mujoco_scene import Drawing
 from legged_torque.viewer.video import Moment, VideoRecorder
 model = mujoco.MjModel.from_xml_path(sys.argv[1])
 qpos = model.key_qpos[0] if model.nkey else model.qpos0
-recorder, frames = VideoRecorder(model, 1, 0.02), []
+recorder, frames = VideoRecorder(Drawing(model), 0.02), []
 recorder.steps = 5 * [[Moment(qpos, np.array([0.5, i, 0.0]), np.zeros(3)) for i in range(int(sys.argv[3]))]]
-recorder.write(Path(sys.argv[2]), lambda *frame: frames.append(frame))
+recorder.write(Path(sys.argv[2]), None, lambda *frame: frames.append(frame))
 assert frames == [(1, 3), (2, 3), (3, 3)], frames
 """
 
@@ -104,7 +105,7 @@ def test_recorded_worlds(make_task):
             recorder.add_step()
         task.commands[:, 0] = 0.2  # the robot of the video stays the same
     for recorder, worlds in ((one, [3]), (four, [0, 1, 2, 3])):
-        assert recorder.model.body(recorder.trunk).name == "trunk"
+        assert recorder.drawing.model.body(recorder.drawing.trunk).name == "trunk"
         for number, moments in enumerate(recorder.steps):
             assert len(moments) == len(worlds)
             for world, kept in zip(worlds, moments, strict=True):
@@ -118,11 +119,10 @@ def test_arrows_of_velocities():
     """Commanded and actual velocity of a trunk that is turned to the left by a quarter; 0 has none."""
     body = "<body pos='0 0 1'><freejoint/><geom size='0.1'/></body>"
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
-    data, scene = mujoco.MjData(model), mujoco.MjvScene(model, 10)
-    data.qpos[3:] = np.sqrt([0.5, 0.0, 0.0, 0.5])
-    mujoco.mj_forward(model, data)
-    add_velocities(scene, data, 1, np.array([1.0, 0.0, 0.3]), np.array([0.0, 0.5, 0.0]), 1.0)
-    add_velocities(scene, data, 1, np.zeros(3), np.zeros(3), 1.0)
+    drawing, scene = Drawing(model), mujoco.MjvScene(model, 10)
+    drawing.move(np.array([0.0, 0.0, 1.0, *np.sqrt([0.5, 0.0, 0.0, 0.5])]))
+    drawing.add_velocities(scene, np.array([1.0, 0.0, 0.3]), np.array([0.0, 0.5, 0.0]))
+    drawing.add_velocities(scene, np.zeros(3), np.zeros(3))
     ways = [geom.mat[:, 2] for geom in scene.geoms[: scene.ngeom]]
     np.testing.assert_allclose(ways, [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]], atol=1e-6)
     assert scene.geoms[0].size[2] == pytest.approx(2.0 * scene.geoms[1].size[2])
@@ -131,8 +131,10 @@ def test_arrows_of_velocities():
 def test_missing_extra(monkeypatch, tmp_path):
     """Without an encoder the extra is named."""
     monkeypatch.setitem(sys.modules, "imageio", None)
+    recorder = VideoRecorder(None, 0.02)
+    recorder.steps = [[moment()]]
     with pytest.raises(UserError, match=r"videos need the extra: pip install 'legged_torque\[video\]'"):
-        VideoRecorder(None, 1, 0.02).write(tmp_path / "out.mp4")
+        recorder.write(tmp_path / "out.mp4", None)
 
 
 def test_videos_in_tensorboard(tmp_path):
