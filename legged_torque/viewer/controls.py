@@ -12,7 +12,7 @@ import viser
 from viser._messages import RunJavascriptMessage
 
 from legged_torque.viewer.ground import Ground
-from legged_torque.viewer.session import FASTEST, SLOWEST, Command, Session
+from legged_torque.viewer.session import AS_LOADED, FASTEST, SLOWEST, Command, Session
 
 PUSHES = {"from behind": 0.0, "from the right": 90.0, "from the front": 180.0, "from the left": -90.0}
 """Directions of pushes from the robot's heading to its left [degrees]."""
@@ -62,7 +62,7 @@ class Controls:
             with gui.add_folder("Mixing weights"):
                 automatic = gui.add_checkbox("as in training", True, hint="the weights at this point of the training")
                 sliders = [gui.add_slider(name.replace("_", " "), 0.0, 1.0, STEP, 0.0) for name in session.mixing]
-                values = (lambda: list(session.mixing.values()), automatic, lambda: not session.is_mixing_set)
+                values = (lambda: list(session.mixing.values()), automatic, lambda: session.chosen_mixing is None)
                 self._bind_sliders(sliders, *values, session.set_mixing)
         if ground:
             with gui.add_folder("Tile"):
@@ -133,7 +133,7 @@ class Controls:
         if session.companion:
             self._add_checkpoint("companion", session.companion)
         hint = "random parameters, pushes and noise; rebuilds the worlds"
-        perturbation = gui.add_dropdown("perturbation", tuple(session.perturbations()), hint=hint)
+        perturbation = gui.add_dropdown("perturbation", (AS_LOADED, *session.task.cfg.perturbations()), hint=hint)
         self._bind(perturbation, lambda: session.perturbation, session.set_perturbation)
 
     def _add_checkpoint(self, label: str, session: Session) -> None:

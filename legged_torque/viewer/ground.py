@@ -40,30 +40,34 @@ class Ground:
         self.layout = layout
         self._heights, self._scale = grid.heights, grid.horizontal_scale
         self._corner, size = np.array(grid.corner), np.array(grid.size)
-        first_x, last_x, first_y, last_y = patches(self._heights).T
-        rows, cols = np.stack([first_x, last_x, last_x, first_x]), np.stack([first_y, first_y, last_y, last_y])
+        rectangles = patches(self._heights)
+        rows, cols = rectangles[:, [0, 1, 1, 0]], rectangles[:, [2, 2, 3, 3]]
         samples, corners = np.unique(rows * self._heights.shape[1] + cols, return_inverse=True)
         places = np.stack(np.unravel_index(samples, self._heights.shape), axis=1) * self._scale
         self.vertices = np.column_stack([places + self._corner, self._heights.flat[samples]]).astype(np.float32)
         self.uv = (places / size).astype(np.float32)
-        triangles = corners.reshape(rows.shape)[[0, 1, 2, 0, 2, 3]]
-        self.faces = np.ascontiguousarray(triangles.T, np.int32).reshape(-1, 3)
+        self._rectangles = corners.reshape(rows.shape)
+        self.faces = self._rectangles[:, [0, 1, 2, 0, 2, 3]].astype(np.int32).reshape(-1, 3)
 
     def picture(self) -> np.ndarray:
         """Return a picture of the map from above, with a color per kind. Shape: (y, x of the world, 3), uint8."""
         layout = self.layout
         size = np.array(self._heights.shape) - 1
         per_metre = min(RESOLUTION, MAX_PIXELS / (size.max() * self._scale))
-        pixels = np.rint(size * self._scale * per_metre).astype(int)
-        places = [(np.arange(count) + 0.5) / per_metre - layout.border_size for count in pixels]
-        tiles = [np.floor(place / layout.tile_size).astype(int) for place in places]
-        shade_x, shade_y = (_shade(place, layout.tile_size, 1.0 / per_metre) for place in places)
+        tiles, shades = [], []
+        for cells in size:
+            pixels = np.arange(np.rint(cells * self._scale * per_metre))
+            place = (pixels + 0.5) / per_metre - layout.border_size  # from the first tile [m]
+            steps, half = (1.0, layout.tile_size), 0.5 * LINE_WIDTH / per_metre
+            is_line, is_edge = (np.abs((place + 0.5 * step) % step - 0.5 * step) < half for step in steps)
+            tiles.append(np.floor(place / layout.tile_size).astype(int))
+            shades.append(np.where(is_edge, 2, is_line.astype(int)))
         colors = np.array([*(color_of(kind) for kind in layout.kinds()), NEUTRAL])
         is_row = (tiles[0] >= 0) & (tiles[0] < layout.num_rows)
         is_col = (tiles[1] >= 0) & (tiles[1] < layout.num_cols)
         column = np.where(is_row & is_col[:, None], tiles[1][:, None], layout.num_cols)
-        shades = (colors[:, None] * np.array(SHADES)[:, None]).astype(np.uint8)
-        return shades[column, np.maximum(shade_x, shade_y[:, None])]
+        shaded = (colors[:, None] * np.array(SHADES)[:, None]).astype(np.uint8)
+        return shaded[column, np.maximum(shades[0], shades[1][:, None])]
 
     def tile_text(self, row: int, column: int) -> str:
         """Return the kind, level and difficulty of a tile as text."""
@@ -95,12 +99,11 @@ class Ground:
         textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ground"
         spec.add_material(name="ground", textures=textures, specular=0.05, rgba=REFLECTANCE)
         mesh = spec.add_mesh(name="ground", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-        p0, p1, p2, _, _, p3 = self.faces.reshape(-1, 6).T
-        corners = self.vertices[[p0, p1, p2, p3]].transpose(1, 0, 2)
+        corners = self.vertices[self._rectangles]
         normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
         mesh.uservert, mesh.usernormal = corners.ravel(), np.repeat(normals, 4, axis=0).ravel()  # so edges stay sharp
-        mesh.usertexcoord = self.uv[[p0, p1, p2, p3]].transpose(1, 0, 2).ravel()
-        starts = 4 * np.arange(len(p0), dtype=np.int32)[:, None]
+        mesh.usertexcoord = self.uv[self._rectangles].ravel()
+        starts = 4 * np.arange(len(corners), dtype=np.int32)[:, None]
         mesh.userface = (starts + np.array([0, 1, 2, 0, 2, 3], np.int32)).ravel()
         planes = [geom for geom in spec.worldbody.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
         floor = planes[0] if planes else spec.worldbody.add_geom()
@@ -149,10 +152,3 @@ def patches(heights: np.ndarray) -> np.ndarray:
     goes_on &= (np.abs(np.diff(rise_first)) < STRAIGHT) & (strip[1:] % MAX_CELLS != 0)
     begins, ends = np.append(True, ~goes_on), np.append(~goes_on, True)
     return np.stack([strip[begins], strip[ends] + 1, first[begins], last[begins]], axis=1)
-
-
-def _shade(places: np.ndarray, tile_size: float, pixel: float) -> np.ndarray:
-    """Return the index in :data:`SHADES` of places along an axis; distances are from the first tile [m]."""
-    half = 0.5 * LINE_WIDTH * pixel
-    is_line, is_edge = (np.abs((places + 0.5 * step) % step - 0.5 * step) < half for step in (1.0, tile_size))
-    return np.where(is_edge, 2, is_line.astype(int))

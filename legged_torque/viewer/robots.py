@@ -1,4 +1,4 @@
-"""Robots on the page: their meshes, from geoms of MuJoCo to glTF, and the contacts of one of them."""
+"""Robots on the page: their meshes, from geoms of MuJoCo, and the contacts of one of them."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ import mujoco
 import numpy as np
 import trimesh
 import viser
-from trimesh.visual import TextureVisuals
-from trimesh.visual.material import PBRMaterial
 from viser import transforms
 
-Tint = tuple[float, float, float, float]  # red, green, blue and opacity, 0 to 1
+Color = tuple[float, float, float, float]  # red, green, blue and opacity, 0 to 1
 
 SHARP_EDGE = 40.0  # smallest angle of an edge that is not smoothed [degrees]
 TINTED = 0.7  # share of a tint in the color of a part
-GAMMA = 2.2  # colors of glTF are linear
 CONTACT_COLOR = (240, 140, 0)
 FORCE_LENGTH = 0.002  # of the arrow of a force of 1 N [m]
 MIN_FORCE = 1.0  # that is drawn [N]
@@ -29,31 +26,45 @@ class Robots:
     """Drawings of equal robots. Browsers get their meshes when the first robot is drawn."""
 
     def __init__(
-        self, scene: viser.SceneApi, name: str, data: mujoco.MjData, geoms: Iterable[int], tint: Tint | None = None
+        self, scene: viser.SceneApi, name: str, data: mujoco.MjData, geoms: Iterable[int], tint: Color | None = None
     ) -> None:
         """Prepare drawings below the node ``name``, of those geoms that belong to the robot; ``data`` is changed."""
-        self._scene, self._name, self._data, self._tint = scene, name, data, tint
-        self._geoms: dict[int, list[int]] = {}
+        self._scene, self._name, self._data, self._tint, model = scene, name, data, tint, data.model
+        self._geoms: dict[tuple[int, Color], list[int]] = {}  # by body and color
         for geom in geoms:
-            if body := int(data.model.geom_bodyid[geom]):
-                self._geoms.setdefault(body, []).append(geom)
-        self._handles: dict[int, viser.BatchedGlbHandle] = {}
+            material = model.geom_matid[geom]
+            rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+            if body := int(model.geom_bodyid[geom]):
+                self._geoms.setdefault((body, tuple(rgba.tolist())), []).append(geom)
+        self._handles: list[viser.BatchedMeshHandle] = []
 
     def draw(self, qpos: np.ndarray) -> None:
         """Draw robots at some positions, or none. Shape: (robots, nq)."""
+        if len(qpos) and not self._handles:
+            self._handles = [self._add(*part, geoms) for part, geoms in self._geoms.items()]
         positions, quats = body_poses(self._data, qpos)
-        for body, geoms in self._geoms.items():
-            if body in self._handles:
-                handle = self._handles[body]
-                handle.visible = len(qpos) > 0
-                if handle.visible:
-                    handle.batched_positions, handle.batched_wxyzs = positions[:, body], quats[:, body]
-            elif len(qpos):
-                model, is_solid = self._data.model, self._tint is None or self._tint[3] == 1.0
-                shown = (f"{self._name}/{model.body(body).name}", body_glb(model, geoms, self._tint), quats[:, body])
-                self._handles[body] = self._scene.add_batched_glb(
-                    *shown, positions[:, body], lod="off", cast_shadow=is_solid
-                )
+        for (body, _), handle in zip(self._geoms, self._handles, strict=False):
+            handle.visible = len(qpos) > 0
+            if handle.visible:
+                handle.batched_positions, handle.batched_wxyzs = positions[:, body], quats[:, body]
+
+    def _add(self, body: int, color: Color, geoms: Sequence[int]) -> viser.BatchedMeshHandle:
+        """Add geoms of a body that have the same color."""
+        model, rgba = self._data.model, np.array(color)
+        if self._tint:
+            rgba = np.array([*(rgba[:3] + TINTED * (np.array(self._tint[:3]) - rgba[:3])), self._tint[3]])
+        mesh = trimesh.util.concatenate([geom_mesh(model, geom) for geom in geoms])
+        return self._scene.add_batched_meshes_simple(
+            f"{self._name}/{model.body(body).name}/{geoms[0]}",
+            mesh.vertices,
+            mesh.faces,
+            batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]),
+            batched_positions=np.zeros((1, 3)),
+            batched_colors=rgba[:3],
+            opacity=None if rgba[3] == 1.0 else rgba[3],
+            lod="off",
+            cast_shadow=rgba[3] == 1.0,
+        )
 
 
 class Contacts:
@@ -92,19 +103,6 @@ def body_poses(data: mujoco.MjData, qpos: np.ndarray) -> tuple[np.ndarray, np.nd
     return positions, quats
 
 
-def body_glb(model: mujoco.MjModel, geoms: Sequence[int], tint: Tint | None) -> bytes:
-    """Return geoms of a body in its frame as a binary glTF with one mesh per material."""
-    by_material: dict[int, list[trimesh.Trimesh]] = {}
-    for geom in geoms:
-        by_material.setdefault(int(model.geom_matid[geom]), []).append(geom_mesh(model, geom))
-    drawing = trimesh.Scene()
-    for material, meshes in by_material.items():
-        mesh = trimesh.util.concatenate(meshes)
-        mesh.visual = TextureVisuals(material=pbr_material(model, material, tint))
-        drawing.add_geometry(mesh)
-    return drawing.export(file_type="glb")
-
-
 def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     """Return a geom in its body's frame."""
     kinds, creation = mujoco.mjtGeom, trimesh.creation
@@ -127,21 +125,3 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     pose[:3, :3] = transforms.SO3(model.geom_quat[geom]).as_matrix()
     pose[:3, 3] = model.geom_pos[geom]
     return mesh.apply_transform(pose)
-
-
-def pbr_material(model: mujoco.MjModel, material: int, tint: Tint | None) -> PBRMaterial:
-    """Return a material of the model, gray for -1, or one that is tinted."""
-    if material < 0:
-        color, looks = np.array([0.5, 0.5, 0.5, 1.0]), dict[str, Any](roughnessFactor=0.7)
-    else:
-        color = model.mat_rgba[material].astype(float)
-        color[:3] **= GAMMA
-        looks = {
-            "emissiveFactor": tuple(color[:3] * model.mat_emission[material]),
-            "metallicFactor": 0.2 * float(model.mat_specular[material]),
-            "roughnessFactor": 0.9 - 0.6 * float(model.mat_shininess[material]),
-        }
-    if tint:
-        color[:3] += TINTED * (np.array(tint[:3]) ** GAMMA - color[:3])
-        color[3] = tint[3]
-    return PBRMaterial(baseColorFactor=tuple(color), alphaMode="OPAQUE" if color[3] == 1.0 else "BLEND", **looks)

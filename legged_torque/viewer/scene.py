@@ -84,7 +84,16 @@ class Scene:
         self._beside = SE3.from_translation(np.full(3, math.inf))  # how the companion's world is moved
         self._height: float | None = None  # smoothed height of the ground below the robot [m]
         self._framed: set[int] = set()  # browsers whose first view has been chosen
-        self._add_surroundings()
+        camera = server.initial_camera
+        camera.position, camera.look_at = self._distance * VIEW_FROM, self._size * VIEW_TO
+        camera.fov = FIELD_OF_VIEW
+        scene.configure_default_lights(True, cast_shadow=True)
+        scene.configure_environment_map("studio", environment_intensity=0.5)
+        self._root = scene.add_frame(ROOT, show_axes=False)
+        if self._ground:
+            scene.add_glb(f"{ROOT}/ground", ground_glb(self._ground), cast_shadow=False, receive_shadow=True)
+        else:
+            scene.add_grid(f"{ROOT}/ground", **PLANE)
         drawn = np.flatnonzero(np.isin(model.geom_group, DRAWN_GROUPS))
         colliding = np.flatnonzero((model.geom_contype | model.geom_conaffinity) != 0)
         kinds = {
@@ -101,19 +110,6 @@ class Scene:
         self._labels = [scene.add_label(f"{ROOT}/name{i}", name) for i, name in enumerate(names)]
         self._command = scene.add_arrows(f"{ROOT}/command", np.zeros((1, 2, 3)), COMMAND_COLOR, **ARROW_SHAPE)
         self._velocity = scene.add_arrows(f"{ROOT}/velocity", np.zeros((1, 2, 3)), VELOCITY_COLOR, **ARROW_SHAPE)
-
-    def _add_surroundings(self) -> None:
-        """Add ground and light, and place the camera."""
-        scene, camera = self._server.scene, self._server.initial_camera
-        self._root = scene.add_frame(ROOT, show_axes=False)
-        if self._ground:
-            scene.add_glb(f"{ROOT}/ground", ground_glb(self._ground), cast_shadow=False, receive_shadow=True)
-        else:
-            scene.add_grid(f"{ROOT}/ground", **PLANE)
-        scene.configure_default_lights(True, cast_shadow=True)
-        scene.configure_environment_map("studio", environment_intensity=0.5)
-        camera.position, camera.look_at = self._distance * VIEW_FROM, self._size * VIEW_TO
-        camera.fov = FIELD_OF_VIEW
 
     def update(self, shown: Collection[str]) -> None:
         """Draw the session's last step; ``shown`` are names of :data:`~legged_torque.viewer.controls.VIEW`."""
@@ -142,7 +138,7 @@ class Scene:
                 label.position = trunk + LABEL_HEIGHT * self._size * UP
             self._draw_arrow(self._command, own[0], snapshot.commands[world], COMMAND_HEIGHT)
             self._draw_arrow(self._velocity, own[0], snapshot.velocities[world], VELOCITY_HEIGHT)
-        self._frame_phones()
+        self._move_cameras()
 
     def _draw_arrow(self, arrow: viser.ArrowsHandle, qpos: np.ndarray, velocity: np.ndarray, height: float) -> None:
         """Draw a velocity in the trunk's frame, which begins with v_x and v_y [m/s], above a robot."""
@@ -156,25 +152,25 @@ class Scene:
         if self._ground:
             self._height = place[2] = smoothed(self._height, float(self._ground.height(trunks[0])))
         self._root.position = -place
-        if self._ground:
-            self._lift_cameras(self._ground, place)
 
-    def _lift_cameras(self, ground: Ground, place: np.ndarray) -> None:
-        """Raise cameras that do not see their target over the ground; ``place`` is at the origin. Shape: (3,)."""
-        for client in self._server.get_clients().values():
-            position, target = np.array(client.camera.position), np.array(client.camera.look_at)
-            lowest = ground.lowest_view(target + place, position + place) - place[2]
-            if target.any() and position[2] < lowest - TOLERANCE:  # a target of 0 is not the page's yet
-                position[2] += LIFTING * (lowest - position[2])
-                place_camera(client, position, target)
+    def _move_cameras(self) -> None:
+        """Let new browsers on phones see the robot above the controls, and raise cameras that do not see their target.
 
-    def _frame_phones(self) -> None:
-        """Let new browsers on phones see the robot above the controls."""
+        The ground may be between them.
+        """
+        place = -np.array(self._root.position)
         for number, client in self._server.get_clients().items():
-            if number not in self._framed and np.any(client.camera.look_at):
-                self._framed.add(number)
-                if client.camera.aspect < PHONE:
-                    place_camera(client, self._distance * PHONE_FROM, self._distance * PHONE_TO)
+            position, target = np.array(client.camera.position), np.array(client.camera.look_at)
+            if not target.any():  # this is not the page's camera yet
+                continue
+            if number not in self._framed and client.camera.aspect < PHONE:
+                place_camera(client, self._distance * PHONE_FROM, self._distance * PHONE_TO)
+            elif self._ground:
+                lowest = self._ground.lowest_view(target + place, position + place) - place[2]
+                if position[2] < lowest - TOLERANCE:
+                    position[2] += LIFTING * (lowest - position[2])
+                    place_camera(client, position, target)
+            self._framed.add(number)
 
 
 def place_camera(client: viser.ClientHandle, position: np.ndarray, target: np.ndarray) -> None:

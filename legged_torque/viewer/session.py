@@ -75,7 +75,7 @@ class Session:
     falls = 0  # in all worlds since the task was built
     command: Command | None = None  # of all worlds; None if commands are drawn as in training
     perturbation = AS_LOADED
-    is_mixing_set = False  # whether a user has set them
+    chosen_mixing: Sequence[float] | None = None  # weights of action terms that a user has set
     checkpoint = 0  # iterations of the loaded checkpoint
     trained_steps = 0  # its environment steps
     checkpoints: tuple[int, ...] = ()  # all of the run
@@ -111,10 +111,6 @@ class Session:
     def stop(self) -> None:
         """Let :meth:`run` return after the current step; may be called from any thread."""
         self._stop.set()
-
-    def perturbations(self) -> list[str]:
-        """Return the names that :meth:`set_perturbation` accepts."""
-        return [AS_LOADED, *self._run.env_cfg.perturbations()]
 
     # ---- the stepping thread -----------------------------------------------------------------------------------------
 
@@ -184,9 +180,9 @@ class Session:
         """Set the chosen weights, or those of the curriculum. They stay, since only rollouts change them."""
         self.task.update_curriculum()
         weights = weighted_terms(self.task)
-        if self.is_mixing_set:
-            for name, weight in weights.items():
-                weight.fill_(self.mixing[name])
+        if self.chosen_mixing is not None:
+            for weight, chosen in zip(weights.values(), self.chosen_mixing, strict=True):
+                weight.fill_(chosen)
         self.mixing = {name: weight.item() for name, weight in weights.items()}
 
     # ---- requests ----------------------------------------------------------------------------------------------------
@@ -254,9 +250,7 @@ class Session:
     def set_mixing(self, weights: Sequence[float] | None) -> None:
         """Set the weights in :attr:`mixing`, in their order; None sets them as in training."""
         check_numbers("a weight", *(weights or ()))
-        self.is_mixing_set = weights is not None
-        if weights is not None:
-            self.mixing = dict(zip(self.mixing, weights, strict=True))
+        self.chosen_mixing = weights
         self._apply_mixing()
 
     @request

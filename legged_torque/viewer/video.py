@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,15 +31,9 @@ TEXT_COLORS = {"plain": (255, 255, 255), "command": (110, 240, 130), "velocity":
 BOX_COLOR = (20, 24, 30, 190)
 
 Row = tuple[str, list[str]]  # a row of text: a key of TEXT_COLORS, and words
-
-
-@dataclass
-class Moment:
-    """One robot after a control step; command and velocity are v_x, v_y [m/s] and yaw rate [rad/s]."""
-
-    qpos: np.ndarray  # positions of the MJCF's joints
-    command: np.ndarray  # (3,)
-    velocity: np.ndarray  # of the trunk, in its own frame; (3,)
+Step = Sequence[np.ndarray]
+"""Robots after a control step: positions of the joints, (robots, nq); v_x, v_y [m/s] and yaw rate [rad/s] as commanded,
+(robots, 3), and of the trunk in its own frame, (robots, 3)."""
 
 
 class VideoRecorder:
@@ -57,7 +50,7 @@ class VideoRecorder:
     def __init__(self, drawing: Drawing, control_step: float) -> None:
         """Start without steps, which last ``control_step`` [s]."""
         self.drawing, self._control_step = drawing, control_step
-        self.steps: list[list[Moment]] = []
+        self.steps: list[Step] = []
 
     def save(self, file: Path, no_renderer: str | None) -> bool:
         """Write the video and print its place, or print why there is none; ``no_renderer`` is one such reason.
@@ -87,7 +80,7 @@ class VideoRecorder:
             import PIL  # noqa: F401
         except ImportError:
             raise UserError("videos need the extra: pip install 'legged_torque[video]'") from None
-        side = math.isqrt(len(self.steps[0]))
+        side = math.isqrt(len(self.steps[0][0]))
         width, height = SIZE if side == 1 else (length // side // 2 * 2 for length in GRID_SIZE)  # even, for mp4
         drawing, model = self.drawing, self.drawing.model
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
@@ -95,30 +88,26 @@ class VideoRecorder:
             renderer = mujoco.Renderer(model, height, width)
         except Exception as error:  # whatever the graphics driver raises
             raise UserError(f"the renderer does not start: {error} ({INSTALL_HINT})") from None
-        cameras = [Camera(drawing.ground, drawing.size) for _ in self.steps[0]]
+        cameras = [Camera(drawing.ground, drawing.size) for _ in range(side**2)]
         shown = list(enumerate(self.steps, start=1))[::STRIDE]
         with tempfile.TemporaryDirectory() as folder:
             part = Path(folder) / file.name
             writer = imageio.get_writer(part, fps=round(1.0 / STRIDE / self._control_step), macro_block_size=1)
             with renderer, writer, Counter("rendering, frame", len(shown)) as counter:
-                for frame, (number, moments) in enumerate(shown, start=1):
+                for frame, (number, step) in enumerate(shown, start=1):
                     tiles = []
-                    for moment, camera in zip(moments, cameras, strict=True):
-                        image = self._draw(renderer, moment, camera)
-                        rows = speed_rows(moment) if side > 1 else velocity_rows(number * self._control_step, moment)
-                        tiles.append(add_text(image, rows))
+                    for camera, qpos, *vectors in zip(cameras, *step, strict=True):
+                        drawing.move(qpos)
+                        renderer.update_scene(drawing.data, camera.look_at(drawing.data.xpos[drawing.trunk]))
+                        drawing.add_velocities(renderer.scene, *vectors)
+                        rows = (
+                            speed_rows(*vectors) if side > 1 else velocity_rows(number * self._control_step, *vectors)
+                        )
+                        tiles.append(add_text(renderer.render(), rows))
                     writer.append_data(np.vstack([np.hstack(tiles[i : i + side]) for i in range(0, len(tiles), side)]))
                     counter.add()
                     on_frame(frame, len(shown))
             write_whole(file, part.read_bytes())
-
-    def _draw(self, renderer: mujoco.Renderer, moment: Moment, camera: Camera) -> np.ndarray:
-        """Return the image of a robot and the arrows of its velocities. Shape: (height, width, 3)."""
-        drawing = self.drawing
-        drawing.move(moment.qpos)
-        renderer.update_scene(drawing.data, camera.look_at(drawing.data.xpos[drawing.trunk]))
-        drawing.add_velocities(renderer.scene, moment.command, moment.velocity)
-        return renderer.render()
 
 
 class SimulationRecorder(VideoRecorder):
@@ -138,7 +127,7 @@ class SimulationRecorder(VideoRecorder):
     def add_step(self) -> None:
         """Record the state after a control step."""
         simulation, robot = self._simulation, self._simulation.robot
-        self.steps.append([Moment(robot.data.qpos.copy(), simulation.command.copy(), robot.planar_velocity())])
+        self.steps.append([np.array([row]) for row in (robot.data.qpos, simulation.command, robot.planar_velocity())])
 
 
 class TaskRecorder(VideoRecorder):
@@ -155,8 +144,7 @@ class TaskRecorder(VideoRecorder):
         task = self._task
         self._worlds = self._worlds or [int(task.commands[:, :2].norm(dim=1).argmax())]
         tensors = (task.sim.qpos, task.commands, task.state.planar_velocity())
-        parts = [tensor[self._worlds].double().cpu().numpy() for tensor in tensors]
-        self.steps.append([Moment(*moment) for moment in zip(*parts, strict=True)])
+        self.steps.append([tensor[self._worlds].double().cpu().numpy() for tensor in tensors])
 
 
 def show_in_tensorboard(video: Path, iterations: int) -> None:
@@ -175,22 +163,23 @@ def show_in_tensorboard(video: Path, iterations: int) -> None:
     writer.close()
 
 
-def velocity_rows(time: float, moment: Moment) -> list[Row]:
+def velocity_rows(time: float, command: np.ndarray, velocity: np.ndarray) -> list[Row]:
     """Return the text of a single robot: time [s], command, velocity."""
-    vectors = (moment.command, moment.velocity)
-    command, velocity = ([f"{round(float(value), 2) + 0.0:+.2f}" for value in vector] for vector in vectors)  # no -0.00
+    wanted, actual = (
+        [f"{round(float(value), 2) + 0.0:+.2f}" for value in row] for row in (command, velocity)
+    )  # no -0.00
     return [
         ("plain", [f"{time:.2f} s", "v_x", "v_y", "yaw"]),
-        ("command", ["command", *command]),
-        ("velocity", ["actual", *velocity]),
+        ("command", ["command", *wanted]),
+        ("velocity", ["actual", *actual]),
         ("plain", ["", "m/s", "m/s", "rad/s"]),
     ]
 
 
-def speed_rows(moment: Moment) -> list[Row]:
+def speed_rows(command: np.ndarray, velocity: np.ndarray) -> list[Row]:
     """Return the short text of a tile: horizontal speeds, commanded and actual."""
-    command, actual = (f"{np.linalg.norm(vector[:2]):.2f} m/s" for vector in (moment.command, moment.velocity))
-    return [("command", ["command", command]), ("velocity", ["actual", actual])]
+    wanted, actual = (f"{np.linalg.norm(vector[:2]):.2f} m/s" for vector in (command, velocity))
+    return [("command", ["command", wanted]), ("velocity", ["actual", actual])]
 
 
 def add_text(image: np.ndarray, rows: list[Row]) -> np.ndarray:

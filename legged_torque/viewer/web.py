@@ -14,15 +14,13 @@ import viser
 
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
-from legged_torque.viewer.access import Guard, GuardedServer
+from legged_torque.viewer.access import GuardedServer
 from legged_torque.viewer.controls import Controls
-from legged_torque.viewer.ground import Ground
 from legged_torque.viewer.mujoco_scene import Drawing
 from legged_torque.viewer.plots import WIDTH, Plots
-from legged_torque.viewer.ports import free_port
 from legged_torque.viewer.scene import Scene
 from legged_torque.viewer.session import Session
-from legged_torque.viewer.video import Moment, VideoRecorder
+from legged_torque.viewer.video import VideoRecorder
 
 FRAME_INTERVAL = 1.0 / 30.0  # seconds between drawings of the robots
 PLOT_INTERVAL = 0.2  # seconds between drawings of the plots and the status
@@ -38,15 +36,14 @@ class Page:
     If drawing fails, the error is shown on the page, and everything else goes on.
 
     Attributes:
-        guard: Decides who may use the page.
-        server: Of viser.
+        server: Of viser, at its address ``url``.
         controls: The right panel.
     """
 
     def __init__(self, session: Session, title: str, host: str, port: int, no_renderer: str | None = None) -> None:
         """Serve the page at a port or the next free one; ``no_renderer`` is a reason why no videos can be drawn."""
-        self._session, self._no_renderer, self.guard = session, no_renderer, Guard(host)
-        self.server = GuardedServer(self.guard, host, free_port(host, port), title)
+        self._session, self._no_renderer = session, no_renderer
+        self.server = GuardedServer(host, port, title)
         gui, drawing = self.server.gui, Drawing.of_task(session.task)
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=COLOR)
         self._ground = drawing.ground
@@ -64,13 +61,6 @@ class Page:
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
         self._thread.start()
-
-    @property
-    def url(self) -> str:
-        """Address of the page for a browser on this machine, with the token if one is needed."""
-        host, token = self.server.get_host(), self.guard.token
-        address = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{self.server.get_port()}"
-        return f"{address}/?token={token}" if token else address
 
     def close(self) -> None:
         """Stop drawing and serving."""
@@ -103,9 +93,22 @@ class Page:
                 traceback.print_exc()
 
     def _draw_status(self) -> None:
-        """Write the status, and show a new error of the session as a notification, too."""
-        message = self._session.message
-        self.controls.status.content = status_html(self._session, self._ground, list(self._errors.values()))
+        """Write checkpoint, time, companion, tile on rough ground, errors and message; notify of a new error."""
+        session, message = self._session, self._session.message
+        running = "paused" if session.is_paused else f"{session.pacer.rate:.2f} x real time"
+        lines = [
+            f"<b>model_{session.checkpoint}</b>, after {session.trained_steps / 1e6:,.1f} million steps",
+            f"{session.sim_time:.1f} s simulated, {running}, {session.falls} falls",
+        ]
+        if other := session.companion:
+            lines.append(f"companion: <b>{html.escape(other.name)}</b>, model_{other.checkpoint}, {other.falls} falls")
+        if self._ground and session.snapshot and session.snapshot.tile:
+            lines.append(self._ground.tile_text(*session.snapshot.tile))
+        texts = [*((error, True) for error in self._errors.values()), (message.text, message.is_error)]
+        lines += [
+            f'<span class="{"lt-error" * is_error}">{html.escape(text) or "&nbsp;"}</span>' for text, is_error in texts
+        ]
+        self.controls.status.content = f'<div class="lt-status">{"<br>".join(lines)}</div>'
         if message.is_error and message is not self._message_shown:
             self._notify("That did not work", message.text)
         self._message_shown = message
@@ -132,18 +135,22 @@ class Page:
         recorder = self._recorder
         if recorder:
             for one in (one for one in list(self._session.history) if one.time > self._recorded):
-                recorder.steps.append([Moment(one.qpos[one.world], one.commands[one.world], one.velocities[one.world])])
+                recorder.steps.append((one.qpos[[one.world]], one.commands[[one.world]], one.velocities[[one.world]]))
                 self._recorded = one.time
             if len(recorder.steps) * self._session.task.dt > MAX_SECONDS:
                 self._start_or_end_recording()
 
     def _send_video(self, recorder: VideoRecorder) -> None:
         """Draw a video and send it to the browsers, or show why there is none."""
+
+        def show_progress(frame: int, total: int) -> None:
+            self._record.label = f"Drawing frame {frame} of {total}"
+
         self._record.disabled = True
         try:
             with tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / "walking.mp4"
-                recorder.write(file, self._no_renderer, self._show_progress)
+                recorder.write(file, self._no_renderer, show_progress)
                 self.server.send_file_download(file.name, file.read_bytes(), save_immediately=True)
         except Exception as error:  # the page goes on
             reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
@@ -151,36 +158,15 @@ class Page:
         finally:
             self._record.label, self._record.disabled = RECORD, False
 
-    def _show_progress(self, frame: int, total: int) -> None:
-        """Show in the button how many frames have been drawn."""
-        self._record.label = f"Drawing frame {frame} of {total}"
-
-
-def status_html(session: Session, ground: Ground | None, errors: list[str]) -> str:
-    """Return the status line by line: checkpoint, time, companion, tile on rough ground, errors, last message."""
-    running = "paused" if session.is_paused else f"{session.pacer.rate:.2f} x real time"
-    lines = [
-        f"<b>model_{session.checkpoint}</b>, after {session.trained_steps / 1e6:,.1f} million steps",
-        f"{session.sim_time:.1f} s simulated, {running}, {session.falls} falls",
-    ]
-    if other := session.companion:
-        lines.append(f"companion: <b>{html.escape(other.name)}</b>, model_{other.checkpoint}, {other.falls} falls")
-    if ground and session.snapshot and session.snapshot.tile:
-        lines.append(ground.tile_text(*session.snapshot.tile))
-    lines += [f'<span class="lt-error">{html.escape(error)}</span>' for error in errors]
-    kind = "lt-error" if session.message.is_error else ""
-    lines.append(f'<span class="{kind}">{html.escape(session.message.text) or "&nbsp;"}</span>')
-    return f'<div class="lt-status">{"<br>".join(lines)}</div>'
-
 
 def watch(session: Session, title: str, host: str, port: int, no_renderer: str | None = None) -> None:
     """Serve a :class:`Page` and step until Ctrl-C."""
     page = Page(session, title, host, port, no_renderer)
     if page.server.get_port() != port:
         print(f"Port {port} is taken.")
-    if page.guard.token:
+    if page.server.token:
         print("Warning: other machines reach this page, unencrypted; whoever has its address can steer the robots.")
-    print(f"See it walk: {page.url} (Ctrl-C ends)", flush=True)
+    print(f"See it walk: {page.server.url} (Ctrl-C ends)", flush=True)
     try:
         with StopRequest(lambda text: session.stop()):
             session.run()
