@@ -11,7 +11,7 @@ from typing import Any
 import viser
 from viser._messages import RunJavascriptMessage
 
-from legged_torque.viewer.ground import Ground
+from legged_torque.viewer.drawing import Ground
 from legged_torque.viewer.session import AS_LOADED, FASTEST, SLOWEST, Command, Session
 
 PUSHES = {"from behind": 0.0, "from the right": 90.0, "from the front": 180.0, "from the left": -90.0}

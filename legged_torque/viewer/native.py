@@ -18,7 +18,7 @@ import mujoco
 from legged_torque.deploy.simulation import Simulation
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
-from legged_torque.viewer.mujoco_scene import AZIMUTH, ELEVATION, Drawing
+from legged_torque.viewer.drawing import AZIMUTH, ELEVATION, Drawing
 from legged_torque.viewer.pacing import Pacer
 
 if TYPE_CHECKING:

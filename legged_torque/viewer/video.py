@@ -18,8 +18,7 @@ from legged_torque.utils.devices import INSTALL_HINT
 from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_whole
-from legged_torque.viewer.ground import Ground, drawn_model
-from legged_torque.viewer.mujoco_scene import Camera, Drawing
+from legged_torque.viewer.drawing import Camera, Drawing, Ground, drawn_model
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot

@@ -16,7 +16,7 @@ from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.viewer.access import GuardedServer
 from legged_torque.viewer.controls import Controls
-from legged_torque.viewer.mujoco_scene import Drawing
+from legged_torque.viewer.drawing import Drawing
 from legged_torque.viewer.plots import WIDTH, Plots
 from legged_torque.viewer.scene import Scene
 from legged_torque.viewer.session import Session

@@ -9,8 +9,7 @@ import torch
 from support.ground import make_ground, rays
 
 from legged_torque.terrain.colors import NEUTRAL, color_of
-from legged_torque.viewer.ground import CLEARANCE, Ground, drawn_model, patches
-from legged_torque.viewer.mujoco_scene import DISTANCE, Camera, size_of, smoothed
+from legged_torque.viewer.drawing import CLEARANCE, DISTANCE, Camera, Ground, drawn_model, patches, size_of, smoothed
 
 XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
 KINDS = {"stairs_up": 0.25, "rough_slope": 0.25, "stepping_stones": 0.25, "pits": 0.25}

@@ -14,7 +14,7 @@ from support.sessions import new_session
 from legged_torque import SCRIPTS_DIR
 from legged_torque.utils.errors import UserError
 from legged_torque.viewer import native
-from legged_torque.viewer.mujoco_scene import Drawing
+from legged_torque.viewer.drawing import Drawing
 
 
 @pytest.fixture(scope="module")

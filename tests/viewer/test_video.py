@@ -17,7 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from legged_torque.utils.errors import UserError
 from legged_torque.viewer import video
-from legged_torque.viewer.mujoco_scene import Drawing
+from legged_torque.viewer.drawing import Drawing
 from legged_torque.viewer.video import TaskRecorder, VideoRecorder, add_text
 
 XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
@@ -30,7 +30,7 @@ reason = choose_offscreen_renderer()
 if reason:
     sys.exit("no renderer: " + reason)
 import mujoco, numpy as np
-from legged_torque.viewer.mujoco_scene import Drawing
+from legged_torque.viewer.drawing import Drawing
 from legged_torque.viewer.video import VideoRecorder
 model = mujoco.MjModel.from_xml_path(sys.argv[1])
 qpos = model.key_qpos[0] if model.nkey else model.qpos0
