@@ -65,15 +65,6 @@ def test_what_is_drawn(session):
     assert rows["v_x [m/s]"].startswith("+0.50 ") and rows["model_0"].endswith(" x real time")
 
 
-def test_no_display(monkeypatch):
-    """Without a screen, the page is recommended."""
-    monkeypatch.setattr("sys.platform", "linux")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(UserError, match="needs a screen; --viewer web works without one"):
-        native.check_display("--viewer web")
-
-
 def test_missing_extra(monkeypatch):
     """Without the page's extra, one line names it."""
     monkeypatch.setenv("MUJOCO_GL", "disable")  # given back afterwards: play.py chooses another one

@@ -85,17 +85,6 @@ def test_controls_follow_the_session(page):
     wait_for(lambda: "lt-error" not in status(page))
 
 
-def test_a_control_that_a_client_has_removed(page, capsys):
-    """A forged message can do that in viser; the page goes on and says so."""
-    slider = control(page, "x [m/s]")
-    slider._impl.removed = True
-    page.session.set_command((-0.2, 0.0, 0.0))
-    wait_for(lambda: "controls: " in status(page))
-    assert moves(page)
-    slider._impl.removed = False
-    wait_for(lambda: slider.value == -0.2)
-
-
 @pytest.mark.parametrize(("host", "is_open"), [("127.0.0.1", False), ("0.0.0.0", True)])
 def test_what_is_printed(page, monkeypatch, capsys, host, is_open):
     """The address, with a token and a warning if other machines reach it."""
