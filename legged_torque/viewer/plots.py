@@ -67,8 +67,7 @@ class Plots:
         feet = np.array([one.feet for one in past[-GAIT_STEPS:]])
         self._gait.content = gait_html(self._feet, feet, GAIT_STEPS, round(GAIT_STEPS * dt, 1))
         self._bars.content = self._torque_bars(past[-1].torques, past[-1].torque_parts)
-        terms = np.mean([one.rewards for one in past[-MEAN_STEPS:]], axis=0)
-        self._rewards.content = reward_bars(dict(zip(self._terms, terms.tolist(), strict=True)))
+        self._rewards.content = self._reward_bars(np.mean([one.rewards for one in past[-MEAN_STEPS:]], axis=0))
         now, past = past[-1].time, past[len(past) % STRIDE :: STRIDE]  # always the same steps, against jitter
         time = np.array([one.time for one in past]) - now
         velocities = [[one.commands[one.world] for one in past], [one.velocities[one.world] for one in past]]
@@ -103,6 +102,14 @@ class Plots:
         weights = zip(self._parts, self._session.mixing.values(), strict=True)
         legend = legend_html((f"{name} x {weight:.2f}", color) for (name, color), weight in weights)
         return block_html(f"<b>Torques and their limits [N m]</b>{legend}", rows)
+
+    def _reward_bars(self, rewards: np.ndarray) -> str:
+        """Return weighted reward terms as bars, rewards in green and penalties in red. Shape: (terms,)."""
+        largest, rows = max(np.abs(rewards).max(initial=0.0), 1e-9), []
+        for name, value in zip(self._terms, rewards, strict=True):
+            color = REWARD if value > 0 else PENALTY
+            rows.append(bars_html(name.replace("_", " "), [value / largest], [color], f"{value:+.3f}", "lt-wide"))
+        return block_html(f"<b>Weighted terms [1/s]; their sum: {rewards.sum():+.3f}</b>", rows)
 
 
 def foot_labels(asset: Asset) -> list[str]:
@@ -161,16 +168,6 @@ def gait_html(names: Sequence[str], contacts: np.ndarray, steps: int, seconds: f
         path = "".join(f"M{begin} 0V1H{end}V0z" for begin, end in changes.reshape(-1, 2))
         rows.append(row_html(name, f"0 0 {steps} 1", [(path, STANCE)], f"{100 * column.mean():.0f} %"))
     return block_html(f"<b>Feet on the ground, last {seconds:g} s</b>", rows)
-
-
-def reward_bars(rewards: dict[str, float]) -> str:
-    """Return weighted reward terms as bars, rewards in green and penalties in red."""
-    largest = max(map(abs, rewards.values()), default=1.0) or 1.0
-    rows = []
-    for name, value in rewards.items():
-        color = REWARD if value > 0 else PENALTY
-        rows.append(bars_html(name.replace("_", " "), [value / largest], [color], f"{value:+.3f}", "lt-wide"))
-    return block_html(f"<b>Weighted terms [1/s]; their sum: {sum(rewards.values()):+.3f}</b>", rows)
 
 
 def legend_html(series: Series) -> str:

@@ -67,6 +67,7 @@ Color = tuple[float, float, float, float]  # red, green, blue and opacity, 0 to 
 
 SHARP_EDGE = 40.0  # smallest angle of an edge that is not smoothed [degrees]
 TINTED = 0.7  # share of a tint in the color of a part
+GAMMA = 2.2  # colors of batched meshes are linear
 CONTACT_COLOR = (240, 140, 0)
 FORCE_LENGTH = 0.002  # of the arrow of a force of 1 N [m]
 MIN_FORCE = 1.0  # that is drawn [N]
@@ -122,7 +123,7 @@ class Scene:
         self._velocity = scene.add_arrows(f"{ROOT}/velocity", np.zeros((1, 2, 3)), VELOCITY_COLOR, **ARROW_SHAPE)
 
     def update(self, shown: Collection[str]) -> None:
-        """Draw the session's last step; ``shown`` are names of :data:`~legged_torque.viewer.controls.VIEW`."""
+        """Draw the session's last step; ``shown`` are names of :data:`~legged_torque.viewer.web.VIEW`."""
         session, snapshot = self._session, self._session.snapshot
         if not snapshot:
             return
@@ -211,9 +212,10 @@ class Robots:
 
     def _add(self, body: int, color: Color, geoms: Sequence[int]) -> viser.BatchedMeshHandle:
         """Add geoms of a body that have the same color."""
-        model, rgba = self._data.model, np.array(color)
+        model, rgb, opacity = self._data.model, np.array(color[:3]) ** GAMMA, color[3]
         if self._tint:
-            rgba = np.array([*(rgba[:3] + TINTED * (np.array(self._tint[:3]) - rgba[:3])), self._tint[3]])
+            rgb += TINTED * (np.array(self._tint[:3]) ** GAMMA - rgb)
+            opacity = self._tint[3]
         mesh = trimesh.util.concatenate([geom_mesh(model, geom) for geom in geoms])
         return self._scene.add_batched_meshes_simple(
             f"{self._name}/{model.body(body).name}/{geoms[0]}",
@@ -221,10 +223,10 @@ class Robots:
             mesh.faces,
             batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]),
             batched_positions=np.zeros((1, 3)),
-            batched_colors=rgba[:3],
-            opacity=None if rgba[3] == 1.0 else rgba[3],
+            batched_colors=rgb,
+            opacity=None if opacity == 1.0 else opacity,
             lod="off",
-            cast_shadow=rgba[3] == 1.0,
+            cast_shadow=opacity == 1.0,
         )
 
 

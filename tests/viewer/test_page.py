@@ -30,7 +30,7 @@ def page(request, tmp_path_factory):
 
 def status(page):
     """What stands above the controls."""
-    return page.controls.status.content
+    return page.status.content
 
 
 def control(page, label):
