@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import tempfile
 from collections.abc import Callable, Sequence
@@ -94,14 +95,12 @@ class VideoRecorder:
             writer = imageio.get_writer(part, fps=round(1.0 / STRIDE / self._control_step), macro_block_size=1)
             with renderer, writer, Counter("rendering, frame", len(shown)) as counter:
                 for frame, (number, step) in enumerate(shown, start=1):
-                    tiles = []
+                    seconds, tiles = number * self._control_step, []
                     for camera, qpos, *vectors in zip(cameras, *step, strict=True):
                         drawing.move(qpos)
                         renderer.update_scene(drawing.data, camera.look_at(drawing.data.xpos[drawing.trunk]))
                         drawing.add_velocities(renderer.scene, *vectors)
-                        rows = (
-                            speed_rows(*vectors) if side > 1 else velocity_rows(number * self._control_step, *vectors)
-                        )
+                        rows = speed_rows(*vectors) if side > 1 else velocity_rows(seconds, *vectors)
                         tiles.append(add_text(renderer.render(), rows))
                     writer.append_data(np.vstack([np.hstack(tiles[i : i + side]) for i in range(0, len(tiles), side)]))
                     counter.add()
@@ -152,7 +151,8 @@ def show_in_tensorboard(video: Path, iterations: int) -> None:
     from tensorboard.compat.proto.summary_pb2 import Summary
     from torch.utils.tensorboard.writer import FileWriter
 
-    frames = imageio.v3.imread(video, plugin="FFMPEG")[::STRIDE, ::2, ::2]
+    shown = itertools.islice(imageio.v3.imiter(video, plugin="FFMPEG"), None, None, STRIDE)
+    frames = np.stack([frame[::2, ::2].copy() for frame in shown])
     duration = 1000.0 * STRIDE / imageio.v3.immeta(video, plugin="FFMPEG")["fps"]  # of a frame of the gif [ms]
     gif = imageio.v3.imwrite("<bytes>", frames, extension=".gif", duration=duration, loop=0)
     size = {"height": frames.shape[1], "width": frames.shape[2], "colorspace": 3}
@@ -164,9 +164,8 @@ def show_in_tensorboard(video: Path, iterations: int) -> None:
 
 def velocity_rows(time: float, command: np.ndarray, velocity: np.ndarray) -> list[Row]:
     """Return the text of a single robot: time [s], command, velocity."""
-    wanted, actual = (
-        [f"{round(float(value), 2) + 0.0:+.2f}" for value in row] for row in (command, velocity)
-    )  # no -0.00
+    rounded = (np.round(row, 2) + 0.0 for row in (command, velocity))  # no -0.00
+    wanted, actual = ([f"{value:+.2f}" for value in row] for row in rounded)
     return [
         ("plain", [f"{time:.2f} s", "v_x", "v_y", "yaw"]),
         ("command", ["command", *wanted]),
