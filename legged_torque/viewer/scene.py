@@ -92,7 +92,7 @@ class Scene:
         if not self._ground:
             side = math.ceil(task.num_envs**0.5)
             self._places[:, :2] = SPACING * np.stack(np.divmod(np.arange(task.num_envs), side), axis=1)
-        self._beside = SE3.from_translation(np.full(3, math.inf))  # how the companion's world is moved
+        self._shift = SE3.from_translation(np.full(3, math.inf))  # how the companion's world is moved
         self._height: float | None = None  # smoothed height of the ground below the robot [m]
         self._framed: set[int] = set()  # browsers whose first view has been chosen
         camera = server.initial_camera
@@ -131,8 +131,8 @@ class Scene:
         own, second, none = qpos[[world]], qpos[:0], qpos[:0]
         if session.companion and session.companion.snapshot:
             other = session.companion.snapshot.qpos[0]
-            self._beside = side_by_side(own[0], other, self._beside)
-            second = moved(other, self._beside)[None]
+            self._shift = side_by_side(own[0], other, self._shift)
+            second = moved(other, self._shift)[None]
         ghost = commanded_pose(list(session.history) or [snapshot], session.task.dt) + self._places[world]
         trunks = np.concatenate([own, second])[:, :3]
         with self._server.atomic():

@@ -139,10 +139,9 @@ class Page:
             lines.append(f"companion: <b>{html.escape(other.name)}</b>, model_{other.checkpoint}, {other.falls} falls")
         if self._ground and session.snapshot and session.snapshot.tile:
             lines.append(self._ground.tile_text(*session.snapshot.tile))
-        texts = [*((error, True) for error in self._errors.values()), (message.text, message.is_error)]
-        lines += [
-            f'<span class="{"lt-error" * is_error}">{html.escape(text) or "&nbsp;"}</span>' for text, is_error in texts
-        ]
+        lines += [f'<span class="lt-error">{html.escape(error)}</span>' for error in self._errors.values()]
+        kind = "lt-error" if message.is_error else ""
+        lines.append(f'<span class="{kind}">{html.escape(message.text) or "&nbsp;"}</span>')
         self.status.content = f'<div class="lt-status">{"<br>".join(lines)}</div>'
         if message.is_error and message is not self._message_shown:
             self._notify("That did not work", message.text)

@@ -77,7 +77,7 @@ def test_picture(terrain, ground):
 
 @pytest.mark.parametrize("azimuth", np.radians([0.0, 50.0, 90.0, 180.0, 300.0]))
 def test_camera(terrain, ground, azimuth):
-    """From anywhere in a pit or beside stones, the camera of a video sees the robot; on level ground it is as ever."""
+    """From anywhere in a pit or between stones, the camera of a video sees the robot; on level ground it is as ever."""
     for row, col in ((1, 3), (1, 2), (1, 0)):
         middle = terrain.layout.origins(terrain.map.heights)[row, col]
         position = middle + 1.7 * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
