@@ -220,8 +220,8 @@ def test_recorder(policy):
         seen.append((robot.data.qpos.tolist(), [0.5, -0.1, 0.2], velocity))
 
     simulation.run(3, 1, on_step)
-    assert recorder.model is robot.model and robot.model.body(recorder.trunk).name == "trunk"
-    assert [(m.qpos.tolist(), m.command.tolist(), m.velocity.tolist()) for (m,) in recorder.steps] == seen
+    assert recorder.drawing.model is robot.model and robot.model.body(recorder.drawing.trunk).name == "trunk"
+    assert [tuple(part[0].tolist() for part in step) for step in recorder.steps] == seen
 
 
 @pytest.mark.parametrize("factor", [None, 1.1, 1.5])

@@ -158,7 +158,10 @@ EXPORTS = {
         "timing.decimation",
     ),
     "no number": (set_entry("episode.length", float("nan")), "episode.length is not a finite number"),
-    "another folder": (set_entry("network.file", "../out/policy.onnx"), "must be the name of a file in the same folder"),
+    "another folder": (
+        set_entry("network.file", "../out/policy.onnx"),
+        "must be the name of a file in the same folder",
+    ),
     "a class": (lambda d: d.update(task={"class_name": "payload:run"}), "task"),
 }
 
