@@ -23,6 +23,7 @@ from legged_torque.deploy.description import (
     FORMAT_VERSION,
     NETWORK_FILE,
     check,
+    columns,
     interface,
     missing_extra,
     to_yaml,
@@ -264,10 +265,10 @@ def differences(task: LeggedRobot, model: MLPModel, policy: Policy) -> list[str]
         obs.append(policy.observation(state, task.commands[world].cpu().numpy()))
         torques.append(policy.torques(actions, state.joint_positions, state.joint_velocities))
     seen, expected = np.array(obs), torch.cat([task.obs_buf[name] for name in model.obs_groups], dim=1).cpu().numpy()
-    columns = task.observations.policy_columns("height_scan") if policy.scan else []
+    is_scan = np.array(columns(policy.description["observations"])) == "height_scan"
     compared = [
-        ("observations", np.delete(seen, columns, axis=1), np.delete(expected, columns, axis=1), TOLERANCE),
-        ("heights of the scan", seen[:, columns], expected[:, columns], SCAN_TOLERANCE),
+        ("observations", seen[:, ~is_scan], expected[:, ~is_scan], TOLERANCE),
+        ("heights of the scan", seen[:, is_scan], expected[:, is_scan], SCAN_TOLERANCE),
         ("torques", np.array(torques), task.torques.cpu().numpy(), TOLERANCE),
     ]
     found = [(name, _difference(ours, theirs), tolerance) for name, ours, theirs, tolerance in compared]

@@ -124,35 +124,33 @@ class Simulation:
 
     def _push(self) -> None:
         """Push the trunk: half of the pushes add to its velocity, the others set it."""
-        velocity = self.robot.velocity
-        drawn = self._rng.uniform(-self._push_velocity, self._push_velocity, 3)
+        drawn, velocity = self._rng.uniform(-self._push_velocity, self._push_velocity, 3), self.robot.velocity
         velocity[:] = velocity + drawn if self._rng.random() < PUSH_ADDED else self._push_set_factor * drawn
 
     def _new_episode(self) -> None:
         """Draw an initial state and a command, and reset the policy."""
-        rng, start, num_joints = self._rng, self._start, len(self.policy.joint_order)
-
-        def drawn(name: str, size: int) -> np.ndarray:
-            low, high = start[name]
-            return rng.uniform(low, high, size)
-
-        angles = [drawn(name, 1).item() for name in ("roll", "pitch", "yaw")]
-        pose = self.policy.nominal_pose * drawn("joint_position_scale", num_joints)
+        start, num_joints = self._start, len(self.policy.joint_order)
+        angles = [self._drawn(start[name]) for name in ("roll", "pitch", "yaw")]
+        pose = self.policy.nominal_pose * self._drawn(start["joint_position_scale"], num_joints)
         sizes = {"trunk_linear_velocity": 3, "trunk_angular_velocity": 3, "joint_velocity": num_joints}
-        velocities = tuple(drawn(name, size) for name, size in sizes.items())
+        velocities = tuple(self._drawn(start[name], size) for name, size in sizes.items())
         position = start["trunk_position"] + self._origin
         if any(start["trunk_place"]):
-            position[:2] += drawn("trunk_place", 2)
+            position[:2] += self._drawn(start["trunk_place"], 2)
         self.robot.reset(position, quaternion(*angles), pose, velocities)
         self.policy.reset()
         self._draw_command()
         self._steps, self._heights = 0, []
 
+    def _drawn(self, limits: list[float], size: int | None = None) -> Any:
+        """Return one or ``size`` numbers that are drawn uniformly from [lowest, highest]."""
+        return self._rng.uniform(limits[0], limits[1], size)
+
     def _draw_command(self) -> None:
         """Draw a command, and a heading if yaw rates follow one."""
         self.command = self._rng.uniform(*self._command_range)
         if "heading" in self._commands:
-            self._heading = self._rng.uniform(*self._commands["heading"])
+            self._heading = self._drawn(self._commands["heading"])
 
     def _follow_heading(self) -> None:
         """Command the yaw rate that turns the trunk to its heading, if there is one, as in training."""

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from legged_torque.importer.robot import FOOT, Robot
+from legged_torque.utils.mjcf import loading
 
 SCENE = """
 <mujoco>
@@ -52,8 +53,11 @@ COMMENT = """<!-- {name}: written by scripts/import_robot.py. Its geoms touch th
 DISTANCE, ELEVATION = 2.5, 1.0  # of the camera along x and -y, and over the trunk; in heights of the trunk
 
 
-def mjcf(robot: Robot) -> str:
-    """Return the text of a robot's MJCF, with the changes to its source in a comment. Numbers have six digits."""
+def mjcf(robot: Robot) -> tuple[str, mujoco.MjModel]:
+    """Return the text of a robot's MJCF, with the changes to its source in a comment, and its model.
+
+    Numbers have six digits. A UserError if MuJoCo refuses the text or warns of it.
+    """
     model, height = robot.source.model, robot.stance.height
     spec = mujoco.MjSpec.from_string(SCENE)
     spec.modelname = robot.name
@@ -82,9 +86,11 @@ def mjcf(robot: Robot) -> str:
         motor.ctrlrange = motor.forcerange = [-limit, limit]
     spec.add_key(name="home", qpos=[0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0, *robot.stance.angles])
     spec.compile()
-    notes = "\n".join(f"       - {_in_comment(note)}" for note in robot.notes)
+    notes = "\n".join(f"       - {_in_comment(note)}" for note in robot.source.notes)
     comment = COMMENT.format(name=robot.name, file=_in_comment(ascii(robot.source.file.name)), notes=notes)
-    return comment + spec.to_xml()
+    text = comment + spec.to_xml()
+    with loading(robot.source.file):
+        return text, mujoco.MjModel.from_xml_string(text)
 
 
 def _add_joint(robot: Robot, body: mujoco.MjsBody, number: int) -> None:

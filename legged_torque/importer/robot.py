@@ -13,7 +13,7 @@ from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names
 from legged_torque.importer.pose import Stance, find_stance
 from legged_torque.importer.shapes import Shape
 from legged_torque.importer.source import GRAVITY, Source, read_source
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, collect_errors
 from legged_torque.utils.mirroring import counterparts
 
 UNLIMITED = np.pi  # range of joints without one, to both sides [rad]
@@ -53,16 +53,6 @@ class Robot:
         tables = self.by_kind(self.stance.stiffness), self.by_kind(self.stance.damping)
         return np.array([[table[kind] for kind in self.kinds] for table in tables])
 
-    @property
-    def weight(self) -> float:
-        """Weight [N]."""
-        return GRAVITY * float(self.source.model.body_mass.sum())
-
-    @property
-    def notes(self) -> list[str]:
-        """Changes and reasons, a line each."""
-        return self.source.notes
-
 
 def import_robot(file: Path, name: str = "", torque_limit: float | None = None) -> Robot:
     """Read a file and derive its robot.
@@ -87,7 +77,10 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     stance = find_stance(source, legs, ranges, torques)
     joints = joint_names(source, legs, mirrored)
     prefixes = [leg.name + "_" for leg in legs]
-    symmetric = _is_symmetric(source, joints, mirrored)
+    asymmetries: list[str] = []
+    with collect_errors(asymmetries):
+        counterparts(joints, mirrored)
+    source.notes += [f"training without mirror images: {reason}" for reason in asymmetries]
     kinds = [next((j.removeprefix(p) for p in prefixes if j.startswith(p)), j) for j in joints]
     damped = source.model.dof_damping[6:]
     if (damped > MUCH_DAMPING * stance.damping).any():
@@ -97,17 +90,7 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
         )
     source.notes.append("contacts and options are those of this library's robots: friction 1, condim 3, steps of 5 ms")
     _name_shapes(source, legs, shapes)
-    return Robot(name, source, legs, shapes, joints, kinds, ranges, torques, speed, mirrored, symmetric, stance)
-
-
-def _is_symmetric(source: Source, joints: list[str], mirrored: list[list[str]]) -> bool:
-    """Return whether every joint has a counterpart, as training with mirror images needs. Adds a note if not."""
-    try:
-        counterparts(joints, mirrored)
-    except UserError as error:
-        source.notes.append(f"training without mirror images: {error}")
-        return False
-    return True
+    return Robot(name, source, legs, shapes, joints, kinds, ranges, torques, speed, mirrored, not asymmetries, stance)
 
 
 def _ranges(source: Source) -> np.ndarray:

@@ -76,7 +76,7 @@ def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
 
     ``path`` is that of its MJCF, as in ``asset.file``; ``is_fused`` says whether the fused step can simulate it.
     """
-    stance = robot.stance
+    stance, leverage = robot.stance, robot.source.weight * robot.stance.height
     return TEMPLATE.format(
         title=robot.name,
         file=ascii(robot.source.file.name),
@@ -97,7 +97,7 @@ def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
         damping=_table(robot.by_kind(stance.damping)),
         torque_scale=float(f"{TORQUE_SCALE * max(robot.torques):.2g}"),
         height=round(stance.height, 3),
-        torques=LeggedRobotCfg.rewards.scales.torques * (WEIGHT_TIMES_HEIGHT / (robot.weight * stance.height)) ** 2,
+        torques=LeggedRobotCfg.rewards.scales.torques * (WEIGHT_TIMES_HEIGHT / leverage) ** 2,
         symmetry=SYMMETRY if robot.symmetric else "",
     )
 
