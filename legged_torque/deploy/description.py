@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 from pathlib import Path
@@ -98,10 +99,9 @@ def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
 
 def _check_schema(description: Any, where: str) -> None:
     """Check structure, types and single values, also that numbers are finite."""
-    try:
-        import jsonschema
-    except ImportError:
-        raise missing_extra("jsonschema") from None
+    require("jsonschema")
+    import jsonschema
+
     draft = jsonschema.Draft202012Validator  # which would take 4.0 as an integer, and NaN as a number
     types = draft.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
     types = types.redefine("number", lambda _, value: type(value) in (int, float) and abs(value) <= LARGEST)
@@ -115,8 +115,9 @@ def _check_schema(description: Any, where: str) -> None:
         raise UserError(f"{where}: {path}: {message if len(message) < 160 else '... ' + message[-150:]}")
 
 
-def missing_extra(package: str) -> UserError:
-    """Return the error for a package that is not installed."""
-    return UserError(
-        f"{package} is not installed; exported policies need the extra: pip install 'legged_torque[export]'"
-    )
+def require(*packages: str) -> None:
+    """Raise a UserError that names the extra if a package is not installed."""
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            extra = "pip install 'legged_torque[export]'"
+            raise UserError(f"{package} is not installed; exported policies need the extra: {extra}")

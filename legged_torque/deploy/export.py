@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import importlib.util
 import os
 import tempfile
 import warnings
@@ -25,7 +24,7 @@ from legged_torque.deploy.description import (
     check,
     columns,
     interface,
-    missing_extra,
+    require,
     to_yaml,
 )
 from legged_torque.deploy.policy import Policy, State, load_network, parts_without_function
@@ -83,9 +82,7 @@ def export_policy(
     Raises:
         UserError: If the network has memory or reads other observations or images, or a package is missing.
     """
-    for package in ("onnx", "onnxruntime", "jsonschema"):
-        if importlib.util.find_spec(package) is None:
-            raise missing_extra(package)
+    require("onnx", "onnxruntime", "jsonschema")
     if model.is_recurrent:
         raise UserError("only policies without memory can be exported")
     if getattr(model, "obs_groups_2d", []):  # of rsl_rl's CNNModel

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from legged_torque.deploy.description import interface, missing_extra, read
+from legged_torque.deploy.description import interface, read, require
 from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.heading import heading
 
@@ -207,10 +207,9 @@ def parts_without_function(description: dict[str, Any]) -> list[str]:
 
 def load_network(file: Path, description: dict[str, Any]) -> Any:
     """Return an onnxruntime session on one thread; a UserError if the file is not the network of a description."""
-    try:
-        import onnxruntime
-    except ImportError:
-        raise missing_extra("onnxruntime") from None
+    require("onnxruntime")
+    import onnxruntime
+
     content, network = file.read_bytes(), description["network"]
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1

@@ -12,7 +12,7 @@ import numpy as np
 from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names, lowest_point, mirrored_legs, zero_pose
 from legged_torque.importer.pose import Stance, find_stance
 from legged_torque.importer.shapes import Shape
-from legged_torque.importer.source import GRAVITY, Source, read_source
+from legged_torque.importer.source import Source, read_source
 from legged_torque.utils.errors import UserError, collect_errors
 from legged_torque.utils.mirroring import counterparts
 
@@ -66,7 +66,9 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     source = read_source(file)
     shapes = find_shapes(source)
     legs = find_legs(source, shapes)
-    ranges = _ranges(source)
+    ranges, unlimited = source.model.jnt_range[1:].copy(), source.model.jnt_limited[1:] == 0
+    ranges[unlimited] = -UNLIMITED, UNLIMITED
+    source.note(f"without a range, +-{UNLIMITED:.2f} rad given", source.which(unlimited))
     torques = _torques(source, shapes, torque_limit)
     mirrored = mirrored_legs(source, legs)
     if torque_limit is not None:
@@ -93,17 +95,6 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     return Robot(name, source, legs, shapes, joints, kinds, ranges, torques, speed, mirrored, not asymmetries, stance)
 
 
-def _ranges(source: Source) -> np.ndarray:
-    """Return the ranges of the joints, a wide one for those without [rad]. Shape: (joints, 2). Adds a note."""
-    model = source.model
-    ranges, limited = model.jnt_range[1:].copy(), model.jnt_limited[1:].astype(bool)
-    free = [name for name, known in zip(source.joints, limited, strict=True) if not known]
-    ranges[~limited] = -UNLIMITED, UNLIMITED
-    if free:
-        source.notes.append(f"without a range, +-{UNLIMITED:.2f} rad given: {', '.join(free)}")
-    return ranges
-
-
 def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None) -> np.ndarray:
     """Return the torque limits of the joints [N m]. Shape: (joints,). Adds a note."""
     model = source.model
@@ -111,14 +102,10 @@ def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None
         return np.full(model.njnt - 1, given)
     data = zero_pose(model, source.pose)
     lowest = min(lowest_point(data, body, shape)[2] for body, found in shapes.items() for shape in found)
-    enough = float(-GRAVITY * model.body_mass.sum() * lowest)
+    enough = float(-source.weight * lowest)
     known = (source.torque_limits > 0) & (source.torque_limits < IMPLAUSIBLE * enough)
-    if not known.all():
-        names = ", ".join(name for name, is_known in zip(source.joints, known, strict=True) if not is_known)
-        source.notes.append(
-            f"no torque limit that means anything at {names}: weight x height, {enough:.1f} N m, assumed; "
-            "give --torque_limit"
-        )
+    assumed = f"weight x height, {enough:.1f} N m, is assumed; --torque_limit sets them"
+    source.note(f"no torque limits that mean anything, so {assumed}", source.which(~known))
     return np.where(known, source.torque_limits, enough)
 
 

@@ -66,11 +66,6 @@ SYMMETRY = """
 """
 
 
-def class_name(name: str) -> str:
-    """Return the prefix of the names of a robot's classes: Go2 for go2, AnymalC for anymal_c."""
-    return "".join(part.capitalize() for part in name.split("_"))
-
-
 def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
     """Return the text of the module with a robot's settings. Everything from its file is written as literals.
 
@@ -80,7 +75,7 @@ def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
     return TEMPLATE.format(
         title=robot.name,
         file=ascii(robot.source.file.name),
-        cls=class_name(robot.name),
+        cls="".join(part.capitalize() for part in robot.name.split("_")),  # AnymalC for anymal_c
         path=_literal(path),
         engine="" if is_fused else ENGINE,
         foot=FOOT,

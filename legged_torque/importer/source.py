@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,6 +49,16 @@ class Source:
     def weight(self) -> float:
         """Weight [N]."""
         return GRAVITY * float(self.model.body_mass.sum())
+
+    def note(self, reason: str, parts: Iterable[str]) -> None:
+        """Add a note on parts whose names follow the reason, if there are any."""
+        names = ", ".join(parts)
+        if names:
+            self.notes.append(f"{reason}: {names}")
+
+    def which(self, joints: np.ndarray) -> list[str]:
+        """Return the names of the joints for which an array is true. Shape: (joints,), bool."""
+        return [name for name, chosen in zip(self.joints, joints, strict=True) if chosen]
 
 
 def read_source(file: Path) -> Source:
