@@ -139,16 +139,6 @@ def test_description(exported, description):
     assert "&id" not in text and max(map(len, text.splitlines())) <= 120
 
 
-def test_torchscript_and_batches(exported):
-    """Both networks take any number of rows and agree."""
-    obs = torch.randn(5, 57, generator=torch.Generator().manual_seed(1))
-    session = Policy(exported).session
-    with torch.inference_mode():
-        expected = torch.jit.load(str(exported / "policy.pt"))(obs).numpy()
-    (actions,) = session.run(["actions"], {"obs": obs.numpy()})
-    np.testing.assert_allclose(actions, expected, atol=1e-5)
-
-
 def test_actions_that_are_not_finite(exported):
     """They are refused instead of sent, like arrays of a wrong size."""
     policy = Policy(exported)
