@@ -304,7 +304,7 @@ def test_motors_of_a_user(tmp_path):
         def apply(self, wanted, pos, vel, substep):
             return 0.5 * wanted
 
-    class WeakMotorWithWords(WeakMotor):
+    class DescribedMotor(WeakMotor):
         def describe(self):
             return {"share": 0.5}
 
@@ -312,19 +312,14 @@ def test_motors_of_a_user(tmp_path):
         def build(self, joints):
             return WeakMotor(self, joints)
 
-    class WeakCfgWithWords(MotorCfg):
+    class DescribedCfg(MotorCfg):
         def build(self, joints):
-            return WeakMotorWithWords(self, joints)
+            return DescribedMotor(self, joints)
 
     class OwnMotorsCfg(A1TorqueCfg):
         class motors:
             chain = ["ideal", "weak", "half"]
-
-            class weak(WeakCfg):
-                pass
-
-            class half(WeakCfgWithWords):
-                pass
+            weak, half = WeakCfg, DescribedCfg
 
     cfg = OwnMotorsCfg()
     cfg.env.num_envs = 3

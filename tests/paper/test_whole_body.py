@@ -121,11 +121,11 @@ def test_place_on_ground():
     place_on_ground(task, RobotDynamics(task.sim.mj_model, 64, "cpu", FEET))
     model, clearances = task.sim.mj_model, []
     data, floor = mujoco.MjData(model), model.geom("floor").id
-    for data.qpos[:] in task.sim.qpos.double().numpy():
+    parts = set(range(model.ngeom)) - {floor}
+    for qpos in task.sim.qpos.double().numpy():
+        data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
-        heights = {
-            i: mujoco.mj_geomDistance(model, data, floor, i, 1.0, None) for i in range(model.ngeom) if i != floor
-        }
+        heights = {part: mujoco.mj_geomDistance(model, data, floor, part, 1.0, None) for part in parts}
         assert min(heights.values()) > -1e-5
         clearances.append(min(heights[model.geom(foot).id] for foot in FEET))
     assert max(clearances) < 0.0201 and np.ptp(clearances) > 0.01
