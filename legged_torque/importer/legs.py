@@ -66,9 +66,9 @@ def find_shapes(source: Source) -> dict[int, list[Shape]]:
             if before:
                 replaced[f"{before} to {shape.kind}"] += 1
     changes = (f"{count} x {key}" for key, count in sorted(replaced.items()))
-    source.note("spheres, capsules and boxes in the place of other geoms", changes)
+    source.notes.on(changes, "spheres, capsules and boxes in the place of other geoms")
     bare = [body for body, found in shapes.items() if not found]
-    source.note("without collision geoms, shaped by their inertia", (model.body(body).name for body in bare))
+    source.notes.on((model.body(body).name for body in bare), "without collision geoms, shaped by their inertia")
     return shapes | {body: [fit_inertia(model, body)] for body in bare}
 
 

@@ -93,9 +93,9 @@ def _nominal_pose(source: Source, legs: list[Leg], ranges: np.ndarray) -> np.nda
             f"legs {share:.0%} stretched"
         )
         far = (f"{name} by {miss:.2f} m" for name, miss in missed.items() if miss > MISSED)
-        source.note("within the limits of joints, feet do not get there", far)
+        source.notes.on(far, "within the limits of joints, feet do not get there")
     outside = (angles < ranges[:, 0]) | (angles > ranges[:, 1])
-    source.note("the nominal pose was beyond the limits and is moved inside", source.which(outside))
+    source.notes.on(source.which(outside), "the nominal pose was beyond the limits and is moved inside")
     low, high = np.ceil(1e3 * ranges[:, 0]) / 1e3, np.floor(1e3 * ranges[:, 1]) / 1e3
     return np.clip(angles.round(3), low, high)  # rounded as in the settings, inside the limits
 

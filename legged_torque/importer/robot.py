@@ -68,7 +68,7 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     legs = find_legs(source, shapes)
     ranges, unlimited = source.model.jnt_range[1:].copy(), source.model.jnt_limited[1:] == 0
     ranges[unlimited] = -UNLIMITED, UNLIMITED
-    source.note(f"without a range, +-{UNLIMITED:.2f} rad given", source.which(unlimited))
+    source.notes.on(source.which(unlimited), f"without a range, +-{UNLIMITED:.2f} rad given")
     torques = _torques(source, shapes, torque_limit)
     mirrored = mirrored_legs(source, legs)
     if torque_limit is not None:
@@ -105,7 +105,7 @@ def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None
     enough = float(-source.weight * lowest)
     known = (source.torque_limits > 0) & (source.torque_limits < IMPLAUSIBLE * enough)
     assumed = f"weight x height, {enough:.1f} N m, is assumed; --torque_limit sets them"
-    source.note(f"no torque limits that mean anything, so {assumed}", source.which(~known))
+    source.notes.on(source.which(~known), f"no torque limits that mean anything, so {assumed}")
     return np.where(known, source.torque_limits, enough)
 
 

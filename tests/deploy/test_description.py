@@ -1,6 +1,7 @@
 """Files of an export that are damaged, changed or do not belong together are refused in one line."""
 
 import copy
+import dataclasses
 import hashlib
 import shutil
 
@@ -11,7 +12,10 @@ from support.scripts import assert_told_in_one_line, run_here
 from support.settings import error_of
 
 from legged_torque.deploy.policy import Policy
+from legged_torque.envs import LeggedRobotCfg
+from legged_torque.terrain.layout import Layout
 
+GROUND = dataclasses.asdict(Layout.of(LeggedRobotCfg.terrain()))
 DAMAGE = [
     ("format_version", 2, "format_version"),
     ("task", None, "'task' is a required property"),
@@ -39,7 +43,7 @@ DAMAGE = [
         "[57]), ('actions', [24])], not [('obs', [114])",
     ),
     ("network.sha256", 64 * "0", "is not the network that was exported with its policy.yaml"),
-    ("network.file", "../policy.onnx", "network.file must be the name of a file beside it"),
+    ("network.file", "../policy.onnx", "network.file must be the name of a file in its folder"),
     ("joints", None, "'joints' is a required property"),
     ("pushes.set_factor", -1.0, "pushes.set_factor: -1.0 is less than the minimum of 0"),
     ("timing.decimation", 0, "timing.decimation"),
@@ -47,7 +51,9 @@ DAMAGE = [
     ("timing.decimation", 5, "timing.physics_frequency is not control_frequency times decimation"),
     ("timing.refresh_torques", "often", "timing.refresh_torques"),
     ("commands.resampling_probability", 1.5, "commands.resampling_probability"),
-    ("terrain", {"rows": 3}, "terrain: "),
+    ("terrain", GROUND | {"rows": 3}, "'rows' was unexpected"),
+    ("terrain", GROUND | {"difficulty_range": [0.0, 1.5]}, "terrain.difficulty_range.1"),
+    ("terrain", GROUND | {"tile_size": 1.0}, "terrain.tile_size: 1.0 is less than the minimum of 6"),
 ]
 
 

@@ -153,7 +153,7 @@ PAIR = '<contact><pair geom1="ball" geom2="ground"/></contact><actuator>'
 FRAME = '<link name="footprint"/><joint name="f" type="fixed"><parent link="footprint"/><child link="base"/>'
 TRAPS = {
     "no gravity": (as_mjcf("").replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'), "contacts and options"),
-    "joint without motor": (as_mjcf("").replace(MOTOR, ""), "no actuator of the file drives FL_calf: given"),
+    "joint without motor": (as_mjcf("").replace(MOTOR, ""), "as every joint must have one: FL_calf"),
     "dynamics": (as_mjcf("").replace(MOTOR, FILTER), "the dynamics of actuators (filters, activations) are left out"),
     "uneven": (as_mjcf("").replace(MOTOR, FILTER), "differ by direction are the smaller of both: FL_calf"),
     "feet in pairs": (
@@ -224,7 +224,7 @@ def test_feet_below_hips(written):
             ),
             "the inertia of 'FL_calf' follows from the mesh 'gone.stl'",
         ),
-        ("<mujoco><worldbody/></mujoco>", "0 bodies with joints"),
+        ("<mujoco><worldbody/></mujoco>", "must have joints, not 0"),
         ("<mujoco", "unclosed token"),
         (urdf().replace('velocity="15"', 'velocity="fast"'), "could not convert string to float: 'fast'"),
     ],
