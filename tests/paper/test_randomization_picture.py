@@ -31,18 +31,10 @@ def test_picture(tmp_path, words):
     assert 20_000 < file.stat().st_size < 400_000
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
-        ("--perturbation=hih", "unknown perturbation 'hih'; did you mean 'high'?"),
-        ("--set=domain_rand.keep_fixed=[gravitation]", "'gravitation'; did you mean 'gravity'?"),
-    ],
-)
-def test_mistakes(tmp_path, words, message):
+def test_mistakes(tmp_path):
     """They are refused in one line, with exit status 2, and nothing is written."""
-    result, _ = plot(tmp_path, words)
-    assert_told_in_one_line(result, message)
+    result, _ = plot(tmp_path, "--set=domain_rand.keep_fixed=[gravitation]")
+    assert_told_in_one_line(result, "'gravitation'; did you mean 'gravity'?")
     assert not list(tmp_path.iterdir())
 
 
