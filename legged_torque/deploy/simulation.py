@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -55,14 +56,14 @@ class Simulation:
         self._max_steps = math.ceil(description["episode"]["length"] * self._timing["control_frequency"] - 1e-6)
         ranges = [self._commands[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")]
         self._command_range = np.array([command, command] if command else np.transpose(ranges), float)
-        self._scan_delay = policy.scan["delay"] if policy.scan else 0
+        self._heights = deque[np.ndarray](maxlen=1 + (policy.scan["delay"] if policy.scan else 0))
         self._push_set_factor, self.notes = pushes.get("set_factor", 1.0), list[str]()
         if push_probability and not pushes:
             self.notes.append(
                 "pushes: policy.yaml does not name pushes.set_factor, so 1.0 is taken; trainings have 1.1 by default"
             )
         self.command = np.zeros(3)
-        self._steps, self._heights = 0, list[np.ndarray]()
+        self._steps = 0
 
     def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:
         """Run one robot for some control steps and return sums of metrics, see ``step_sums``. Shape: (NUM_SUMS,).
@@ -93,9 +94,9 @@ class Simulation:
         """Observe, act, and apply torques in all physics steps of a control step."""
         policy, robot = self.policy, self.robot
         state = robot.state()
-        heights = robot.position[2] - robot.ground_heights(policy.scan_places(robot.position, robot.quat))
-        self._heights = [heights, *(self._heights or [heights] * self._scan_delay)][: self._scan_delay + 1]
-        state.heights = self._heights[-1]
+        places = policy.scan_places(robot.position, robot.quat)
+        self._heights.append(robot.position[2] - robot.ground_heights(places))
+        state.heights = self._heights[0]  # the oldest, of this episode
         actions = policy.act(policy.observation(state, self.command))
         for i in range(self._timing["decimation"]):
             if i == 0 or self._timing["refresh_torques"]:
@@ -124,7 +125,7 @@ class Simulation:
 
     def _push(self) -> None:
         """Push the trunk: half of the pushes add to its velocity, the others set it."""
-        drawn, velocity = self._rng.uniform(-self._push_velocity, self._push_velocity, 3), self.robot.velocity
+        velocity, drawn = self.robot.velocity, self._drawn([-self._push_velocity, self._push_velocity], 3)
         velocity[:] = velocity + drawn if self._rng.random() < PUSH_ADDED else self._push_set_factor * drawn
 
     def _new_episode(self) -> None:
@@ -140,7 +141,8 @@ class Simulation:
         self.robot.reset(position, quaternion(*angles), pose, velocities)
         self.policy.reset()
         self._draw_command()
-        self._steps, self._heights = 0, []
+        self._heights.clear()
+        self._steps = 0
 
     def _drawn(self, limits: list[float], size: int | None = None) -> Any:
         """Return one or ``size`` numbers that are drawn uniformly from [lowest, highest]."""
