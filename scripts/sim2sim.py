@@ -43,6 +43,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--video", type=Path, help="mp4 of the first robot")
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
+    cli.add_options(parser, "task_file")
     args = parser.parse_args()
     cli.check_args(args, steps=Count, robots=Count, seed=Number, command=list[float])
     cli.check_args(args, push_velocity=NotNegative, push_probability=Share)
@@ -61,6 +62,7 @@ def main() -> None:
     """Load a policy and a robot, simulate, print the metrics, and write JSON and video if asked to."""
     args = parse_args()
     no_renderer = None if args.viewer else choose_offscreen_renderer()
+    cli.options_of(args)  # imports files of tasks, which may add numpy functions of their terms
     with cli.slow_imports():
         import numpy as np
 

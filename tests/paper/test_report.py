@@ -24,7 +24,6 @@ from support.reports import (
 )
 
 from legged_torque.experiments.times import write_times
-from legged_torque.paper.report import figures
 from legged_torque.paper.report.evaluations import METRIC_NAMES
 from legged_torque.paper.report.experiment import read_experiment
 from legged_torque.paper.report.figures_curves import draw_curves, smoothed
@@ -32,15 +31,8 @@ from legged_torque.paper.report.report import fenced, markdown_table, to_html
 from legged_torque.paper.report.tables import welch
 
 EVIL = "</code></pre><script>alert(1)</script> <img src=http://evil.example/x.png> & `x` | **y** ![z](/etc/passwd)"
+pytestmark = pytest.mark.usefixtures("coarse")
 NAMES = ["Figure 3", "Figure 3 over seconds", "Figure 5a", "Figure 5b", "Figure 6", "Figure 7"]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def coarse():
-    """Figures of few pixels, which are drawn fast."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(figures.SETTINGS, "savefig.dpi", 20)
-        yield
 
 
 def rows_of(content):

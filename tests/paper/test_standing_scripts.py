@@ -7,7 +7,6 @@ import sys
 import matplotlib.image
 import pytest
 import torch
-from support.command import command, complete
 from support.gravity import TASK
 from support.gravity import made as made  # a fixture
 from support.reports import line, write_run
@@ -126,11 +125,3 @@ def test_mistakes(made, tmp_path, monkeypatch):
         result, picture = plot(figure, report, tmp_path)
         assert_told_in_one_line(result, "pip install 'legged_torque[plots]'")
         assert not picture.exists()
-
-
-def test_command(tmp_path):
-    """The console command has the figures' own help, and completes their names and options."""
-    status, output, error = command("plot", "curves", "--help")
-    assert (status, error) == (0, "") and output.startswith("usage: legged-torque plot curves ")
-    assert complete("legged-torque plot cur", tmp_path / "1") == ["curves"]
-    assert complete("legged-torque plot curves --o", tmp_path / "2") == ["--out"]
