@@ -35,10 +35,9 @@ def test_perturbations(name, velocity, probability):
     assert without.domain_rand.init_dof_vel == plain["domain_rand"]["init_dof_vel"] == [0.0, 0.0]
 
 
+CONTROL = ("motor_strength", "stiffness", "damping")
 DEFAULT = {
-    "motor_strength": {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]},
-    "stiffness": {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]},
-    "damping": {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]},
+    **dict.fromkeys(CONTROL, {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]}),
     "joint_offset": {"add": [-0.01, 0.01]},
     "ground_friction": {"set": [0.8, 1.2]},
     "contact_stiffness": {"set": [900.0, 1100.0]},
@@ -55,9 +54,7 @@ DEFAULT = {
     "keep_probability": 0.0,
 }
 HARD = {
-    "motor_strength": {"scale": [0.5, 1.5], "scale_per_joint": [0.95, 1.05]},
-    "stiffness": {"scale": [0.5, 1.5], "scale_per_joint": [0.95, 1.05]},
-    "damping": {"scale": [0.5, 1.5], "scale_per_joint": [0.95, 1.05]},
+    **dict.fromkeys(CONTROL, {"scale": [0.5, 1.5], "scale_per_joint": [0.95, 1.05]}),
     "joint_offset": {"add": [-0.05, 0.05]},
     "ground_friction": {"set": [0.001, 2.0]},
     "contact_stiffness": {"set": [500.0, 1500.0]},
@@ -149,19 +146,11 @@ def test_ranges_of_another_robot(make_task, name, limits, note):
     assert make_task("a1_position", 1, **ON, **ranges).notes == []
 
 
-@pytest.mark.parametrize("option", ["--perturbation=hih", "--ranges=defalt"])
-def test_unknown_names(option):
-    """They are told with those that there are."""
-    assert "did you mean" in error_of(get_cfgs, option)
-
-
 @pytest.mark.parametrize(
     ("name", "limits", "message"),
     [
         ("trunk_mass", {"add": [-5.0, 1.0]}, "'trunk_mass' can be -0.287 with the ranges given"),
         ("stiffness", {"add": [-21.0, 0.0]}, "'stiffness' can be -1"),
-        ("damping", {"add": [-0.6, 0.0]}, "'damping' can be -0.1"),
-        ("action_scale", {"add": [-0.3, 0.0]}, "'action_scale' can be -0.05"),
     ],
 )
 def test_sums_that_make_no_sense(make_task, name, limits, message):
@@ -175,19 +164,13 @@ def test_sums_that_make_no_sense(make_task, name, limits, message):
     [
         ("domain_rand.gravity", {"set": [10.0, 9.0]}),
         ("domain_rand.gravity", [9.0, 10.0]),
-        ("domain_rand.gravity", {"sett": [9.0, 10.0]}),
         ("domain_rand.gravity", {"set": [9.0, 10.0], "add": [0.0, 1.0]}),
         ("domain_rand.dof_damping", {"set": [-0.1, 0.2]}),
         ("domain_rand.trunk_mass", {"scale": [-0.5, 1.0]}),
         ("domain_rand.gravity", {"set": [9.0, math.nan]}),
-        ("domain_rand.joint_offset", {"add": [-math.inf, 0.1]}),
         ("domain_rand.motor_strength", {"scale_per_joint": []}),
-        ("domain_rand.foot_radius", {"set": [0.02]}),
         ("domain_rand.push_probability", 1.1),
-        ("domain_rand.resampling_probability", -0.1),
-        ("domain_rand.keep_probability", 2.0),
         ("domain_rand.keep_fixed", ["gravitation"]),
-        ("domain_rand.keep_fixed", ["init_roll"]),
         ("domain_rand.keep_fixed", ["push_velocity"]),
         ("noise.noise_scales.dof_vel", -1.0),
     ],

@@ -10,7 +10,6 @@ import torch
 from support.robot_files import (
     A1,
     EVEN_TRUNK,
-    UNITREE_ORDER,
     joint,
     servo,
     setting,
@@ -52,31 +51,6 @@ def torques_of(file, ctrl):
 # --------------------------------------------------------------------------------------------------- orders
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_motors_in_another_order(changed, engine):
-    """Torques reach the joints that they are meant for: a step is that of plain MuJoCo, whose motors go by name."""
-    file = changed(shuffle_motors, setting("option", iterations="100"))
-    cfg = cfg_of(file)
-    asset = load_asset(cfg)
-    assert asset.dof_names == list(POSE)
-    sim = make_engine(engine, asset.mj_model, 1, "cpu", 100, 50)
-    reference = mujoco.MjModel.from_xml_path(file)
-    assert [reference.actuator(i).name for i in range(12)] != [asset.mj_model.actuator(i).name for i in range(12)]
-    data = mujoco.MjData(reference)
-    torques = np.random.default_rng(1).uniform(-20, 20, 12)
-    qpos = np.array([0, 0, 1, 1, 0, 0, 0, *POSE.values()])
-    data.qpos[:] = qpos
-    sim.qpos.copy_(torch.tensor(qpos))
-    sim.ctrl.copy_(torch.tensor(torques))
-    for name, torque in zip(POSE, torques, strict=True):
-        data.actuator(name.removesuffix("_joint")).ctrl = torque
-    for _ in range(5):
-        mujoco.mj_step(reference, data)
-        sim.step()
-    np.testing.assert_allclose(sim.qvel[0], data.qvel, atol=2e-3)
-    assert np.abs(data.qvel[6:]).max() > 1.0
-
-
 def test_the_same_robot_in_another_order(changed, make_task):
     """Unitree's orders of joints and motors lead to the same torques per joint, rewards and observations as ours."""
     ours = make_task("a1_torque_multihead", 2)
@@ -93,34 +67,6 @@ def test_the_same_robot_in_another_order(changed, make_task):
             assert torch.equal(getattr(theirs, name), getattr(ours, name)), name
         assert all(torch.equal(group, ours.obs_buf[name]) for name, group in theirs.obs_buf.items())
     assert (ours.torques.abs() > 1.0).any() and ours.contacts.any()
-
-
-def test_policies_in_another_order(changed, make_task):
-    """Settings in Unitree's order, as of a policy trained on its file: it moves as in ours but for rounding."""
-    names = [f"{leg}_{part}_joint" for leg in UNITREE_ORDER for part in ("hip", "thigh", "calf")]
-    order = [list(POSE).index(name) for name in names]
-    pose = {"init_state.default_joint_angles": {name: POSE[name] for name in names}}
-    ours, theirs = make_task("a1_torque_multihead", 2), make_task("a1_torque_multihead", 2, **pose)
-    assert theirs.dof_names == names
-    theirs.commands.copy_(ours.commands)
-    theirs.sim.qpos.copy_(torch.cat([ours.sim.qpos[:, :7], ours.sim.qpos[:, 7:][:, order]], dim=1))
-    theirs.sim.qvel.copy_(torch.cat([ours.sim.qvel[:, :6], ours.sim.qvel[:, 6:][:, order]], dim=1))
-    generator = torch.Generator().manual_seed(1)
-    for _ in range(12):
-        actions = 0.3 * torch.randn(2, 2, 12, generator=generator)
-        ours.step(actions.flatten(1))
-        theirs.step(actions[:, :, order].flatten(1))
-        torch.testing.assert_close(theirs.torques, ours.torques[:, order], atol=1e-4, rtol=0)
-        torch.testing.assert_close(theirs.rew_buf, ours.rew_buf, atol=1e-5, rtol=0)
-    assert (ours.torques.abs() > 1.0).any() and ours.contacts.any()
-
-
-def test_orders_that_no_limb_leads_to(changed):
-    """Policies see joints in the order of the settings, so that a file in another one cannot pass unseen."""
-    cfg = cfg_of(changed())
-    first, second, *others = POSE.items()
-    cfg.init_state.default_joint_angles = dict([second, first, *others])
-    assert "joints cannot be put in the order of init_state.default_joint_angles" in error_of(load_asset, cfg)
 
 
 # --------------------------------------------------------------------------------------------------- motors
@@ -285,19 +231,6 @@ def test_notes(changed):
         "the body 'FL_calf' has 0 feet; asset.foot_name chooses FR_foot, RR_foot, RL_foot_2, RL_foot",
         "the body 'RL_calf' has 2 feet; asset.foot_name chooses FR_foot, RR_foot, RL_foot_2, RL_foot",
     ]
-
-
-def test_ranges_of_another_robot(changed, make_task, capsys):
-    """Ranges that leave out the robot's own values are told when they are drawn; a negative trunk is refused."""
-    file = changed(setting(".//default[@class='foot_collision']/geom", size="0.022"))
-    drawn = {"asset.file": file, "domain_rand.randomize_parameters": True}
-    assert make_task("a1_torque", 1, **{"asset.file": file}).notes == []
-    capsys.readouterr()
-    (note,) = make_task("a1_torque", 1, **drawn).notes
-    assert note.startswith("domain_rand.foot_radius draws 0.019 to 0.021, but the robot's own value is 0.022")
-    assert f"Note: {note}\n" in capsys.readouterr().out
-    heavy = {"domain_rand.trunk_mass": {"add": [-6.0, 6.0]}}
-    assert "random parameter 'trunk_mass' can be -1.287" in error_of(make_task, "a1_torque", 1, **drawn, **heavy)
 
 
 def test_nominal_pose_is_held(changed, make_task):

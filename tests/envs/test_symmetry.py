@@ -138,17 +138,6 @@ def test_mirror_agrees_with_physics(make_symmetric, name):
     assert touching > num
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_torques_of_mirrored_actions(make_symmetric, name):
-    """Actions of every kind become mirrored torques in the mirrored world."""
-    task = make_symmetric(name)
-    num = task.num_envs // 2
-    actions = torch.randn(num, task.num_actions)
-    torques = task._compute_torques(torch.cat([actions, task.mirror("actions", actions)]))
-    torch.testing.assert_close(torques[num:], mirror_joints(torques[:num]))
-    assert (torques.abs().mean(dim=0) > 0.5).all()
-
-
 def test_both_or_one_of_observations_and_actions(make_task):
     """What rsl_rl asks for: originals first, then their images; None stays None."""
     task = make_task("a1_torque_multihead", 2)
@@ -299,28 +288,6 @@ def test_mirror_loss_makes_policies_symmetric(make_runner):
     before = asymmetry()
     runner.alg.update()
     assert asymmetry() < 0.3 * before
-
-
-@pytest.mark.parametrize("name", ["a1_torque", "a1_torque_multihead"])
-@pytest.mark.parametrize(("augmentation", "loss"), [(False, False), (True, False), (False, True), (True, True)])
-def test_training_with_each_flag(make_runner, tmp_path, name, augmentation, loss):
-    """Losses are finite, everything is learned, and without a flag there is no symmetry."""
-    runner = make_runner(name, tmp_path, augmentation, loss, **{"algorithm.num_mini_batches": 2})
-    assert (runner.alg.symmetry is not None) == (augmentation or loss)
-    losses, update = [], runner.alg.update
-
-    def noted_update():
-        losses.append(update())
-        return losses[-1]
-
-    runner.alg.update = noted_update
-    networks = [*runner.alg.actor.parameters(), *runner.alg.critic.parameters()]
-    before = [parameter.detach().clone() for parameter in networks]
-    runner.learn(2)
-    assert len(losses) == 2 and all(math.isfinite(value) for each in losses for value in each.values())
-    assert all(each["skipped_updates"] == 0.0 for each in losses)
-    for parameter, old in zip(networks, before, strict=True):
-        assert torch.isfinite(parameter).all() and not torch.equal(parameter, old)
 
 
 @pytest.mark.parametrize("name", TASKS)
