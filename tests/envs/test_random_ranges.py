@@ -37,7 +37,7 @@ def test_perturbations(name, velocity, probability):
 
 CONTROL = ("motor_strength", "stiffness", "damping")
 DEFAULT = {
-    **dict.fromkeys(CONTROL, {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]}),
+    **{name: {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]} for name in CONTROL},
     "joint_offset": {"add": [-0.01, 0.01]},
     "ground_friction": {"set": [0.8, 1.2]},
     "contact_stiffness": {"set": [900.0, 1100.0]},
@@ -54,7 +54,7 @@ DEFAULT = {
     "keep_probability": 0.0,
 }
 HARD = {
-    **dict.fromkeys(CONTROL, {"scale": [0.5, 1.5], "scale_per_joint": [0.95, 1.05]}),
+    **{name: {"scale": [0.5, 1.5], "scale_per_joint": [0.95, 1.05]} for name in CONTROL},
     "joint_offset": {"add": [-0.05, 0.05]},
     "ground_friction": {"set": [0.001, 2.0]},
     "contact_stiffness": {"set": [500.0, 1500.0]},
