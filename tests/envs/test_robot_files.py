@@ -1,4 +1,4 @@
-"""Files with a trap each, made from the A1's: read by name and transmission, or refused with all that is wrong."""
+"""Variants of the A1's file: joints and motors are read by name, and unusable files are refused with all problems."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -40,7 +40,7 @@ def cfg_of(file):
 
 
 def torques_of(file, ctrl):
-    """What plain MuJoCo makes of the same control of all motors of a file: torques by joint."""
+    """Torques by joint of plain MuJoCo, with the same control of all motors of a file."""
     model = mujoco.MjModel.from_xml_path(file)
     data = mujoco.MjData(model)
     data.ctrl[:] = ctrl
@@ -79,13 +79,14 @@ LIMITS = {
     "all": [
         setting(".//default/motor", gear="0.5", ctrlrange="-30 40"),
         joint("FL_calf_joint", actuatorfrcrange="-7 9"),
+        shuffle_motors,
     ],
 }
 
 
 @pytest.mark.parametrize("changes", LIMITS.values(), ids=LIMITS)
 def test_torque_limits_are_the_tightest(changed, changes):
-    """They are what plain MuJoCo cuts torques at, whichever way the file says so; less than that arrives as it is."""
+    """They are where plain MuJoCo clips torques, however the file says so; smaller torques reach their joints."""
     file = changed(*changes)
     model = load_asset(cfg_of(file)).mj_model
     extremes = [torques_of(file, ctrl) for ctrl in (-1e6, 1e6)]
@@ -110,11 +111,11 @@ def test_the_a1_stays_as_it_is():
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_servos_are_refused(changed, make_task, engine):
-    """Every engine says which actuators are no motors, and what to do, in tasks and in simulators of a model."""
+    """Every engine names the actuators that are no motors and the remedy, in tasks and in simulators of a model."""
     file = changed(servo(3, 4))
-    told = error_of(make_task, "a1_torque", 1, **{"asset.file": file, "sim.engine": engine})
+    message = error_of(make_task, "a1_torque", 1, **{"asset.file": file, "sim.engine": engine})
     advice = "a servo, whose control is a target: import_robot.py reads it as a motor (FL_hip, FL_thigh)"
-    assert f"make a <motor> with a forcerange of what is {advice}" in told
+    assert f"make a <motor> with a forcerange of what is {advice}" in message
     model = build_model(read_spec(file), [])
     assert "reads it as a motor (FL_hip, FL_thigh)" in error_of(make_engine, engine, model, 1)
 
@@ -132,7 +133,7 @@ def second_motor(root):
     ElementTree.SubElement(root.find("actuator"), "motor", name="x", joint="FR_hip_joint", ctrlrange="-1 1")
 
 
-def arm_beside(root):
+def second_tree(root):
     """A hinge that hangs on the world."""
     body = ElementTree.SubElement(root.find("worldbody"), "body")
     ElementTree.SubElement(body, "joint", name="door")
@@ -162,10 +163,14 @@ REFUSED = {
         [setting(".//joint[@name='RL_calf_joint']", name=None), remove("actuator/motor[12]")],
         "a joint of the body 'RL_calf' has no name",
     ),
-    "beside the trunk": ([arm_beside], "the joint 'door' does not hang on the trunk 'trunk'"),
+    "not on the trunk": ([second_tree], "the joint 'door' does not hang on the trunk 'trunk'"),
     "nominal pose": (
         [joint("FL_calf_joint", range="-2.6 -1.6")],
         "init_state.default_joint_angles has -1.5 for 'FL_calf_joint', whose range is -2.6 to -1.6",
+    ),
+    "feet through the floor": (
+        [setting(".//default[@class='foot_collision']/geom", contype="2", conaffinity="2")],
+        "contype and conaffinity let FR_foot, FL_foot, RR_foot, RL_foot through the geom 'floor'",
     ),
     "missing geoms": (
         [setting(".//geom[@name='trunk']", name="base")],
@@ -176,50 +181,37 @@ REFUSED = {
 
 @pytest.mark.parametrize(("changes", "reason"), REFUSED.values(), ids=REFUSED)
 def test_refused(changed, changes, reason):
-    """What a task cannot simulate is told in a line that names the file and the part."""
+    """A file that a task cannot simulate is refused in a line that names the file and the part."""
     file = changed(*changes)
-    told = error_of(load_asset, cfg_of(file))
-    assert told.startswith(f"'{file}' cannot be simulated: ") and reason in told
-
-
-def test_feet_fall_through_the_floor(changed):
-    """Feet that the floor does not touch are told, for every engine."""
-    feet = setting(".//default[@class='foot_collision']/geom", contype="2", conaffinity="2")
-    told = error_of(load_asset, cfg_of(changed(feet)))
-    assert "contype and conaffinity let FR_foot, FL_foot, RR_foot, RL_foot through the geom 'floor'" in told
+    message = error_of(load_asset, cfg_of(file))
+    assert message.startswith(f"'{file}' cannot be simulated: ") and reason in message
 
 
 def test_all_problems_at_once(changed):
-    """A file with several traps is refused once, with a clause for each."""
-    beyond, limits = joint("FL_calf_joint", range="-2.6 -1.6"), setting("actuator/motor[1]", ctrllimited="false")
-    none = setting("actuator/motor[1]", forcelimited="false")
-    told = error_of(load_asset, cfg_of(changed(servo(11), beyond, limits, none)))
+    """A file with several problems is refused once, with a clause for each."""
+    beyond, unlimited = joint("FL_calf_joint", range="-2.6 -1.6"), setting("actuator/motor[1]", ctrllimited="false")
+    file = changed(servo(11), beyond, unlimited, setting("actuator/motor[1]", forcelimited="false"))
+    message = error_of(load_asset, cfg_of(file))
     for part in ("as a motor (RL_calf)", "a forcerange (FR_hip_joint,", "has -1.5 for 'FL_calf_joint'"):
-        assert part in told
-    unnamed, floor = setting(".//geom[@name='RL_calf']", name=None), setting(".//geom[@name='floor']", name="ground")
-    told = error_of(
-        load_asset, cfg_of(changed(unnamed, floor, setting(".//geom[@name='trunk']", name="base"), servo(11)))
-    )
-    for part in ("those of 'RL_calf'", "a geom 'floor'", "geom (part of its name) 'trunk'", "as a motor (RL_calf)"):
-        assert part in told
+        assert part in message
 
 
-def test_fused_tells_all(changed, make_task):
-    """Whatever the fused step cannot simulate of a robot is told together."""
+def test_fused_names_all(changed, make_task):
+    """The fused step names everything about a robot that it cannot simulate."""
     file = changed(
         setting("option", integrator="RK4", cone="elliptic"),
         setting(".//geom[@name='FL_hip']", type="ellipsoid", size="0.04 0.04 0.02"),
     )
-    told = error_of(make_task, "a1_torque", 1, **{"asset.file": file})
+    message = error_of(make_task, "a1_torque", 1, **{"asset.file": file})
     for reason in ("integrator must be implicitfast", "cone must be pyramidal", "boxes may collide, unlike 'FL_hip'"):
-        assert reason in told
+        assert reason in message
 
 
 # --------------------------------------------------------------------------------------------------- what is noted
 
 
 def test_notes(changed):
-    """A robot that no view draws, legs without feet or with two, are told."""
+    """A robot that no view draws and legs without feet or with two are noted."""
     hidden = [setting(".//default[@class='visual']/geom", group="4")]
     hidden += [
         setting(".//geom[@name='FL_foot']", name="FL_toe"),
@@ -243,15 +235,15 @@ def test_nominal_pose_is_held(changed, make_task):
     assert standing_note(make_task("a1_torque", 1, **{"control.stiffness": 0.0})) == "", "it is not held at all"
 
 
-def test_training_says_that_the_robot_falls(tmp_path):
-    """Before a training, its nominal pose is tried."""
+def test_training_notes_a_robot_that_falls(tmp_path):
+    """Training tries the nominal pose first."""
     words = ["--task=a1_torque", "--num_envs=2", "--max_iterations=1", "--device=cpu", "--set", "control.stiffness=3"]
     status, output, _ = run_here("train.py", *words, root=tmp_path)
     assert status == 0 and output.splitlines()[0].startswith("Note: the nominal pose does not stand under PD control")
 
 
 def test_another_robot_than_in_training(changed, tmp_path):
-    """A file with other axes or masses than that of the training is told; one in another order is the same robot."""
+    """Other axes or masses than in the training are noted; a file in another order is the same robot."""
     assert list(robot_notes(Path(changed(unitree_order, shuffle_motors)), A1)) == []
     other = Path(changed(turn_left_hips, setting("worldbody/body/inertial", mass="5.713")))
     axes, mass = robot_notes(other, A1)
@@ -295,7 +287,7 @@ def test_unlike_sides_are_no_mirror_images(changed, make_task):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_joints_without_range(changed, make_task, engine):
-    """They have no limits, neither for rewards nor for initial angles, instead of the range 0 to 0 of their fields."""
+    """They have no limits for rewards and initial angles, although their field holds the range 0 to 0."""
     free = joint("FL_hip_joint", limited="false")
     task = make_task("a1_torque", 2, **{"asset.file": changed(free), "sim.engine": engine})
     assert task.dof_pos_limits[3].tolist() == [-np.inf, np.inf] and task.dof_pos_limits[0].isfinite().all()

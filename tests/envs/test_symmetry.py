@@ -1,4 +1,4 @@
-"""Mirror images: those of observations and actions against those of the physics, and what learning makes of them."""
+"""Mirror images of observations and actions, and learning from them; test_robots.py compares with the physics."""
 
 import math
 
@@ -9,7 +9,6 @@ from support.symmetry import mirror_joints, mirror_policy
 from tensordict import TensorDict
 from torch import nn
 
-from legged_torque import RESOURCES_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.symmetry import with_mirror_images
 from legged_torque.utils.config import set_by_path
@@ -24,18 +23,8 @@ DRAWN = 117
 """Numbers of a world that may be drawn at random."""
 
 
-def mirror_qpos(qpos):
-    """The plane y = 0 reflects positions in y and turns rotations about x and z around."""
-    return torch.cat([qpos[:, :7] * torch.tensor([1.0, -1, 1, 1, -1, 1, -1]), mirror_joints(qpos[:, 7:])], dim=1)
-
-
-def mirror_qvel(qvel):
-    """Velocities are reflected as positions are; angular velocities about x and z change their sign."""
-    return torch.cat([qvel[:, :6] * torch.tensor([1.0, -1, 1, -1, 1, -1]), mirror_joints(qvel[:, 6:])], dim=1)
-
-
 def mirror_critic(obs):
-    """The policy's, then linear velocity, height, contacts of the feet, and what is drawn at random."""
+    """The policy's observations, then linear velocity, height, contacts of the feet, and random parameters."""
     policy, more, drawn = obs.split([obs.shape[1] - 8 - DRAWN, 8, DRAWN], dim=1)
     more = (more * torch.tensor([1.0, -1, 1, 1, 1, 1, 1, 1]))[:, [0, 1, 2, 3, 5, 4, 7, 6]]
     return torch.cat([mirror_policy(policy), more, mirror_drawn(drawn)], dim=1)
@@ -59,47 +48,6 @@ def mirror_drawn(drawn):
 BY_HAND = {"policy": mirror_policy, "critic": mirror_critic, "actions": mirror_joints}
 
 
-@pytest.fixture(scope="module")
-def make_symmetric(make_task, tmp_path_factory):
-    """Factory of tasks whose trunk, unlike the real one, has its mass in the middle, and that change nothing at random.
-
-    Of its worlds, the second half is the mirror image of the first one, in states of all kinds.
-    """
-    file = tmp_path_factory.mktemp("symmetric") / "a1.xml"
-    text = (RESOURCES_DIR / "robots/a1/a1.xml").read_text()
-    for old, new in (
-        ('pos="0 0.0041 -0.0005"', 'pos="0.003 0 -0.0005"'),
-        ("-3.66e-05 -6.11e-05 -2.75e-05", "0 6e-4 0"),
-    ):
-        assert old in text
-        text = text.replace(old, new)
-    file.write_text(text)
-    overrides = {
-        "asset.file": str(file),
-        "commands.resampling_probability": 0.0,
-        "asset.terminate_after_contacts_on": [],
-        "rewards.only_positive_rewards": False,
-    }
-
-    def make(name, num=32):
-        task = make_task(name, 2 * num, **overrides)
-        generator = torch.Generator().manual_seed(2)
-        sim = task.sim
-        qpos, qvel = sim.qpos[:num].clone(), torch.randn(num, 18, generator=generator)
-        qpos[:, 2] = torch.linspace(0.1, 0.4, num)
-        qpos[:, 3:7], qpos[:, 7:] = torch.tensor([1.0, 0.0, 0.0, 0.0]), task.default_dof_pos  # not what was drawn
-        qpos[:, 3:7] += 0.2 * torch.randn(num, 4, generator=generator)
-        qpos[:, 3:7] /= qpos[:, 3:7].norm(dim=1, keepdim=True)
-        qpos[:, 7:] += 0.3 * torch.randn(num, 12, generator=generator)
-        sim.qpos.copy_(torch.cat([qpos, mirror_qpos(qpos)]))
-        sim.qvel.copy_(torch.cat([qvel, mirror_qvel(qvel)]))
-        command = torch.randn(num, 3, generator=generator)
-        task.commands.copy_(torch.cat([command, command * torch.tensor([1.0, -1.0, -1.0])]))
-        return task
-
-    return make
-
-
 # --------------------------------------------------------------------------------------------------- mirror images
 
 
@@ -116,30 +64,8 @@ def test_mirrored_twice(make_task, name):
         assert not torch.equal(image, values) and torch.equal(task.mirror(group, image), values)
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_mirror_agrees_with_physics(make_symmetric, name):
-    """The mirror image of a world, given mirrored actions, is seen as the mirror image of what is seen of the world."""
-    task = make_symmetric(name)
-    num = task.num_envs // 2
-    generator = torch.Generator().manual_seed(3)
-    touching = 0
-    for _ in range(3):
-        actions = torch.randn(num, task.num_actions, generator=generator)
-        obs, rewards, dones, _ = task.step(torch.cat([actions, task.mirror("actions", actions)]))
-        assert not dones.any()
-        for group in ("policy", "critic"):
-            seen, image = obs[group][:num], obs[group][num:]
-            torch.testing.assert_close(image, task.mirror(group, seen), rtol=0, atol=5e-4)
-            assert ((image - seen).abs().max(dim=1).values > 0.1).all()
-        torch.testing.assert_close(mirror_qpos(task.sim.qpos[:num]), task.sim.qpos[num:], rtol=0, atol=1e-4)
-        torch.testing.assert_close(rewards[num:], rewards[:num], rtol=0, atol=1e-3)
-        assert rewards.abs().mean() > 0.01
-        touching += int(task.feet_contact.sum())
-    assert touching > num
-
-
 def test_both_or_one_of_observations_and_actions(make_task):
-    """What rsl_rl asks for: originals first, then their images; None stays None."""
+    """The result is as rsl_rl needs it: originals first, then their images; None stays None."""
     task = make_task("a1_torque_multihead", 2)
     obs = TensorDict({name: torch.randn(3, value.shape[1]) for name, value in task.get_observations().items()}, [3])
     actions = torch.randn(3, 24)
@@ -171,7 +97,7 @@ def test_counterparts():
 def make_runner(make_task):
     """Factory of runners with small networks and one update per rollout; flags by name."""
 
-    def make(name="a1_torque", log_root=None, augmentation=True, loss=False, **overrides):
+    def make(name="a1_torque", augmentation=True, loss=False, **overrides):
         _, train_cfg = task_registry.get_cfgs(name)
         settings = {
             "runner.num_steps_per_env": STEPS,
@@ -187,7 +113,7 @@ def make_runner(make_task):
             set_by_path(train_cfg, path, value)
         task = make_task(name, WORLDS)
         torch.manual_seed(0)
-        return task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=log_root)[0]
+        return task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=None)[0]
 
     return make
 
@@ -239,7 +165,7 @@ def test_losses_of_an_update(make_runner, name, augmentation):
 
 
 class Symmetrized(nn.Module):
-    """The mean of a network and of its mirror image: what a symmetric policy is."""
+    """A symmetric policy: the mean of a network and of its mirror image."""
 
     def __init__(self, network):
         """Keep the network."""
@@ -253,7 +179,7 @@ class Symmetrized(nn.Module):
 
 @pytest.mark.parametrize("augmentation", [True, False])
 def test_mirror_loss(make_runner, augmentation):
-    """It is the mean square of what mirrored observations change, and nothing for a symmetric policy."""
+    """It is the mean square of the change by mirrored observations, and 0 for a symmetric policy."""
     runner = make_runner(augmentation=augmentation, loss=True)
     alg, batch = runner.alg, roll_out(runner)
     obs, actor = batch.observations["policy"], alg.actor
@@ -290,9 +216,8 @@ def test_mirror_loss_makes_policies_symmetric(make_runner):
     assert asymmetry() < 0.3 * before
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_who_learns_from_images(name):
-    """All tasks of the A1 do, unless the paper's settings are asked for."""
-    for words, expected in (((), True), (("--preset=paper",), False)):
-        symmetry = get_cfgs(*words, task=name)[1].algorithm.symmetry_cfg
-        assert symmetry.use_data_augmentation == expected and not symmetry.use_mirror_loss
+@pytest.mark.parametrize(("words", "expected"), [((), True), (("--preset=paper",), False)])
+def test_augmentation_is_the_default(words, expected):
+    """Tasks learn from mirror images, unless the paper's settings are asked for."""
+    symmetry = get_cfgs(*words, task="a1_torque")[1].algorithm.symmetry_cfg
+    assert symmetry.use_data_augmentation == expected and not symmetry.use_mirror_loss
