@@ -1,4 +1,4 @@
-"""The reference pages say what the code says."""
+"""The reference pages agree with the code."""
 
 import re
 import runpy
@@ -30,8 +30,8 @@ def flat(values, path=""):
 
 @pytest.mark.parametrize("page", ["settings", "scripts"])
 def test_pages_are_up_to_date(generator, page, monkeypatch):
-    """To mend it: ``python docs/reference/generate.py``."""
-    monkeypatch.chdir(REFERENCE.parents[1])  # whence examples are written
+    """If it fails: ``python docs/reference/generate.py``."""
+    monkeypatch.chdir(REFERENCE.parents[1])  # for the paths in examples
     written, made = (REFERENCE / f"{page}.md").read_text(), generator[f"{page}_page"]()
     assert written.split() == made.split()  # line breaks of --help depend on the version of Python
 
@@ -47,7 +47,7 @@ def test_every_setting_is_explained():
 
 
 def test_every_logged_number_is_explained(tmp_path, make_task):
-    """What a training writes has a row."""
+    """Every number that a training logs has a row."""
     text = (REFERENCE / "logs.md").read_text()
     settings = ["runner.num_steps_per_env=4", "evaluation.interval=32", "evaluation.num_samples=8"]
     _, train_cfg = task_registry.get_cfgs("a1_torque_multihead", Options(device="cpu", set=settings))
