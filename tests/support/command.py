@@ -1,4 +1,4 @@
-"""Shared by tests: command."""
+"""The console command."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Simulators, tasks and trainings on a device of the test's choice, and what tests read of them."""
+"""Simulators, tasks and trainings on a device, and results of their steps."""
 
 import contextlib
 import gc
@@ -67,16 +67,6 @@ def make_runner(device, *words, log_root=None):
     """The runner of a command line, with the task that it trains."""
     env, train_cfg = make_env(device, *words)
     return task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=log_root)[0]
-
-
-def sim_of(env):
-    """The simulator of a task."""
-    return env.sim
-
-
-def use_graphs(env, on):
-    """Choose whether control steps of a task replay as a CUDA graph."""
-    env.step_graph.enabled = on
 
 
 @contextlib.contextmanager
