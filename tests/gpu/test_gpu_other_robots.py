@@ -1,6 +1,5 @@
 """The fused step with two and with eight threads per world, some of them idle, against plain MuJoCo."""
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -37,14 +36,7 @@ def test_unlike_legs_under_applied_forces(device, crab):
         for applied, values in zip(sim.applied_forces(), (of_bodies, of_joints), strict=True):
             applied.copy_(torch.tensor(values))
         sim.step()
-        velocities, data = [], mujoco.MjData(model)
-        for world in range(count):
-            mujoco.mj_resetData(model, data)
-            for name in FIELDS:
-                getattr(data, name)[:] = states[name][world]
-            data.xfrc_applied[:], data.qfrc_applied[:] = of_bodies[world], of_joints[world]
-            mujoco.mj_step(model, data)
-            velocities.append(data.qvel.copy())
+        velocities = step_mujoco(model, states, of_bodies, of_joints)[0]
         error = np.abs(results(sim)[0] - velocities).max(axis=1)
         assert np.median(error) < 1e-4 and error.max() < 5e-3, error.max()
         assert (np.abs(velocities - without[0]).max(axis=1) > 0.05).all()

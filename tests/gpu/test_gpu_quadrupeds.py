@@ -7,7 +7,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-import warp as wp
 from support.fused import FIELDS, put, random, step_mujoco
 from support.on_device import assert_matches, make_robot, make_sim, results, step, thrown
 
@@ -110,15 +109,3 @@ def test_worlds_with_parameters_of_their_own(device, a1):
         expected = step_mujoco(own, alone)[0][0]
         np.testing.assert_allclose(actual[world], expected, rtol=0, atol=3e-3, err_msg=f"world {world}")
         assert (np.abs(expected - plain[world]).max() > 1e-2) == (world % 2 == 0)
-
-
-def test_as_on_a_cpu(device, a1):
-    """A GPU's step is that of a CPU, where one thread does a whole world, up to rounding."""
-    if not wp.is_cpu_available():
-        pytest.skip("needs Warp's compiler for the CPU")
-    model, states = a1
-    ours, theirs = (step(make_sim(model, WORLDS, each), states) for each in (device, "cpu"))
-    alike = (ours[2] == theirs[2]).all(axis=1)  # in others a contact only just touches
-    error = np.abs(ours[0] - theirs[0])[alike]
-    assert alike.mean() >= 0.99
-    assert np.median(error) < 1e-5 and np.quantile(error, 0.999) < 1e-3, (np.median(error), error.max())

@@ -5,6 +5,7 @@ import numpy as np
 import torch
 from support.capture import differences
 from support.fused import draw_states, make_a1, step_mujoco
+from support.maps import make_map, tilted
 from support.on_device import assert_matches, make_robot, make_sim, results, step
 
 from legged_torque.terrain.height_map import HeightMap
@@ -21,37 +22,29 @@ def test_graphs_change_nothing(device):
     assert found == {}
 
 
-def make_map(device, height, scale=0.05, cells=60):
-    """The map of a function of x and y around the origin."""
-    axis = (np.arange(cells + 1) - 0.5 * cells) * scale
-    heights = height(*np.meshgrid(axis, axis, indexing="ij"))
-    return HeightMap(heights.astype(np.float32), scale, (axis[0], axis[0]), device)
-
-
 def test_a_plane_as_a_map(device):
     """A map of a tilted plane gives what plain MuJoCo does with the plane.
 
     Of boxes that are more than half in it, MuJoCo lets only the lower corners touch: those are not compared.
     """
-    along = 0.5 * np.array([np.cos(0.7), np.sin(0.7)])
-    normal = np.array([*-along, 1.0]) / np.sqrt(1.0 + along @ along)
+    along, normal, quat = tilted(0.5, 0.7)
 
     def tilt(spec):
-        spec.geom("floor").quat = [1.0 + normal[2], -normal[1], normal[0], 0.0] / np.sqrt(2.0 + 2.0 * normal[2])
+        spec.geom("floor").quat = quat
 
-    tilted = make_robot("a1", tilt)
-    states = draw_states(tilted, 200, (0.05, 0.4))
-    data, boxes = mujoco.MjData(tilted), tilted.geom_type == mujoco.mjtGeom.mjGEOM_BOX
+    model = make_robot("a1", tilt)
+    states = draw_states(model, 200, (0.05, 0.4))
+    data, boxes = mujoco.MjData(model), model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
     kept = []
     for data.qpos[:] in states["qpos"]:
-        mujoco.mj_kinematics(tilted, data)
+        mujoco.mj_kinematics(model, data)
         kept.append((data.geom_xpos[boxes] @ normal > 0.0).all())
     states = {name: values[kept] for name, values in states.items()}
-    ground = make_map(device, lambda x, y: along[0] * x + along[1] * y)
-    expected = step_mujoco(tilted, states)
+    ground = HeightMap(*make_map(lambda x, y: along[0] * x + along[1] * y), device)
+    expected = step_mujoco(model, states)
     assert (expected[2] > 0).any(axis=1).mean() > 0.3
     sim = make_sim(make_robot("a1"), int(sum(kept)), device, height_map=ground)
-    assert_matches(tilted, states, step(sim, states), expected)
+    assert_matches(model, states, step(sim, states), expected)
 
 
 def feet_only(spec):
@@ -69,7 +62,7 @@ def roofs(x, y):
 def test_slopes_under_each_foot(device):
     """Robots that stand on roofs move as in plain MuJoCo with a plane posed under each foot, where that is exact."""
     rng, worlds, model = np.random.default_rng(2), 200, make_robot("a1", feet_only)
-    ground = make_map(device, roofs, cells=120)
+    ground = HeightMap(*make_map(roofs, cells=120), device)
     sim, home = make_sim(model, worlds, device, height_map=ground), torch.tensor(model.key_qpos[0], device=device)
     sim.qpos.copy_(home)
     sim.qpos[:, :2] = torch.tensor(rng.uniform(-1.5, 1.5, (worlds, 2)), device=device)

@@ -160,29 +160,6 @@ def test_parameters(device):
     assert correlation.abs().max() < 4.5 / math.sqrt(int(changed.sum()))
 
 
-def test_pushes(device):
-    """Their share, their sizes, and that half of them add to the velocity: next to the same worlds without pushes."""
-    pushes = ["--set=domain_rand.push_probability=0.3", "--set=domain_rand.push_velocity=[-2,2]"]
-    pushes += ["--set=domain_rand.push_set_factor=1.5"]
-    velocities = []
-    for on in (True, False):
-        env, _ = make_env(device, *MANY, HIGH_UP, *pushes, f"--set=domain_rand.push_robots={on}")
-        take_steps(env, 3)
-        torch.manual_seed(0)
-        env.reset()
-        env.sim.qvel[:, :3] = 10.0  # whatever pushes the reset has brought
-        take_steps(env, 1)
-        velocities.append(env.sim.qvel[:, :3].clone())
-    pushed, undisturbed = velocities
-    mask = (pushed != undisturbed).any(dim=1)
-    assert abs(float(mask.float().mean()) - 0.3) < 4.0 * math.sqrt(0.21 / NUM)
-    added = pushed[mask][:, 0] > 5.0
-    assert abs(float(added.float().mean()) - 0.5) < 4.0 * math.sqrt(0.25 / int(mask.sum()))
-    changes = torch.where(added.unsqueeze(1), pushed[mask] - undisturbed[mask], pushed[mask] / 1.5)
-    for axis in range(3):
-        assert_uniform(changes[:, axis], -2.0, 2.0)
-
-
 def test_new_episodes(device):
     """Exactly the worlds whose time is over start anew: state, parameters, commands and counters."""
     chances = ["domain_rand.resampling_probability", "domain_rand.push_probability", "commands.resampling_probability"]

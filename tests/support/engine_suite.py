@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.fused import ROBOTS, compiled, draw_states, make_a1, put, random
+from support.fused import ROBOTS, compiled, draw_states, make_a1, put, random, step_mujoco
 from support.simulator import LEGS, SENSED, WEIGHT, contacts_by_hand
 
 from legged_torque.sim.engine import CAPABILITIES
@@ -271,27 +271,15 @@ class EngineSuite:
             for applied, values in zip(sim.applied_forces(), (on_bodies, on_joints), strict=True):
                 applied.copy_(torch.tensor(values))
             sim.step()
-            expected = self._pushed(model, states, on_bodies, on_joints)
+            expected = step_mujoco(model, states, on_bodies, on_joints)[0]
             error = np.abs(sim.qvel.double().numpy() - expected).max(axis=1)
             assert np.median(error) < 1e-4 and error.max() < 5e-3
-            without = self._pushed(model, states, 0.0 * xfrc, 0.0 * qfrc)
+            without = step_mujoco(model, states)[0]
             assert (np.abs(expected - without).max(axis=1) > 0.05).all()
         mask = torch.arange(20) == 3
         sim.reset(mask)
         for applied in sim.applied_forces():
             assert (applied[mask] == 0.0).all() and applied[~mask].any() == applied.any()
-
-    @staticmethod
-    def _pushed(model, states, xfrc, qfrc):
-        """Velocities after one step of plain MuJoCo under forces."""
-        data, result = mujoco.MjData(model), []
-        for world in range(len(xfrc)):
-            for field, values in states.items():
-                getattr(data, field)[:] = values[world]
-            data.xfrc_applied[:], data.qfrc_applied[:] = xfrc[world], qfrc[world]
-            mujoco.mj_step(model, data)
-            result.append(data.qvel.copy())
-        return np.array(result)
 
     def test_parameters_per_world(self):
         """Worlds with rows of their own move as MuJoCo's models with these numbers; writing them acts at once."""
@@ -314,7 +302,7 @@ class EngineSuite:
             for world in range(3):
                 for name, values in tables.items():
                     getattr(model.opt if name == "gravity" else model, name)[:] = values[world]
-                expected = self._pushed(model, states, np.zeros((1, 14, 6)), np.zeros((1, 18)))[0]
+                expected = step_mujoco(model, states)[0][0]
                 np.testing.assert_allclose(sim.qvel[world], expected, rtol=0, atol=2e-3)
             assert np.abs(np.diff(sim.qvel.numpy(), axis=0)).max(axis=1).min() > 0.1
             tables["dof_damping"] = 0.5 * tables["dof_damping"]

@@ -116,13 +116,15 @@ def draw_states(model, num, heights=FLOOR, seed=0):
     return dict(zip(FIELDS, map(np.array, zip(*states, strict=True)), strict=True))
 
 
-def step_mujoco(model, states):
-    """Velocities, positions, contact counts and contact forces after one step of plain MuJoCo."""
+def step_mujoco(model, states, wrenches=None, forces=None):
+    """Velocities, positions, contact counts and contact forces after one step of plain MuJoCo, with applied forces."""
     data, result = mujoco.MjData(model), []
     for world in range(len(states["qpos"])):
         mujoco.mj_resetData(model, data)
         for field in FIELDS:
             getattr(data, field)[:] = states[field][world]
+        if wrenches is not None:
+            data.xfrc_applied[:], data.qfrc_applied[:] = wrenches[world], forces[world]
         mujoco.mj_step(model, data)
         sensors = data.sensordata.reshape(-1, 4).copy()
         result.append((data.qvel.copy(), data.qpos.copy(), sensors[:, 0], sensors[:, 1:]))
