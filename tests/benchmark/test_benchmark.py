@@ -8,12 +8,12 @@ import signal
 
 import pytest
 import torch
+from support.runners import build_runner
 from support.scripts import assert_told_in_one_line, run_here
 
 from legged_torque.benchmark import measure as benchmark
 from legged_torque.benchmark.measure import summarize
 from legged_torque.envs import LeggedRobot, task_registry
-from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import is_out_of_memory
 
 SETTINGS = {"runner.num_steps_per_env": 3, "algorithm.num_learning_epochs": 1, "algorithm.num_mini_batches": 1}
@@ -34,14 +34,9 @@ def measured(tmp_path_factory):
 
 
 @pytest.fixture
-def runner(tmp_path):
+def runner(make_task, tmp_path):
     """A runner that is ready to train."""
-    env_cfg, train_cfg = task_registry.get_cfgs("a1_position")
-    env_cfg.env.num_envs = 2
-    for path, value in SETTINGS.items():
-        set_by_path(train_cfg, path, value)
-    env = task_registry.get_task_class("a1_position")(env_cfg, "cpu")
-    runner, _ = task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=tmp_path)
+    runner = build_runner(make_task, "a1_position", 2, log_root=tmp_path, **SETTINGS)
     runner.claim_log_dir({})
     return runner
 

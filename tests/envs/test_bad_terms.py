@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from support.runners import build_runner
 from support.scripts import run_here
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -15,7 +16,6 @@ from legged_torque.envs.approaches.torque_curriculum import TorqueCurriculumRobo
 from legged_torque.envs.base.observations import ObservationTerm
 from legged_torque.envs.tasks import A1TorqueCurriculumCfg, A1TorqueCurriculumCfgPPO
 from legged_torque.learning.guard import PATIENCE
-from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import TrainingError
 from legged_torque.utils.mirroring import SCALAR
 
@@ -137,16 +137,13 @@ def test_observation_that_divides_by_zero(make_dividing):
 
 
 @pytest.fixture
-def make_runner(make_dividing):
-    """Factory of trainings of such tasks, and the task."""
+def make_runner(make_task, make_dividing):
+    """Factory of trainings of such tasks, in which no learning rate changes, and the task."""
 
     def make(log_root, **overrides):
-        _, train_cfg = task_registry.get_cfgs("a1_torque_curriculum")
-        settings = {"runner.num_steps_per_env": 4, "algorithm.num_mini_batches": 2, "algorithm.schedule": "fixed"}
-        for path, value in {**settings, **overrides}.items():
-            set_by_path(train_cfg, path, value)
-        task = make_dividing(4)
-        return task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=log_root)[0], task
+        settings = {"algorithm.schedule": "fixed", **overrides}
+        runner = build_runner(make_task, "a1_DividingRobot", log_root=log_root, **settings)
+        return runner, runner.env
 
     return make
 

@@ -4,14 +4,13 @@ import math
 
 import pytest
 import torch
+from support.runners import build_runner
 from support.settings import get_cfgs
 from support.symmetry import mirror_joints, mirror_policy
 from tensordict import TensorDict
 from torch import nn
 
-from legged_torque.envs import task_registry
 from legged_torque.envs.base.symmetry import with_mirror_images
-from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import counterparts
 
@@ -98,7 +97,6 @@ def make_runner(make_task):
     """Factory of runners with small networks and one update per rollout; flags by name."""
 
     def make(name="a1_torque", augmentation=True, loss=False, **overrides):
-        _, train_cfg = task_registry.get_cfgs(name)
         settings = {
             "runner.num_steps_per_env": STEPS,
             "runner.logger": "none",
@@ -109,11 +107,7 @@ def make_runner(make_task):
             "algorithm.symmetry_cfg.use_data_augmentation": augmentation,
             "algorithm.symmetry_cfg.use_mirror_loss": loss,
         }
-        for path, value in {**settings, **overrides}.items():
-            set_by_path(train_cfg, path, value)
-        task = make_task(name, WORLDS)
-        torch.manual_seed(0)
-        return task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=None)[0]
+        return build_runner(make_task, name, WORLDS, **{**settings, **overrides})
 
     return make
 
