@@ -21,7 +21,7 @@ def test_last_run_was_of_this_code():
     assert run["fingerprint"] == fingerprint(), f"the code has changed since: {ADVICE}"
 
 
-SOURCE = '''"""What it does."""
+SOURCE = '''"""Doubles."""
 
 LIMIT = 3
 """Its unit."""

@@ -65,7 +65,7 @@ def start(installed, folder, *commands):
 
 
 def finish(process):
-    """Wait for scripts that must end well; return what they have printed."""
+    """Wait for scripts that must end well; return their output."""
     with process:
         output, _ = process.communicate(timeout=200)
     assert process.returncode == 0, output

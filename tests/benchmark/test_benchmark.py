@@ -42,7 +42,7 @@ def runner(make_task, tmp_path):
 
 
 def test_numbers_belong_together(measured):
-    """What is derived follows from the milliseconds; settings given by ``--set`` are those that were measured."""
+    """Derived numbers follow from the milliseconds; settings given by ``--set`` were measured."""
     _, result = measured
     assert [row["num_envs"] for row in result["rows"]] == [2, 4]
     assert result["task"] == "a1_position" and result["set"] == CHANGES

@@ -28,7 +28,7 @@ def reported(task):
 
 
 class DividingRobot(TorqueCurriculumRobot):
-    """A robot whose reward or observation divides by what is zero in some worlds."""
+    """A robot whose reward or observation divides by zero in some worlds."""
 
     def _init_buffers(self):
         """Add the divisors."""

@@ -65,7 +65,7 @@ def test_gravity_with_curriculum():
 
 @pytest.mark.parametrize("total_steps", [0, 25_000_000, 60_000_000])
 def test_actions_for_torques(make_task, total_steps):
-    """At every weight of the PD part it gives nothing, and the torque part gives what is wanted."""
+    """At every weight of the PD part it gives nothing, and the torque part gives the wanted torques."""
     task = make_task(GRAVITY, 3)
     to_steps(task, total_steps)
     q, qd, _ = random_state(task)
@@ -134,7 +134,7 @@ def test_higher_pose(make_task):
 
 
 def send(task, count, num_worlds, seed=0):
-    """Act at random for some control steps; return what was sent. Shape: (steps, worlds, 24)."""
+    """Act at random for some control steps; return the actions. Shape: (steps, worlds, 24)."""
     sent = 2.0 * torch.randn(count, num_worlds, 24, generator=torch.Generator().manual_seed(seed))
     for actions in sent:
         task.step(actions)

@@ -25,7 +25,7 @@ def test_position_torques(make_task, kp, kd, scale):
 
 @pytest.mark.parametrize("name", ["a1_torque", "a1_torque_curriculum"])
 def test_torque_torques(make_task, name):
-    """Torque control is 8 N m per unit of action, 4 N m in the curriculum, whatever the state."""
+    """Torque control is 8 N m per unit of action, 4 N m in the curriculum, in any state."""
     task, torque_scale = make_task(name, 3), 4.0 if name == "a1_torque_curriculum" else 8.0
     _, _, action = random_state(task)
     np.testing.assert_allclose(task._compute_torques(torch.tensor(action).float()), torque_scale * action, rtol=1e-5)
@@ -58,7 +58,7 @@ def test_mixing_changes_between_rollouts_only(make_task):
 
 @pytest.mark.parametrize("name", ["a1_position", "a1_multihead"])
 def test_torques_are_clipped(make_task, name):
-    """Whatever the action, no joint gets more than 33.5 N m, and extreme actions give exactly that."""
+    """No joint gets more than 33.5 N m, and extreme actions give exactly that."""
     task = make_task(name, 2)
     signs = torch.tensor([1.0, -1.0]).repeat(2, task.num_actions // 2)
     signs[1] *= -1
@@ -106,7 +106,7 @@ def test_step_is_four_physics_steps(make_task, name, refresh):
         state = torch.cat([task.sim.qpos[world], 0.01 * task.sim.qvel[world]])
         np.testing.assert_allclose(state, results[refresh][0], atol=2e-4)
         np.testing.assert_allclose(task.torques[world], results[refresh][1], atol=2e-2)
-        assert np.abs(results[True][0] - results[False][0]).max() > 2e-2  # the two are told apart
+        assert np.abs(results[True][0] - results[False][0]).max() > 2e-2  # the two differ
 
 
 def test_contacts_are_those_of_the_last_physics_step(make_task):

@@ -20,7 +20,7 @@ ON = {"domain_rand.randomize_parameters": True}
     [("low", 0.3, 0.002), ("high", 1.0, 0.002), ("high_frequency", 1.0, 0.006), ("doubled", 1.0, 0.012)],
 )
 def test_perturbations(name, velocity, probability):
-    """The paper's four environments, in training and over what a loaded run has; none takes all of it back."""
+    """The paper's four environments, in training and over a loaded run; "none" switches all off."""
     plain = to_dict(get_cfgs()[0])
     cfg = get_cfgs(f"--perturbation={name}")[0]
     rand = cfg.domain_rand
@@ -82,7 +82,7 @@ HARD = {
     ],
 )
 def test_ranges(words, ranges, errors):
-    """They are the published ones, whole, over what a loaded run has, and go with any perturbation."""
+    """They are the published ones, replace those of a loaded run, and go with any perturbation."""
     old = get_cfgs("--perturbation=high")[0]
     old.domain_rand.foot_radius, old.domain_rand.keep_probability = {"set": [0.0195, 0.0205]}, 0.3
     old.domain_rand.action_scale, old.noise.noise_scales.dof_pos = {"add": [-0.1, 0.1]}, 0.5
@@ -138,9 +138,9 @@ def test_units_of_the_robot(make_task):
     ],
 )
 def test_ranges_of_another_robot(make_task, name, limits, note):
-    """A line says which ranges do not fit the robot; the A1's own do, the hard ones as well."""
-    (told,) = make_task("a1_position", 1, **ON, **{f"domain_rand.{name}": limits}).notes
-    assert told == f"domain_rand.{note}: is it the range of another robot?"
+    """A line says which ranges do not fit the robot; those of the A1 fit, also the hard ones."""
+    (message,) = make_task("a1_position", 1, **ON, **{f"domain_rand.{name}": limits}).notes
+    assert message == f"domain_rand.{note}: is it the range of another robot?"
     hard = get_cfgs("--ranges=hard")[0].parameter_ranges()["hard"]["domain_rand"]
     ranges = {f"domain_rand.{key}": value for key, value in hard.items()}
     assert make_task("a1_position", 1, **ON, **ranges).notes == []
@@ -154,7 +154,7 @@ def test_ranges_of_another_robot(make_task, name, limits, note):
     ],
 )
 def test_sums_that_make_no_sense(make_task, name, limits, message):
-    """What a range leads to with the robot's own value is refused if it is negative, where it is drawn."""
+    """A range that can make a parameter negative is refused if it is drawn."""
     make_task("a1_torque", 1, **{f"domain_rand.{name}": limits})
     assert message in error_of(make_task, "a1_torque", 1, **ON, **{f"domain_rand.{name}": limits})
 

@@ -120,7 +120,7 @@ def test_servos_are_refused(changed, make_task, engine):
     assert "reads it as a motor (FL_hip, FL_thigh)" in error_of(make_engine, engine, model, 1)
 
 
-# --------------------------------------------------------------------------------------------------- what is refused
+# --------------------------------------------------------------------------------------------------- refusals
 
 
 def remove(path):
@@ -207,7 +207,7 @@ def test_fused_names_all(changed, make_task):
         assert reason in message
 
 
-# --------------------------------------------------------------------------------------------------- what is noted
+# --------------------------------------------------------------------------------------------------- notes
 
 
 def test_notes(changed):

@@ -35,8 +35,8 @@ def test_gains_by_joint():
 def test_order_of_the_pose():
     """A pose's order is that of all vectors of joints; one that the file's limbs cannot be put in is refused."""
     assert nominal_pose({"a": 1.0, "b": 2.0}, ["a", "b"]) == [1.0, 2.0]
-    told = error_of(nominal_pose, {"b": 2.0, "a": 1.0}, ["a", "b"])
-    assert "cannot be put in the order of init_state.default_joint_angles" in told and told.endswith(": a, b")
+    message = error_of(nominal_pose, {"b": 2.0, "a": 1.0}, ["a", "b"])
+    assert "cannot be put in the order of init_state.default_joint_angles" in message and message.endswith(": a, b")
 
 
 def test_robot_without_mirrored_legs(make_task):
@@ -60,7 +60,7 @@ def test_robot_without_mirrored_legs(make_task):
     ],
 )
 def test_observation_terms_that_do_not_fit(term, message):
-    """A name twice, or another number of scales or mirrored values, would shift what the networks see."""
+    """A name twice and another number of scales or mirrored values are refused."""
     name, size, *rest = term
 
     class Robot(LeggedRobot):

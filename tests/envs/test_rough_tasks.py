@@ -44,7 +44,7 @@ def test_headings(make_task):
 
 
 def test_a_held_command_has_no_heading(make_task):
-    """What a user holds is commanded as it is, and headings are followed again afterwards."""
+    """A command that a user holds is given as it is, and headings are followed again afterwards."""
     task = make_task("a1_rough_position", 3, **SMALL)
     task.command_generator.hold((0.5, -0.2, 0.3))
     task.command_generator.resample(torch.ones(3, dtype=torch.bool))

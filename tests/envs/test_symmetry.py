@@ -52,7 +52,7 @@ BY_HAND = {"policy": mirror_policy, "critic": mirror_critic, "actions": mirror_j
 
 @pytest.mark.parametrize("name", TASKS)
 def test_mirrored_twice(make_task, name):
-    """Mirroring is what it is by hand, is no identity, and undoes itself."""
+    """Mirroring is as by hand, no identity, and its own inverse."""
     task = make_task(name, 2)
     sizes = {key: value.shape[1] for key, value in task.get_observations().items()} | {"actions": task.num_actions}
     assert set(sizes) == set(GROUPS)

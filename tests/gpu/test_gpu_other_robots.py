@@ -49,7 +49,7 @@ def with_forces(sim):
 
 
 def test_worlds_do_not_see_each_other(device, crab):
-    """With idle threads, too, the first worlds of many move to the bit as they do alone."""
+    """Also with idle threads the first worlds of many move to the bit as they do alone."""
     model, states = crab
     together = step(with_forces(make_sim(model, len(states["qpos"]), device)), states)
     for number in (1, 7):

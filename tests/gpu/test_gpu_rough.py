@@ -17,7 +17,7 @@ WORDS += ["--set=algorithm.num_mini_batches=2", "--set=algorithm.num_learning_ep
 
 
 def test_graphs_change_nothing(device):
-    """With a height scan and a terrain curriculum, too, everything that ``recorded`` compares is the same bits."""
+    """Also with a height scan and a terrain curriculum everything that ``recorded`` compares is the same bits."""
     found, _ = differences(device, 4, *WORDS)
     assert found == {}
 

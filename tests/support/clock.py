@@ -25,4 +25,4 @@ def wait_for(condition, timeout=120.0):
         if value:
             return value
         time.sleep(0.05)
-    raise AssertionError(f"waited in vain for {condition.__name__}")
+    raise AssertionError(f"no end of waiting for {condition.__name__}")

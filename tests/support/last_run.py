@@ -73,7 +73,7 @@ class Recorder:
             FILE.write_text(json.dumps(self._record(), indent=2) + "\n")
 
     def _record(self):
-        """What the file holds."""
+        """The contents of the file."""
         counts = Counter(self._outcomes.values())
         return {
             "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),

@@ -71,7 +71,7 @@ def make_runner(device, *words, log_root=None):
 
 @contextlib.contextmanager
 def no_waiting(device):
-    """Let torch refuse whatever waits for a GPU."""
+    """Let torch refuse operations that wait for a GPU."""
     if torch.device(device).type != "cuda":
         yield
         return

@@ -44,6 +44,6 @@ def train(root, iterations, *words):
 
 
 def content(runner, iterations):
-    """All that a run's checkpoint holds, by name, apart from times."""
+    """The contents of a run's checkpoint by name, without times."""
     file = Path(runner.log_dir) / f"model_{iterations}.pt"
     return dict(values(torch.load(file, weights_only=True)))
