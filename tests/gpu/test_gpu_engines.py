@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from support.fused import random, step_mujoco
-from support.on_device import make_env, make_robot, make_sim, results, step
+from support.on_device import make_env, make_robot, make_sim, sim_of, step
 
 from legged_torque.sim.registry import ENGINES
 
@@ -34,23 +34,6 @@ def test_one_step(device, lively, engine):
     assert np.median(error) < (2e-5 if engine == "fused" else 1e-4) and np.quantile(error, 0.99) < 1e-2, error.max()
 
 
-def test_reset(device, lively):
-    """With either engine the worlds of a mask are at rest in the reference pose, and the others as they were."""
-    model, states, _ = lively
-    mask = torch.arange(WORLDS, device=device) % 3 == 0
-    own = mask.cpu().numpy()
-    for engine in ENGINES:
-        sim = make_sim(model, WORLDS, device, engine)
-        before = step(sim, states)
-        sim.reset(mask)
-        after = results(sim)
-        for one, other in zip(before, after, strict=True):
-            np.testing.assert_array_equal(one[~own], other[~own])
-        velocities, positions, *contacts = (values[own] for values in after)
-        assert not velocities.any() and not any(values.any() for values in contacts)
-        np.testing.assert_allclose(positions, np.tile(model.qpos0, (len(positions), 1)), rtol=0, atol=1e-6)
-
-
 def test_mujoco_warp_stands_in_a_graph(device):
     """A task on MuJoCo Warp's step, replayed as a graph, stands on four feet, which carry the robot's weight."""
     words = ["--task=a1_position", "--num_envs=64", "--set=sim.engine=mujoco_warp"]
@@ -58,6 +41,6 @@ def test_mujoco_warp_stands_in_a_graph(device):
     env, _ = make_env(device, *words, "--set=domain_rand.init_dof_pos_scale=[1,1]")
     for _ in range(80):
         env.step(torch.zeros(64, env.num_actions, device=device))
-    force, weight = env.sim.contact_force, 9.81 * 12.453
+    force, weight = sim_of(env).contact_force, 9.81 * 12.453
     assert ((force[:, :, 2] > 5.0).sum(dim=1) == 4).all()
     np.testing.assert_allclose(force.sum(dim=1).cpu().numpy(), [[0.0, 0.0, weight]] * 64, rtol=0, atol=0.02 * weight)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from support.fused import AIR, FIELDS, FLOOR, compiled, draw_states, make_crab, put, random, step_mujoco
-from support.on_device import assert_matches, make_robot, make_sim, results, step, thrown
+from support.on_device import assert_matches, assert_move_as_alone, make_robot, make_sim, results, step, thrown
 
 
 def test_two_long_legs(device):
@@ -42,17 +42,6 @@ def test_unlike_legs_under_applied_forces(device, crab):
         assert (np.abs(velocities - without[0]).max(axis=1) > 0.05).all()
 
 
-def with_forces(sim):
-    """An engine whose kernel reads applied forces."""
-    sim.applied_forces()
-    return sim
-
-
 def test_worlds_do_not_see_each_other(device, crab):
-    """Also with idle threads the first worlds of many move to the bit as they do alone."""
-    model, states = crab
-    together = step(with_forces(make_sim(model, len(states["qpos"]), device)), states)
-    for number in (1, 7):
-        few = {name: values[:number] for name, values in states.items()}
-        for ours, theirs in zip(step(with_forces(make_sim(model, number, device)), few), together, strict=True):
-            np.testing.assert_array_equal(ours, theirs[:number])
+    """With idle threads, too, the first worlds of many move to the bit as they do alone."""
+    assert_move_as_alone(*crab, device, 1, 7, prepare=lambda sim: sim.applied_forces())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from support.fused import FIELDS, put, random, step_mujoco
-from support.on_device import assert_matches, make_robot, make_sim, results, step, thrown
+from support.on_device import assert_matches, assert_move_as_alone, make_robot, make_sim, results, step, thrown
 
 WORLDS = 200
 
@@ -35,12 +35,7 @@ def test_matches_plain_mujoco(device, robot):
 
 def test_worlds_do_not_see_each_other(device, a1):
     """The first worlds of many move to the bit as they do alone, however many share a group of threads."""
-    model, states = a1
-    together = step(make_sim(model, WORLDS, device), states)
-    for number in (1, 3, 37):
-        alone = step(make_sim(model, number, device), {name: values[:number] for name, values in states.items()})
-        for ours, theirs in zip(alone, together, strict=True):
-            np.testing.assert_array_equal(ours, theirs[:number])
+    assert_move_as_alone(*a1, device, 1, 3, 37)
 
 
 def test_bad_numbers_stay_in_their_world(device, a1):

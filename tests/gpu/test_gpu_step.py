@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import kstest
-from support.on_device import make_env, no_waiting, used_memory
+from support.on_device import make_env, no_waiting, sim_of, use_graphs, used_memory
 
 WORLDS = 1024
 WORDS = ["--task=a1_torque_multihead", f"--num_envs={WORLDS}", "--perturbation=low"]
@@ -26,7 +26,7 @@ def outcome(env, step):
     """Take a step from a seed, and return copies of what came of it."""
     torch.manual_seed(100 + step)
     obs, rewards, dones, extras = env.step(actions_of(env, step))
-    exact = {"dones": dones, "time outs": extras["time_outs"], "qpos": env.sim.qpos, "qvel": env.sim.qvel}
+    exact = {"dones": dones, "time outs": extras["time_outs"], "qpos": sim_of(env).qpos, "qvel": sim_of(env).qvel}
     rounded = {**obs, "rewards": rewards, "episode sums": env.episode_sums, "air time": env.feet_air_time}
     return tuple({name: value.clone() for name, value in part.items()} for part in (exact, rounded))
 
@@ -64,7 +64,7 @@ def test_a_step_waits_for_nothing(device, walking):
     """Nothing is read back to the host, replayed or not: torch would refuse it here."""
     actions = actions_of(walking, 0)
     for is_replayed in (False, True):
-        walking.step_graph.enabled = is_replayed
+        use_graphs(walking, is_replayed)
         walking.step(actions)
         with no_waiting(device):
             for _ in range(5):
@@ -92,8 +92,8 @@ def test_bad_numbers_end_their_world(device):
     for step in range(8):
         actions = actions_of(broken, step)
         if step == 4:
-            broken.sim.qpos[worlds[0], 8] = math.nan
-            broken.sim.qvel[worlds[1], 10] = math.inf
+            sim_of(broken).qpos[worlds[0], 8] = math.nan
+            sim_of(broken).qvel[worlds[1], 10] = math.inf
         results = []
         for env in (broken, healthy):
             torch.manual_seed(step)
@@ -101,7 +101,7 @@ def test_bad_numbers_end_their_world(device):
             if step == 4 and env is broken:
                 given[worlds[2], 0] = math.nan
             obs, rewards, dones, _ = env.step(given)
-            state = (env.sim.qpos, env.sim.qvel)
+            state = (sim_of(env).qpos, sim_of(env).qvel)
             results.append([tensor.clone() for tensor in (*obs.values(), rewards, dones, *state)])
         for mine, other in zip(*results, strict=True):
             assert torch.isfinite(mine).all() and torch.equal(mine[others], other[others]), step
@@ -139,7 +139,7 @@ def assert_uniform(values, low, high):
 
 def numbers(env):
     """The chosen number of each field in all worlds. Shape: (fields, num_envs)."""
-    fields = {name: env.sim.field(name).flatten(1) for name in DRAWN}
+    fields = {name: sim_of(env).field(name).flatten(1) for name in DRAWN}
     return torch.stack([field[:, DRAWN[name][0]] for name, field in fields.items()])
 
 
@@ -158,25 +158,3 @@ def test_parameters(device):
         assert_uniform(values[changed], *limits)
     correlation = torch.corrcoef(torch.cat([after, before])[:, changed]) - torch.eye(2 * len(DRAWN), device=device)
     assert correlation.abs().max() < 4.5 / math.sqrt(int(changed.sum()))
-
-
-def test_new_episodes(device):
-    """Exactly the worlds whose time is over start anew: state, parameters, commands and counters."""
-    chances = ["domain_rand.resampling_probability", "domain_rand.push_probability", "commands.resampling_probability"]
-    env, _ = make_env(
-        device, *MANY, HIGH_UP, *(f"--set={name}=0" for name in chances), "--set=commands.heading_command=False"
-    )
-    take_steps(env, 3)
-    ends = torch.arange(NUM, device=device) % 5 == 0
-    env.episode_length_buf = torch.where(ends, int(env.max_episode_length), env.episode_length_buf)
-    before = {"parameters": numbers(env).T.clone(), "commands": env.commands.clone()}
-    _, _, dones, extras = env.step(torch.zeros(NUM, env.num_actions, device=device))
-    assert torch.equal(dones, ends) and torch.equal(extras["time_outs"], ends)
-    for name, now in {"parameters": numbers(env).T, "commands": env.commands}.items():
-        assert torch.equal(now[~ends], before[name][~ends]), name
-        assert (now[ends] != before[name][ends]).any(dim=1).all(), name
-    assert (env.episode_length_buf[ends] == 0).all() and (env.episode_length_buf[~ends] == 4).all()
-    height, velocity = env.sim.qpos[:, 2], env.sim.qvel
-    assert (height[ends] == 50.0).all() and (height[~ends] < 50.0).any()
-    assert_uniform(velocity[ends][:, 0], -0.5, 0.5)
-    assert_uniform(velocity[ends][:, 6:], -10.5, 10.5)

@@ -308,10 +308,11 @@ class EngineSuite:
             tables["dof_damping"] = 0.5 * tables["dof_damping"]
             sim.field("dof_damping").mul_(0.5)
 
-    def test_derived_constants(self):
+    @pytest.mark.parametrize("robot", ["walker", "crab"])
+    def test_derived_constants(self, robot):
         """Inverse weights follow masses and armatures, in the worlds of the mask, as by mj_setConst."""
         self.need("per_world")
-        model = compiled(ROBOTS["walker"]())
+        model = compiled(ROBOTS[robot]())
         sim, mask = self.make(3, model), torch.tensor([True, False, True])
         sim.field("body_mass")[:, 1:] *= torch.tensor(random((3, model.nbody - 1), 0.5, 2.0))
         sim.field("dof_armature")[:, 6:] += torch.tensor(random((3, model.nv - 6), 0.0, 0.1))

@@ -3,6 +3,7 @@
 import contextlib
 import gc
 
+import numpy as np
 import torch
 import warp as wp
 from support.fused import assert_alike, compiled, draw_states, put
@@ -41,6 +42,18 @@ def step(sim, states):
     return results(sim)
 
 
+def assert_move_as_alone(model, states, device, *numbers, prepare=lambda sim: None):
+    """Assert that the first so many worlds of many move to the bit as they do by themselves."""
+    together = None
+    for number in (len(states["qpos"]), *numbers):
+        sim = make_sim(model, number, device)
+        prepare(sim)
+        found = step(sim, {name: values[:number] for name, values in states.items()})
+        together = together or found
+        for ours, theirs in zip(found, together, strict=True):
+            np.testing.assert_array_equal(ours, theirs[:number])
+
+
 def thrown(model, num, seed=0):
     """States of a robot that was thrown on the floor, in proportion to its height."""
     height = model.key_qpos[0][2]
@@ -67,6 +80,16 @@ def make_runner(device, *words, log_root=None):
     """The runner of a command line, with the task that it trains."""
     env, train_cfg = make_env(device, *words)
     return task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=log_root)[0]
+
+
+def sim_of(env):
+    """The simulator of a task."""
+    return env.sim
+
+
+def use_graphs(env, on):
+    """Choose whether control steps of a task replay as a CUDA graph."""
+    env.step_graph.enabled = on
 
 
 @contextlib.contextmanager
