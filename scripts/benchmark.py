@@ -66,8 +66,7 @@ def main() -> None:
             sizes.append(task_registry.get_cfgs(args.task, options))
             check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
         device = resolve_device(args.device)
-        from legged_torque.benchmark.learning_time import time_training
-        from legged_torque.benchmark.measure import MemoryMeter
+        from legged_torque.benchmark.measure import MemoryMeter, time_training
     for file in filter(None, (args.json, args.profile)):
         cli.check_output(file)
     result = {"task": args.task, "device": device_name(device), "versions": package_versions(), "rounds": args.rounds}

@@ -91,7 +91,7 @@ def parse_args() -> argparse.Namespace:
     hint = """none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's
         window; default: %(default)s"""
     parser.add_argument("--viewer", choices=NUM_ENVS, default="none", help=hint)
-    hint = "folder of a run whose policy walks beside the followed robot, under the same command (--viewer web)"
+    hint = "folder of a run whose policy walks next to the followed robot, under the same command (--viewer web)"
     parser.add_argument("--compare", metavar="RUN", help=hint)
     hint = "address of the page; default: %(default)s, this machine alone; others need the printed token"
     parser.add_argument("--host", default="127.0.0.1", help=hint)
@@ -125,7 +125,7 @@ def show(args: argparse.Namespace, run: LoadedRun) -> None:
 
 
 def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
-    """Return the run of ``--compare``; a UserError if its robot cannot walk beside that of another run."""
+    """Return the run of ``--compare``; a UserError if its robot cannot walk next to that of another run."""
     task = load_config(Path(args.compare))["task"]
     options = Options(task, args.device, num_envs=1, load_run=args.compare, perturbation=args.perturbation)
     options.ranges, options.set = args.ranges, args.set

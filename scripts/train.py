@@ -39,9 +39,9 @@ def main() -> None:
     cli.add_task_args(parser)
     cli.add_options(parser, *cli.TRAINING)
     parser.add_argument("--list", action="store_true", help="print all tasks and exit")
-    hint = "web: a page beside the training, on which its newest policy walks; default: %(default)s"
+    hint = "web: a page on which the newest policy of the training walks; default: %(default)s"
     parser.add_argument("--viewer", choices=("none", "web"), default="none", help=hint)
-    hint = "iterations from one short video of the policy to the next, made beside the training; default: no videos"
+    hint = "iterations from one short video of the policy to the next, made during the training; default: no videos"
     parser.add_argument("--video_interval", type=int, default=0, metavar="N", help=hint)
     args = parser.parse_args()
     cli.check_at_least(args, 0, "video_interval")
@@ -126,7 +126,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
             print(f"{what}: {cli.script_command(script)} {run_words(options, runner.log_dir)}")
     runner.close()
     if runner.stopped_by:
-        sys.exit(128 + runner.stopped_by)  # as shells tell it: 130 after Ctrl-C
+        sys.exit(128 + runner.stopped_by)  # as shells do: 130 after Ctrl-C
 
 
 def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: Any, total: int, page: str) -> None:

@@ -41,7 +41,7 @@ def read(path: str | Path) -> tuple[dict[str, Any], Path]:
     check(description, f"'{file}'")
     name = description["network"]["file"]
     if Path(name).name != name:
-        raise UserError(f"'{file}': network.file must be the name of a file beside it, not '{name}'")
+        raise UserError(f"'{file}': network.file must be the name of a file in the same folder, not '{name}'")
     network = path if is_network else folder / name
     if not network.is_file():
         raise UserError(f"there is no network '{network}'")

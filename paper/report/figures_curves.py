@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 AXES = {"steps": (MILLION, "environment steps [millions]"), "seconds": (1.0, "time of training [s]")}
-"""What curves are drawn over: its unit, and the label of its axis."""
+"""Horizontal axes of curves: unit and label."""
 SINGLE_CURVES = ("track_percentage", "track_xy", "cost_of_transport")  # metrics shown for single trainings
 SEED_LINES = ("-.", "-", "--", ":")  # line styles of single trainings, by seed modulo four
 LABELS = {metric.name: metric.label for metric in (*CURVE_METRICS, LEVEL)}

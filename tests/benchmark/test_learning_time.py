@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from legged_torque.benchmark.learning_time import first_reaching, time_training
+from legged_torque.benchmark.measure import first_reaching, time_training
 from legged_torque.utils.errors import TrainingError
 
 TRACKING = [0.4, float("nan"), 0.7, 0.6, 0.8]

@@ -90,7 +90,7 @@ def test_derived_constants(make_task):
     check_constants(task.sim)
     before = {name: task.sim.field(name).clone() for name in (*FIELDS, "body_invweight0", "dof_invweight0")}
     mask = torch.tensor([True, False, True, False, False, False])
-    task.events.happen(mask)
+    task.events.apply(mask)
     for name, old in before.items():
         new = task.sim.field(name)
         assert torch.equal(new[~mask], old[~mask]), name

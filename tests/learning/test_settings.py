@@ -41,7 +41,7 @@ def test_activations():
 
 
 def test_names_of_a_users_own_task():
-    """What a user's task or one of its presets names is known, for every task, and a mistake in it is told."""
+    """Names in a user's task or in one of its presets are known for every task; a mistake in one is reported."""
 
     class Cfg(A1CfgPPO):
         class critic:

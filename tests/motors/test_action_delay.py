@@ -11,7 +11,7 @@ from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.config import set_by_path
 
 EXCEEDED = {1: 10.83, 3: 16.27, 5: 20.52, 15: 37.70, 35: 66.62}
-"""What 1 in 1000 chi-square numbers exceeds, by degrees of freedom."""
+"""The 99.9% quantile of chi-square, by degrees of freedom."""
 
 
 def delayed(low, high, unit="physics_steps", decimation=4, **more):

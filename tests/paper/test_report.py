@@ -23,7 +23,7 @@ from support.reports import (
     write_rows,
 )
 
-from legged_torque.experiments.times import Times, write_times
+from legged_torque.experiments.times import write_times
 from legged_torque.paper.report import figures
 from legged_torque.paper.report.evaluations import METRIC_NAMES
 from legged_torque.paper.report.experiment import read_experiment
@@ -69,7 +69,7 @@ def folder(tmp_path_factory):
     run = folder / "a1_torque-low-s1" / "2026-01-01_00-00-00"
     write_part(run, [line(i, i / 100) for i in range(10, 60, 10)], **settings["a1_torque"])
     (run.parent / "result_<script>&.json").write_text("{")
-    write_times(folder / "a1_position-low-s1", Times(110_000_000, {"gpu training": 55.0}))
+    write_times(folder / "a1_position-low-s1", {"steps": 110_000_000, "gpu training": 55.0})
     (folder / "videos").mkdir()
     for name in ("a1_torque.mp4", "a1_position.gif", "a1_other.mp4", "a1_torque.txt"):
         (folder / "videos" / name).write_bytes(name.encode())

@@ -178,11 +178,11 @@ def test_final_observations(changes):
     for step in range(40):
         actions = torch.randn(5, 12, generator=torch.Generator().manual_seed(step))
         states = []
-        happen = task.events.happen
-        task.events.happen = lambda mask, run=happen, kept=states: (kept.append(task.sim.qpos.clone()), run(mask))
+        apply = task.events.apply
+        task.events.apply = lambda mask, run=apply, kept=states: (kept.append(task.sim.qpos.clone()), run(mask))
         torch.manual_seed(step)
         obs, _, dones, extras = task.step(actions)
-        task.events.happen = happen
+        task.events.apply = apply
         torch.manual_seed(step)
         expected, _, _, nothing = plain.step(actions)
         for group in ("policy", "critic", "camera"):

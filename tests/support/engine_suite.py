@@ -21,7 +21,7 @@ USES = {
     "per_world": lambda sim: sim.field("body_mass"),
     "height_map": lambda sim: make_engine(sim.name, sim.mj_model, 1, height_map=object()),
 }
-"""What needs a capability."""
+"""Tests that need a capability."""
 
 
 def steep_capsule_touches(model, data):

@@ -1,4 +1,4 @@
-"""What is committed names no folder of one machine."""
+"""No committed file names a folder of one machine."""
 
 from pathlib import Path
 
