@@ -1,4 +1,4 @@
-"""The console command."""
+"""Shared by tests: command."""
 
 import os
 import subprocess

@@ -117,7 +117,7 @@ def draw_states(model, num, heights=FLOOR, seed=0):
 
 
 def step_mujoco(model, states, wrenches=None, forces=None):
-    """Velocities, positions, contact counts and contact forces after one step of plain MuJoCo, with applied forces."""
+    """Velocities, positions, contact counts and contact forces after one step of plain MuJoCo, under applied forces."""
     data, result = mujoco.MjData(model), []
     for world in range(len(states["qpos"])):
         mujoco.mj_resetData(model, data)
