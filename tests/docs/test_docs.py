@@ -80,3 +80,12 @@ def test_navigation_has_every_page():
         return entry.values() if isinstance(entry, dict) else entry
 
     assert sorted(files(settings["nav"])) == sorted(str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md"))
+
+
+def test_sizes():
+    """Documents stay short: lines of the README and the changelog, words in all, and bytes of docs/."""
+    lines = {name: len((ROOT / name).read_text("utf-8").splitlines()) for name in ("README.md", "CHANGELOG.md")}
+    assert lines["README.md"] <= 120 and lines["CHANGELOG.md"] <= 100
+    generated = {DOCS / "reference" / "settings.md", DOCS / "reference" / "scripts.md", *DOCS.rglob("report.md")}
+    assert sum(len(page.read_text("utf-8").split()) for page in {*PAGES} - generated) <= 30_000
+    assert sum(file.stat().st_size for file in DOCS.rglob("*") if file.is_file()) <= 3_000_000
