@@ -280,7 +280,7 @@ def test_mirror_images_follow_axes(changed, make_task):
 def test_unlike_sides_are_no_mirror_images(changed, make_task):
     """A leg at another place, or with another axis, has no mirror image."""
     task = make_task("a1_torque", 1, **{"asset.file": changed(setting(".//body[@name='FL_calf']", pos="0 0 -0.25"))})
-    assert "beside the mirror image of its counterpart" in error_of(lambda: task.mirror)
+    assert "away from the mirror image of its counterpart" in error_of(lambda: task.mirror)
     task = make_task("a1_torque", 1, **{"asset.file": changed(joint("FL_hip_joint", axis="1 0 0.3"))})
     assert "the axes of 'FR_hip_joint' and 'FL_hip_joint' are not mirror images" in error_of(lambda: task.mirror)
 
