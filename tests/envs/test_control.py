@@ -44,18 +44,6 @@ def test_multi_head_torques(make_task, name, end, total_steps):
     np.testing.assert_allclose(torques, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_mixing_changes_between_rollouts_only(make_task):
-    """Steps alone never change the mixing weights, however many intervals pass; the hook between rollouts does."""
-    task = make_task("a1_multihead", 2)
-    task.total_steps.fill_(24_999_999)
-    for _ in range(2):
-        task.step(torch.zeros(2, 24))
-    task.reset()
-    assert task.mixing.tolist() == [1.0, 1.0]
-    task.update_curriculum()
-    assert task.mixing[0].item() == pytest.approx(0.55072, rel=1e-5)
-
-
 @pytest.mark.parametrize("name", ["a1_position", "a1_multihead"])
 def test_torques_are_clipped(make_task, name):
     """No joint gets more than 33.5 N m, and extreme actions give exactly that."""

@@ -126,19 +126,11 @@ def test_tracking_of_headings_by_hand(make_task):
     assert metrics.means()["track_angular"] == pytest.approx((0.299**2 + 0.3**2) / 2)
 
 
-@pytest.mark.parametrize(
-    ("numerator", "denominator", "mean", "error"),
-    [
-        ([1.0, 3.0], [1.0, 1.0], 2.0, 1.0),
-        ([2.0, 0.0, 4.0], [1.0, 2.0, 3.0], 1.0, 0.5),  # residuals 1, -2, 1
-        ([2.0, 4.0, 6.0], [1.0, 2.0, 3.0], 2.0, 0.0),
-        ([3.0], [2.0], 1.5, math.nan),
-    ],
-)
-def test_standard_error_by_hand(numerator, denominator, mean, error):
+def test_standard_error_by_hand():
     """A ratio of sums with its standard error, which is unknown with one world."""
-    result = estimate(np.array(numerator, float), np.array(denominator, float))
-    assert (result.mean, result.standard_error) == pytest.approx((mean, error), rel=1e-12, nan_ok=True)
+    result = estimate(np.array([2.0, 0.0, 4.0]), np.array([1.0, 2.0, 3.0]))  # residuals 1, -2, 1
+    assert (result.mean, result.standard_error) == pytest.approx((1.0, 0.5), rel=1e-12)
+    assert math.isnan(estimate(np.array([3.0]), np.array([2.0])).standard_error)
 
 
 def test_lying_robots_against_mujoco(make_task):

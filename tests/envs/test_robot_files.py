@@ -99,16 +99,6 @@ def test_torque_limits_are_the_tightest(changed, changes):
     np.testing.assert_allclose([data.joint(name).qfrc_actuator[0] for name in POSE], wanted)
 
 
-def test_the_a1_stays_as_it_is():
-    """Its motors are plain and in order: its model is that of its file, and nothing is noted."""
-    asset = load_asset(A1Cfg())
-    spec = read_spec(A1)
-    model = build_model(spec, asset.geom_names)
-    for field in ("ctrlrange", "forcerange", "gear", "trnid"):
-        np.testing.assert_array_equal(getattr(asset.mj_model, f"actuator_{field}"), getattr(model, f"actuator_{field}"))
-    assert asset.notes == []
-
-
 @pytest.mark.parametrize("engine", ENGINES)
 def test_servos_are_refused(changed, make_task, engine):
     """Every engine names the actuators that are no motors and the remedy, in tasks and in simulators of a model."""
