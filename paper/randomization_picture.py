@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from legged_torque.envs import task_registry
+from legged_torque.paper.plotting import load_pyplot, save_figure
 from legged_torque.utils import cli
-from legged_torque.utils.plotting import load_pyplot, save_figure
 from legged_torque.utils.task_registry import set_seed
 
 if TYPE_CHECKING:

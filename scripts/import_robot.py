@@ -13,6 +13,7 @@ from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer, disable_renderer
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_whole
+from legged_torque.utils.limits import Positive
 
 
 def main() -> None:
@@ -21,12 +22,11 @@ def main() -> None:
     parser.add_argument("file", type=Path, help="MJCF or URDF; its meshes are used if they are near it")
     parser.add_argument("--name", default="", help="name of the robot; default: that of the file")
     parser.add_argument("--out", type=Path, help="folder for both files; default: where the library keeps its robots")
-    parser.add_argument("--torque_limit", type=cli.finite, help="[N m] of all joints; default: those of the file")
+    parser.add_argument("--torque_limit", type=float, help="[N m] of all joints; default: those of the file")
     parser.add_argument("--check", action="store_true", help="hold the nominal pose for 5 s and draw a picture of it")
     parser.add_argument("--force", action="store_true", help="write over files that exist")
     args = parser.parse_args()
-    if args.torque_limit is not None and args.torque_limit <= 0:
-        raise UserError(f"--torque_limit must be above 0, not {args.torque_limit}")
+    cli.check_args(args, torque_limit=Positive)
     no_picture = choose_offscreen_renderer() if args.check else disable_renderer()
     with cli.slow_imports():
         from legged_torque.importer.mjcf import mjcf

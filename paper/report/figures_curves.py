@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from legged_torque.paper.plotting import load_pyplot
 from legged_torque.paper.report.evaluations import CURVE_METRICS, LEVEL, MILLION, read_curves
 from legged_torque.paper.report.experiment import LAST_SHARE, Experiment
 from legged_torque.paper.report.style import name_of, style
 from legged_torque.paper.values import ENVIRONMENTS
-from legged_torque.utils.plotting import load_pyplot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -220,8 +220,8 @@ def test_recorder(policy):
         seen.append((robot.data.qpos.tolist(), [0.5, -0.1, 0.2], velocity))
 
     simulation.run(3, 1, on_step)
-    assert recorder.model is robot.model and robot.model.body(recorder.trunk).name == "trunk"
-    assert [(m.qpos.tolist(), m.command.tolist(), m.velocity.tolist()) for (m,) in recorder.steps] == seen
+    assert recorder.drawing.model is robot.model and robot.model.body(recorder.drawing.trunk).name == "trunk"
+    assert [tuple(part[0].tolist() for part in step) for step in recorder.steps] == seen
 
 
 @pytest.mark.parametrize("factor", [None, 1.1, 1.5])
@@ -292,7 +292,7 @@ MISTAKES = [
     ("--seed=-1", "--seed must be at least 0, not -1"),
     ("--push_probability=0.1", "--push_probability needs --push_velocity"),
     ("--push_velocity=1 --push_probability=2", "--push_probability must be from 0 to 1"),
-    ("--push_velocity=nan", "argument --push_velocity: it must be finite, not nan"),
+    ("--push_velocity=nan", "--push_velocity must be finite, at most 1e+09 either way, not nan"),
     ("--step=3", "unknown option '--step=3'; did you mean '--steps'?"),
     ("--viewer", "MuJoCo's window needs a screen; --video works without one"),
     ("--xml=nothing.xml", "cannot load the robot 'nothing.xml': there is no such file"),

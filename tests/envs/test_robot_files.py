@@ -27,7 +27,7 @@ from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.sim.model import build_model
 from legged_torque.sim.registry import ENGINES, make_engine
 from legged_torque.utils.mjcf import read_spec, robot_notes
-from legged_torque.viewer.ground import drawn_model
+from legged_torque.viewer.drawing import drawn_model
 
 POSE = A1Cfg.init_state.default_joint_angles
 

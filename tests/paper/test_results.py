@@ -13,12 +13,12 @@ from support.reports import HEADER, SETTINGS, line, whole_run, write_experiment,
 from support.settings import error_of
 
 from legged_torque.experiments.matrix import Cell, Matrix
+from legged_torque.paper.metrics import METRICS, PAPER_METRICS
 from legged_torque.paper.report.evaluations import METRIC_NAMES, read_curves, read_evaluations
 from legged_torque.paper.report.experiment import Experiment, Training, read_experiment
 from legged_torque.paper.report.report import run_problems
 from legged_torque.paper.report.tables import best_torque, holm, summarize, verdict, welch
-from legged_torque.paper.values import ENVIRONMENTS, PAPER_METRICS, TABLE_I, paper_value
-from legged_torque.utils.metrics import METRICS
+from legged_torque.paper.values import ENVIRONMENTS, TABLE_I, paper_value
 
 CELL = Cell(Path("a1_torque-low-s1"), "a1_torque", "low", 1, ("low",))
 METRIC = {metric.name: metric for metric in METRICS}

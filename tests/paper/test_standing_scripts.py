@@ -7,7 +7,7 @@ import sys
 import matplotlib.image
 import pytest
 import torch
-from support.command import command
+from support.command import command, complete
 from support.gravity import TASK
 from support.gravity import made as made  # a fixture
 from support.reports import line, write_run
@@ -132,10 +132,5 @@ def test_command(tmp_path):
     """The console command has the figures' own help, and completes their names and options."""
     status, output, error = command("plot", "curves", "--help")
     assert (status, error) == (0, "") and output.startswith("usage: legged-torque plot curves ")
-    for words, expected in {"plot cur": ["curves"], "plot curves --o": ["--out"]}.items():
-        offered = tmp_path / expected[0]
-        line = f"legged-torque {words}"
-        variables = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
-        variables |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(offered), "_ARGCOMPLETE_SHELL": "bash"}
-        assert command(env=variables)[0] == 0
-        assert offered.read_text().split() == expected
+    assert complete("legged-torque plot cur", tmp_path / "1") == ["curves"]
+    assert complete("legged-torque plot curves --o", tmp_path / "2") == ["--out"]
