@@ -1,4 +1,4 @@
-"""Links between the pages lead somewhere, on the site as in the repository, and the site has every page."""
+"""Links between pages have targets, on the site as in the repository, and the site has every page."""
 
 import re
 from pathlib import Path
@@ -25,7 +25,7 @@ def anchors(page):
 
 
 def broken_links(page):
-    """Links of a page to files or headings that are not there, and of the site's pages to what the site lacks."""
+    """Links of a page to missing files or headings, and of the site's pages to files outside of the site."""
     broken = []
     for link in re.findall(r"\]\(\s*([^)\s]+)\s*\)", without_code(page)):
         if re.match(r"[a-z]+:", link):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from support.fused import random, step_mujoco
-from support.on_device import make_env, make_robot, make_sim, results, sim_of, step
+from support.on_device import make_env, make_robot, make_sim, sim_of, step
 
 from legged_torque.sim.registry import ENGINES
 
@@ -32,23 +32,6 @@ def test_one_step(device, lively, engine):
     error = np.abs(actual[0] - expected[0]).max(axis=1)[alike]
     assert alike.mean() >= 0.99
     assert np.median(error) < (2e-5 if engine == "fused" else 1e-4) and np.quantile(error, 0.99) < 1e-2, error.max()
-
-
-def test_reset(device, lively):
-    """With either engine the worlds of a mask are at rest in the reference pose, and the others as they were."""
-    model, states, _ = lively
-    mask = torch.arange(WORLDS, device=device) % 3 == 0
-    own = mask.cpu().numpy()
-    for engine in ENGINES:
-        sim = make_sim(model, WORLDS, device, engine)
-        before = step(sim, states)
-        sim.reset(mask)
-        after = results(sim)
-        for one, other in zip(before, after, strict=True):
-            np.testing.assert_array_equal(one[~own], other[~own])
-        velocities, positions, *contacts = (values[own] for values in after)
-        assert not velocities.any() and not any(values.any() for values in contacts)
-        np.testing.assert_allclose(positions, np.tile(model.qpos0, (len(positions), 1)), rtol=0, atol=1e-6)
 
 
 def test_mujoco_warp_stands_in_a_graph(device):

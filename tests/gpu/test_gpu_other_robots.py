@@ -1,11 +1,10 @@
 """The fused step with two and with eight threads per world, some of them idle, against plain MuJoCo."""
 
-import mujoco
 import numpy as np
 import pytest
 import torch
 from support.fused import AIR, FIELDS, FLOOR, compiled, draw_states, make_crab, put, random, step_mujoco
-from support.on_device import assert_matches, make_robot, make_sim, results, step, thrown
+from support.on_device import assert_matches, assert_move_as_alone, make_robot, make_sim, results, step, thrown
 
 
 def test_two_long_legs(device):
@@ -37,30 +36,12 @@ def test_unlike_legs_under_applied_forces(device, crab):
         for applied, values in zip(sim.applied_forces(), (of_bodies, of_joints), strict=True):
             applied.copy_(torch.tensor(values))
         sim.step()
-        velocities, data = [], mujoco.MjData(model)
-        for world in range(count):
-            mujoco.mj_resetData(model, data)
-            for name in FIELDS:
-                getattr(data, name)[:] = states[name][world]
-            data.xfrc_applied[:], data.qfrc_applied[:] = of_bodies[world], of_joints[world]
-            mujoco.mj_step(model, data)
-            velocities.append(data.qvel.copy())
+        velocities = step_mujoco(model, states, of_bodies, of_joints)[0]
         error = np.abs(results(sim)[0] - velocities).max(axis=1)
         assert np.median(error) < 1e-4 and error.max() < 5e-3, error.max()
         assert (np.abs(velocities - without[0]).max(axis=1) > 0.05).all()
 
 
-def with_forces(sim):
-    """An engine whose kernel reads applied forces."""
-    sim.applied_forces()
-    return sim
-
-
 def test_worlds_do_not_see_each_other(device, crab):
     """With idle threads, too, the first worlds of many move to the bit as they do alone."""
-    model, states = crab
-    together = step(with_forces(make_sim(model, len(states["qpos"]), device)), states)
-    for number in (1, 7):
-        few = {name: values[:number] for name, values in states.items()}
-        for ours, theirs in zip(step(with_forces(make_sim(model, number, device)), few), together, strict=True):
-            np.testing.assert_array_equal(ours, theirs[:number])
+    assert_move_as_alone(*crab, device, 1, 7, prepare=lambda sim: sim.applied_forces())

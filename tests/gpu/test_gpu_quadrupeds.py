@@ -7,9 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-import warp as wp
 from support.fused import FIELDS, put, random, step_mujoco
-from support.on_device import assert_matches, make_robot, make_sim, results, step, thrown
+from support.on_device import assert_matches, assert_move_as_alone, make_robot, make_sim, results, step, thrown
 
 WORLDS = 200
 
@@ -36,12 +35,7 @@ def test_matches_plain_mujoco(device, robot):
 
 def test_worlds_do_not_see_each_other(device, a1):
     """The first worlds of many move to the bit as they do alone, however many share a group of threads."""
-    model, states = a1
-    together = step(make_sim(model, WORLDS, device), states)
-    for number in (1, 3, 37):
-        alone = step(make_sim(model, number, device), {name: values[:number] for name, values in states.items()})
-        for ours, theirs in zip(alone, together, strict=True):
-            np.testing.assert_array_equal(ours, theirs[:number])
+    assert_move_as_alone(*a1, device, 1, 3, 37)
 
 
 def test_bad_numbers_stay_in_their_world(device, a1):
@@ -78,7 +72,7 @@ OWN = {  # how each number of a field is changed: by a factor, or by a sum
 
 
 def test_worlds_with_parameters_of_their_own(device, a1):
-    """They move as MuJoCo's models with these numbers, and so do the others; what follows from masses is mj_setConst's.
+    """They move as MuJoCo's models with these numbers, and so do the others; inverse weights are mj_setConst's.
 
     Only the worlds of a mask are changed.
     """
@@ -110,15 +104,3 @@ def test_worlds_with_parameters_of_their_own(device, a1):
         expected = step_mujoco(own, alone)[0][0]
         np.testing.assert_allclose(actual[world], expected, rtol=0, atol=3e-3, err_msg=f"world {world}")
         assert (np.abs(expected - plain[world]).max() > 1e-2) == (world % 2 == 0)
-
-
-def test_as_on_a_cpu(device, a1):
-    """A GPU's step is that of a CPU, where one thread does a whole world, up to rounding."""
-    if not wp.is_cpu_available():
-        pytest.skip("needs Warp's compiler for the CPU")
-    model, states = a1
-    ours, theirs = (step(make_sim(model, WORLDS, each), states) for each in (device, "cpu"))
-    alike = (ours[2] == theirs[2]).all(axis=1)  # in others a contact only just touches
-    error = np.abs(ours[0] - theirs[0])[alike]
-    assert alike.mean() >= 0.99
-    assert np.median(error) < 1e-5 and np.quantile(error, 0.999) < 1e-3, (np.median(error), error.max())

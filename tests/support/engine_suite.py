@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.fused import ROBOTS, compiled, draw_states, make_a1, put, random
+from support.fused import ROBOTS, compiled, draw_states, make_a1, put, random, step_mujoco
 from support.simulator import LEGS, SENSED, WEIGHT, contacts_by_hand
 
 from legged_torque.sim.engine import CAPABILITIES
@@ -99,7 +99,7 @@ class EngineSuite:
         assert len(errors) > 0.85 * 800 and in_contact > 0.5 * 800
 
     def test_worlds_do_not_interact(self):
-        """A world in contact moves bitwise alike whatever its neighbours do, not finite ones included."""
+        """A world in contact moves to the bit alike next to any neighbours, also next to one that is not finite."""
         torques, trajectories = torch.tensor(random((20, 12), -12.0, 12.0)), []
         for height in (0.15, 5.0, float("nan")):
             sim = self.scattered(2)
@@ -172,7 +172,7 @@ class EngineSuite:
 
     @pytest.mark.parametrize("worlds", [[0], [1, 3], [0, 1, 2, 3]])
     def test_reset_touches_only_masked_worlds(self, worlds):
-        """A reset puts worlds at rest into the reference pose; the others go on as if nothing had happened."""
+        """A reset puts worlds at rest into the reference pose; the others go on unchanged."""
         sim, twin = (self.scattered(4, lowest=0.1) for _ in range(2))
         torques, mask = torch.tensor(random((8, 4, 12), -12.0, 12.0)), torch.zeros(4, dtype=torch.bool)
         mask[worlds] = True
@@ -251,7 +251,7 @@ class EngineSuite:
 
     @pytest.mark.parametrize("capability", USES)
     def test_what_lacks_is_refused(self, capability):
-        """An engine's capabilities are known ones; what it lacks is refused by both names."""
+        """An engine's capabilities are known ones; one that it lacks is refused by both names."""
         sim = self.make(1)
         assert sim.capabilities <= set(CAPABILITIES)
         if capability not in sim.capabilities:
@@ -271,27 +271,15 @@ class EngineSuite:
             for applied, values in zip(sim.applied_forces(), (on_bodies, on_joints), strict=True):
                 applied.copy_(torch.tensor(values))
             sim.step()
-            expected = self._pushed(model, states, on_bodies, on_joints)
+            expected = step_mujoco(model, states, on_bodies, on_joints)[0]
             error = np.abs(sim.qvel.double().numpy() - expected).max(axis=1)
             assert np.median(error) < 1e-4 and error.max() < 5e-3
-            without = self._pushed(model, states, 0.0 * xfrc, 0.0 * qfrc)
+            without = step_mujoco(model, states)[0]
             assert (np.abs(expected - without).max(axis=1) > 0.05).all()
         mask = torch.arange(20) == 3
         sim.reset(mask)
         for applied in sim.applied_forces():
             assert (applied[mask] == 0.0).all() and applied[~mask].any() == applied.any()
-
-    @staticmethod
-    def _pushed(model, states, xfrc, qfrc):
-        """Velocities after one step of plain MuJoCo under forces."""
-        data, result = mujoco.MjData(model), []
-        for world in range(len(xfrc)):
-            for field, values in states.items():
-                getattr(data, field)[:] = values[world]
-            data.xfrc_applied[:], data.qfrc_applied[:] = xfrc[world], qfrc[world]
-            mujoco.mj_step(model, data)
-            result.append(data.qvel.copy())
-        return np.array(result)
 
     def test_parameters_per_world(self):
         """Worlds with rows of their own move as MuJoCo's models with these numbers; writing them acts at once."""
@@ -314,16 +302,17 @@ class EngineSuite:
             for world in range(3):
                 for name, values in tables.items():
                     getattr(model.opt if name == "gravity" else model, name)[:] = values[world]
-                expected = self._pushed(model, states, np.zeros((1, 14, 6)), np.zeros((1, 18)))[0]
+                expected = step_mujoco(model, states)[0][0]
                 np.testing.assert_allclose(sim.qvel[world], expected, rtol=0, atol=2e-3)
             assert np.abs(np.diff(sim.qvel.numpy(), axis=0)).max(axis=1).min() > 0.1
             tables["dof_damping"] = 0.5 * tables["dof_damping"]
             sim.field("dof_damping").mul_(0.5)
 
-    def test_derived_constants(self):
+    @pytest.mark.parametrize("robot", ["walker", "crab"])
+    def test_derived_constants(self, robot):
         """Inverse weights follow masses and armatures, in the worlds of the mask, as by mj_setConst."""
         self.need("per_world")
-        model = compiled(ROBOTS["walker"]())
+        model = compiled(ROBOTS[robot]())
         sim, mask = self.make(3, model), torch.tensor([True, False, True])
         sim.field("body_mass")[:, 1:] *= torch.tensor(random((3, model.nbody - 1), 0.5, 2.0))
         sim.field("dof_armature")[:, 6:] += torch.tensor(random((3, model.nv - 6), 0.0, 0.1))

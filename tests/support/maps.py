@@ -5,9 +5,10 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import torch
-from support.fused import compiled, spoil
+from support.fused import compiled, draw_states, make_a1, spoil
 
 from legged_torque.sim.registry import make_engine
+from tools.accuracy import PlanePerFoot, copy_state, reference_step
 
 BALL = """<mujoco><compiler angle="radian" autolimits="true"/>
 <option cone="pyramidal" integrator="implicitfast" impratio="1" timestep="0.005"/>
@@ -96,3 +97,51 @@ def heights_under(height_map, points):
     x, y = places[..., 0] - i, places[..., 1] - j
     a, b, c, d = heights[i, j], heights[i + 1, j], heights[i, j + 1], heights[i + 1, j + 1]
     return np.where(x >= y, a + (b - a) * x + (d - b) * y, a + (c - a) * y + (d - c) * x)
+
+
+def roofs(x, y):
+    """Slopes of 0.8 m by 0.8 m, which meet in ridges and valleys."""
+    return 0.3 * np.abs(x % 1.6 - 0.8) + 0.2 * np.abs(y % 1.6 - 0.8)
+
+
+def states_on_slope(slope, num):
+    """The A1 on a tilted plane, states in which it touches it, and the map of this plane.
+
+    Of boxes that are more than half in it, MuJoCo lets only the lower corners touch: those states are left out.
+    """
+    along, normal, quat = tilted(slope, 0.7)
+    model = compiled(make_a1(lambda spec: setattr(spec.geom("floor"), "quat", quat)))
+    states = draw_states(model, num, (0.05, 0.4))
+    data, boxes = mujoco.MjData(model), model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
+    kept = []
+    for data.qpos[:] in states["qpos"]:
+        mujoco.mj_kinematics(model, data)
+        kept.append((data.geom_xpos[boxes] @ normal > 0.0).all())
+    states = {field: values[kept] for field, values in states.items()}
+    return model, states, make_map(lambda x, y: along[0] * x + along[1] * y)
+
+
+def feet_only(spec):
+    """Let nothing but feet reach the ground: all else that collides is tiny and at the joints."""
+    for geom in spec.geoms:
+        if geom.conaffinity and not geom.name.endswith("foot") and geom.name != "floor":
+            geom.size, geom.pos = [1e-3, 1e-3, 1e-3], [0.0, 0.0, 0.0]
+
+
+def assert_feet_meet_planes(worlds, device="cpu"):
+    """Robots that stand on roofs move as in plain MuJoCo with a plane posed under each foot, where that is exact."""
+    rng, ground = np.random.default_rng(2), make_map(roofs, cells=120)
+    sim = make_engine("fused", compiled(make_a1(feet_only)), worlds, device, 100, 50, ground)
+    home = torch.tensor(sim.mj_model.key_qpos[0], dtype=torch.float32, device=device)
+    sim.qpos.copy_(home)
+    sim.qpos[:, :2] = torch.tensor(rng.uniform(-1.5, 1.5, (worlds, 2)), device=device)
+    sim.qpos[:, 2] += 0.4
+    for _ in range(150):
+        sim.ctrl.copy_(60.0 * (home[7:] - sim.qpos[:, 7:]) - 1.5 * sim.qvel[:, 6:])
+        sim.step()
+    states = copy_state(sim)
+    planes = PlanePerFoot(make_a1(feet_only), [f"{leg}_foot" for leg in ("FR", "FL", "RR", "RL")], ground)
+    expected, exact = reference_step(planes.model, states, planes.pose)
+    sim.step()
+    assert exact.mean() > 0.3 and (sim.contact_found.cpu().numpy()[exact] > 0).any(axis=1).mean() > 0.9
+    np.testing.assert_allclose(sim.qvel.cpu().numpy()[exact], expected[exact], rtol=0, atol=1e-3)

@@ -1,8 +1,9 @@
-"""Simulators, tasks and trainings on a device of the test's choice, and what tests read of them."""
+"""Simulators, tasks and trainings on a device, and results of their steps."""
 
 import contextlib
 import gc
 
+import numpy as np
 import torch
 import warp as wp
 from support.fused import assert_alike, compiled, draw_states, put
@@ -39,6 +40,18 @@ def step(sim, states):
     put(sim, states)
     sim.step()
     return results(sim)
+
+
+def assert_move_as_alone(model, states, device, *numbers, prepare=lambda sim: None):
+    """Assert that the first so many worlds of many move to the bit as they do by themselves."""
+    together = None
+    for number in (len(states["qpos"]), *numbers):
+        sim = make_sim(model, number, device)
+        prepare(sim)
+        found = step(sim, {name: values[:number] for name, values in states.items()})
+        together = together or found
+        for ours, theirs in zip(found, together, strict=True):
+            np.testing.assert_array_equal(ours, theirs[:number])
 
 
 def thrown(model, num, seed=0):
@@ -81,7 +94,7 @@ def use_graphs(env, on):
 
 @contextlib.contextmanager
 def no_waiting(device):
-    """Let torch refuse whatever waits for a GPU."""
+    """Let torch refuse operations that wait for a GPU."""
     if torch.device(device).type != "cuda":
         yield
         return
