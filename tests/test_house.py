@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LEVELS = [
     ("utils",),
-    ("sim", "terrain", "learning.settings"),
+    ("sim", "terrain"),
     ("motors", "envs.base.state"),
     ("sensors",),
     ("envs.base",),

@@ -7,8 +7,8 @@ from rsl_rl.utils import resolve_nn_activation
 from support.settings import error_of, get_cfgs, parse
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.base.training_config import Activation
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
-from legged_torque.learning.settings import Activation
 from legged_torque.utils.task_registry import TaskRegistry
 
 

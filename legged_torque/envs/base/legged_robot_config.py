@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from legged_torque.envs.base.older_runs import RENAMED, converted, is_older
-from legged_torque.learning.settings import Activation, TrainingCfg
+from legged_torque.envs.base.training_config import Activation, TrainingCfg
 from legged_torque.motors.config import DelayCfg, IdealCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
 from legged_torque.utils.errors import UserError
