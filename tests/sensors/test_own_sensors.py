@@ -7,7 +7,7 @@ from support.settings import error_of
 
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.observations import ObservationTerm
-from legged_torque.envs.tasks import A1TorqueCfg
+from legged_torque.envs.tasks import A1TorqueCfg, A1TorqueCfgPPO, task_registry
 from legged_torque.sensors.config import SensorCfg
 from legged_torque.sensors.sensor import Sensor
 from legged_torque.utils.math import quat_rotate_yaw
@@ -167,6 +167,10 @@ def test_mistakes():
             return [*super().observation_terms(), ObservationTerm("more", lambda: self.commands, None, group="critic")]
 
     assert "the observation group 'critic' of 'more' exists already" in error_of(Taken, RayCfg())
+    train_cfg = A1TorqueCfgPPO()
+    train_cfg.obs_groups.actor = ["policy", "camera"]
+    refused = error_of(lambda: task_registry.make_alg_runner(make(), train_cfg=train_cfg, log_root=None))
+    assert refused.startswith("obs_groups: The MLP model only supports 1D observations") and "'camera'" in refused
 
 
 @pytest.mark.parametrize("changes", [{}, {"delay": 0.04}])
