@@ -6,11 +6,11 @@ __version__ = "0.1.0"
 
 _CHECKOUT = Path(__file__).resolve().parents[1]
 if (_CHECKOUT / "paper" / "__init__.py").is_file():
-    __path__.append(str(_CHECKOUT))  # legged_torque.paper lies beside the package; a wheel holds it inside
+    __path__.append(str(_CHECKOUT))  # legged_torque.paper is next to the package; a wheel holds it inside
 
 
 def _find_dir(name: str, installed_name: str = "") -> Path:
-    """Return a folder that a wheel holds inside the package, maybe by another name, and a checkout beside it."""
+    """Return a folder that a wheel holds inside the package, maybe by another name, and a checkout next to it."""
     package = Path(__file__).resolve().parent
     installed = package / (installed_name or name)
     return installed if installed.is_dir() else package.parent / name

@@ -1,1 +1,1 @@
-"""The paper: gravity pre-training, its published values, and reports of experiments beside them."""
+"""The paper: gravity pre-training, its published values, and reports that compare experiments with them."""

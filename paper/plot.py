@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from legged_torque.paper.plotting import load_pyplot, save_figure
 from legged_torque.paper.report import check_extra
 from legged_torque.utils.cli import Parser, check_output, slow_imports
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.plotting import load_pyplot, read_data, save_figure
+from legged_torque.utils.files import read_data
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

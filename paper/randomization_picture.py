@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from legged_torque.envs import task_registry
+from legged_torque.paper.plotting import load_pyplot, save_figure
 from legged_torque.utils import cli
-from legged_torque.utils.plotting import load_pyplot, save_figure
 from legged_torque.utils.task_registry import set_seed
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def pushes(task: LeggedRobot) -> Panel:
     rand.push_set_factor = 1.0
     for _ in range(STEPS):
         velocity.zero_()
-        task.events.happen(torch.zeros_like(task.reset_buf))
+        task.events.apply(torch.zeros_like(task.reset_buf))
         pushed.append(velocity[(velocity != 0.0).any(dim=1)].flatten())
     low, high = np.multiply(rand.push_velocity, rand.push_robots)
     values = torch.cat(pushed).double().cpu().numpy()

@@ -12,9 +12,6 @@ Collision forces fit newtons: a standing A1 presses on the ground with 122 N.
 
 from __future__ import annotations
 
-from legged_torque.utils.metrics import METRICS
-
-PAPER_METRICS = tuple(metric for metric in METRICS if metric.in_paper)  # the metrics of Table I, in its order
 ENVIRONMENTS = {
     "low": "Low perturbation",
     "high": "High perturbation",

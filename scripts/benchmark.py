@@ -20,6 +20,7 @@ from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError, is_out_of_memory
 from legged_torque.utils.files import without_machine, write_json
+from legged_torque.utils.limits import Count, Number
 from legged_torque.utils.runs import package_versions
 
 if TYPE_CHECKING:
@@ -66,7 +67,6 @@ def main() -> None:
             sizes.append(task_registry.get_cfgs(args.task, options))
             check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
         device = resolve_device(args.device)
-        from legged_torque.benchmark.learning_time import time_training
         from legged_torque.benchmark.measure import MemoryMeter
     for file in filter(None, (args.json, args.profile)):
         cli.check_output(file)
@@ -86,8 +86,7 @@ def main() -> None:
         rows.append(row)
         print_row(row, args.profile)
         if args.learn and "error" not in row:
-            row["learn"] = time_training(training_command(args, row["num_envs"]))
-            print_learning(row["learn"])
+            row["learn"] = learn(args, row["num_envs"])
         if args.json:
             write_json(args.json, result | {"rows": rows})
     if baseline:
@@ -111,8 +110,7 @@ def parse_args() -> argparse.Namespace:
     help_text = "also run N iterations and compare the first tenth with the last"
     parser.add_argument("--endurance", type=int, default=0, metavar="N", help=help_text)
     args = parser.parse_args()
-    cli.check_at_least(args, 1, "rounds")
-    cli.check_at_least(args, 0, "endurance")
+    cli.check_args(args, rounds=Count, endurance=Number)
     if args.profile and len(args.num_envs or [None]) > 1:
         raise UserError("--profile writes one trace: give one number of worlds")
     if args.learn:
@@ -138,10 +136,16 @@ def measure_size(args: argparse.Namespace, cfgs: tuple, memory: MemoryMeter) -> 
     return row | {"left_memory_mib": memory.used()}
 
 
-def training_command(args: argparse.Namespace, num_envs: int) -> list[str]:
-    """Return the command that trains with the same options."""
+def learn(args: argparse.Namespace, num_envs: int) -> dict[str, Any]:
+    """Run train.py with the same options, print its wall clock and return it."""
+    from legged_torque.benchmark.measure import time_training
+
     words = [*cli.option_words(args, *cli.SETTINGS, "preset"), f"--num_envs={num_envs}"]
-    return [sys.executable, str(SCRIPTS_DIR / "train.py"), *words]
+    times = time_training([sys.executable, str(SCRIPTS_DIR / "train.py"), *words])
+    print(LEARNING.format(**times))
+    for point in times["reached"]:
+        print((REACHED if point["steps"] else NOT_REACHED).format(**point), flush=True)
+    return times
 
 
 def print_row(row: dict[str, Any], trace: Path) -> None:
@@ -152,13 +156,6 @@ def print_row(row: dict[str, Any], trace: Path) -> None:
         print(ENDURANCE.format(**row["endurance"]))
     if "profile" in row:
         print(*row["profile"], f"The trace is in {trace}; Warp's kernels show on a GPU only.", sep="\n")
-
-
-def print_learning(times: dict[str, Any]) -> None:
-    """Print the wall clock of a training."""
-    print(LEARNING.format(**times))
-    for point in times["reached"]:
-        print((REACHED if point["steps"] else NOT_REACHED).format(**point), flush=True)
 
 
 def print_comparison(file: Path, baseline: Baseline, rows: list[dict[str, Any]]) -> None:

@@ -24,6 +24,7 @@ from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import portable_path, without_machine, write_json
+from legged_torque.utils.limits import Count
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import LoadedRun, set_seed
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 
     from legged_torque.envs.base.crossing import Grounds
     from legged_torque.envs.base.legged_robot import LeggedRobot
-    from legged_torque.envs.base.metrics import CommandBreakdown
 
 WORLDS, STEPS = 16, 2000  # of one checkpoint, where robots do not cross tiles
 CURVE_WORLDS, CURVE_STEPS = 256, 1000  # of each of all checkpoints
@@ -77,7 +77,12 @@ def main() -> None:
     else:
         measured = walk(run, env, runner, args.steps, bool(args.command))
     if args.json:
-        write_json(args.json, without_machine(circumstances(args, run, env, runner) | measured))
+        kept, device = "as in training", device_name(env.device)
+        result = {"task": args.task, "run": portable_path(run.folder), "checkpoint": run.checkpoint.name}
+        result |= {"steps": runner.logger.tot_timesteps, "perturbation": args.perturbation or kept}
+        result |= {"ranges": args.ranges or kept, "command": args.command, "num_envs": env.num_envs}
+        result |= {"seed": args.seed, "device": device, "versions": package_versions()}
+        write_json(args.json, without_machine(result | measured))
 
 
 def parse_args() -> argparse.Namespace:
@@ -93,7 +98,7 @@ def parse_args() -> argparse.Namespace:
         straight on, 0.6 0 0 unless it is given"""
     parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
     hint = "difficulties of rough ground, 0 to 1; default: the ten of training, 0 to 0.9"
-    parser.add_argument("--level", nargs="+", type=cli.finite, help=hint)
+    parser.add_argument("--level", nargs="+", type=float, help=hint)
     parser.add_argument("--json", type=Path, help="file to write")
     args = parser.parse_args()
     if args.all_checkpoints and (args.terrain or args.checkpoint is not None):
@@ -106,7 +111,7 @@ def parse_args() -> argparse.Namespace:
     args.num_envs = num_envs if args.num_envs is None else args.num_envs
     args.steps = steps if args.steps is None else args.steps
     args.level = args.level or GROUNDS["levels"]
-    cli.check_at_least(args, 1, "steps")
+    cli.check_args(args, steps=Count, command=list[float])
     return args
 
 
@@ -120,11 +125,12 @@ def walk(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, num_steps: in
     print(f"{run.checkpoint}, after {trained:,} steps of training, {env.num_envs} worlds x {num_steps} steps:")
     for name, estimate in metrics.items():
         print(f"  {name:<18} {estimate.mean:10.4f} +- {estimate.standard_error:.4f} {UNITS[name]}")
-    if is_fixed:
-        for name, parts in breakdown.table().items():
-            print(f"  error of {name:<12}", *(f"{part['error']:7.3f}" for part in parts))
-    else:
-        print_breakdown(breakdown)
+    if not is_fixed:
+        print(f"  {'command':<12} {'from':>6} {'to':>6} {'share':>6} {'tracking':>9} {'error':>7}")
+    line = "  {:<12} {from:>6.2f} {to:>6.2f} {share:>6.2f} {track_percentage:>9.3f} {error:>7.3f}"
+    for name, parts in breakdown.table().items():
+        for part in parts:
+            print(("  error of {:<12} {error:7.3f}" if is_fixed else line).format(name, **part))
     shown = {name: asdict(estimate) for name, estimate in metrics.items()}
     return {"num_steps": num_steps, "metrics": shown, "by_command": breakdown.table()}
 
@@ -147,15 +153,6 @@ def measure_all(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runn
     return result | {"trained_env": run.config["env"], "points": points}
 
 
-def print_breakdown(breakdown: CommandBreakdown) -> None:
-    """Print a line per part of each command's range."""
-    print(f"  {'command':<12} {'from':>6} {'to':>6} {'share':>6} {'tracking':>9} {'error':>7}")
-    for name, parts in breakdown.table().items():
-        for part in parts:
-            line = "  {:<12} {from:>6.2f} {to:>6.2f} {share:>6.2f} {track_percentage:>9.3f} {error:>7.3f}"
-            print(line.format(name, **part))
-
-
 def cross_tiles(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, grounds: Grounds) -> dict[str, Any]:
     """Let a policy try to cross tiles, print what came out, and return it."""
     from legged_torque.envs.base.crossing import cross
@@ -171,16 +168,6 @@ def cross_tiles(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, ground
         place = f"  {result.kind:<18} {result.level:>6g} {result.worlds:>6}"
         print(f"{place} {shares[0]:>16} {shares[1]:>16} {tracking:>9.3f} {cost:>6.2f}")
     return {"time_limit": time_limit, "grounds": [asdict(result) for result in results]}
-
-
-def circumstances(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner) -> dict[str, Any]:
-    """Return what was measured, and how."""
-    kept = "as in training"
-    result = {"task": args.task, "run": portable_path(run.folder), "checkpoint": run.checkpoint.name}
-    result |= {"steps": runner.logger.tot_timesteps, "perturbation": args.perturbation or kept}
-    result |= {"ranges": args.ranges or kept, "command": args.command}
-    result |= {"num_envs": env.num_envs, "seed": args.seed}
-    return result | {"device": device_name(env.device), "versions": package_versions()}
 
 
 if __name__ == "__main__":

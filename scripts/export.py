@@ -5,6 +5,7 @@ Examples:
     python scripts/export.py --task=a1_torque_multihead --load_run=RUN --checkpoint=500 --out=exported
 """
 
+import shlex
 from pathlib import Path
 
 from legged_torque.deploy.description import DESCRIPTION_FILE
@@ -37,7 +38,8 @@ def main() -> None:
         print("  policy.yaml does not describe the whole task, so sim2sim.py refuses it; the networks are complete:")
         print("".join(f"  - {problem}\n" for problem in unsupported), end="")
     else:
-        print(f"See it in plain MuJoCo: {cli.script_command('sim2sim')} {out}")
+        words = shlex.join([str(out), *cli.option_words(options, "task_file")])
+        print(f"See it in plain MuJoCo: {cli.script_command('sim2sim')} {words}")
 
 
 if __name__ == "__main__":

@@ -45,9 +45,9 @@ def main() -> None:
         f"legged_torque {legged_torque.__version__}": [f"in {Path(legged_torque.__file__).parent}"],
         "versions": [f"{name:<14} {version}" for name, version in package_versions().items()],
         "machine": [platform.platform(), f"{os.cpu_count()} cores, threads of torch: {torch.get_num_threads()}"],
-        "GPU": gpus(driver()),
+        "GPU": gpus(),
         "caches": caches(),
-        "extras": extras(installed_requirements()),
+        "extras": extras(),
         "rendering": [
             f"videos: {no_renderer or os.environ['MUJOCO_GL']}",
             f"MuJoCo's window: {' '.join(no_window) or 'ok'}",
@@ -57,23 +57,18 @@ def main() -> None:
         print(title, *lines, sep="\n  ")
 
 
-def driver() -> list[str]:
-    """Return a line per GPU of NVIDIA's driver; none without a driver."""
-    command = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return []
-    return [line.strip() for line in done.stdout.splitlines() if line.strip()]
-
-
-def gpus(of_driver: list[str]) -> list[str]:
-    """Return the GPUs and, if there are some that cannot be used, why."""
+def gpus() -> list[str]:
+    """Return a line per GPU of NVIDIA's driver and, if there are some that cannot be used, why."""
     import torch
 
-    lines = [f"{line} (name, driver, memory)" for line in of_driver] or ["none with a driver of NVIDIA"]
+    command = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.splitlines()
+    except (OSError, subprocess.SubprocessError):
+        found = []  # there is no driver
+    lines = [f"{line.strip()} (name, driver, memory)" for line in found] or ["none with a driver of NVIDIA"]
     if torch.version.cuda is None:
-        return [*lines, "torch is a build for the CPU" + (": install one for CUDA to use the GPU" if of_driver else "")]
+        return [*lines, "torch is a build for the CPU" + (": install one for CUDA to use the GPU" if found else "")]
     usable = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
     return [*lines, f"torch, for CUDA {torch.version.cuda}, can use: {', '.join(usable) or 'none'}"]
 
@@ -96,17 +91,11 @@ def size_of(folder: Path) -> int:
     return sum(file.lstat().st_size for file in files if os.path.lexists(file))
 
 
-def installed_requirements() -> list[Requirement] | None:
-    """Return the requirements of the installed package, with its extras; None if it is not installed."""
-    try:
-        return [Requirement(text) for text in importlib.metadata.requires("legged_torque") or []]
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def extras(requirements: list[Requirement] | None) -> list[str]:
+def extras() -> list[str]:
     """Return for each extra whether all that it needs is there, or what is missing and the command that installs it."""
-    if requirements is None:
+    try:
+        requirements = [Requirement(text) for text in importlib.metadata.requires("legged_torque") or []]
+    except importlib.metadata.PackageNotFoundError:
         return ["unknown, as the package is not installed: pip install -e ."]
     lines = []
     for extra, purpose in PURPOSES.items():

@@ -12,16 +12,16 @@ from __future__ import annotations
 
 import argparse
 import functools
-import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from legged_torque.envs import task_registry
 from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer, resolve_device
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.limits import Count, Limits
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.options import Options
 from legged_torque.utils.runs import load_config
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 AGENTS = ("zero", "random")  # what acts without a policy
 NUM_ENVS = {"none": 16, "web": 4, "native": 1}  # default number of worlds, by viewer
-MAX_GRID = 25  # maximum number of tiles; more would be unreadable
+GRIDS = (1, 4, 9, 16, 25)  # numbers of tiles of a video; more would be unreadable
 
 
 def main() -> None:
@@ -84,29 +84,51 @@ def parse_args() -> argparse.Namespace:
     hint = "who acts: the run's policy, or zero or random actions (from -1 to 1) without a run; default: %(default)s"
     parser.add_argument("--agent", choices=("policy", *AGENTS), default="policy", help=hint)
     cli.add_command_arg(parser)
-    add_terrain_args(parser)
+    hint = "kinds of rough ground, or all: a column of tiles of each; default: the ground of the training"
+    parser.add_argument("--terrain", nargs="+", metavar="KIND", default=[], help=hint)
+    hint = "difficulties of rough ground, 0 to 1: a row of tiles of each; default: those of the training"
+    parser.add_argument("--level", nargs="+", type=float, default=[], help=hint)
     parser.add_argument("--video", type=Path, help="mp4 to write; default: in the run's folder")
     parser.add_argument("--no_video", action="store_true", help="print metrics alone")
     parser.add_argument("--grid", type=int, help="number of robots in the video: 1, 4, 9, 16 or 25; default: 1")
     hint = """none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's
         window; default: %(default)s"""
     parser.add_argument("--viewer", choices=NUM_ENVS, default="none", help=hint)
-    hint = "folder of a run whose policy walks beside the followed robot, under the same command (--viewer web)"
+    hint = "folder of a run whose policy walks next to the followed robot, under the same command (--viewer web)"
     parser.add_argument("--compare", metavar="RUN", help=hint)
     hint = "address of the page; default: %(default)s, this machine alone; others need the printed token"
     parser.add_argument("--host", default="127.0.0.1", help=hint)
     parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
     args = parser.parse_args()
-    cli.check_at_least(args, 1, "steps")
-    if not 1 <= args.port <= 65535:
-        raise UserError(f"--port must be from 1 to 65535, not {args.port}")
-    choose_worlds(args)
-    check_agent(args)
-    if args.level and not args.terrain:
-        raise UserError("--level needs --terrain: the kinds of rough ground")
+    cli.check_args(args, steps=Count, command=list[float], port=Annotated[int, Limits(1, 65535)])
+    check_combinations(args)
+    args.grid = args.grid or 1
+    if args.num_envs is None:
+        args.num_envs = 1 if args.compare else max(NUM_ENVS[args.viewer], args.grid)
     if args.video:
         cli.check_output(args.video)
     return args
+
+
+def check_combinations(args: argparse.Namespace) -> None:
+    """Raise a UserError for options that exclude each other."""
+    has_viewer = args.viewer != "none"
+    if args.grid not in (None, *GRIDS):
+        raise UserError(f"--grid must be 1, 4, 9, 16 or 25, not {args.grid}")
+    if args.grid and has_viewer:
+        raise UserError(f"--grid is for videos, which --viewer {args.viewer} does not make")
+    if args.grid and args.num_envs is not None and 1 <= args.num_envs < args.grid:
+        raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
+    if args.agent != "policy" and (args.load_run or args.checkpoint is not None or has_viewer):
+        raise UserError(f"--agent {args.agent} has no run: --load_run, --checkpoint and --viewer are for the policy's")
+    if args.headless and args.viewer == "native":
+        raise UserError("--headless opens no window, but --viewer native is one; --viewer web is a page")
+    if args.compare and args.viewer != "web":
+        raise UserError("--compare needs --viewer web")
+    if args.no_video and (args.video or (args.grid or 1) > 1 or has_viewer):
+        raise UserError("--no_video prints metrics alone: leave out --video, --grid and --viewer")
+    if args.level and not args.terrain:
+        raise UserError("--level needs --terrain: the kinds of rough ground")
 
 
 def show(args: argparse.Namespace, run: LoadedRun) -> None:
@@ -125,7 +147,7 @@ def show(args: argparse.Namespace, run: LoadedRun) -> None:
 
 
 def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
-    """Return the run of ``--compare``; a UserError if its robot cannot walk beside that of another run."""
+    """Return the run of ``--compare``; a UserError if its robot cannot walk next to that of another run."""
     task = load_config(Path(args.compare))["task"]
     options = Options(task, args.device, num_envs=1, load_run=args.compare, perturbation=args.perturbation)
     options.ranges, options.set = args.ranges, args.set
@@ -139,45 +161,12 @@ def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
     return compared
 
 
-def choose_worlds(args: argparse.Namespace) -> None:
-    """Choose how many worlds there are and how many of them are drawn; a UserError if that many cannot be."""
-    if args.grid is not None and args.viewer != "none":
-        raise UserError(f"--grid is for videos, which --viewer {args.viewer} does not make")
-    args.grid = 1 if args.grid is None else args.grid
-    if not 1 <= args.grid <= MAX_GRID or math.isqrt(args.grid) ** 2 != args.grid:
-        raise UserError(f"--grid must be 1, 4, 9, 16 or {MAX_GRID}, not {args.grid}")
-    if args.num_envs is None:
-        args.num_envs = 1 if args.compare else max(NUM_ENVS[args.viewer], args.grid)
-    elif 1 <= args.num_envs < args.grid:
-        raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
-
-
-def check_agent(args: argparse.Namespace) -> None:
-    """Raise a UserError for options that exclude each other."""
-    if args.agent != "policy" and (args.load_run or args.checkpoint is not None or args.viewer != "none"):
-        raise UserError(f"--agent {args.agent} has no run: --load_run, --checkpoint and --viewer are for the policy's")
-    if args.headless and args.viewer == "native":
-        raise UserError("--headless opens no window, but --viewer native is one; --viewer web is a page")
-    if args.compare and args.viewer != "web":
-        raise UserError("--compare needs --viewer web")
-    if args.no_video and (args.video or args.grid > 1 or args.viewer != "none"):
-        raise UserError("--no_video prints metrics alone: leave out --video, --grid and --viewer")
-
-
 def agent(name: str, env: LeggedRobot) -> Callable[[TensorDict], Tensor]:
     """Return what acts without a policy: zero actions, or random ones, drawn uniformly from -1 to 1."""
     import torch
 
     actions = torch.zeros(env.num_envs, env.num_actions, device=env.device)
     return lambda obs: actions.uniform_(-1.0, 1.0) if name == "random" else actions
-
-
-def add_terrain_args(parser: cli.Parser) -> None:
-    """Add what chooses the ground."""
-    hint = "kinds of rough ground, or all: a column of tiles of each; default: the ground of the training"
-    parser.add_argument("--terrain", nargs="+", metavar="KIND", default=[], help=hint)
-    hint = "difficulties of rough ground, 0 to 1: a row of tiles of each; default: those of the training"
-    parser.add_argument("--level", nargs="+", type=cli.finite, default=[], help=hint)
 
 
 def import_viewer(args: argparse.Namespace) -> Callable[[Session], None]:

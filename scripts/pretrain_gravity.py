@@ -69,9 +69,7 @@ def pretrain(args: argparse.Namespace) -> None:
     if args.json:
         write_json(args.json, without_machine(report))
     print(f"The policy is in {file}")
-    words = [*cli.option_words(args, "task_file"), f"--task={args.task}"]
-    words += [f"--log_root={args.log_root}"] if args.log_root else []
-    words += [word for change in args.set for word in ("--set", change)]  # another policy would be made otherwise
+    words = cli.option_words(args, "task_file", "task", "log_root", "set")  # all of which choose the policy
     print(f"Train from it: {cli.script_command('train')} {shlex.join(words)}")
 
 

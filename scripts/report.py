@@ -7,6 +7,7 @@ from pathlib import Path
 
 from legged_torque.paper.report import check_extra
 from legged_torque.utils import cli
+from legged_torque.utils.limits import NotNegative
 
 
 def main() -> None:
@@ -22,8 +23,7 @@ def main() -> None:
     help_text = "folder with videos <task>.mp4, .webm or .gif, to be shown in the page"
     parser.add_argument("--videos", type=Path, help=help_text)
     args = parser.parse_args()
-    if args.from_step is not None:
-        cli.check_at_least(args, 0, "from_step")
+    cli.check_args(args, from_step=NotNegative)
     out = args.out or args.experiment / "report"
     cli.check_output(out / "report.md")
     cli.check_output(out / "report.html")

@@ -12,17 +12,13 @@ import argparse
 import contextlib
 import importlib.metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from legged_torque import resource_path
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_json
-
-if TYPE_CHECKING:
-    from legged_torque.deploy.policy import Policy
-    from legged_torque.utils.metrics import Estimate
+from legged_torque.utils.limits import Count, NotNegative, Number, Share
 
 
 def parse_args() -> argparse.Namespace:
@@ -34,31 +30,29 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--robots", type=int, default=16, help="robots, one after another; default: %(default)s")
     cli.add_command_arg(parser)
     hint = "largest velocity of a push per axis [m/s]; default: none"
-    parser.add_argument("--push_velocity", type=cli.finite, default=0.0, help=hint)
-    parser.add_argument(
-        "--push_probability", type=cli.finite, help="probability of a push per control step; default: 0.002"
-    )
+    parser.add_argument("--push_velocity", type=float, default=0.0, help=hint)
+    hint = "probability of a push per control step; default: 0.002"
+    parser.add_argument("--push_probability", type=float, help=hint)
     parser.add_argument("--seed", type=int, default=1, help="random seed; default: %(default)s")
     hint = "kinds of rough ground, or all; each robot starts on one of their tiles; default: the ground of training"
     parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
     hint = "difficulties of rough ground, 0 to 1; default: those of training"
-    parser.add_argument("--level", nargs="+", type=cli.finite, default=(), help=hint)
+    parser.add_argument("--level", nargs="+", type=float, default=(), help=hint)
     hint = "with height fields: corrected to those of training, or MuJoCo's own; default: %(default)s"
     parser.add_argument("--contacts", choices=("training", "mujoco"), default="training", help=hint)
     parser.add_argument("--video", type=Path, help="mp4 of the first robot")
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
+    cli.add_options(parser, "task_file")
     args = parser.parse_args()
-    cli.check_at_least(args, 1, "steps", "robots")
-    cli.check_at_least(args, 0, "seed", "push_velocity")
+    cli.check_args(args, steps=Count, robots=Count, seed=Number, command=list[float])
+    cli.check_args(args, push_velocity=NotNegative, push_probability=Share)
     if args.level and not args.terrain:
         raise UserError("--level needs --terrain: the kinds of rough ground")
     if args.push_probability is not None and not args.push_velocity:
         raise UserError("--push_probability needs --push_velocity")
     if args.push_probability is None:
         args.push_probability = 0.002 if args.push_velocity else 0.0
-    if not 0.0 <= args.push_probability <= 1.0:
-        raise UserError(f"--push_probability must be from 0 to 1, not {args.push_probability}")
     for file in filter(None, (args.json, args.video)):
         cli.check_output(file)
     return args
@@ -68,6 +62,7 @@ def main() -> None:
     """Load a policy and a robot, simulate, print the metrics, and write JSON and video if asked to."""
     args = parse_args()
     no_renderer = None if args.viewer else choose_offscreen_renderer()
+    cli.options_of(args)  # imports files of tasks, which may add numpy functions of their terms
     with cli.slow_imports():
         import numpy as np
 
@@ -105,19 +100,13 @@ def main() -> None:
     for name, value in metrics.items():
         print(f"  {name:<18} {value.mean:10.4f} +- {value.standard_error:.4f} {UNITS[name]}")
     if args.json:
-        write_results(args, policy, notes, metrics)
+        result = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
+        result |= {"task": policy.description["task"], "training": training, "notes": notes}
+        result["versions"] = {name: importlib.metadata.version(name) for name in ("mujoco", "numpy")}
+        result["metrics"] = {name: vars(estimate) for name, estimate in metrics.items()}
+        write_json(args.json, result)  # in which null stands for values that were not measured
     if recorder:
         recorder.save(args.video, no_renderer)
-
-
-def write_results(args: argparse.Namespace, policy: Policy, notes: list[str], metrics: dict[str, Estimate]) -> None:
-    """Write arguments and results; null stands for values that were not measured."""
-    result = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
-    result["task"], result["training"] = policy.description["task"], policy.description["training"]
-    result["notes"] = notes
-    result["versions"] = {name: importlib.metadata.version(name) for name in ("mujoco", "numpy")}
-    result["metrics"] = {name: vars(estimate) for name, estimate in metrics.items()}
-    write_json(args.json, result)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from legged_torque.utils import cli, distributed
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.devices import busy_cores_note, device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
+from legged_torque.utils.limits import Number
 from legged_torque.utils.options import DEFAULT_PRESET, Options
 from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, package_versions
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
@@ -39,13 +40,13 @@ def main() -> None:
     cli.add_task_args(parser)
     cli.add_options(parser, *cli.TRAINING)
     parser.add_argument("--list", action="store_true", help="print all tasks and exit")
-    hint = "web: a page beside the training, on which its newest policy walks; default: %(default)s"
+    hint = "web: a page on which the newest policy of the training walks; default: %(default)s"
     parser.add_argument("--viewer", choices=("none", "web"), default="none", help=hint)
-    hint = "iterations from one short video of the policy to the next, made beside the training; default: no videos"
+    hint = "iterations from one short video of the policy to the next, made during the training; default: no videos"
     parser.add_argument("--video_interval", type=int, default=0, metavar="N", help=hint)
     args = parser.parse_args()
-    cli.check_at_least(args, 0, "video_interval")
-    options = cli.options_of(args)
+    cli.check_args(args, video_interval=Number)
+    options, is_first = cli.options_of(args), distributed.rank() == 0
     if args.list:
         print("\n".join(task_registry.names()))
         return
@@ -61,7 +62,7 @@ def main() -> None:
         env_cfg, train_cfg = run.env_cfg, run.train_cfg
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
         options.max_iterations = options.max_iterations or run.config.get("max_iterations")
-        if distributed.rank() == 0:
+        if is_first:
             print(f"Resuming from {run.checkpoint}, after {run.iterations} iterations.")
     elif options.load_run or options.checkpoint is not None:
         raise UserError("--load_run and --checkpoint need --resume")
@@ -69,11 +70,10 @@ def main() -> None:
         with cli.slow_imports():
             env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     folder = experiment_dir(train_cfg, options.log_root)
-    if distributed.rank() == 0:  # the others write nothing
+    if is_first:  # the others write nothing
         cli.check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)
     with cli.slow_imports():
         from legged_torque.utils.progress import CompileProgress
-    is_first = distributed.rank() == 0
     viewer = TrainingViewer(is_first and args.viewer == "web", args.video_interval if is_first else 0)
     set_seed(train_cfg.seed)
     with CompileProgress() if is_first else contextlib.nullcontext():  # one line for all processes
@@ -126,7 +126,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
             print(f"{what}: {cli.script_command(script)} {run_words(options, runner.log_dir)}")
     runner.close()
     if runner.stopped_by:
-        sys.exit(128 + runner.stopped_by)  # as shells tell it: 130 after Ctrl-C
+        sys.exit(128 + runner.stopped_by)  # as shells do: 130 after Ctrl-C
 
 
 def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: Any, total: int, page: str) -> None:

@@ -1,4 +1,4 @@
-"""What all tests share: tasks on the CPU, small and seeded."""
+"""Fixtures of all tests: tasks on the CPU, small and seeded."""
 
 import os
 

@@ -65,7 +65,7 @@ def start(installed, folder, *commands):
 
 
 def finish(process):
-    """Wait for scripts that must end well; return what they have printed."""
+    """Wait for scripts that must end well; return their output."""
     with process:
         output, _ = process.communicate(timeout=200)
     assert process.returncode == 0, output
@@ -74,11 +74,8 @@ def finish(process):
 
 def files(folder):
     """The names of all files below a folder."""
-    return {
-        path.relative_to(folder).as_posix()
-        for path in folder.rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
-    }
+    found = (path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+    return {path.relative_to(folder).as_posix() for path in found}
 
 
 def test_contents(installed):

@@ -30,6 +30,7 @@ from legged_torque.sim.model import FLOOR, build_model
 from legged_torque.sim.registry import ENGINES, make_engine
 from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name
+from legged_torque.utils.limits import Count
 from legged_torque.utils.mjcf import read_spec
 from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import LoadedRun, set_seed
@@ -326,7 +327,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100, help="control steps to walk; the states after each are kept")
     parser.add_argument("--worlds", type=int, default=1500, help="states of each kind; default: %(default)s")
     args = parser.parse_args()
-    cli.check_at_least(args, 1, "steps", "worlds")
+    cli.check_args(args, steps=Count, worlds=Count)
     options = cli.options_of(args)
     run = task_registry.load_run(options)
     set_seed(args.seed)

@@ -21,6 +21,7 @@ from legged_torque.sim.model import build_model, collision_geoms
 from legged_torque.sim.registry import ENGINES, make_engine
 from legged_torque.utils import cli
 from legged_torque.utils.devices import resolve_device
+from legged_torque.utils.limits import Count
 from legged_torque.utils.mjcf import read_spec
 
 FIELDS = ("qpos", "qvel", "qacc_warmstart", "ctrl")
@@ -94,7 +95,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=400, help="bad numbers per engine; default: %(default)s")
     cli.add_options(parser, "device")
     args = parser.parse_args()
-    cli.check_at_least(args, 1, "count")
+    cli.check_args(args, count=Count)
     device, spec = resolve_device(args.device), read_spec(RESOURCES_DIR / "robots/a1/a1.xml")
     model, is_good = build_model(spec, collision_geoms(spec)), True
     for engine in ENGINES:

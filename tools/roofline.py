@@ -35,6 +35,7 @@ from legged_torque.sim.fused.model import unread_columns
 from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.limits import Count
 
 RATES = (("update", "flop"), ("update", "bytes"), ("physics", "bytes"))
 _ROUNDS = 5  # timings of each peak
@@ -160,7 +161,7 @@ def main() -> None:
     cli.add_options(parser, *cli.SETTINGS, "num_envs")
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
     args = parser.parse_args()
-    cli.check_at_least(args, 1, "rounds")
+    cli.check_args(args, rounds=Count)
     device, options = resolve_device(args.device), cli.options_of(args)
     options.set = ["evaluation.interval=0", *options.set]  # without evaluations iterations are alike
     env_cfg, train_cfg = task_registry.get_cfgs(args.task, options)

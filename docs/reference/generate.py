@@ -48,7 +48,7 @@ SETTINGS_HEAD = """# Settings
 
 Made by `python docs/reference/generate.py` from the config classes. `--set section.setting=value` changes a setting for
 one run, a subclass changes it for a task. Units are in brackets; a comment without a unit means a number without one.
-Every number must be finite, at most 1e9 either way; what else a setting must be stands beside its default in the code,
+Every number must be finite, at most 1e9 either way; what else a setting must be stands next to its default in the code,
 and other values are refused.
 
 A class that is listed with few settings inherits all others from its base. A run's `config.yaml` holds every value that

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.plotting import read_data
+from legged_torque.utils.files import read_data
 
 SETTINGS = ("task", "preset", "perturbation", "ranges", "set", "device")
 """Entries that are compared like the versions of software."""

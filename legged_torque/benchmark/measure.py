@@ -1,11 +1,13 @@
-"""Speed and memory of training."""
+"""Speed and memory of training, and the time until a robot walks."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import gc
 import os
 import resource
+import subprocess
 import sys
 import tempfile
 import time
@@ -23,7 +25,9 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.sim.graph import CudaGraph, prepare_device
+from legged_torque.utils.errors import TrainingError
 from legged_torque.utils.progress import CompileProgress
+from legged_torque.utils.runs import EVALUATIONS_FILE
 from legged_torque.utils.task_registry import set_seed
 
 WARM_UP = 2  # iterations before timing begins: the first one compiles, the second one captures the rollout
@@ -32,6 +36,8 @@ PHYSICS_STEPS = 5
 """Control steps of physics timed in a row: enough to hide the cost of the reset before them, and no robot falls yet."""
 ACTION_SCALE = 0.5  # standard deviation of the random actions while env.step is timed
 GPU_CALLS = 20  # calls per timing on a GPU, where a single one is short; on the CPU one call is timed
+TRACKING = (0.70, 0.75)
+"""Shares of the commanded velocity, by ``track_percentage`` of the evaluations during training."""
 _MIB = 2**20
 _MS = 1e3
 
@@ -233,3 +239,40 @@ def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[str]:
     profiler.export_chrome_trace(str(file))
     order = "self_device_time_total" if cuda else "self_cpu_time_total"
     return profiler.key_averages().table(sort_by=order, row_limit=10).splitlines()
+
+
+def time_training(command: list[str]) -> dict[str, Any]:
+    """Run a whole training, a command to which the folder of its logs is added, and return its wall clock [s].
+
+    Returns:
+        "start_s" from the command to the first iteration, "total_s" to the end of the process, "steps" of the last
+        evaluation, and "reached" for each of :data:`TRACKING`, see :func:`first_reaching`.
+
+    Raises:
+        TrainingError: The process has failed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.time()
+        status = subprocess.run([*command, f"--log_root={folder}"], stdout=subprocess.DEVNULL).returncode
+        total = time.time() - began
+        if status:
+            raise TrainingError(f"the training of --learn has ended with status {status}")
+        (file,) = Path(folder).glob(f"*/*/{EVALUATIONS_FILE}")
+        lines, written = file.read_text(encoding="utf-8").splitlines(), file.stat().st_mtime - began
+    rows = [{name: float(number) for name, number in row.items()} for row in csv.DictReader(lines)]
+    start = written - rows[-1]["seconds"]
+    reached = [first_reaching(share, rows, start) for share in TRACKING]
+    return {"start_s": start, "total_s": total, "steps": int(rows[-1]["steps"]), "reached": reached}
+
+
+def first_reaching(share: float, rows: list[dict[str, float]], start: float) -> dict[str, float | None]:
+    """Return when tracking was first at or above a share, of the rows of evaluations; None if it never was.
+
+    "training_s" is the time since the first iteration, which began ``start`` seconds after the command, and "command_s"
+    that since the command.
+    """
+    row = next((row for row in rows if row["track_percentage"] >= share), None)  # NaN reaches none
+    if row is None:
+        return {"share": share, "steps": None, "training_s": None, "command_s": None}
+    times = {"training_s": row["seconds"], "command_s": start + row["seconds"]}
+    return {"share": share, "steps": int(row["steps"]), **times}

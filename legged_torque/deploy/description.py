@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 from pathlib import Path
@@ -28,20 +29,19 @@ def read(path: str | Path) -> tuple[dict[str, Any], Path]:
     path = Path(path)
     if not path.exists():
         raise UserError(f"there is no file or folder '{path}'")
-    folder = path if path.is_dir() else path.parent
-    is_network = path.suffix == ".onnx"
+    folder, is_network = path if path.is_dir() else path.parent, path.suffix == ".onnx"
     file = folder / DESCRIPTION_FILE if path.is_dir() or is_network else path
-    if not file.is_file():
-        raise UserError(f"there is no {DESCRIPTION_FILE} in '{folder}'")
     try:
         text = file.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise UserError(f"there is no {DESCRIPTION_FILE} in '{folder}'") from None
     except (OSError, ValueError) as error:
         raise UserError(f"'{file}' is not valid YAML: {error}") from None
     description = parse_yaml(text, f"'{file}'")
     check(description, f"'{file}'")
     name = description["network"]["file"]
     if Path(name).name != name:
-        raise UserError(f"'{file}': network.file must be the name of a file beside it, not '{name}'")
+        raise UserError(f"'{file}': network.file must be the name of a file in the same folder, not '{name}'")
     network = path if is_network else folder / name
     if not network.is_file():
         raise UserError(f"there is no network '{network}'")
@@ -64,8 +64,19 @@ def interface(description: dict[str, Any]) -> dict[str, str]:
     return {key: json.dumps(description[key]) for key in ("joint_order", "nominal_pose", "observations", "actions")}
 
 
+def columns(observations: dict[str, Any]) -> list[str]:
+    """Return the names of the terms of all numbers that the network reads, from the section ``observations``."""
+    with_history, others = list[str](), list[str]()
+    for term in observations["terms"]:
+        (others if "group" in term else with_history).extend([term["name"]] * term["size"])
+    return with_history * observations["history_length"] + others
+
+
 def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
-    """Check structure, values and their consistency; a UserError names the first wrong entry, and ``where`` it is."""
+    """Check structure and values; a UserError names the first wrong entry, and ``where`` it is.
+
+    Entries of which the network has a copy, see :func:`interface`, are compared with it when it is loaded.
+    """
     _check_schema(description, where)
     joints = description["joint_order"]
     by_joint = {key: description[key] for key in ("nominal_pose", "torque_limits", "joints")}
@@ -77,14 +88,10 @@ def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
         for name in joints:
             if name not in values:
                 raise UserError(f"{where}: {path} lacks the joint '{name}'")
-    _check_terms(description, where)
-    sections = ("torque_limits", "commands", "initial_state")
-    ranges = {f"{section}.{key}": limits for section in sections for key, limits in description[section].items()}
-    ranges |= {f"clip of {term['name']}": term["clip"] for term in description["observations"]["terms"]}
-    ranges["actions.clip"] = description["actions"]["clip"]
-    for path, limits in ranges.items():
-        if isinstance(limits, list) and len(limits) == 2 and limits[0] > limits[1]:
-            raise UserError(f"{where}: {path} must be [lowest, highest], not {limits}")
+    for section in ("torque_limits", "commands", "initial_state"):
+        for key, limits in description[section].items():
+            if isinstance(limits, list) and len(limits) == 2 and limits[0] > limits[1]:
+                raise UserError(f"{where}: {section}.{key} must be [lowest, highest], not {limits}")
     timing = description["timing"]
     if not math.isclose(timing["physics_frequency"], timing["control_frequency"] * timing["decimation"], rel_tol=1e-6):
         raise UserError(f"{where}: timing.physics_frequency is not control_frequency times decimation")
@@ -92,10 +99,9 @@ def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
 
 def _check_schema(description: Any, where: str) -> None:
     """Check structure, types and single values, also that numbers are finite."""
-    try:
-        import jsonschema
-    except ImportError:
-        raise missing_extra("jsonschema") from None
+    require("jsonschema")
+    import jsonschema
+
     draft = jsonschema.Draft202012Validator  # which would take 4.0 as an integer, and NaN as a number
     types = draft.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
     types = types.redefine("number", lambda _, value: type(value) in (int, float) and abs(value) <= LARGEST)
@@ -109,38 +115,9 @@ def _check_schema(description: Any, where: str) -> None:
         raise UserError(f"{where}: {path}: {message if len(message) < 160 else '... ' + message[-150:]}")
 
 
-def _check_terms(description: dict[str, Any], where: str) -> None:
-    """Check the terms of observations and actions, and their sizes; terms of a user's task may have any size."""
-    observations, actions, network = (description[key] for key in ("observations", "actions", "network"))
-    num_joints, num_actions = len(description["joint_order"]), sum(term["size"] for term in actions["terms"])
-    sizes = dict.fromkeys(("projected_gravity", "angular_velocity", "command"), 3)
-    sizes |= dict.fromkeys(("joint_position", "joint_velocity", "position_residual", "torque"), num_joints)
-    sizes |= {"last_action": num_actions, "position_phase": 1}
-    for terms in (observations["terms"], actions["terms"]):
-        names = [term["name"] for term in terms]
-        for term in terms:
-            name, scan = term["name"], term.get("scan")
-            if (name == "height_scan") != (scan is not None):
-                raise UserError(f"{where}: the term 'height_scan' must have an entry scan, and no other term")
-            size = len(scan["points_x"]) * len(scan["points_y"]) if scan else sizes.get(name, term["size"])
-            if names.count(name) > 1:
-                raise UserError(f"{where}: the term '{name}' occurs more than once")
-            if term["size"] != size:
-                raise UserError(f"{where}: the term '{name}' must have size {size}, not {term['size']}")
-            if isinstance(term["scale"], list) and len(term["scale"]) != size:
-                raise UserError(f"{where}: the term '{name}' must have one scale or {size}, not {len(term['scale'])}")
-    in_group = ["group" in term for term in observations["terms"]]
-    if in_group != sorted(in_group):
-        raise UserError(f"{where}: the terms of further groups must come after those without a group")
-    steps = [1 if "group" in term else observations["history_length"] for term in observations["terms"]]
-    num_observations = sum(count * term["size"] for count, term in zip(steps, observations["terms"], strict=True))
-    for key, value in {"num_observations": num_observations, "num_actions": num_actions}.items():
-        if network[key] != value:
-            raise UserError(f"{where}: network.{key} is {network[key]}, but the terms have {value} numbers")
-
-
-def missing_extra(package: str) -> UserError:
-    """Return the error for a package that is not installed."""
-    return UserError(
-        f"{package} is not installed; exported policies need the extra: pip install 'legged_torque[export]'"
-    )
+def require(*packages: str) -> None:
+    """Raise a UserError that names the extra if a package is not installed."""
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            extra = "pip install 'legged_torque[export]'"
+            raise UserError(f"{package} is not installed; exported policies need the extra: {extra}")

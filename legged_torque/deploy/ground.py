@@ -26,7 +26,7 @@ CONTACT_NOTES = {
     "--contacts=mujoco leaves MuJoCo's",
     "mujoco": "contacts with height fields are MuJoCo's own: feet also touch edges inside of level ground",
 }
-"""What to say of contacts with height fields, by whose act."""
+"""Notes on contacts with height fields, by ``--contacts``."""
 SAME_FACE = math.cos(math.radians(2.6))  # least cosine between normals of one face, as in training
 _ABOVE = 10.0  # height over a place from which rays look down on it [m]
 _SPHERE, _CAPSULE = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from legged_torque.deploy.description import interface, missing_extra, read
+from legged_torque.deploy.description import interface, read, require
 from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.heading import heading
 
@@ -58,45 +58,37 @@ class Policy:
         session: The network in onnxruntime.
     """
 
-    def __init__(self, path: str | Path, dtype: type = np.float32) -> None:
-        """Load a policy.
+    def __init__(self, path: str | Path) -> None:
+        """Load ``policy.yaml``, or ``policy.onnx`` in the same folder, or both of that folder.
 
-        Args:
-            path: ``policy.yaml``, ``policy.onnx`` in the same folder, or that folder.
-            dtype: Type of observations, actions and torques: ``np.float32`` as in training, or ``np.float64``.
-
-        Raises:
-            UserError: If a file is missing, damaged or does not fit the other one, or a term has no function here.
+        A UserError if a file is missing, damaged or does not fit the other one, or a term has no function here.
         """
         self.description, network = read(path)
         refuse(self.description.get("unsupported", []), f"'{path}' can only be run by its task")
         refuse(parts_without_function(self.description), f"'{path}'")
-        self.dtype = dtype
+        self.session = load_network(network, self.description)
         self.joint_order: list[str] = self.description["joint_order"]
         self.nominal_pose = self._by_joint(self.description["nominal_pose"])
         self.torque_limits = self._by_joint(self.description["torque_limits"]).T
         gains = self.description["gains"]
         self.stiffness, self.damping = self._by_joint(gains["stiffness"]), self._by_joint(gains["damping"])
         self._action_terms = self.description["actions"]["terms"]
-        self._intervals = {term["name"]: term.get("interval", 1) for term in self._action_terms}
         self._action_clip = self.description["actions"]["clip"]
         terms = self.description["observations"]["terms"]
-        self._observations = [OBSERVATIONS[term["name"]] for term in terms]
-        sizes = [term["size"] for term in terms]
-        self._scale = np.concatenate([np.full(term["size"], term["scale"], dtype) for term in terms])
-        self._clip: np.ndarray = np.repeat(np.array([term["clip"] for term in terms], dtype), sizes, axis=0).T
+        self._observations, sizes = [OBSERVATIONS[term["name"]] for term in terms], [term["size"] for term in terms]
+        self._scale = np.concatenate([np.full(term["size"], term["scale"], np.float32) for term in terms])
+        self._clip: np.ndarray = np.repeat(np.array([term["clip"] for term in terms], np.float32), sizes, axis=0).T
         self._num_kept = sum(term["size"] for term in terms if "group" not in term)  # of which there is a history
         scans = [term["scan"] for term in terms if "scan" in term]
         self.scan: dict[str, Any] | None = scans[0] if scans else None
         points = [(x, y) for scan in scans for x in scan["points_x"] for y in scan["points_y"]]
         self.scan_points = np.array(points, float).reshape(-1, 2)
-        self.session = load_network(network, self.description)
         self.reset()
 
     def reset(self) -> None:
         """Start a new episode: forget the last action and the history."""
         self._steps = 0
-        self.last_action = np.zeros(self.description["network"]["num_actions"], self.dtype)
+        self.last_action = np.zeros(self.description["network"]["num_actions"], np.float32)
         self._history: np.ndarray | None = None
 
     def observation(self, state: State, command: np.ndarray) -> np.ndarray:
@@ -105,7 +97,7 @@ class Policy:
         Call it once per control step, since it keeps the history. The command is v_x, v_y [m/s] and the yaw rate
         [rad/s] in the trunk's frame. Shapes: (3,) to (observations,).
         """
-        now = np.concatenate([np.asarray(value(self, state, command), self.dtype) for value in self._observations])
+        now = np.concatenate([np.asarray(value(self, state, command), np.float32) for value in self._observations])
         if now.shape != self._scale.shape:
             raise ValueError(f"a state and a command make {now.size} observations, not {self._scale.size}")
         now, others = np.split(np.clip(now * self._scale, *self._clip), [self._num_kept])
@@ -123,7 +115,7 @@ class Policy:
         (actions,) = self.session.run(["actions"], {"obs": np.asarray(obs, np.float32)[np.newaxis]})
         if not np.isfinite(actions).all():  # such actions must not reach a robot
             raise UserError("the network's actions are not finite: check the observations")
-        new = np.clip(actions[0], *self._action_clip).astype(self.dtype)
+        new = np.clip(actions[0], *self._action_clip)
         is_due = np.repeat([self.phase(term["name"]) == 0.0 for term in self._action_terms], len(self.joint_order))
         self.last_action = np.where(is_due, new, self.last_action)
         self._steps += 1
@@ -134,12 +126,12 @@ class Policy:
 
         Joint positions [rad] and velocities [rad/s] are the present ones. Shapes: (joints,).
         """
-        actions = np.asarray(actions, self.dtype).reshape(len(self._action_terms), len(self.joint_order))
+        actions = np.asarray(actions, np.float32).reshape(len(self._action_terms), len(self.joint_order))
         positions, velocities = self.joints(joint_positions), self.joints(joint_velocities)
         total = np.zeros_like(self.nominal_pose)
         for i, term in enumerate(self._action_terms):
-            torques = ACTIONS[term["name"]](self, self.dtype(term["scale"]) * actions[i], positions, velocities)
-            total += self.dtype(term["mixing_weight"]) * torques
+            torques = ACTIONS[term["name"]](self, np.float32(term["scale"]) * actions[i], positions, velocities)
+            total += np.float32(term["mixing_weight"]) * torques
         return np.clip(total, *self.torque_limits)
 
     def scan_places(self, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
@@ -152,25 +144,25 @@ class Policy:
         return np.asarray(position)[:2] + self.scan_points @ np.array([[cos, sin], [-sin, cos]])
 
     def height_scan(self, heights: np.ndarray | None) -> np.ndarray:
-        """Return the height scan for heights above the ground, in the policy's precision. Shapes: (points,) [m]."""
+        """Return the height scan for heights above the ground. Shapes: (points,) [m]."""
         assert self.scan  # the description has it with the term
         if heights is None or np.shape(heights) != (len(self.scan_points),):
             raise ValueError(f"a state needs {len(self.scan_points)} heights above the ground, at scan_places")
         limit = self.scan["limit"]
-        return np.clip(np.asarray(heights, self.dtype) - self.dtype(self.scan["offset"]), -limit, limit)
+        return np.clip(np.asarray(heights, np.float32) - np.float32(self.scan["offset"]), -limit, limit)
 
     def phase(self, name: str) -> float:
         """Return the share of its interval for which the actions of a term have been held; 0: new ones are due."""
-        interval = self._intervals.get(name, 1)
+        interval = next((term.get("interval", 1) for term in self._action_terms if term["name"] == name), 1)
         return self._steps % interval / interval
 
     def _by_joint(self, values: dict[str, Any]) -> np.ndarray:
         """Return values by joint in the policy's order. Shape: (joints, ...)."""
-        return np.array([values[name] for name in self.joint_order], self.dtype)
+        return np.array([values[name] for name in self.joint_order], np.float32)
 
     def joints(self, values: np.ndarray) -> np.ndarray:
-        """Return one number per joint in the policy's precision; a ValueError for others. Shape: (joints,)."""
-        values = np.asarray(values, self.dtype)
+        """Return one number per joint as float32; a ValueError for others. Shape: (joints,)."""
+        values = np.asarray(values, np.float32)
         if values.shape != self.nominal_pose.shape:
             raise ValueError(f"there are {self.nominal_pose.size} joints, the array has shape {values.shape}")
         return values
@@ -215,10 +207,9 @@ def parts_without_function(description: dict[str, Any]) -> list[str]:
 
 def load_network(file: Path, description: dict[str, Any]) -> Any:
     """Return an onnxruntime session on one thread; a UserError if the file is not the network of a description."""
-    try:
-        import onnxruntime
-    except ImportError:
-        raise missing_extra("onnxruntime") from None
+    require("onnxruntime")
+    import onnxruntime
+
     content, network = file.read_bytes(), description["network"]
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1

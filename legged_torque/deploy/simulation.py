@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -55,14 +56,14 @@ class Simulation:
         self._max_steps = math.ceil(description["episode"]["length"] * self._timing["control_frequency"] - 1e-6)
         ranges = [self._commands[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")]
         self._command_range = np.array([command, command] if command else np.transpose(ranges), float)
-        self._scan_delay = policy.scan["delay"] if policy.scan else 0
+        self._heights = deque[np.ndarray](maxlen=1 + (policy.scan["delay"] if policy.scan else 0))
         self._push_set_factor, self.notes = pushes.get("set_factor", 1.0), list[str]()
         if push_probability and not pushes:
             self.notes.append(
                 "pushes: policy.yaml does not name pushes.set_factor, so 1.0 is taken; trainings have 1.1 by default"
             )
         self.command = np.zeros(3)
-        self._steps, self._heights = 0, list[np.ndarray]()
+        self._steps = 0
 
     def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:
         """Run one robot for some control steps and return sums of metrics, see ``step_sums``. Shape: (NUM_SUMS,).
@@ -93,9 +94,9 @@ class Simulation:
         """Observe, act, and apply torques in all physics steps of a control step."""
         policy, robot = self.policy, self.robot
         state = robot.state()
-        heights = robot.position[2] - robot.ground_heights(policy.scan_places(robot.position, robot.quat))
-        self._heights = [heights, *(self._heights or [heights] * self._scan_delay)][: self._scan_delay + 1]
-        state.heights = self._heights[-1]
+        places = policy.scan_places(robot.position, robot.quat)
+        self._heights.append(robot.position[2] - robot.ground_heights(places))
+        state.heights = self._heights[0]  # the oldest, of this episode
         actions = policy.act(policy.observation(state, self.command))
         for i in range(self._timing["decimation"]):
             if i == 0 or self._timing["refresh_torques"]:
@@ -124,35 +125,34 @@ class Simulation:
 
     def _push(self) -> None:
         """Push the trunk: half of the pushes add to its velocity, the others set it."""
-        velocity = self.robot.velocity
-        drawn = self._rng.uniform(-self._push_velocity, self._push_velocity, 3)
+        velocity, drawn = self.robot.velocity, self._drawn([-self._push_velocity, self._push_velocity], 3)
         velocity[:] = velocity + drawn if self._rng.random() < PUSH_ADDED else self._push_set_factor * drawn
 
     def _new_episode(self) -> None:
         """Draw an initial state and a command, and reset the policy."""
-        rng, start, num_joints = self._rng, self._start, len(self.policy.joint_order)
-
-        def drawn(name: str, size: int) -> np.ndarray:
-            low, high = start[name]
-            return rng.uniform(low, high, size)
-
-        angles = [drawn(name, 1).item() for name in ("roll", "pitch", "yaw")]
-        pose = self.policy.nominal_pose * drawn("joint_position_scale", num_joints)
+        start, num_joints = self._start, len(self.policy.joint_order)
+        angles = [self._drawn(start[name]) for name in ("roll", "pitch", "yaw")]
+        pose = self.policy.nominal_pose * self._drawn(start["joint_position_scale"], num_joints)
         sizes = {"trunk_linear_velocity": 3, "trunk_angular_velocity": 3, "joint_velocity": num_joints}
-        velocities = tuple(drawn(name, size) for name, size in sizes.items())
+        velocities = tuple(self._drawn(start[name], size) for name, size in sizes.items())
         position = start["trunk_position"] + self._origin
         if any(start["trunk_place"]):
-            position[:2] += drawn("trunk_place", 2)
+            position[:2] += self._drawn(start["trunk_place"], 2)
         self.robot.reset(position, quaternion(*angles), pose, velocities)
         self.policy.reset()
         self._draw_command()
-        self._steps, self._heights = 0, []
+        self._heights.clear()
+        self._steps = 0
+
+    def _drawn(self, limits: list[float], size: int | None = None) -> Any:
+        """Return one or ``size`` numbers that are drawn uniformly from [lowest, highest]."""
+        return self._rng.uniform(limits[0], limits[1], size)
 
     def _draw_command(self) -> None:
         """Draw a command, and a heading if yaw rates follow one."""
         self.command = self._rng.uniform(*self._command_range)
         if "heading" in self._commands:
-            self._heading = self._rng.uniform(*self._commands["heading"])
+            self._heading = self._drawn(self._commands["heading"])
 
     def _follow_heading(self) -> None:
         """Command the yaw rate that turns the trunk to its heading, if there is one, as in training."""

@@ -42,7 +42,7 @@ _LATER = {
     "LeggedRobot": "legged_torque.envs.base.legged_robot:LeggedRobot",
     "ObservationTerm": "legged_torque.envs.base.observations:ObservationTerm",
 }
-"""Where classes are that need torch, by name."""
+"""Modules of the classes that need torch."""
 
 
 def __getattr__(name: str) -> Any:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO, Protocol
 
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, cell_state, command_of, is_json, step_words
-from legged_torque.experiments.times import read_times, write_times
+from legged_torque.experiments.times import STEPS, read_times, write_times
 from legged_torque.learning.training_display import UNIT, read_tracking
 from legged_torque.utils.display import read_progress
 from legged_torque.utils.errors import UserError
@@ -83,7 +83,7 @@ class Job:
 
     def add_time(self, seconds: float) -> None:
         """Count device time of the step [s], and write it now and then, so that a kill does not lose it."""
-        self._times.add(self._time_of, seconds)
+        self._times[self._time_of] = self._times.get(self._time_of, 0.0) + seconds
         if time.monotonic() - self._kept >= KEEP_EVERY:
             self.keep_times()
 
@@ -92,7 +92,7 @@ class Job:
         self._kept = time.monotonic()
         try:
             if self.process.poll() is not None:  # looking for checkpoints takes a while
-                self._times.steps = cell_state(self.cell).steps
+                self._times[STEPS] = cell_state(self.cell).steps
             write_times(self.cell.folder, self._times)
         except (OSError, UserError) as error:
             print(f"{self.cell.name}: its device time is not kept: {error}", file=sys.stderr)
@@ -119,16 +119,15 @@ class Job:
         if status == LOST:
             return f"the machine was lost during {self}"
         if status:
-            return (
-                f"{self} {f'was ended by signal {-status}' if status < 0 else f'has failed with exit status {status}'}"
-            )
+            how = f"was ended by signal {-status}" if status < 0 else f"has failed with exit status {status}"
+            return f"{self} {how}"
         try:
             if self.kind == "training":
                 state = cell_state(self.cell)
-                ended = (
-                    f"after {state.iterations} of {state.total} iterations" if state.total else "without a checkpoint"
-                )
-                return f"training has ended {ended}" if state.step in ("train", "resume") else ""
+                if state.step == "train":
+                    return "training has ended without a checkpoint"
+                so_far = f"after {state.iterations} of {state.total} iterations"
+                return f"training has ended {so_far}" if state.step == "resume" else ""
             part, result = (file(self.state.missing[0]) for file in (self.cell.part_file, self.cell.result_file))
             if not is_json(part):
                 return f"{self} has left no readable '{part}'"

@@ -19,7 +19,7 @@ from rich.table import Column
 
 from legged_torque.experiments.job import LOST, Job, Launcher, try_lock
 from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, check_same, is_done
-from legged_torque.experiments.times import add_up, describe, read_times
+from legged_torque.experiments.times import describe, read_times
 from legged_torque.utils.display import duration, is_terminal, time_left_text
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import held, write_whole
@@ -81,7 +81,7 @@ class ExperimentRun:
                 with contextlib.suppress(UserError):  # an error of one must not keep others from saving
                     while job.process.poll() is None:
                         time.sleep(POLL)
-        spent = describe(add_up(read_times(cell.folder) for cell in self._matrix.cells(self._out)))
+        spent = describe(read_times(cell.folder) for cell in self._matrix.cells(self._out))
         print(*filter(None, [spent, f"{self._num_done} of {self._num_cells} cells are done."]), sep="\n", flush=True)
         for failure in self._failures:
             print(failure, file=sys.stderr)

@@ -65,15 +65,11 @@ def find_shapes(source: Source) -> dict[int, list[Shape]]:
             shapes[body].append(shape)
             if before:
                 replaced[f"{before} to {shape.kind}"] += 1
-    if replaced:
-        changes = ", ".join(f"{count} x {key}" for key, count in sorted(replaced.items()))
-        source.notes.append(f"spheres, capsules and boxes in the place of other geoms: {changes}")
+    changes = (f"{count} x {key}" for key, count in sorted(replaced.items()))
+    source.notes.on(changes, "spheres, capsules and boxes in the place of other geoms")
     bare = [body for body, found in shapes.items() if not found]
-    shapes |= {body: [fit_inertia(model, body)] for body in bare}
-    if bare:
-        names = ", ".join(model.body(body).name for body in bare)
-        source.notes.append(f"without collision geoms, shaped by their inertia: {names}")
-    return shapes
+    source.notes.on((model.body(body).name for body in bare), "without collision geoms, shaped by their inertia")
+    return shapes | {body: [fit_inertia(model, body)] for body in bare}
 
 
 def find_legs(source: Source, shapes: dict[int, list[Shape]]) -> list[Leg]:

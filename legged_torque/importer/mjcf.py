@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from legged_torque.importer.robot import FOOT, Robot
+from legged_torque.utils.mjcf import loading
 
 SCENE = """
 <mujoco>
@@ -44,16 +45,18 @@ SCENE = """
 </mujoco>
 """
 """Everything but the robot's own parts. The robot's geoms touch the floor and never each other."""
-COMMENT = """<!-- {name}: written by scripts/import_robot.py. Its geoms touch the floor and never each other.
+COMMENT = """{name}: written by scripts/import_robot.py. Its geoms touch the floor and never each other.
      Source: {file}
      Changes:
-{notes} -->
-"""
+{notes}"""
 DISTANCE, ELEVATION = 2.5, 1.0  # of the camera along x and -y, and over the trunk; in heights of the trunk
 
 
-def mjcf(robot: Robot) -> str:
-    """Return the text of a robot's MJCF, with the changes to its source in a comment. Numbers have six digits."""
+def mjcf(robot: Robot) -> tuple[str, mujoco.MjModel]:
+    """Return the text of a robot's MJCF, with the changes to its source in a comment, and its model.
+
+    Numbers have six digits. A UserError if MuJoCo refuses the text or warns of it.
+    """
     model, height = robot.source.model, robot.stance.height
     spec = mujoco.MjSpec.from_string(SCENE)
     spec.modelname = robot.name
@@ -65,7 +68,20 @@ def mjcf(robot: Robot) -> str:
     for number in range(2, model.nbody):
         parent = bodies[int(model.body_parentid[number])]
         bodies[number] = parent.add_body(pos=model.body_pos[number], quat=model.body_quat[number])
-        _add_joint(robot, bodies[number], int(model.body_jntadr[number]))
+        joint = int(model.body_jntadr[number])
+        dof, address, place = int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint]), joint - 1
+        bodies[number].add_joint(
+            name=robot.joints[place],
+            pos=model.jnt_pos[joint],
+            axis=model.jnt_axis[joint],
+            range=robot.ranges[place],
+            armature=robot.stance.armature[place],
+            stiffness=model.jnt_stiffness[joint],
+            damping=model.dof_damping[dof],
+            frictionloss=model.dof_frictionloss[dof],
+            ref=model.qpos0[address],
+            springref=model.qpos_spring[address],
+        )
     for number, body in bodies.items():
         body.name = model.body(number).name or robot.shapes[number][0].name
         body.mass, body.inertia = model.body_mass[number], model.body_inertia[number]
@@ -77,34 +93,13 @@ def mjcf(robot: Robot) -> str:
             geom.size[: len(shape.size)] = shape.size
             if shape.kind != "sphere":
                 geom.quat = shape.quat
-    for joint, limit in zip(robot.joints, robot.torques, strict=True):
-        motor = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    for name, limit in zip(robot.joints, robot.torques, strict=True):
+        motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.ctrlrange = motor.forcerange = [-limit, limit]
     spec.add_key(name="home", qpos=[0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0, *robot.stance.angles])
     spec.compile()
-    notes = "\n".join(f"       - {_in_comment(note)}" for note in robot.notes)
-    comment = COMMENT.format(name=robot.name, file=_in_comment(ascii(robot.source.file.name)), notes=notes)
-    return comment + spec.to_xml()
-
-
-def _add_joint(robot: Robot, body: mujoco.MjsBody, number: int) -> None:
-    """Add a joint of the source to a body."""
-    model, place = robot.source.model, number - 1
-    dof, address = int(model.jnt_dofadr[number]), int(model.jnt_qposadr[number])
-    body.add_joint(
-        name=robot.joints[place],
-        pos=model.jnt_pos[number],
-        axis=model.jnt_axis[number],
-        range=robot.ranges[place],
-        armature=robot.stance.armature[place],
-        stiffness=model.jnt_stiffness[number],
-        damping=model.dof_damping[dof],
-        frictionloss=model.dof_frictionloss[dof],
-        ref=model.qpos0[address],
-        springref=model.qpos_spring[address],
-    )
-
-
-def _in_comment(text: str) -> str:
-    """Return a text without the end of a comment, which XML forbids in one."""
-    return re.sub("-(?=-)", "- ", text)
+    notes = "\n".join(f"       - {note}" for note in robot.source.notes)
+    comment = COMMENT.format(name=robot.name, file=ascii(robot.source.file.name), notes=notes)
+    text = f"<!-- {re.sub('-(?=-)', '- ', comment)} -->\n{spec.to_xml()}"  # XML forbids two dashes in a comment
+    with loading(robot.source.file):
+        return text, mujoco.MjModel.from_xml_string(text)

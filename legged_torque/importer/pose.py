@@ -92,12 +92,10 @@ def _nominal_pose(source: Source, legs: list[Leg], ranges: np.ndarray) -> np.nda
             f"nominal pose: inverse kinematics, feet below {'the center of mass' if len(legs) == 2 else 'hips'}, "
             f"legs {share:.0%} stretched"
         )
-        far = ", ".join(f"{name} by {miss:.2f} m" for name, miss in missed.items() if miss > MISSED)
-        if far:
-            source.notes.append(f"within the limits of joints, feet do not get there: {far}")
-    outside = [name for name, q, (low, high) in zip(source.joints, angles, ranges, strict=True) if not low <= q <= high]
-    if outside:
-        source.notes.append(f"the nominal pose was beyond the limits of {', '.join(outside)} and is moved inside")
+        far = (f"{name} by {miss:.2f} m" for name, miss in missed.items() if miss > MISSED)
+        source.notes.on(far, "within the limits of joints, feet do not get there")
+    outside = (angles < ranges[:, 0]) | (angles > ranges[:, 1])
+    source.notes.on(source.which(outside), "the nominal pose was beyond the limits and is moved inside")
     low, high = np.ceil(1e3 * ranges[:, 0]) / 1e3, np.floor(1e3 * ranges[:, 1]) / 1e3
     return np.clip(angles.round(3), low, high)  # rounded as in the settings, inside the limits
 

@@ -12,8 +12,8 @@ import numpy as np
 from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names, lowest_point, mirrored_legs, zero_pose
 from legged_torque.importer.pose import Stance, find_stance
 from legged_torque.importer.shapes import Shape
-from legged_torque.importer.source import GRAVITY, Source, read_source
-from legged_torque.utils.errors import UserError
+from legged_torque.importer.source import Source, read_source
+from legged_torque.utils.errors import UserError, collect_errors
 from legged_torque.utils.mirroring import counterparts
 
 UNLIMITED = np.pi  # range of joints without one, to both sides [rad]
@@ -53,16 +53,6 @@ class Robot:
         tables = self.by_kind(self.stance.stiffness), self.by_kind(self.stance.damping)
         return np.array([[table[kind] for kind in self.kinds] for table in tables])
 
-    @property
-    def weight(self) -> float:
-        """Weight [N]."""
-        return GRAVITY * float(self.source.model.body_mass.sum())
-
-    @property
-    def notes(self) -> list[str]:
-        """Changes and reasons, a line each."""
-        return self.source.notes
-
 
 def import_robot(file: Path, name: str = "", torque_limit: float | None = None) -> Robot:
     """Read a file and derive its robot.
@@ -76,7 +66,9 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     source = read_source(file)
     shapes = find_shapes(source)
     legs = find_legs(source, shapes)
-    ranges = _ranges(source)
+    ranges, unlimited = source.model.jnt_range[1:].copy(), source.model.jnt_limited[1:] == 0
+    ranges[unlimited] = -UNLIMITED, UNLIMITED
+    source.notes.on(source.which(unlimited), f"without a range, +-{UNLIMITED:.2f} rad given")
     torques = _torques(source, shapes, torque_limit)
     mirrored = mirrored_legs(source, legs)
     if torque_limit is not None:
@@ -87,7 +79,10 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     stance = find_stance(source, legs, ranges, torques)
     joints = joint_names(source, legs, mirrored)
     prefixes = [leg.name + "_" for leg in legs]
-    symmetric = _is_symmetric(source, joints, mirrored)
+    asymmetries: list[str] = []
+    with collect_errors(asymmetries):
+        counterparts(joints, mirrored)
+    source.notes += [f"training without mirror images: {reason}" for reason in asymmetries]
     kinds = [next((j.removeprefix(p) for p in prefixes if j.startswith(p)), j) for j in joints]
     damped = source.model.dof_damping[6:]
     if (damped > MUCH_DAMPING * stance.damping).any():
@@ -97,28 +92,7 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
         )
     source.notes.append("contacts and options are those of this library's robots: friction 1, condim 3, steps of 5 ms")
     _name_shapes(source, legs, shapes)
-    return Robot(name, source, legs, shapes, joints, kinds, ranges, torques, speed, mirrored, symmetric, stance)
-
-
-def _is_symmetric(source: Source, joints: list[str], mirrored: list[list[str]]) -> bool:
-    """Return whether every joint has a counterpart, as training with mirror images needs. Adds a note if not."""
-    try:
-        counterparts(joints, mirrored)
-    except UserError as error:
-        source.notes.append(f"training without mirror images: {error}")
-        return False
-    return True
-
-
-def _ranges(source: Source) -> np.ndarray:
-    """Return the ranges of the joints, a wide one for those without [rad]. Shape: (joints, 2). Adds a note."""
-    model = source.model
-    ranges, limited = model.jnt_range[1:].copy(), model.jnt_limited[1:].astype(bool)
-    free = [name for name, known in zip(source.joints, limited, strict=True) if not known]
-    ranges[~limited] = -UNLIMITED, UNLIMITED
-    if free:
-        source.notes.append(f"without a range, +-{UNLIMITED:.2f} rad given: {', '.join(free)}")
-    return ranges
+    return Robot(name, source, legs, shapes, joints, kinds, ranges, torques, speed, mirrored, not asymmetries, stance)
 
 
 def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None) -> np.ndarray:
@@ -128,14 +102,10 @@ def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None
         return np.full(model.njnt - 1, given)
     data = zero_pose(model, source.pose)
     lowest = min(lowest_point(data, body, shape)[2] for body, found in shapes.items() for shape in found)
-    enough = float(-GRAVITY * model.body_mass.sum() * lowest)
+    enough = float(-source.weight * lowest)
     known = (source.torque_limits > 0) & (source.torque_limits < IMPLAUSIBLE * enough)
-    if not known.all():
-        names = ", ".join(name for name, is_known in zip(source.joints, known, strict=True) if not is_known)
-        source.notes.append(
-            f"no torque limit that means anything at {names}: weight x height, {enough:.1f} N m, assumed; "
-            "give --torque_limit"
-        )
+    assumed = f"weight x height, {enough:.1f} N m, is assumed; --torque_limit sets them"
+    source.notes.on(source.which(~known), f"no torque limits that mean anything, so {assumed}")
     return np.where(known, source.torque_limits, enough)
 
 

@@ -66,21 +66,16 @@ SYMMETRY = """
 """
 
 
-def class_name(name: str) -> str:
-    """Return the prefix of the names of a robot's classes: Go2 for go2, AnymalC for anymal_c."""
-    return "".join(part.capitalize() for part in name.split("_"))
-
-
 def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
     """Return the text of the module with a robot's settings. Everything from its file is written as literals.
 
     ``path`` is that of its MJCF, as in ``asset.file``; ``is_fused`` says whether the fused step can simulate it.
     """
-    stance = robot.stance
+    stance, leverage = robot.stance, robot.source.weight * robot.stance.height
     return TEMPLATE.format(
         title=robot.name,
         file=ascii(robot.source.file.name),
-        cls=class_name(robot.name),
+        cls="".join(part.capitalize() for part in robot.name.split("_")),  # AnymalC for anymal_c
         path=_literal(path),
         engine="" if is_fused else ENGINE,
         foot=FOOT,
@@ -97,7 +92,7 @@ def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
         damping=_table(robot.by_kind(stance.damping)),
         torque_scale=float(f"{TORQUE_SCALE * max(robot.torques):.2g}"),
         height=round(stance.height, 3),
-        torques=LeggedRobotCfg.rewards.scales.torques * (WEIGHT_TIMES_HEIGHT / (robot.weight * stance.height)) ** 2,
+        torques=LeggedRobotCfg.rewards.scales.torques * (WEIGHT_TIMES_HEIGHT / leverage) ** 2,
         symmetry=SYMMETRY if robot.symmetric else "",
     )
 

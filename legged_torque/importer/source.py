@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,16 @@ SITE = "link:"  # prefix of the names of sites in the places of fixed links
 PARENTS = 4  # folders above that of the file in which meshes are looked for
 
 
+class Notes(list[str]):
+    """Changes and reasons, a line each."""
+
+    def on(self, parts: Iterable[str], reason: str) -> None:
+        """Add a reason followed by the names of parts, if there are any."""
+        names = ", ".join(parts)
+        if names:
+            self.append(f"{reason}: {names}")
+
+
 @dataclass
 class Source:
     """A robot as its file describes it: a floating trunk, every other body with one hinge joint.
@@ -37,7 +48,7 @@ class Source:
     pose: np.ndarray | None  # angles of the file's keyframe, by hinge joint [rad]
     torque_limits: np.ndarray  # tightest of the file, by joint; infinite without any [N m]
     speed_limits: list[float]  # of a URDF [rad/s]
-    notes: list[str]  # changes and reasons, a line each
+    notes: Notes
 
     @property
     def joints(self) -> list[str]:
@@ -48,6 +59,10 @@ class Source:
     def weight(self) -> float:
         """Weight [N]."""
         return GRAVITY * float(self.model.body_mass.sum())
+
+    def which(self, joints: np.ndarray) -> list[str]:
+        """Return the names of the joints for which an array is true. Shape: (joints,), bool."""
+        return [name for name, chosen in zip(self.joints, joints, strict=True) if chosen]
 
 
 def read_source(file: Path) -> Source:
@@ -92,7 +107,7 @@ def read_source(file: Path) -> Source:
     return Source(file, model, sites, pose, limits, [speed for speed in speeds if speed > 0], notes)
 
 
-def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
+def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
     """Make a file compile to one floating robot without anything else; return notes on the changes."""
     notes = _find_meshes(spec, file, is_urdf)
     in_pairs = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
@@ -107,14 +122,12 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
             geom.conaffinity = 1
             if geom.name not in in_pairs:
                 switched_on[geom.parent.name] = None
-    if switched_on:
-        bodies = ", ".join(switched_on)
-        notes.append(f"geoms of group {COLLISION_GROUP}, which the file switches off, collide: {bodies}")
+    notes.on(switched_on, f"geoms of group {COLLISION_GROUP}, which the file switches off, collide")
     for part in [*spec.materials, *spec.textures]:
         spec.delete(part)
     roots = [body for body in spec.worldbody.bodies if body.find_all("joint")]
     if len(roots) != 1:
-        raise UserError(f"cannot import '{file}': {len(roots)} bodies with joints hang on the world, it must be one")
+        raise UserError(f"cannot import '{file}': one child of the world must have joints, not {len(roots)}")
     if not roots[0].joints:
         roots[0].add_freejoint()
         notes.append(f"'{roots[0].name}' was fixed to the world; it floats now")
@@ -137,7 +150,7 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
     return notes
 
 
-def _compile(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
+def _compile(spec: mujoco.MjSpec, notes: Notes) -> mujoco.MjModel:
     """Compile; impossible inertias, which MuJoCo refuses, are replaced where links are fixed. Adds notes."""
     for body in spec.bodies:
         moves = any(joint.type != mujoco.mjtJoint.mjJNT_FREE for joint in body.joints)
@@ -158,7 +171,7 @@ def _compile(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
         return spec.compile()
 
 
-def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
+def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
     """Set the paths of meshes; drop those that are missing or that MuJoCo cannot read, and return notes.
 
     A mesh is at its path in the file, or at an end of it below a parent folder.
@@ -188,11 +201,12 @@ def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> list[str]:
         spec.delete(geom)
     for mesh in missing.values():
         spec.delete(mesh)
-    links = ", ".join(lost)
-    return [f"collision meshes of {links} are missing or not {types}: shapes follow from inertias"] if lost else []
+    notes = Notes()
+    notes.on(lost, f"collision meshes are missing or not {types}, so shapes follow from inertias")
+    return notes
 
 
-def _torque_limits(model: mujoco.MjModel, notes: list[str]) -> np.ndarray:
+def _torque_limits(model: mujoco.MjModel, notes: Notes) -> np.ndarray:
     """Return the tightest torque limit of each hinge in either direction [N m]. Shape: (joints,). Adds notes."""
     for actuator in range(model.nu):
         if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
@@ -215,8 +229,6 @@ def _torque_limits(model: mujoco.MjModel, notes: list[str]) -> np.ndarray:
         limits.append(min(down, up))
         bare += [name] if model.nu and not motors else []
         uneven += [name] if down != up else []
-    if bare:
-        notes.append(f"no actuator of the file drives {', '.join(bare)}: given motors, as every joint must have one")
-    if uneven:
-        notes.append(f"torque limits that differ by direction are the smaller of both: {', '.join(uneven)}")
+    notes.on(bare, "joints that no actuator of the file drives get motors, as every joint must have one")
+    notes.on(uneven, "torque limits that differ by direction are the smaller of both")
     return np.array(limits)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import math
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import is_whole_archive, write_whole
+from legged_torque.utils.limits import NotNegative, Number, check_value
 
 
 def write(file: Path, content: dict[str, Any]) -> str:
@@ -51,14 +51,14 @@ def read(file: Path, what: str, device: str) -> Any:
 
 def check_counters(state: dict[str, Any], file: str) -> None:
     """Raise a UserError if the counters of a checkpoint are not numbers."""
-    if not isinstance(state, dict) or not isinstance(state.get("infos"), dict):
-        raise UserError(f"'{file}' is not a usable checkpoint: it lacks the entry infos")
-    infos = state["infos"]
-    counters = {"iter": state["iter"]} | {key: infos[key] for key in ("total_timesteps", "seconds")}
-    for name, value in counters.items():
-        kinds = (int, float) if name == "seconds" else (int,)
-        if type(value) not in kinds or not 0 <= value < math.inf:
-            raise UserError(f"'{file}' is not a usable checkpoint: its {name} is {value!r}")
+    try:
+        if not isinstance(state, dict) or not isinstance(state.get("infos"), dict):
+            raise UserError("it lacks the entry infos")
+        counters = state["infos"] | {"iter": state["iter"]}
+        for name, hint in {"iter": Number, "total_timesteps": Number, "seconds": NotNegative}.items():
+            check_value(name, counters[name], hint)
+    except UserError as error:
+        raise UserError(f"'{file}' is not a usable checkpoint: {error}") from None
 
 
 def digest(file: Path) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -138,9 +137,7 @@ def make_evaluators(
 
 def append_row(file: Path, row: dict[str, float]) -> None:
     """Append a row to a CSV file, after a header if the file is new; a UserError if it cannot be written."""
-    is_new = not file.exists()
-    with write_errors(file), file.open("a", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, row, lineterminator="\n")
-        if is_new:
-            writer.writeheader()
-        writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
+    cells = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in row.values()]
+    lines = [cells] if file.exists() else [row, cells]
+    with write_errors(file), file.open("a", encoding="utf-8") as stream:
+        stream.writelines(",".join(line) + "\n" for line in lines)

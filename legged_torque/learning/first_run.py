@@ -7,7 +7,6 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from legged_torque.learning import checkpoint
 from legged_torque.learning.worlds import worlds_file
 from legged_torque.utils import distributed
 from legged_torque.utils.devices import resolve_device
@@ -26,27 +25,23 @@ def use_first_run(options: Options) -> None:
     """
     device = resolve_device(options.device)
     distributed.join(device)
-    digests, problem = {}, ""
+    contents, problem = dict[Path, bytes](), ""
     if distributed.rank() == 0:
         try:
             run = task_registry.load_run(options)
-            options.checkpoint, checkpoint_file = run.iterations, run.checkpoint.resolve()
-            files = (run.folder.resolve() / CONFIG_FILE, checkpoint_file, worlds_file(checkpoint_file))
-            digests = {str(file): checkpoint.digest(file) for file in files if file.is_file()}
+            options.checkpoint, checkpoint = run.iterations, run.checkpoint.resolve()
+            files = (run.folder.resolve() / CONFIG_FILE, checkpoint, worlds_file(checkpoint))
+            contents = {file: file.read_bytes() for file in files if file.is_file()}
         except UserError as error:
             problem = str(error)
-    digests, options.checkpoint, problem = distributed.from_first((digests, options.checkpoint, problem), device)
+    contents, options.checkpoint, problem = distributed.from_first((contents, options.checkpoint, problem), device)
     if problem:
         raise UserError(problem)
-    folder = Path(next(iter(digests))).parent
-    is_missing = any(checkpoint.digest(Path(name)) != digest for name, digest in digests.items())
-    if distributed.any_process(is_missing, device):
-        mine = {Path(name).name: Path(name).read_bytes() for name in digests} if distributed.rank() == 0 else None
-        contents = distributed.from_first(mine, device)
-        if is_missing:
-            temporary = tempfile.mkdtemp(prefix="legged_torque_")
-            atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-            folder = Path(temporary) / folder.name
-            for name, content in contents.items():
-                write_whole(folder / name, content)
+    folder = next(iter(contents)).parent
+    if any(not file.is_file() or file.read_bytes() != content for file, content in contents.items()):
+        temporary = tempfile.mkdtemp(prefix="legged_torque_")
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        folder = Path(temporary) / folder.name
+        for file, content in contents.items():
+            write_whole(folder / file.name, content)
     options.load_run = str(folder)

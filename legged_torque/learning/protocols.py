@@ -37,12 +37,23 @@ class Transition:
     extras: dict[str, Any]
 
 
-class Learner(Protocol):
+class Stateful(Protocol):
+    """An object with a state that files keep."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return tensors and plain values, in nested dictionaries."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a :meth:`state_dict`, which may have further entries."""
+
+
+class Learner(Stateful, Protocol):
     """A reinforcement learning algorithm, built by ``construct_algorithm(obs, env, cfg, device)`` as in rsl_rl.
 
-    Three methods are optional. ``set_progress(iteration, num_iterations)`` is called before each update.
-    ``broadcast_parameters()`` gives all processes the parameters of the first one; a learner without it trains in one
-    process only. ``close()`` is called when training is over.
+    Tensors of its :meth:`state_dict` have memory of their own. Three methods are optional.
+    ``set_progress(iteration, num_iterations)`` is called before each update. ``broadcast_parameters()`` gives all
+    processes the parameters of the first one; a learner without it trains in one process only. ``close()`` is called
+    when training is over.
 
     Attributes:
         capturable: Whether :meth:`act` and :meth:`observe` may be captured in a CUDA graph: fixed shapes and addresses,
@@ -73,12 +84,6 @@ class Learner(Protocol):
     def policy(self) -> nn.Module:
         """Return the network from observations to mean actions, always the same object."""
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return tensors and plain values from which learning continues, in memory of their own."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a :meth:`state_dict`, which may have further entries."""
-
 
 class EpisodeLog(Protocol):
     """Sums over the steps of a task."""
@@ -94,8 +99,8 @@ class Health(Protocol):
         """Return the share of worlds that have diverged since the last call, and resets by tensor that caused them."""
 
 
-class Task(Protocol):
-    """A batch of worlds.
+class Task(Stateful, Protocol):
+    """A batch of worlds, with the counters that a checkpoint keeps as its state.
 
     Some methods are optional. ``make_evaluation(num_envs, perturbation)`` returns an :class:`Evaluation`; without it,
     ``evaluation.interval`` must be 0. Worlds of a task with these three go on in a resumed training, others start anew:
@@ -137,12 +142,6 @@ class Task(Protocol):
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return scalars of curricula to be logged."""
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the counters that a checkpoint keeps."""
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from the counters of a checkpoint."""
-
     def check_buffers(self) -> str | None:
         """Return a warning if the simulation has dropped anything; called with each checkpoint."""
 
@@ -172,7 +171,8 @@ class Evaluation(Protocol):
 def check_learner(alg: Any, env: Any, num_processes: int) -> None:
     """Raise a UserError if an object is no :class:`Learner`, or needs what the task or several processes lack."""
     name = type(alg).__name__
-    members = [*Learner.__annotations__, *(name for name in vars(Learner) if not name.startswith("_"))]
+    methods = [*vars(Learner), *vars(Stateful)]
+    members = [*Learner.__annotations__, *(name for name in methods if not name.startswith("_"))]
     missing = [member for member in members if not hasattr(alg, member)]
     if missing:
         raise UserError(f"algorithm.class_name: {name} is no learner, it lacks {', '.join(missing)}")

@@ -11,7 +11,7 @@ from torch import nn
 import legged_torque
 from legged_torque.learning.trainer import Trainer
 from legged_torque.utils import distributed
-from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.errors import UserError, unknown_name
 
 
 class OnPolicyRunner(Trainer, runners.OnPolicyRunner):
@@ -34,7 +34,12 @@ class OnPolicyRunner(Trainer, runners.OnPolicyRunner):
                     raise unknown_name(f"observation group in obs_groups.{key}", group, groups_of_task)
         if hasattr(env, "step_graph"):
             env.step_graph.enabled = train_cfg["capture"]
-        runners.OnPolicyRunner.__init__(self, env, train_cfg, log_dir, device)
+        try:
+            runners.OnPolicyRunner.__init__(self, env, train_cfg, log_dir, device)
+        except ValueError as error:
+            if "observations" not in str(error):
+                raise
+            raise UserError(f"obs_groups: {error}") from error  # such as images for a network of vectors
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         Trainer.__init__(self, env, self.alg, train_cfg, self.logger)
 

@@ -8,25 +8,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from legged_torque.learning import checkpoint
+from legged_torque.learning.protocols import Stateful
 from legged_torque.utils import distributed
 from legged_torque.utils.display import warn
 from legged_torque.utils.errors import UserError
-
-
-class Stateful(Protocol):
-    """An object with a state."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return tensors by name."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a :meth:`state_dict`, which may have further entries."""
 
 
 class Worlds:

@@ -20,7 +20,7 @@ CAPABILITIES = {
     "applied_forces": "has Engine.applied_forces",
     "per_world": "has Engine.field and what belongs to it: parameters of the model that differ from world to world",
 }
-"""What an engine may be able to do besides stepping worlds."""
+"""Optional abilities of engines."""
 
 
 class HeightMap(Protocol):

@@ -12,7 +12,7 @@ from legged_torque.sim.robot_file import actuator_problems
 from legged_torque.utils.errors import refuse, unknown_name
 
 ENGINES: dict[str, type[Engine]] = {engine.name: engine for engine in (FusedEngine, MuJoCoWarpEngine)}
-"""What ``sim.engine`` may be. A file of a user's may add an engine of its own."""
+"""Values of ``sim.engine``. A user's file may add an engine."""
 
 
 def engine_class(name: str) -> type[Engine]:

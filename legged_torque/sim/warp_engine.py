@@ -1,4 +1,4 @@
-"""What the engines on MuJoCo Warp's arrays share: state, resets, divergence, parameters per world."""
+"""Base of engines on MuJoCo Warp's arrays: state, resets, divergence, parameters per world."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where tiles of rough ground lie, and the map that they make."""
+"""The layout of tiles of rough ground, and their map."""
 
 from __future__ import annotations
 

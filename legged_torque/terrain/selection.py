@@ -1,4 +1,4 @@
-"""Which kinds of rough ground, and how difficult, a policy is watched or measured on."""
+"""Kinds and levels of rough ground for watching and measuring a policy."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
 Formulas and ranges are legged_gym's (Rudin et al., *Learning to Walk in Minutes Using Massively Parallel Deep
 Reinforcement Learning*), but holes are less deep, gaps are around a platform of 3 m, and waves, which legged_gym does
-not use, are our own. Lengths are rounded to whole cells, heights not at all. A wall is one cell wide; lengths beside it
-are those at half its height. Robots start in the middle of a tile: slopes and stairs go up or down as seen from there.
+not use, are our own. Lengths are rounded to whole cells, heights not at all. A wall is one cell wide; lengths are
+those at half its height. Robots start in the middle of a tile: slopes and stairs go up or down as seen from there.
 
 A kind of one's own is a function with these arguments in :data:`TILES`, and its share in
 ``terrain.terrain_proportions``.

@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import errno
 import gc
-import math
+import importlib.util
 import os
 import re
 import shutil
@@ -15,18 +14,18 @@ import signal
 import sys
 import tempfile
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.utils.devices import disable_renderer
 from legged_torque.utils.errors import TrainingError, UserError, is_out_of_memory, unknown_name
-from legged_torque.utils.limits import describe, types_of
+from legged_torque.utils.files import write_errors
+from legged_torque.utils.limits import check_value, describe, types_of
 from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import task_registry
 
-MAX_NAME = 255  # bytes of the name of a file, on the usual systems
 COMMAND = "legged-torque"  # the console command that runs every script
 SETTINGS = ("task", "task_file", "seed", "perturbation", "ranges", "device", "set")  # options of every task
 RUNS = ("log_root", "experiment_name", "load_run", "checkpoint")  # of scripts that keep or load runs
@@ -90,6 +89,22 @@ class Parser(argparse.ArgumentParser):
         return namespace
 
 
+def take_command(kind: str, names: Sequence[str]) -> str:
+    """Make the first word a part of the program's name and return it; nothing before an option or a completion.
+
+    A UserError if it is not one of the names, which are those of a ``kind``.
+    """
+    name, is_completing = "".join(sys.argv[1:2]), "_ARGCOMPLETE" in os.environ
+    if name in names:
+        sys.argv = [f"{sys.argv[0]} {name}", *sys.argv[2:]]
+        if is_completing:  # one more word of the line belongs to the command
+            os.environ["_ARGCOMPLETE"] = str(int(os.environ["_ARGCOMPLETE"]) + 1)
+        return name
+    if name and not name.startswith("-") and not is_completing:
+        raise unknown_name(kind, name, names)
+    return ""
+
+
 def add_options(parser: Parser, *names: str) -> None:
     """Add fields of :class:`Options` in groups of ``--help``."""
     types, defaults = types_of(Options), Options()
@@ -140,6 +155,8 @@ def options_of(args: argparse.Namespace) -> Options:
     options = Options(**{name: getattr(args, name) for name in names if hasattr(args, name)})
     if options.task_file:
         with slow_imports():
+            if os.environ.get("MUJOCO_GL") == "osmesa" and importlib.util.find_spec("triton"):
+                importlib.import_module("triton")  # after MuJoCo, it crashes: it and OSMesa have different LLVMs
             task_registry.import_files(options.task_file)
     return options
 
@@ -211,41 +228,28 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
     sys.exit(status)
 
 
-def check_at_least(args: object, lowest: int, *names: str) -> None:
-    """Raise a UserError if one of the named arguments is lower, NaN, infinite or too large to count."""
-    for name in names:
-        value = getattr(args, name)
-        if not value >= lowest:
-            raise UserError(f"--{name} must be at least {lowest}, not {value}")
-        if value >= 2**31:
-            raise UserError(f"--{name} is too large: {value}")
-
-
-def finite(text: str) -> float:
-    """Return the number that an argument gives, as its ``type``; NaN and infinity are refused."""
-    if not math.isfinite(float(text)):
-        raise argparse.ArgumentTypeError(f"it must be finite, not {text}")
-    return float(text)
+def check_args(args: object, **hints: Any) -> None:
+    """Raise a UserError if an argument does not have the type ``hints[name]``, with its bounds; None has any."""
+    for name, hint in hints.items():
+        if getattr(args, name) is not None:
+            check_value(f"--{name}", getattr(args, name), hint)
 
 
 def add_command_arg(parser: Parser) -> None:
     """Add a fixed command of the robots."""
     hint = "fixed command: forwards, to the left [m/s], yaw rate [rad/s]; default: drawn as in training"
-    parser.add_argument("--command", type=finite, nargs=3, metavar=("X", "Y", "YAW"), help=hint)
+    parser.add_argument("--command", type=float, nargs=3, metavar=("X", "Y", "YAW"), help=hint)
 
 
 def check_output(file: Path) -> None:
     """Raise a UserError if a file cannot be written later; nothing is created or changed yet."""
-    try:
+    with write_errors(file):
         if file.is_dir():
             raise UserError(f"cannot write '{file}': it is a folder")
         if file.exists():
             file.open("ab").close()
-        else:
-            folder = next(parent for parent in file.absolute().parents if parent.exists())
-            with tempfile.TemporaryFile(dir=folder):
-                too_long = max(len(os.fsencode(part)) for part in file.parts) > MAX_NAME
-            if too_long:
-                raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
-    except OSError as error:
-        raise UserError(f"cannot write '{file}': {error.strerror}") from None
+            return
+        folder = next(parent for parent in file.absolute().parents if parent.exists())
+        tempfile.TemporaryFile(dir=folder).close()
+        with contextlib.suppress(FileNotFoundError):
+            file.stat()  # whose name may be too long

@@ -9,8 +9,7 @@ import sys
 
 import legged_torque
 from legged_torque import SCRIPTS_DIR, __version__
-from legged_torque.utils.cli import COMMAND, Parser, run_script
-from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.cli import COMMAND, Parser, run_script, take_command
 
 USUAL = ("train", "play", "evaluate", "export", "sim2sim", "experiment", "report", "import_robot", "info")
 """Scripts for most users, in the order of ``--help``."""
@@ -18,22 +17,20 @@ USUAL = ("train", "play", "evaluate", "export", "sim2sim", "experiment", "report
 
 def main() -> None:
     """Run the script that the first word names, with the other words as its own."""
-    if "_ARGCOMPLETE" in os.environ:
-        words = os.environ["COMP_LINE"][: int(os.environ["COMP_POINT"])].split(" ")[1:-1]
-        os.environ["_ARGCOMPLETE"] = str(1 + bool(words))  # how many words of the line are the command's name
-    else:
-        words = sys.argv[1:]
+    run_script(run_command)
+
+
+def run_command() -> None:
+    """Run a script as ``python scripts/<name>.py`` does, or show what there is."""
+    sys.argv[0] = COMMAND
+    if "_ARGCOMPLETE" in os.environ:  # the words are those before the one to complete
+        sys.argv[1:] = os.environ["COMP_LINE"][: int(os.environ["COMP_POINT"])].split(" ")[1:-1]
+        os.environ["_ARGCOMPLETE"] = "1"  # how many words of the line are the command's name
     others = sorted(file.stem for file in SCRIPTS_DIR.glob("[!_]*.py") if file.stem not in USUAL)
-    is_script = bool(words) and not words[0].startswith("-")
-    run_script(lambda: start(words, [*USUAL, *others]) if is_script else show_overview([*USUAL, *others]))
-
-
-def start(words: list[str], scripts: list[str]) -> None:
-    """Run a script as ``python scripts/<name>.py`` does; a UserError if none of them has the name."""
-    name = words[0]
-    if name not in scripts:
-        raise unknown_name("command", name, scripts)
-    sys.argv = [f"{COMMAND} {name}", *words[1:]]
+    name = take_command("command", [*USUAL, *others])
+    if not name:
+        show_overview([*USUAL, *others])
+        return
     spec = importlib.util.spec_from_file_location("__main__", SCRIPTS_DIR / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = sys.modules["__main__"] = importlib.util.module_from_spec(spec)

@@ -61,6 +61,19 @@ def write_json(file: Path, value: Any) -> None:
     write_whole(file, json.dumps(finite(value), indent=1) + "\n")
 
 
+def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
+    """Return the JSON object with at least these keys that ``script`` has written; a UserError if it is none."""
+    if not file.is_file():  # a device might never end
+        raise UserError(f"cannot read '{file}': there is no such file")
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:  # nested too deeply
+        raise UserError(f"cannot read '{file}': {error}") from None
+    if not isinstance(data, dict) or not keys <= data.keys():
+        raise UserError(f"'{file}' is not a file that {script} has written")
+    return data
+
+
 @contextlib.contextmanager
 def held(lock: Path) -> Iterator[None]:
     """Hold a lock file, after others have released it; a UserError if it cannot be written. The file is kept."""

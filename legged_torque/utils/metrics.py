@@ -27,43 +27,17 @@ import numpy as np
 Array: TypeAlias = Any  # a numpy array or a torch tensor
 
 
-@dataclass(frozen=True)
-class Metric:
-    """Name and presentation of a metric."""
-
-    name: str  # in files and on the terminal
-    unit: str  # empty if it has none
-    title: str  # its name in tables and figures; the paper's own name, if the metric is in Table I
-    lower_is_better: bool | None  # None if neither direction is better
-    in_paper: bool = False  # whether Table I of the paper has it
-    digits: int = 4  # decimals shown in tables; as many as the paper prints
-
-    @property
-    def label(self) -> str:
-        """The title with the unit."""
-        return f"{self.title} [{self.unit.replace('^2', '²')}]" if self.unit else self.title
-
-    def gain(self, value: float, other: float) -> float:
-        """Return by how much a value is better than another one; negative if it is worse."""
-        if self.lower_is_better is None:
-            raise ValueError(f"neither direction of {self.name} is better")
-        return other - value if self.lower_is_better else value - other
-
-
-METRICS = (
-    Metric("track_percentage", "", "Track % [share]", False, in_paper=True),  # the paper prints 0.76, not 76
-    Metric("track_xy", "m^2/s^2", "Track xy", True, in_paper=True),
-    Metric("track_angular", "rad^2/s^2", "Track angular", True, in_paper=True),
-    Metric("collision_force", "N", "Collision forces", True, in_paper=True, digits=1),
-    Metric("cost_of_transport", "", "Cost of transport", True, in_paper=True),
-    Metric("height", "m", "Walking height", None),
-    Metric("speed", "m/s", "Speed", None),
-    Metric("falls_per_minute", "1/min", "Falls per minute", True),
-)
-"""The metrics of an evaluation, the five of the paper first; each has its formula in :func:`ratios`."""
-
-UNITS = {metric.name: metric.unit for metric in METRICS}  # unit of each metric
-
+UNITS = {
+    "track_percentage": "",
+    "track_xy": "m^2/s^2",
+    "track_angular": "rad^2/s^2",
+    "collision_force": "N",
+    "cost_of_transport": "",
+    "height": "m",
+    "speed": "m/s",
+    "falls_per_minute": "1/min",
+}
+"""Units of the metrics, by their names in files and on the terminal; each has its formula in :func:`ratios`."""
 NUM_SUMS = 10  # numbers that step_sums returns for each world
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
-import re
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from glob import glob
+from pathlib import Path
 from typing import TextIO
 
 import warp as wp
@@ -39,9 +39,7 @@ class CompileProgress(threading.Thread):
         super().__init__(name="compile progress", daemon=True)
         self.modules: set[str] = set()
         self._stream = stream or sys.stderr
-        self._build = re.compile(rf"(\w+)_p{os.getpid()}_t\d+")  # folder of a build of this process
-        self._seconds, self._last_look = 0.0, time.monotonic()
-        self._last_line = -math.inf
+        self._seconds, self._next_line = 0.0, SHOW_AFTER  # of compilation
         self._is_closed = threading.Event()
 
     def __enter__(self) -> CompileProgress:
@@ -56,31 +54,30 @@ class CompileProgress(threading.Thread):
 
     def run(self) -> None:
         """Look again and again until the context is closed."""
+        last = time.monotonic()
         while not self._is_closed.wait(_POLL):
-            self.look(time.monotonic())
+            now = time.monotonic()
+            self.look(now - last)
+            last = now
 
-    def look(self, now: float) -> None:
-        """Look for builds at a time [s], and report them if that is due."""
-        names, folder = list[str](), wp.config.kernel_cache_dir  # None before Warp's start
-        for place in (folder, os.path.join(folder, "lto")) if folder else ():  # and that of link-time optimization
-            with contextlib.suppress(OSError):
-                names += os.listdir(place)
-        builds = {found[1] for found in map(self._build.fullmatch, names) if found}
-        seconds, self._last_look = now - self._last_look, now
+    def look(self, seconds: float) -> None:
+        """Look for builds, some seconds after the last look, and report them if that is due."""
+        folder, own = wp.config.kernel_cache_dir, f"*_p{os.getpid()}_t*"  # the folders of builds of this process
+        places = (own, f"lto/{own}") if folder else ()  # no cache before Warp's start; lto is of link-time optimization
+        builds = {Path(name).name.rpartition("_p")[0] for place in places for name in glob(place, root_dir=folder)}
         view = Display.shown if self._stream.isatty() else None
-        if builds or TORCH_COMPILES.is_set():
-            self.modules |= builds
-            self._seconds += seconds
-            line = f"{COMPILING}: {len(self.modules)} modules, {self._seconds:.0f} s"
-            if self._seconds < SHOW_AFTER:
-                return
-            if view is not None:
-                view.activity = line
-            elif now - self._last_line >= LINE_EVERY:
-                self._last_line = now
-                print(line, file=self._stream, flush=True)
-        elif view is not None and view.activity.startswith(COMPILING):
-            view.activity = ""
+        if not builds and not TORCH_COMPILES.is_set():
+            if view is not None and view.activity.startswith(COMPILING):
+                view.activity = ""
+            return
+        self.modules |= builds
+        self._seconds += seconds
+        line = f"{COMPILING}: {len(self.modules)} modules, {self._seconds:.0f} s"
+        if view is not None and self._seconds >= SHOW_AFTER:
+            view.activity = line
+        elif view is None and self._seconds >= self._next_line:
+            self._next_line = self._seconds + LINE_EVERY
+            print(line, file=self._stream, flush=True)
 
 
 @contextlib.contextmanager

@@ -77,7 +77,7 @@ class TaskRegistry:
             name: Name of the task.
             task_class: Its class, or ``"module:Class"``, which is imported when the task is built.
             env_cfg: Settings of the task.
-            train_cfg: Settings of its training, of a :class:`~legged_torque.learning.settings.TrainingCfg`.
+            train_cfg: Settings of its training, of a :class:`~legged_torque.envs.base.training_config.TrainingCfg`.
         """
         if name in self._tasks:
             raise UserError(f"'{name}' is a task already; choose another name")

@@ -18,21 +18,52 @@ import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from legged_torque.viewer.ports import free_port
 
-class Guard:
-    """Accepts or refuses HTTP requests and WebSocket handshakes.
+
+class GuardedServer(viser.ViserServer):
+    """A viser server that accepts or refuses HTTP requests and WebSocket handshakes.
 
     Attributes:
         token: Required in the first request; empty if the server is reachable from this machine only.
     """
 
-    def __init__(self, host: str) -> None:
-        """Require a token unless the server's address is a loopback address."""
+    def __init__(self, host: str, port: int, label: str) -> None:
+        """Serve at a port or the next free one. A token is required unless the address is a loopback address."""
         self.token = "" if is_local(host) else secrets.token_hex(16)
         self._cookie = f"legged_torque_{secrets.token_hex(4)}"  # cookies are shared by all ports of a machine
+        start = websockets.asyncio.server.serve
 
-    def refusal(self, request: Request) -> str:
-        """Return why a request is refused, or an empty string."""
+        def serve(*args: Any, process_request: Callable[..., Response | None], **settings: Any) -> Any:
+            return start(*args, process_request=functools.partial(self._answer, process_request), **settings)
+
+        with mock.patch.object(websockets.asyncio.server, "serve", serve):  # viser has no hook for requests
+            super().__init__(host, free_port(host, port), label=label, verbose=False)
+
+    @property
+    def url(self) -> str:
+        """Address of the page for a browser on this machine, with the token if one is needed."""
+        host = "127.0.0.1" if self.get_host() == "0.0.0.0" else self.get_host()
+        return f"http://{host}:{self.get_port()}" + (f"/?token={self.token}" if self.token else "")
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """Refuse to open a tunnel from the internet, which viser does for any page that asks."""
+        return None
+
+    def _answer(
+        self, serve: Callable[..., Response | None], connection: ServerConnection, request: Request
+    ) -> Response | None:
+        """Refuse a request or answer it as ``serve`` does. A valid token is kept by the browser as a cookie."""
+        given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+        if refusal := self._refusal(request, given):
+            return connection.respond(http.HTTPStatus.FORBIDDEN, f"{refusal}\n")
+        response = serve(connection, request)
+        if response is not None and self.token and given:
+            response.headers["Set-Cookie"] = f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        return response
+
+    def _refusal(self, request: Request, token: str) -> str:
+        """Return why a request with a token in its address, or without one, is refused, or an empty string."""
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin", "")
         if origin and urlsplit(origin).netloc != host:
             return "only the page itself may connect, no page of another site"
@@ -41,39 +72,9 @@ class Guard:
             is_address = ":" in name or name.replace(".", "").isdecimal()
             return "" if name == "localhost" or is_address else "open the page by its address, not by a name"
         cookie = SimpleCookie(request.headers.get("Cookie", "")).get(self._cookie)
-        given = (_token_of(request), cookie.value if cookie else "")
-        is_known = any(secrets.compare_digest(text.encode(), self.token.encode()) for text in given)
+        texts = (token, cookie.value if cookie else "")
+        is_known = any(secrets.compare_digest(text.encode(), self.token.encode()) for text in texts)
         return "" if is_known else "open the address that play.py has printed, with its token"
-
-    def answer(
-        self, serve: Callable[..., Response | None], connection: ServerConnection, request: Request
-    ) -> Response | None:
-        """Refuse a request or answer it as ``serve`` does. A valid token is kept by the browser as a cookie."""
-        refusal = self.refusal(request)
-        if refusal:
-            return connection.respond(http.HTTPStatus.FORBIDDEN, f"{refusal}\n")
-        response = serve(connection, request)
-        if response is not None and self.token and _token_of(request):
-            response.headers["Set-Cookie"] = f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
-        return response
-
-
-class GuardedServer(viser.ViserServer):
-    """A viser server whose requests pass a :class:`Guard`."""
-
-    def __init__(self, guard: Guard, host: str, port: int, label: str) -> None:
-        """Serve at an address. viser has no hook for requests, so the function that it calls is replaced meanwhile."""
-        start = websockets.asyncio.server.serve
-
-        def serve(*args: Any, process_request: Callable[..., Response | None], **settings: Any) -> Any:
-            return start(*args, process_request=functools.partial(guard.answer, process_request), **settings)
-
-        with mock.patch.object(websockets.asyncio.server, "serve", serve):
-            super().__init__(host, port, label=label, verbose=False)
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refuse to open a tunnel from the internet, which viser does for any page that asks."""
-        return None
 
 
 def is_local(host: str) -> bool:
@@ -83,8 +84,3 @@ def is_local(host: str) -> bool:
     except OSError:
         return False
     return all(ipaddress.ip_address(address[0]).is_loopback for *_, address in found)
-
-
-def _token_of(request: Request) -> str:
-    """Return the token in the address of a request, or an empty string."""
-    return parse_qs(urlsplit(request.path).query).get("token", [""])[0]

@@ -18,8 +18,7 @@ import mujoco
 from legged_torque.deploy.simulation import Simulation
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
-from legged_torque.viewer.ground import Ground, drawn_task
-from legged_torque.viewer.mujoco_scene import AZIMUTH, ELEVATION, TRUNK, add_velocities, size_of
+from legged_torque.viewer.drawing import AZIMUTH, ELEVATION, Drawing
 from legged_torque.viewer.pacing import Pacer
 
 if TYPE_CHECKING:
@@ -33,10 +32,14 @@ PUSH_SPEED, PUSH_ANGLE = 0.8, 1.5708  # of a push: speed [m/s], direction from t
 DISTANCE = 1.8  # of the camera, for the A1 [m]
 CLOSE_TIMEOUT = 5.0  # seconds that MuJoCo's thread may take to end
 
-_SPACE, _COMMA, _PERIOD, _ZERO, _P, _R = 32, 44, 46, 48, 80, 82  # key codes of GLFW
-_RIGHT, _LEFT, _DOWN, _UP = 262, 263, 264, 265
-_COMMAND_KEYS = {_UP: (0, STEP), _DOWN: (0, -STEP), _COMMA: (1, STEP), _PERIOD: (1, -STEP)}
-_COMMAND_KEYS |= {_LEFT: (2, STEP), _RIGHT: (2, -STEP)}  # index in the command and change
+COMMAND_KEYS = {265: (0, STEP), 264: (0, -STEP), 44: (1, STEP), 46: (1, -STEP), 263: (2, STEP), 262: (2, -STEP)}
+"""Index in the command and its change, by GLFW's codes of up, down, comma, period, left and right."""
+ACTIONS: dict[int, Callable[[Session], None]] = {
+    ord(" "): lambda session: session.set_paused(not session.is_paused),
+    ord("R"): lambda session: session.reset(),
+    ord("P"): lambda session: session.push(PUSH_ANGLE, PUSH_SPEED),
+}
+STAND_STILL = ord("0")
 
 
 def check_display(instead: str) -> None:
@@ -64,23 +67,19 @@ class Keyboard:
         ranges = session.task.cfg.commands.ranges
         self._limits = [ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw]
         self._command = [0.0, 0.0, 0.0]
-        self.press(_ZERO)
+        self.press(STAND_STILL)
 
     def press(self, key: int) -> None:
         """Request the action of a key, given by its code of GLFW."""
-        if key in _COMMAND_KEYS:
-            index, change = _COMMAND_KEYS[key]
+        if key in ACTIONS:
+            ACTIONS[key](self._session)
+        elif key in COMMAND_KEYS:
+            index, change = COMMAND_KEYS[key]
             low, high = self._limits[index]
             self._command[index] = round(min(max(self._command[index] + change, low), high), 3)
-        elif key == _ZERO:
+        elif key == STAND_STILL:
             self._command = [0.0, 0.0, 0.0]
-        elif key == _SPACE:
-            self._session.set_paused(not self._session.is_paused)
-        elif key == _R:
-            self._session.reset()
-        elif key == _P:
-            self._session.push(PUSH_ANGLE, PUSH_SPEED)
-        if key in _COMMAND_KEYS or key == _ZERO:
+        if key in COMMAND_KEYS or key == STAND_STILL:
             v_x, v_y, yaw_rate = self._command
             self._session.set_command((v_x, v_y, yaw_rate))
 
@@ -89,55 +88,45 @@ def watch(session: Session) -> None:
     """Show the first world until the window is closed or Ctrl-C. The session steps in a thread of its own."""
     import mujoco.viewer  # needs a screen
 
-    model, ground = drawn_task(session.task)
-    data, size = mujoco.MjData(model), size_of(model)
-    keyboard = Keyboard(session)
+    drawing, keyboard = Drawing.of_task(session.task), Keyboard(session)
     print(KEYS, flush=True)
     before = set(threading.enumerate())
     hidden = {"show_left_ui": False, "show_right_ui": False}
-    window = mujoco.viewer.launch_passive(model, data, key_callback=keyboard.press, **hidden)
-    drawing = set(threading.enumerate()) - before
+    window = mujoco.viewer.launch_passive(drawing.model, drawing.data, key_callback=keyboard.press, **hidden)
+    of_window = set(threading.enumerate()) - before
     try:
         with window, StopRequest(lambda text: session.stop()):
-            window.cam.type, window.cam.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, TRUNK
-            window.cam.distance, window.cam.azimuth, window.cam.elevation = DISTANCE * size, AZIMUTH, -ELEVATION
+            window.cam.type, window.cam.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, drawing.trunk
+            window.cam.distance, window.cam.azimuth, window.cam.elevation = DISTANCE * drawing.size, AZIMUTH, -ELEVATION
             stepping = threading.Thread(target=session.run, name="session")  # drawing must not delay the steps
             stepping.start()
             while window.is_running() and stepping.is_alive():
-                draw(session, window, model, data, size, ground)
+                draw(session, window, drawing)
                 stepping.join(FRAME_INTERVAL)
             session.stop()
             stepping.join()
     finally:
-        for thread in drawing:
+        for thread in of_window:
             thread.join(CLOSE_TIMEOUT)  # Python would crash if it ended while the window still draws
 
 
-def draw(
-    session: Session,
-    window: mujoco.viewer.Handle,
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    size: float,
-    ground: Ground | None,
-) -> None:
-    """Show the first world by ``data``, which the window draws, and command, velocity and tile as text."""
+def draw(session: Session, window: mujoco.viewer.Handle, drawing: Drawing) -> None:
+    """Show the first world by ``drawing``, whose data the window draws, and command, velocity and tile as text."""
     snapshot = session.snapshot
     if snapshot is None:
         return
     command, velocity = snapshot.commands[0], snapshot.velocities[0]
     with window.lock():
         window.opt.geomgroup[0] = 1  # MuJoCo's own key 0 hides this group, which contains the floor
-        data.qpos[:] = snapshot.qpos[0]
-        mujoco.mj_forward(model, data)
+        drawing.move(snapshot.qpos[0])
         window.user_scn.ngeom = 0
-        add_velocities(window.user_scn, data, TRUNK, command, velocity, size)
+        drawing.add_velocities(window.user_scn, command, velocity)
     texts = {"": "commanded, actual"}
     for name, wanted, actual in zip(("v_x [m/s]", "v_y [m/s]", "yaw [rad/s]"), command, velocity, strict=True):
         texts[name] = f"{wanted:+.2f}   {actual:+.2f}"
-    texts[f"model_{session.checkpoint}"] = "paused" if session.is_paused else f"{session.real_time:.2f} x real time"
-    if ground and snapshot.tile:
-        texts["tile"] = ground.tile_text(*snapshot.tile)
+    texts[f"model_{session.checkpoint}"] = "paused" if session.is_paused else f"{session.pacer.rate:.2f} x real time"
+    if drawing.ground and snapshot.tile:
+        texts["tile"] = drawing.ground.tile_text(*snapshot.tile)
     window.set_texts((None, None, "\n".join(texts), "\n".join(texts.values())))
     window.sync()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -15,34 +16,29 @@ class Pacer:
 
     Attributes:
         speed: Wanted simulated seconds per second; 1 is real time.
+        rate: Actual ones over the last :data:`AVERAGED` steps; 0 before there are two.
     """
+
+    speed, rate = 1.0, 0.0
 
     def __init__(
         self, dt: float, clock: Callable[[], float] = time.perf_counter, sleep: Callable[[float], None] = time.sleep
     ) -> None:
         """Start without a schedule: the first step, of ``dt`` simulated seconds, is due at once."""
-        self.speed = 1.0
         self._dt, self._clock, self._sleep = dt, clock, sleep
-        self._due: float | None = None
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the schedule, after a pause."""
+        self._due = -math.inf
         self._begun: deque[float] = deque(maxlen=AVERAGED + 1)
 
     def wait(self) -> None:
         """Wait until the next step is due. A delay of more than :data:`MAX_LAG` is not caught up."""
         now = self._clock()
-        if self._due is None or now - self._due > MAX_LAG:
-            self._due = now
+        self._due = now if now - self._due > MAX_LAG else self._due
         if self._due > now:
             self._sleep(self._due - now)
         self._due += self._dt / self.speed
         self._begun.append(self._clock())
-
-    def restart(self) -> None:
-        """Forget the schedule, after a pause."""
-        self._due = None
-        self._begun.clear()
-
-    def achieved(self) -> float:
-        """Return simulated seconds per second over the last :data:`AVERAGED` steps; 0 before there are two."""
-        if len(self._begun) < 2:
-            return 0.0
-        return (len(self._begun) - 1) * self._dt / max(self._begun[-1] - self._begun[0], 1e-9)
+        self.rate = (len(self._begun) - 1) * self._dt / max(self._begun[-1] - self._begun[0], 1e-9)

@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import cycle
 
 import numpy as np
 import viser
+from numpy.typing import ArrayLike
 
 from legged_torque.envs.base.asset import Asset
 from legged_torque.viewer.session import HISTORY_STEPS, Session
-from legged_torque.viewer.snapshot import Snapshot
 
-Series = list[tuple[str, str]]  # names and colors
+Series = Iterable[tuple[str, str]]  # names and colors
 
 COMMAND, ACTUAL, APPLIED, COMPANION = "#1faa55", "#2f7df6", "#343a40", "#f08c00"
 PARTS = ("#f08c00", "#2f7df6", "#ae3ec9", "#1faa55")  # colors of the parts of torques
+REWARD, PENALTY, STANCE, MIDDLE = "#1faa55", "#e03131", "#343a40", "#868e96"
 VELOCITIES = ("v_x, forward [m/s]", "v_y, to the left [m/s]", "yaw rate, to the left [rad/s]")
 VELOCITY_LIMITS = (-1.6, 1.6)
+TORQUE, ANGLE = "torque of {} [N m]", "angle of {} [rad]"
 STRIDE = 2  # control steps per point of a plot
-WIDTH = 300  # of the panel [pixels]
 GAIT_STEPS = HISTORY_STEPS // 2  # control steps in the gait diagram
+MEAN_STEPS = 15  # control steps over which present reward terms are means: 0.3 s
 SUM = "sum of all"  # of the reward terms
-REWARD, PENALTY, STANCE, MIDDLE = "#1faa55", "#e03131", "#343a40", "#868e96"
-NAME, LONG_NAME = 52, 116  # widths of names [pixels]
+WIDTH = 300  # of the panel [pixels]
 
 
 class Plots:
@@ -32,16 +34,13 @@ class Plots:
     def __init__(self, gui: viser.GuiApi, session: Session) -> None:
         """Build the panel at the left of the page."""
         task, self._session = session.task, session
-        self._joints = [name.removesuffix("_joint") for name in task.dof_names]
-        self._legs = joints_by_leg(self._joints, task.cfg.asset.mirrored_legs)
+        self._joints = [name.removesuffix("_joint").replace("_", " ") for name in task.dof_names]
+        self._legs = joints_by_leg(task.dof_names, task.cfg.asset.mirrored_legs)
         self._limits = task.torque_limits.abs().amax(dim=0).tolist()
-        self._feet = foot_labels(task.asset)
-        self._terms = task.reward_names
-        seconds = HISTORY_STEPS * task.dt
-        names = [name.replace("_", " ") for name in session.mixing]
-        self._parts = [(name, PARTS[i % len(PARTS)]) for i, name in enumerate(names)]
+        self._feet, self._terms = foot_labels(task.asset), task.reward_names
+        self._parts = list(zip((name.replace("_", " ") for name in session.mixing), cycle(PARTS), strict=False))
         self._has_targets = any(term.name == "position_residual" for term in task.control_law.terms)
-        panel = gui.add_panel()
+        seconds, panel = HISTORY_STEPS * task.dt, gui.add_panel()
         with panel.add_tab("Walking", viser.Icon.ACTIVITY):
             lines = [("commanded", COMMAND), ("actual", ACTUAL), ("companion", COMPANION)]
             lines = lines if session.companion else lines[:2]
@@ -53,8 +52,6 @@ class Plots:
             self._torques = add_plots(gui, seconds, titles, [*self._parts, ("applied", APPLIED)])
             lines = [("target", COMMAND), ("position", ACTUAL)]
             self._angles = add_plots(gui, seconds, titles, lines if self._has_targets else lines[1:])
-            self._leg.on_update(lambda event: self._choose_leg())
-            self._choose_leg()
         with panel.add_tab("Rewards", viser.Icon.TROPHY):
             self._term = gui.add_dropdown("over time", (SUM, *self._terms))
             self._reward = add_plots(gui, seconds, ["weighted, per second"], [("term", ACTUAL)])
@@ -64,58 +61,55 @@ class Plots:
 
     def update(self) -> None:
         """Draw everything."""
-        session, past = self._session, list(self._session.history)
+        past, dt = list(self._session.history), self._session.task.dt
         if len(past) < 2 * STRIDE:
             return
-        feet = np.array([snapshot.feet for snapshot in past[-GAIT_STEPS:]])
-        self._gait.content = gait_html(self._feet, feet, GAIT_STEPS, round(GAIT_STEPS * session.task.dt, 1))
-        self._bars.content = self._torque_bars(past[-1])
-        self._rewards.content = reward_bars(dict(zip(self._terms, session.rewards.tolist(), strict=True)))
-        self._draw_curves(past[len(past) % STRIDE :: STRIDE], past[-1].time)  # always the same steps, against jitter
-
-    def _choose_leg(self) -> None:
-        """Write the names of the chosen leg's joints above the plots."""
-        self._chosen = self._legs[self._leg.value]
-        for title, plots in (("torque of {} [N m]", self._torques), ("angle of {} [rad]", self._angles)):
-            for i, plot in enumerate(plots):
-                plot.visible = i < len(self._chosen)
-                if plot.visible:
-                    plot.title = title.format(self._joints[self._chosen[i]].replace("_", " "))
-
-    def _draw_curves(self, past: Sequence[Snapshot], now: float) -> None:
-        """Draw some snapshots over their time before ``now`` [s]."""
+        feet = np.array([one.feet for one in past[-GAIT_STEPS:]])
+        self._gait.content = gait_html(self._feet, feet, GAIT_STEPS, round(GAIT_STEPS * dt, 1))
+        self._bars.content = self._torque_bars(past[-1].torques, past[-1].torque_parts)
+        self._rewards.content = self._reward_bars(np.mean([one.rewards for one in past[-MEAN_STEPS:]], axis=0))
+        now, past = past[-1].time, past[len(past) % STRIDE :: STRIDE]  # always the same steps, against jitter
         time = np.array([one.time for one in past]) - now
-        velocities = [np.array([(one.commands[one.world], one.velocities[one.world]) for one in past])]
-        if self._session.companion:
-            velocities.append(self._companion_velocities(past)[:, None])
-        draw(self._velocities, time, np.concatenate(velocities, axis=1))
+        velocities = [[one.commands[one.world] for one in past], [one.velocities[one.world] for one in past]]
+        if other := self._session.companion:
+            known = {round(one.time, 4): one.velocities[0] for one in list(other.history)}
+            velocities.append([known.get(round(one.time, 4), np.full(3, np.nan)) for one in past])
+        draw(self._velocities, time, velocities)
         torques = np.array([[*one.torque_parts, one.torques] for one in past])
-        draw(self._torques, time, torques[:, :, self._chosen])
-        positions = np.array([one.qpos[one.world, -len(self._joints) :] for one in past])
-        targets = np.array([one.targets for one in past])
-        angles = np.stack([targets, positions] if self._has_targets else [positions], axis=1)
-        draw(self._angles, time, angles[:, :, self._chosen])
+        self._draw_leg(self._torques, TORQUE, time, torques.swapaxes(0, 1))
+        targets = [[one.targets for one in past]] if self._has_targets else []
+        self._draw_leg(self._angles, ANGLE, time, [*targets, [one.qpos[one.world, 7:] for one in past]])
         rewards = np.array([one.rewards for one in past])
         shown = rewards.sum(axis=1) if self._term.value == SUM else rewards[:, self._terms.index(self._term.value)]
-        draw(self._reward, time, shown[:, None, None])
+        draw(self._reward, time, [shown[:, None]])
 
-    def _companion_velocities(self, past: Sequence[Snapshot]) -> np.ndarray:
-        """Return the velocities of the companion's robot at the times of snapshots, or NaN. Shape: (steps, 3)."""
-        assert self._session.companion
-        known = {round(one.time, 4): one.velocities[0] for one in list(self._session.companion.history)}
-        return np.array([known.get(round(one.time, 4), np.full(3, np.nan)) for one in past])
+    def _draw_leg(self, plots: Sequence[viser.GuiUplotHandle], title: str, time: np.ndarray, values: ArrayLike) -> None:
+        """Draw curves of the chosen leg's joints over time, given those of all. Shape: (series, steps, num_dof)."""
+        chosen = self._legs[self._leg.value]
+        for i, plot in enumerate(plots):
+            plot.visible = i < len(chosen)
+            if plot.visible:
+                plot.title = title.format(self._joints[chosen[i]])
+        draw(plots, time, np.array(values)[:, :, chosen])
 
-    def _torque_bars(self, snapshot: Snapshot) -> str:
+    def _torque_bars(self, torques: np.ndarray, parts: np.ndarray) -> str:
         """Return the present torques as bars, in parts if the task mixes action terms."""
         colors = [color for _, color in self._parts] or [ACTUAL]
-        parts = snapshot.torque_parts if self._parts else snapshot.torques[None]
+        parts = parts if self._parts else torques[None]
         rows = []
-        for name, values, torque, limit in zip(self._joints, parts.T, snapshot.torques, self._limits, strict=True):
-            bars = [(value / limit, color) for value, color in zip(values, colors, strict=True)]
-            rows.append(bars_html(name, bars, f"{torque:+.1f}/{limit:.0f}"))
+        for name, values, torque, limit in zip(self._joints, parts.T, torques, self._limits, strict=True):
+            rows.append(bars_html(name, values / limit, colors, f"{torque:+.1f}/{limit:.0f}"))
         weights = zip(self._parts, self._session.mixing.values(), strict=True)
-        legend = legend_html([(f"{name} x {weight:.2f}", color) for (name, color), weight in weights])
-        return block_html("Torques and their limits [N m]" + legend, rows)
+        legend = legend_html((f"{name} x {weight:.2f}", color) for (name, color), weight in weights)
+        return block_html(f"<b>Torques and their limits [N m]</b>{legend}", rows)
+
+    def _reward_bars(self, rewards: np.ndarray) -> str:
+        """Return weighted reward terms as bars, rewards in green and penalties in red. Shape: (terms,)."""
+        largest, rows = max(np.abs(rewards).max(initial=0.0), 1e-9), []
+        for name, value in zip(self._terms, rewards, strict=True):
+            color = REWARD if value > 0 else PENALTY
+            rows.append(bars_html(name.replace("_", " "), [value / largest], [color], f"{value:+.3f}", "lt-wide"))
+        return block_html(f"<b>Weighted terms [1/s]; their sum: {rewards.sum():+.3f}</b>", rows)
 
 
 def foot_labels(asset: Asset) -> list[str]:
@@ -139,12 +133,12 @@ def add_plots(
     gui: viser.GuiApi,
     seconds: float,
     titles: Sequence[str],
-    series: Series,
+    series: Sequence[tuple[str, str]],
     limits: tuple[float, float] | None = None,
 ) -> list[viser.GuiUplotHandle]:
     """Add plots of equal series over the last seconds, below a legend; limits of None are those of the data."""
     if len(series) > 1:
-        gui.add_html(legend_html(series))
+        gui.add_html(block_html(legend_html(series), []))
     lines = [{"label": name, "stroke": color, "width": 1.5, "points": {"show": False}} for name, color in series]
     values = {"auto": True} if limits is None else {"auto": False, "range": limits}
     settings = {
@@ -157,10 +151,10 @@ def add_plots(
     return [gui.add_uplot(nothing, ({"label": "s"}, *lines), title=title, **settings) for title in titles]
 
 
-def draw(plots: Sequence[viser.GuiUplotHandle], time: np.ndarray, curves: np.ndarray) -> None:
-    """Draw curves over time, one plot per item of the last axis. Shapes: (steps,), (steps, series, plots)."""
-    for plot, series in zip(plots, np.moveaxis(curves, 2, 0), strict=False):
-        plot.data = (time, *series.T)
+def draw(plots: Sequence[viser.GuiUplotHandle], time: np.ndarray, curves: ArrayLike) -> None:
+    """Draw curves over time, a plot per item of the last axis. Shapes: (steps,), (series, steps, plots)."""
+    for plot, series in zip(plots, np.moveaxis(np.array(curves), 2, 0), strict=False):
+        plot.data = (time, *series)
 
 
 def gait_html(names: Sequence[str], contacts: np.ndarray, steps: int, seconds: float) -> str:
@@ -173,45 +167,30 @@ def gait_html(names: Sequence[str], contacts: np.ndarray, steps: int, seconds: f
         changes = np.flatnonzero(np.diff(column.astype(int), prepend=0, append=0)) + steps - len(column)
         path = "".join(f"M{begin} 0V1H{end}V0z" for begin, end in changes.reshape(-1, 2))
         rows.append(row_html(name, f"0 0 {steps} 1", [(path, STANCE)], f"{100 * column.mean():.0f} %"))
-    return block_html(f"Feet on the ground, last {seconds:g} s", rows)
+    return block_html(f"<b>Feet on the ground, last {seconds:g} s</b>", rows)
 
 
-def reward_bars(rewards: dict[str, float]) -> str:
-    """Return weighted reward terms as bars, rewards in green and penalties in red."""
-    largest = max(map(abs, rewards.values()), default=1.0) or 1.0
-    rows = [
-        bars_html(name, [(value / largest, REWARD if value > 0 else PENALTY)], f"{value:+.3f}", LONG_NAME)
-        for name, value in rewards.items()
-    ]
-    return block_html(f"Weighted terms [1/s]; their sum: {sum(rewards.values()):+.3f}", rows)
-
-
-def legend_html(series: list[tuple[str, str]]) -> str:
+def legend_html(series: Series) -> str:
     """Return names with colored dots."""
-    dot = '<span style="margin-right:12px;white-space:nowrap"><span style="color:{}">&#9679;</span> {}</span>'
-    dots = "".join(dot.format(color, name) for name, color in series)
-    return f'<div style="font-size:12px;padding:2px 10px">{dots}</div>'
+    dots = (f'<span><span style="color:{color}">&#9679;</span> {name}</span>' for name, color in series)
+    return f'<div class="lt-legend">{"".join(dots)}</div>'
 
 
 def block_html(title: str, rows: list[str]) -> str:
     """Return rows below a title."""
-    return f'<div style="font-size:12px;padding:4px 10px"><b>{title}</b>{"".join(rows)}</div>'
+    return f'<div class="lt-plot">{title}{"".join(rows)}</div>'
 
 
-def bars_html(name: str, bars: list[tuple[float, str]], text: str, name_width: int = NAME) -> str:
-    """Return a row of bars from its middle, with their lengths from -1 to 1 and colors, between a name and a text."""
-    shapes = [(f"M0 {i}V{i + 1}H{np.clip(value, -1, 1):.3f}V{i}z", color) for i, (value, color) in enumerate(bars)]
-    middle = (f"M-.004 0V{len(bars)}H.004V0z", MIDDLE)
-    return row_html(name, f"-1 0 2 {len(bars)}", [*shapes, middle], text, name_width)
+def bars_html(name: str, lengths: Iterable[float], colors: Sequence[str], text: str, kind: str = "") -> str:
+    """Return a row of bars from its middle, with lengths from -1 to 1, between a name and a text."""
+    bars = enumerate(zip(lengths, colors, strict=True))
+    shapes = [(f"M0 {i}V{i + 1}H{np.clip(length, -1, 1):.3f}V{i}z", color) for i, (length, color) in bars]
+    middle = (f"M-.004 0V{len(colors)}H.004V0z", MIDDLE)
+    return row_html(name, f"-1 0 2 {len(colors)}", [*shapes, middle], text, kind)
 
 
-def row_html(name: str, view: str, shapes: list[tuple[str, str]], text: str, name_width: int = NAME) -> str:
+def row_html(name: str, view: str, shapes: Series, text: str, kind: str = "") -> str:
     """Return a row with an SVG of paths and colors in a view box, between a name and a text."""
     paths = "".join(f'<path d="{path}" fill="{color}"/>' for path, color in shapes)
-    style = "flex:1;min-width:0;height:13px;background:#8882;border-radius:2px"
-    return (
-        '<div style="display:flex;align-items:center;gap:6px;height:17px">'
-        f'<span style="width:{name_width}px;white-space:nowrap">{html.escape(name.replace("_", " "))}</span>'
-        f'<svg viewBox="{view}" preserveAspectRatio="none" style="{style}">{paths}</svg>'
-        f'<span style="width:58px;text-align:right;font-variant-numeric:tabular-nums">{text}</span></div>'
-    )
+    svg = f'<svg viewBox="{view}" preserveAspectRatio="none">{paths}</svg>'
+    return f'<div class="lt-row {kind}"><span>{html.escape(name)}</span>{svg}<span>{text}</span></div>'

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import cmath
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import mujoco
@@ -14,20 +14,20 @@ import viser
 from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
-from viser import transforms
+from viser.transforms import SE3, SO3
 
+from legged_torque.utils.heading import heading
 from legged_torque.utils.mjcf import DRAWN_GROUPS
-from legged_torque.viewer.ground import Ground
-from legged_torque.viewer.mujoco_scene import (
+from legged_torque.viewer.drawing import (
     ARROW_LENGTH,
     COMMAND_HEIGHT,
     MIN_SPEED,
     VELOCITY_HEIGHT,
-    size_of,
+    Drawing,
+    Ground,
     smoothed,
 )
-from legged_torque.viewer.poses import SideBySide
-from legged_torque.viewer.robots import Contacts, Robots
+from legged_torque.viewer.session import Session
 from legged_torque.viewer.snapshot import Snapshot
 
 ROOT = "/world"  # node of all that moves such that the followed robot stays where the cameras look
@@ -39,6 +39,9 @@ SCAN_SHAPE: dict[str, Any] = {"point_size": 0.009, "point_shape": "circle", "pre
 SCAN_HEIGHT = 0.01  # of the points above the ground, which would hide them [m]
 LABEL_HEIGHT = 0.35  # of a name above the trunk's origin, for the A1 [m]
 UP = np.array([0.0, 0.0, 1.0])
+GHOST_SECONDS = 1.0  # for which the ghost has followed the commands
+SIDE = 0.8  # distance of the companion at the start, to the right of the followed robot [m]
+FARTHEST = 2.0  # distance at which the companion returns to the side of the followed robot [m]
 
 FIELD_OF_VIEW = 0.75  # vertical [rad]
 VIEW_FROM, VIEW_TO = np.array([1.2, -1.2, 0.62]), np.array([0.0, 0.0, 0.24])  # place and target, for the A1 [m]
@@ -60,17 +63,16 @@ PLANE: dict[str, Any] = {
     "fade_distance": 18.0,  # [m]
 }
 
+Color = tuple[float, float, float, float]  # red, green, blue and opacity, 0 to 1
 
-@dataclass
-class View:
-    """What is drawn; changes take effect with the next frame."""
-
-    follow: bool = True  # keep the followed robot in view
-    others: bool = True  # the robots of the other worlds
-    contacts: bool = True  # points and forces
-    collision: bool = False  # the collision geoms
-    ghost: bool = False  # where the commands of the last second lead
-    scan: bool = True  # the height scan, on rough ground
+SHARP_EDGE = 40.0  # smallest angle of an edge that is not smoothed [degrees]
+TINTED = 0.7  # share of a tint in the color of a part
+GAMMA = 2.2  # colors of batched meshes are linear
+CONTACT_COLOR = (240, 140, 0)
+FORCE_LENGTH = 0.002  # of the arrow of a force of 1 N [m]
+MIN_FORCE = 1.0  # that is drawn [N]
+FORCE_SHAPE: dict[str, Any] = {"shaft_radius": 0.006, "head_radius": 0.016, "head_length": 0.03}  # [m]
+POINT_SHAPE: dict[str, Any] = {"point_size": 0.02, "point_shape": "circle", "precision": "float32"}
 
 
 class Scene:
@@ -81,84 +83,78 @@ class Scene:
     where the page's camera looks. Users can turn and zoom freely.
     """
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        model: mujoco.MjModel,
-        num_envs: int,
-        geoms: Sequence[str],
-        ground: Ground | None,
-        names: Sequence[str] = (),
-    ) -> None:
-        """Build everything; a ground of None is a plane.
-
-        The model's joints and ``geoms``, the names of its collision geoms, are in the order of the snapshots. ``names``
-        are those of the followed robot and its companion, if there is one.
-        """
-        self.view = View()
-        self._server, self._ground = server, ground
-        self._size = size_of(model)
-        self._distance = self._size * (TWO_ROBOTS if names else 1.0)
-        self._places = np.zeros((num_envs, model.nq))  # added to the positions of a world
-        if not ground:
-            self._places[:, :2] = SPACING * np.stack(np.divmod(np.arange(num_envs), math.ceil(num_envs**0.5)), axis=1)
-        self._side_by_side = SideBySide()
+    def __init__(self, server: viser.ViserServer, session: Session, drawing: Drawing) -> None:
+        """Build everything, with ``drawing`` as the session's robot and ground."""
+        self._server, self._session, self._ground, self._size = server, session, drawing.ground, drawing.size
+        scene, model, task, other = server.scene, drawing.model, session.task, session.companion
+        self._distance = self._size * (TWO_ROBOTS if other else 1.0)
+        self._places = np.zeros((task.num_envs, model.nq))  # added to the positions of a world
+        if not self._ground:
+            side = math.ceil(task.num_envs**0.5)
+            self._places[:, :2] = SPACING * np.stack(np.divmod(np.arange(task.num_envs), side), axis=1)
+        self._shift = SE3.from_translation(np.full(3, math.inf))  # how the companion's world is moved
         self._height: float | None = None  # smoothed height of the ground below the robot [m]
         self._framed: set[int] = set()  # browsers whose first view has been chosen
-        self._add_surroundings()
-        scene, data, drawn = server.scene, mujoco.MjData(model), np.isin(model.geom_group, DRAWN_GROUPS)
-        colliding = (model.geom_contype | model.geom_conaffinity) != 0
-        self._robots = Robots(scene, f"{ROOT}/robot", data, np.flatnonzero(drawn))
-        self._robots.draw(model.qpos0 + self._places)  # now, since making the meshes takes seconds
-        self._companion = Robots(scene, f"{ROOT}/companion", data, np.flatnonzero(drawn), COMPANION_TINT)
-        self._ghost = Robots(scene, f"{ROOT}/ghost", data, np.flatnonzero(drawn), GHOST_TINT)
-        self._collision = Robots(scene, f"{ROOT}/collision", data, np.flatnonzero(colliding), COLLISION_TINT)
-        self._contacts = Contacts(scene, f"{ROOT}/contacts", data, geoms)
-        self._scan = scene.add_point_cloud(f"{ROOT}/scan", np.zeros((1, 3)), SCAN_COLOR, **SCAN_SHAPE)
-        self._labels = [scene.add_label(f"{ROOT}/name{i}", name) for i, name in enumerate(names)]
-        self._command = scene.add_arrows(f"{ROOT}/command", np.zeros((1, 2, 3)), COMMAND_COLOR, **ARROW_SHAPE)
-        self._velocity = scene.add_arrows(f"{ROOT}/velocity", np.zeros((1, 2, 3)), VELOCITY_COLOR, **ARROW_SHAPE)
-
-    def _add_surroundings(self) -> None:
-        """Add ground and light, and place the camera."""
-        scene, camera = self._server.scene, self._server.initial_camera
+        camera = server.initial_camera
+        camera.position, camera.look_at = self._distance * VIEW_FROM, self._size * VIEW_TO
+        camera.fov = FIELD_OF_VIEW
+        scene.configure_default_lights(True, cast_shadow=True)
+        scene.configure_environment_map("studio", environment_intensity=0.5)
         self._root = scene.add_frame(ROOT, show_axes=False)
         if self._ground:
             scene.add_glb(f"{ROOT}/ground", ground_glb(self._ground), cast_shadow=False, receive_shadow=True)
         else:
             scene.add_grid(f"{ROOT}/ground", **PLANE)
-        scene.configure_default_lights(True, cast_shadow=True)
-        scene.configure_environment_map("studio", environment_intensity=0.5)
-        camera.position, camera.look_at = self._distance * VIEW_FROM, self._size * VIEW_TO
-        camera.fov = FIELD_OF_VIEW
+        drawn = np.flatnonzero(np.isin(model.geom_group, DRAWN_GROUPS))
+        colliding = np.flatnonzero((model.geom_contype | model.geom_conaffinity) != 0)
+        kinds = {
+            "robot": (drawn, None),
+            "companion": (drawn, COMPANION_TINT),
+            "ghost": (drawn, GHOST_TINT),
+            "collision": (colliding, COLLISION_TINT),
+        }
+        self._robots = {name: Robots(scene, f"{ROOT}/{name}", drawing.data, *kind) for name, kind in kinds.items()}
+        self._robots["robot"].draw(model.qpos0 + self._places)  # now, since making the meshes takes seconds
+        self._contacts = Contacts(scene, f"{ROOT}/contacts", drawing.data, task.asset.geom_names)
+        self._scan = scene.add_point_cloud(f"{ROOT}/scan", np.zeros((1, 3)), SCAN_COLOR, **SCAN_SHAPE)
+        names = (session.name, other.name) if other else ()
+        self._labels = [scene.add_label(f"{ROOT}/name{i}", name) for i, name in enumerate(names)]
+        self._command = scene.add_arrows(f"{ROOT}/command", np.zeros((1, 2, 3)), COMMAND_COLOR, **ARROW_SHAPE)
+        self._velocity = scene.add_arrows(f"{ROOT}/velocity", np.zeros((1, 2, 3)), VELOCITY_COLOR, **ARROW_SHAPE)
 
-    def update(self, snapshot: Snapshot, world: int, ghost: np.ndarray, companion: np.ndarray | None) -> None:
-        """Draw a snapshot with a world to follow, its ghost, and its companion in its own simulation. Shapes: (nq,)."""
-        view, qpos, is_current = self.view, snapshot.qpos + self._places, world == snapshot.world
+    def update(self, shown: Collection[str]) -> None:
+        """Draw the session's last step; ``shown`` are names of :data:`~legged_torque.viewer.web.VIEW`."""
+        session, snapshot = self._session, self._session.snapshot
+        if not snapshot:
+            return
+        world, qpos = snapshot.world, snapshot.qpos + self._places
         own, second, none = qpos[[world]], qpos[:0], qpos[:0]
-        if companion is not None:
-            second = self._side_by_side.place(own[0], companion)[None]
+        if session.companion and session.companion.snapshot:
+            other = session.companion.snapshot.qpos[0]
+            self._shift = side_by_side(own[0], other, self._shift)
+            second = moved(other, self._shift)[None]
+        ghost = commanded_pose(list(session.history) or [snapshot], session.task.dt) + self._places[world]
         trunks = np.concatenate([own, second])[:, :3]
         with self._server.atomic():
-            if view.follow:
+            if "follow" in shown:
                 self._follow(trunks)
-            self._robots.draw(qpos if view.others else own)
-            self._companion.draw(second)
-            self._collision.draw(own if view.collision else none)
-            self._ghost.draw((ghost + self._places[world])[None] if view.ghost and is_current else none)
-            self._contacts.draw(own, snapshot.forces if view.contacts and is_current else snapshot.forces[:0])
-            self._scan.visible = view.scan and is_current and len(snapshot.scan) > 0
+            self._robots["robot"].draw(qpos if "others" in shown else own)
+            self._robots["companion"].draw(second)
+            self._robots["ghost"].draw(ghost[None] if "ghost" in shown else none)
+            self._robots["collision"].draw(own if "collision" in shown else none)
+            self._contacts.draw(own, snapshot.forces if "contacts" in shown else snapshot.forces[:0])
+            self._scan.visible = "scan" in shown and len(snapshot.scan) > 0
             self._scan.points = (snapshot.scan + SCAN_HEIGHT * UP).astype(np.float32)
             for label, trunk in zip(self._labels, trunks, strict=False):
                 label.position = trunk + LABEL_HEIGHT * self._size * UP
             self._draw_arrow(self._command, own[0], snapshot.commands[world], COMMAND_HEIGHT)
             self._draw_arrow(self._velocity, own[0], snapshot.velocities[world], VELOCITY_HEIGHT)
-        self._frame_phones()
+        self._move_cameras()
 
     def _draw_arrow(self, arrow: viser.ArrowsHandle, qpos: np.ndarray, velocity: np.ndarray, height: float) -> None:
         """Draw a velocity in the trunk's frame, which begins with v_x and v_y [m/s], above a robot."""
         start = qpos[:3] + height * self._size * UP
-        end = start + ARROW_LENGTH * transforms.SO3(qpos[3:7]).as_matrix()[:, :2] @ velocity[:2]
+        end = start + ARROW_LENGTH * SO3(qpos[3:7]).as_matrix()[:, :2] @ velocity[:2]
         arrow.points, arrow.visible = np.stack([start, end])[None], bool(np.hypot(*velocity[:2]) > MIN_SPEED)
 
     def _follow(self, trunks: np.ndarray) -> None:
@@ -167,32 +163,145 @@ class Scene:
         if self._ground:
             self._height = place[2] = smoothed(self._height, float(self._ground.height(trunks[0])))
         self._root.position = -place
-        if self._ground:
-            self._lift_cameras(self._ground, place)
 
-    def _lift_cameras(self, ground: Ground, place: np.ndarray) -> None:
-        """Raise cameras that do not see their target over the ground; ``place`` is at the origin. Shape: (3,)."""
-        for client in self._server.get_clients().values():
-            position, target = np.array(client.camera.position), np.array(client.camera.look_at)
-            lowest = ground.lowest_view(target + place, position + place) - place[2]
-            if target.any() and position[2] < lowest - TOLERANCE:  # a target of 0 is not the page's yet
-                position[2] += LIFTING * (lowest - position[2])
-                self._place(client, position, target)
+    def _move_cameras(self) -> None:
+        """Let new browsers on phones see the robot above the controls, and raise cameras that do not see their target.
 
-    def _frame_phones(self) -> None:
-        """Let new browsers on phones see the robot above the controls."""
+        The ground may be between them.
+        """
+        place = -np.array(self._root.position)
         for number, client in self._server.get_clients().items():
-            if number not in self._framed and np.any(client.camera.look_at):
-                self._framed.add(number)
-                if client.camera.aspect < PHONE:
-                    self._place(client, self._distance * PHONE_FROM, self._distance * PHONE_TO)
+            position, target = np.array(client.camera.position), np.array(client.camera.look_at)
+            if not target.any():  # this is not the page's camera yet
+                continue
+            if number not in self._framed and client.camera.aspect < PHONE:
+                place_camera(client, self._distance * PHONE_FROM, self._distance * PHONE_TO)
+            elif self._ground:
+                lowest = self._ground.lowest_view(target + place, position + place) - place[2]
+                if position[2] < lowest - TOLERANCE:
+                    position[2] += LIFTING * (lowest - position[2])
+                    place_camera(client, position, target)
+            self._framed.add(number)
 
-    @staticmethod
-    def _place(client: viser.ClientHandle, position: np.ndarray, target: np.ndarray) -> None:
-        """Move a browser's camera."""
-        with client.atomic():
-            client.camera.position = position  # moves the target, too
-            client.camera.look_at = target
+
+class Robots:
+    """Drawings of equal robots. Browsers get their meshes when the first robot is drawn."""
+
+    def __init__(
+        self, scene: viser.SceneApi, name: str, data: mujoco.MjData, geoms: Iterable[int], tint: Color | None = None
+    ) -> None:
+        """Prepare drawings below the node ``name``, of those geoms that belong to the robot; ``data`` is changed."""
+        self._scene, self._name, self._data, self._tint, model = scene, name, data, tint, data.model
+        self._geoms: dict[tuple[int, Color], list[int]] = {}  # by body and color
+        for geom in geoms:
+            material = model.geom_matid[geom]
+            rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+            if body := int(model.geom_bodyid[geom]):
+                self._geoms.setdefault((body, tuple(rgba.tolist())), []).append(geom)
+        self._handles: list[viser.BatchedMeshHandle] = []
+
+    def draw(self, qpos: np.ndarray) -> None:
+        """Draw robots at some positions, or none. Shape: (robots, nq)."""
+        if len(qpos) and not self._handles:
+            self._handles = [self._add(*part, geoms) for part, geoms in self._geoms.items()]
+        positions, quats = body_poses(self._data, qpos)
+        for (body, _), handle in zip(self._geoms, self._handles, strict=False):
+            handle.visible = len(qpos) > 0
+            if handle.visible:
+                handle.batched_positions, handle.batched_wxyzs = positions[:, body], quats[:, body]
+
+    def _add(self, body: int, color: Color, geoms: Sequence[int]) -> viser.BatchedMeshHandle:
+        """Add geoms of a body that have the same color."""
+        model, rgb, opacity = self._data.model, np.array(color[:3]) ** GAMMA, color[3]
+        if self._tint:
+            rgb += TINTED * (np.array(self._tint[:3]) ** GAMMA - rgb)
+            opacity = self._tint[3]
+        mesh = trimesh.util.concatenate([geom_mesh(model, geom) for geom in geoms])
+        return self._scene.add_batched_meshes_simple(
+            f"{self._name}/{model.body(body).name}/{geoms[0]}",
+            mesh.vertices,
+            mesh.faces,
+            batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]),
+            batched_positions=np.zeros((1, 3)),
+            batched_colors=rgb,
+            opacity=None if opacity == 1.0 else opacity,
+            lod="off",
+            cast_shadow=opacity == 1.0,
+        )
+
+
+class Contacts:
+    """Points and arrows of the ground's forces on the collision geoms of one robot."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, data: mujoco.MjData, geoms: Sequence[str]) -> None:
+        """Prepare drawings below the node ``name``; ``geoms`` are the names of the collision geoms."""
+        self._data, model = data, data.model
+        self._geoms = [(int(model.geom(geom).bodyid[0]), geom_mesh(model, model.geom(geom).id)) for geom in geoms]
+        nowhere = np.zeros((1, 2, 3))
+        self._arrows = scene.add_arrows(f"{name}/forces", nowhere, CONTACT_COLOR, **FORCE_SHAPE, visible=False)
+        points = (f"{name}/points", nowhere[0, :1], CONTACT_COLOR)
+        self._points = scene.add_point_cloud(*points, **POINT_SHAPE, visible=False)
+
+    def draw(self, qpos: np.ndarray, forces: np.ndarray) -> None:
+        """Draw forces in the world [N] at the lowest points of geoms, or none. Shapes: (1, nq), (geoms or 0, 3)."""
+        positions, quats = body_poses(self._data, qpos)
+        touching = np.flatnonzero(np.linalg.norm(forces, axis=1) > MIN_FORCE).tolist()
+        self._arrows.visible = self._points.visible = bool(touching)
+        if touching:
+            points = []
+            for body, mesh in (self._geoms[geom] for geom in touching):
+                corners = mesh.vertices @ SO3(quats[0, body]).as_matrix().T
+                points.append(corners[corners[:, 2].argmin()] + positions[0, body])
+            self._points.points = np.array(points, np.float32)
+            self._arrows.points = np.stack([points, points + FORCE_LENGTH * forces[touching]], axis=1)
+
+
+def place_camera(client: viser.ClientHandle, position: np.ndarray, target: np.ndarray) -> None:
+    """Move a browser's camera."""
+    with client.atomic():
+        client.camera.position = position  # moves the target, too
+        client.camera.look_at = target
+
+
+def commanded_pose(past: Sequence[Snapshot], dt: float) -> np.ndarray:
+    """Return where the followed robot would be if it had followed its commands for a second. Shape: (nq,).
+
+    The pose is upright, with the present height and joints. A younger episode counts from its start. ``past`` are the
+    last steps, the present one included, of ``dt`` [s] each.
+    """
+    now = past[-1]
+    steps = min(round(GHOST_SECONDS / dt), len(past) - 1, now.age)
+    pose, start = now.qpos[now.world].copy(), on_ground(past[-1 - steps].qpos[now.world])
+    way, angle = 0j, 0.0
+    for snapshot in past[len(past) - steps :]:
+        v_x, v_y, yaw_rate = snapshot.commands[now.world]
+        way += dt * complex(v_x, v_y) * cmath.rect(1.0, angle + 0.5 * yaw_rate * dt)
+        angle += yaw_rate * dt
+    pose[:2] = start.apply(np.array([way.real, way.imag, 0.0]))[:2]
+    pose[3:7] = (start.rotation() @ SO3.from_z_radians(angle)).wxyz
+    return pose
+
+
+def side_by_side(own: np.ndarray, other: np.ndarray, before: SE3) -> SE3:
+    """Return how to move a companion's world so that it walks next to a robot, given their positions. Shapes: (nq,).
+
+    That is as ``before`` until they are far apart; then the companion starts again at the robot's right.
+    """
+    if np.linalg.norm(before.apply(other[:3])[:2] - own[:2]) < FARTHEST:
+        return before
+    return on_ground(own) @ SE3.from_translation(np.array([0.0, -SIDE, 0.0])) @ on_ground(other).inverse()
+
+
+def moved(qpos: np.ndarray, by: SE3) -> np.ndarray:
+    """Return the positions of a robot in a world that is moved. Shape: (nq,)."""
+    return np.array([*by.apply(qpos[:3]), *(by.rotation() @ SO3(qpos[3:7])).wxyz, *qpos[7:]])
+
+
+def on_ground(qpos: np.ndarray) -> SE3:
+    """Return the frame below a robot at height 0 that points where the robot is heading. Shape: (nq,)."""
+    x_ahead, y_ahead, _ = heading(qpos[3:7])
+    turn = SO3.from_z_radians(math.atan2(y_ahead, x_ahead))
+    return SE3.from_rotation_and_translation(turn, np.array([*qpos[:2], 0.0]))
 
 
 def ground_glb(ground: Ground) -> bytes:
@@ -204,3 +313,37 @@ def ground_glb(ground: Ground) -> bytes:
     visual = TextureVisuals(ground.uv, material=material)
     mesh = trimesh.Trimesh(ground.vertices, ground.faces, visual=visual, process=False)
     return trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=False)
+
+
+def body_poses(data: mujoco.MjData, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the poses of all bodies. Shapes: (robots, nq) to (robots, nbody, 3) [m] and (robots, nbody, 4)."""
+    positions, quats = (np.zeros((len(qpos), data.model.nbody, size), np.float32) for size in (3, 4))
+    for robot, row in enumerate(qpos):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(data.model, data)
+        positions[robot], quats[robot] = data.xpos, data.xquat
+    return positions, quats
+
+
+def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
+    """Return a geom in its body's frame."""
+    kinds, creation = mujoco.mjtGeom, trimesh.creation
+    kind, size = kinds(model.geom_type[geom]), model.geom_size[geom]
+    if kind == kinds.mjGEOM_MESH:
+        part = model.mesh(model.geom_dataid[geom])
+        vertices = model.mesh_vert[part.vertadr[0] :][: part.vertnum[0]]
+        faces = model.mesh_face[part.faceadr[0] :][: part.facenum[0]]
+        mesh = trimesh.Trimesh(vertices, faces)
+    else:
+        makers = {
+            kinds.mjGEOM_SPHERE: lambda: creation.icosphere(subdivisions=3, radius=size[0]),
+            kinds.mjGEOM_CAPSULE: lambda: creation.capsule(height=2.0 * size[1], radius=size[0], count=(16, 16)),
+            kinds.mjGEOM_CYLINDER: lambda: creation.cylinder(radius=size[0], height=2.0 * size[1], sections=40),
+            kinds.mjGEOM_ELLIPSOID: lambda: creation.icosphere(subdivisions=3).apply_scale(size),
+        }
+        mesh = makers.get(kind, lambda: creation.box(extents=2.0 * size))()
+    mesh = trimesh.graph.smooth_shade(mesh, angle=np.radians(SHARP_EDGE))
+    pose = np.eye(4)
+    pose[:3, :3] = SO3(model.geom_quat[geom]).as_matrix()
+    pose[:3, 3] = model.geom_pos[geom]
+    return mesh.apply_transform(pose)

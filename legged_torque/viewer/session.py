@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -31,7 +30,6 @@ SCAN_INTERVAL = 1.0  # seconds between two looks for new checkpoints
 IDLE = 0.02  # seconds between two looks for requests while paused
 SLOWEST, FASTEST = 0.1, 1.0  # limits of the speed [simulated seconds per second]
 MAX_NUMBER = 100.0  # of numbers in requests: velocities [m/s, rad/s], angles [rad] and weights
-SMOOTHING = 0.06  # share of the newest step in the shown reward terms: they are means over about 0.3 s
 AS_LOADED = "as loaded"  # the perturbation of the run or of the command line
 
 Command = tuple[float, float, float]  # commanded v_x, v_y [m/s] and yaw rate [rad/s]
@@ -72,15 +70,12 @@ class Session:
     companion: Session | None = None  # another policy, which steps with this one under the followed world's command
     snapshot: Snapshot | None = None  # the last step; None before the first
     sim_time = 0.0  # simulated time since the start [s]
-    real_time = 0.0  # simulated seconds per second over the last steps
-    speed = 1.0  # the wanted ones
     is_paused = False
     world = 0  # the followed world
-    rewards = np.zeros(0)  # its weighted reward terms per second, smoothed; (terms,)
     falls = 0  # in all worlds since the task was built
     command: Command | None = None  # of all worlds; None if commands are drawn as in training
     perturbation = AS_LOADED
-    is_mixing_set = False  # whether a user has set them
+    chosen_mixing: Sequence[float] | None = None  # weights of action terms that a user has set
     checkpoint = 0  # iterations of the loaded checkpoint
     trained_steps = 0  # its environment steps
     checkpoints: tuple[int, ...] = ()  # all of the run
@@ -97,18 +92,17 @@ class Session:
     ) -> None:
         """Build the task and load the checkpoint; a UserError if that cannot be loaded."""
         self._make_task = functools.partial(watched(task_class), device=device)
-        self._cfg, self._run_dir = run.env_cfg, run.folder
-        self._clock, self._sleep = clock, sleep
+        self._run, self._clock, self._sleep = run, clock, sleep
         self._stop, self._next_scan, self._tried = threading.Event(), -math.inf, -1
         self.requests: deque[Callable[[], None]] = deque()  # not carried out yet, the present one included
         self.history: deque[Snapshot] = deque(maxlen=HISTORY_STEPS)  # the last steps of the followed world
         self.mixing: dict[str, float] = {}  # weights of the action terms that have one, by name
-        self.task = self._make_task(self._cfg)
+        self.task = self._make_task(run.env_cfg)
         self._obs = self.task.get_observations()
         task = run.config.get("task")
         self.name = f"{task}, {run.folder.name}"  # of the run, for users
         self._runner, _ = task_registry.make_alg_runner(self.task, task, train_cfg=run.train_cfg, log_root=None)
-        self._pacer = Pacer(self.task.dt, clock, sleep)
+        self.pacer = Pacer(self.task.dt, clock, sleep)
         self._load(run.iterations)
         self._policy = self._runner.get_inference_policy(device)
         self._adopt(self.task)
@@ -117,10 +111,6 @@ class Session:
     def stop(self) -> None:
         """Let :meth:`run` return after the current step; may be called from any thread."""
         self._stop.set()
-
-    def perturbations(self) -> list[str]:
-        """Return the names that :meth:`set_perturbation` accepts."""
-        return [AS_LOADED, *self._cfg.perturbations()]
 
     # ---- the stepping thread -----------------------------------------------------------------------------------------
 
@@ -137,7 +127,7 @@ class Session:
         if self.is_paused:
             self._sleep(IDLE)
             return
-        self._pacer.wait()
+        self.pacer.wait()
         snapshot = self.step()
         if self.companion:
             v_x, v_y, yaw_rate = snapshot.commands[self.world].tolist()
@@ -163,24 +153,22 @@ class Session:
     def step(self) -> Snapshot:
         """Make one control step."""
         self._obs = self.task.step(self._policy(self._obs))[0]
-        self.task.total_steps.copy_(self._trained_steps)  # curricula stay at the checkpoint's level
+        self.task.total_steps.fill_(self.trained_steps)  # curricula stay at the checkpoint's level
         self.snapshot = self.task.snapshot(self.sim_time + self.task.dt, self.world)
         self.history.append(self.snapshot)
         self.sim_time, self.falls = self.snapshot.time, self.falls + self.snapshot.falls
-        self.rewards = self.rewards + SMOOTHING * (self.snapshot.rewards - self.rewards)
-        self.real_time = self._pacer.achieved()
         return self.snapshot
 
     @torch.no_grad()
     def _adopt(self, task: WatchedRobot) -> None:
         """Continue with a task: the first one, or one with another perturbation."""
         self.task = self._runner.env = task
-        self.snapshot, self.falls, self.rewards = None, 0, np.zeros(len(task.reward_names))
+        self.snapshot, self.falls = None, 0
         self.history.clear()
         self.hold(self.command)
         self._apply_mixing()
         self._obs = task.reset()
-        self._pacer.restart()
+        self.pacer.restart()
 
     def hold(self, command: Command | None) -> None:
         """Give all worlds a command, or a random one each, from the next step on."""
@@ -192,9 +180,9 @@ class Session:
         """Set the chosen weights, or those of the curriculum. They stay, since only rollouts change them."""
         self.task.update_curriculum()
         weights = weighted_terms(self.task)
-        if self.is_mixing_set:
-            for name, weight in weights.items():
-                weight.fill_(self.mixing[name])
+        if self.chosen_mixing is not None:
+            for weight, chosen in zip(weights.values(), self.chosen_mixing, strict=True):
+                weight.fill_(chosen)
         self.mixing = {name: weight.item() for name, weight in weights.items()}
 
     # ---- requests ----------------------------------------------------------------------------------------------------
@@ -219,7 +207,7 @@ class Session:
     @request
     def set_paused(self, is_paused: bool) -> None:
         """Pause, or continue without catching up."""
-        self._pacer.restart()
+        self.pacer.restart()
         self.is_paused = is_paused
 
     @request
@@ -247,23 +235,22 @@ class Session:
     def set_speed(self, speed: float) -> None:
         """Set the simulated seconds per second, from :data:`SLOWEST` to :data:`FASTEST`."""
         check_numbers("a speed", speed)
-        self.speed = self._pacer.speed = min(max(speed, SLOWEST), FASTEST)
-        self._pacer.restart()
+        self.pacer.speed = min(max(speed, SLOWEST), FASTEST)
+        self.pacer.restart()
 
     @request
     def follow_world(self, world: int) -> None:
         """Choose the world whose values are shown."""
         self.history.clear()
-        self.rewards = np.zeros_like(self.rewards)
         self.world = min(max(world, 0), self.task.num_envs - 1)
+        if self.snapshot:
+            self.snapshot = self.task.snapshot(self.sim_time, self.world)
 
     @request
     def set_mixing(self, weights: Sequence[float] | None) -> None:
         """Set the weights in :attr:`mixing`, in their order; None sets them as in training."""
         check_numbers("a weight", *(weights or ()))
-        self.is_mixing_set = weights is not None
-        if weights is not None:
-            self.mixing = dict(zip(self.mixing, weights, strict=True))
+        self.chosen_mixing = weights
         self._apply_mixing()
 
     @request
@@ -290,7 +277,7 @@ class Session:
     @request
     def set_perturbation(self, name: str) -> None:
         """Rebuild the task with a perturbation of its settings or :data:`AS_LOADED`; on errors, the old one stays."""
-        cfg = copy.deepcopy(self._cfg)
+        cfg = copy.deepcopy(self._run.env_cfg)
         if name != AS_LOADED:
             apply_perturbation(cfg, name)
         if self.companion:
@@ -312,7 +299,7 @@ class Session:
     def _scan(self) -> None:
         """Look for checkpoints, and load the newest one if that is wanted; a broken one is tried once."""
         self._next_scan = self._clock() + SCAN_INTERVAL
-        self.checkpoints = tuple(checkpoint_numbers(self._run_dir))
+        self.checkpoints = tuple(checkpoint_numbers(self._run.folder))
         newest = max(self.checkpoints, default=-1)
         if self.follows_newest and newest not in (self.checkpoint, self._tried):
             self._tried = newest
@@ -321,6 +308,5 @@ class Session:
     def _load(self, number: int) -> None:
         """Load a checkpoint into the networks and its counters into the task."""
         with torch.no_grad():
-            infos = self._runner.load(str(checkpoint_file(self._run_dir, number)), {"actor": True})
-        self._trained_steps = self.task.total_steps.clone()
-        self.checkpoint, self.trained_steps = number, int(infos["total_timesteps"])
+            self._runner.load(str(checkpoint_file(self._run.folder, number)), {"actor": True})
+        self.checkpoint, self.trained_steps = number, int(self.task.total_steps)

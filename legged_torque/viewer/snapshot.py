@@ -14,6 +14,8 @@ from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.sensors.height_scan import HeightScan
 from legged_torque.terrain.rough import RoughGround
 
+PD_CONTROL = "position_residual"  # name of the action term with joint positions as targets
+
 
 @dataclass(frozen=True)
 class Snapshot:
@@ -60,27 +62,30 @@ class WatchedRobot(LeggedRobot):
         return super()._compute_torques(actions)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
-        """Keep what a control step overwrites, and make one."""
-        self._watched_before = self.commands.clone(), self.episode_sums.clone()
+        """Keep the commands, which a control step may draw anew at its end, and make one."""
+        self._commands_before = self.commands.clone()
         return super().step(actions)
 
     def snapshot(self, time: float, world: int) -> Snapshot:
         """Return the result of the last step; for the arguments see :class:`Snapshot`."""
-        commands, sums = self._watched_before
-        rewards = self.episode_sums - torch.where(self.reset_buf, 0.0, sums)
-        tile, scan = None, commands[:0]
+        tile, scan = None, self.commands[:0]
         if isinstance(self.terrain, RoughGround):
             tile = int(self.terrain.levels[world]), int(self.terrain.columns[world])
             scan = self._watched_scan.points()[world]
             scan[:, 2] = self.terrain.height(scan)
+        names, targets = [term.name for term in self.control_law.terms], self.actions[:, :0]
+        if PD_CONTROL in names:
+            place = names.index(PD_CONTROL)
+            scaled = self.control_law.terms[place].scale * self.actions.split(self.num_dof, dim=1)[place]
+            targets = self.control.default_dof_pos + self.control.joint_offset + scaled
         tensors = {
             "qpos": self.sim.qpos,
-            "commands": commands,
+            "commands": self._commands_before,
             "velocities": self.state.planar_velocity(),
             "torques": self.torques[world],
             "torque_parts": self.torque_parts[:, world],
-            "targets": self._position_targets()[world],
-            "rewards": rewards[:, world] / self.dt,
+            "targets": targets[world],
+            "rewards": self.rewards.terms[:, world] / self.dt,
             "feet": self.feet_contact[world],
             "forces": self.sim.contact_force[world],
             "scan": scan,
@@ -88,14 +93,6 @@ class WatchedRobot(LeggedRobot):
         arrays = {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}
         falls, age = int((self.reset_buf & ~self.time_out_buf).sum()), int(self.episode_length_buf[world])
         return Snapshot(time, world, falls=falls, age=age, tile=tile, **arrays)
-
-    def _position_targets(self) -> Tensor:
-        """Return the joint positions wanted by PD control, see :class:`Snapshot`. Shape: (num_envs, num_dof or 0)."""
-        for place, term in enumerate(self.control_law.terms):
-            if term.name == "position_residual":
-                actions = self.actions[:, place * self.num_dof :][:, : self.num_dof]
-                return self.control.default_dof_pos + self.control.joint_offset + term.scale * actions
-        return self.actions[:, :0]
 
 
 def watched(task_class: type[LeggedRobot]) -> type[WatchedRobot]:

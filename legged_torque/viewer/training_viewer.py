@@ -94,9 +94,10 @@ def start(words: list[str], log: Path) -> subprocess.Popen[bytes]:
     """Start ``play.py`` on the CPU with the lowest priority, with its output in a file."""
     log.parent.mkdir(exist_ok=True)
     variables = {name: value for name, value in os.environ.items() if name not in OWN_VARIABLES}
-    command = [sys.executable, str(SCRIPTS_DIR / "play.py"), *words, "--device=cpu"]
+    nice = ["nice", "-n", str(LOWEST_PRIORITY)] if hasattr(os, "nice") else []
+    command = [*nice, sys.executable, str(SCRIPTS_DIR / "play.py"), *words, "--device=cpu"]
     with log.open("wb") as file:
-        process = subprocess.Popen(
+        return subprocess.Popen(
             ending_with_parent(command),
             env=variables | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""},
             stdin=subprocess.DEVNULL,
@@ -104,9 +105,6 @@ def start(words: list[str], log: Path) -> subprocess.Popen[bytes]:
             stderr=subprocess.STDOUT,
             start_new_session=True,  # Ctrl-C is for the training
         )
-    if hasattr(os, "setpriority"):
-        os.setpriority(os.PRIO_PROCESS, process.pid, LOWEST_PRIORITY)
-    return process
 
 
 def end(process: subprocess.Popen[bytes]) -> None:

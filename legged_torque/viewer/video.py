@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
+import itertools
 import math
 import tempfile
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -21,8 +19,7 @@ from legged_torque.utils.devices import INSTALL_HINT
 from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_whole
-from legged_torque.viewer.ground import Ground, drawn_model, drawn_task
-from legged_torque.viewer.mujoco_scene import TRUNK, Camera, add_velocities, size_of
+from legged_torque.viewer.drawing import Camera, Drawing, Ground, drawn_model
 
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -34,15 +31,9 @@ TEXT_COLORS = {"plain": (255, 255, 255), "command": (110, 240, 130), "velocity":
 BOX_COLOR = (20, 24, 30, 190)
 
 Row = tuple[str, list[str]]  # a row of text: a key of TEXT_COLORS, and words
-
-
-@dataclass
-class Moment:
-    """One robot after a control step; command and velocity are v_x, v_y [m/s] and yaw rate [rad/s]."""
-
-    qpos: np.ndarray  # positions of the MJCF's joints
-    command: np.ndarray  # (3,)
-    velocity: np.ndarray  # of the trunk, in its own frame; (3,)
+Step = Sequence[np.ndarray]
+"""Robots after a control step: positions of the joints, (robots, nq); v_x, v_y [m/s] and yaw rate [rad/s] as commanded,
+(robots, 3), and of the trunk in its own frame, (robots, 3)."""
 
 
 class VideoRecorder:
@@ -52,15 +43,14 @@ class VideoRecorder:
     tiles of a grid, row by row.
 
     Attributes:
-        model: One robot with its ground. The size of its off-screen buffer is changed.
-        trunk: Body that the camera follows.
+        drawing: One robot with its ground. The size of its model's off-screen buffer is changed.
         steps: The robots after each control step; their number is a square number.
     """
 
-    def __init__(self, model: mujoco.MjModel, trunk: int, control_step: float, ground: Ground | None = None) -> None:
-        """Start without steps, which last ``control_step`` [s]; cameras stay above the ground. None is a plane."""
-        self.model, self.trunk, self._control_step, self._ground = model, trunk, control_step, ground
-        self.steps: list[list[Moment]] = []
+    def __init__(self, drawing: Drawing, control_step: float) -> None:
+        """Start without steps, which last ``control_step`` [s]."""
+        self.drawing, self._control_step = drawing, control_step
+        self.steps: list[Step] = []
 
     def save(self, file: Path, no_renderer: str | None) -> bool:
         """Write the video and print its place, or print why there is none; ``no_renderer`` is one such reason.
@@ -68,60 +58,54 @@ class VideoRecorder:
         Returns whether there is one.
         """
         try:
-            if no_renderer:
-                raise UserError(no_renderer)
-            self.write(file)
+            self.write(file, no_renderer)
             print(f"video: {file}")
             return True
         except UserError as error:
             print(f"no video: {error}")
             return False
 
-    def write(self, file: Path, on_frame: Callable[[int, int], None] = lambda number, total: None) -> None:
-        """Write the video; a UserError if there is no renderer or no encoder.
+    def write(
+        self, file: Path, no_renderer: str | None, on_frame: Callable[[int, int], None] = lambda number, total: None
+    ) -> None:
+        """Write the video; a UserError if there is no renderer, for a known reason or another, or no encoder.
 
         ``on_frame`` is called after each frame with its number and the number of all.
         """
+        if no_renderer or not self.steps:
+            raise UserError(no_renderer or "nothing has moved")
         try:
             import imageio
             import imageio_ffmpeg  # noqa: F401
             import PIL  # noqa: F401
         except ImportError:
             raise UserError("videos need the extra: pip install 'legged_torque[video]'") from None
-        side = math.isqrt(len(self.steps[0]))
+        side = math.isqrt(len(self.steps[0][0]))
         width, height = SIZE if side == 1 else (length // side // 2 * 2 for length in GRID_SIZE)  # even, for mp4
-        self.model.vis.global_.offwidth, self.model.vis.global_.offheight = width, height
+        drawing, model = self.drawing, self.drawing.model
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         try:
-            renderer = mujoco.Renderer(self.model, height, width)
+            renderer = mujoco.Renderer(model, height, width)
         except Exception as error:  # whatever the graphics driver raises
             raise UserError(f"the renderer does not start: {error} ({INSTALL_HINT})") from None
-        size, data = size_of(self.model), mujoco.MjData(self.model)
-        cameras = [Camera(self._ground, size) for _ in self.steps[0]]
+        cameras = [Camera(drawing.ground, drawing.size) for _ in range(side**2)]
         shown = list(enumerate(self.steps, start=1))[::STRIDE]
         with tempfile.TemporaryDirectory() as folder:
             part = Path(folder) / file.name
             writer = imageio.get_writer(part, fps=round(1.0 / STRIDE / self._control_step), macro_block_size=1)
             with renderer, writer, Counter("rendering, frame", len(shown)) as counter:
-                for frame, (number, moments) in enumerate(shown, start=1):
-                    tiles = []
-                    for moment, camera in zip(moments, cameras, strict=True):
-                        image = self._draw(renderer, data, moment, camera, size)
-                        rows = speed_rows(moment) if side > 1 else velocity_rows(number * self._control_step, moment)
-                        tiles.append(add_text(image, rows))
+                for frame, (number, step) in enumerate(shown, start=1):
+                    seconds, tiles = number * self._control_step, []
+                    for camera, qpos, *vectors in zip(cameras, *step, strict=True):
+                        drawing.move(qpos)
+                        renderer.update_scene(drawing.data, camera.look_at(drawing.data.xpos[drawing.trunk]))
+                        drawing.add_velocities(renderer.scene, *vectors)
+                        rows = speed_rows(*vectors) if side > 1 else velocity_rows(seconds, *vectors)
+                        tiles.append(add_text(renderer.render(), rows))
                     writer.append_data(np.vstack([np.hstack(tiles[i : i + side]) for i in range(0, len(tiles), side)]))
                     counter.add()
                     on_frame(frame, len(shown))
             write_whole(file, part.read_bytes())
-
-    def _draw(
-        self, renderer: mujoco.Renderer, data: mujoco.MjData, moment: Moment, camera: Camera, size: float
-    ) -> np.ndarray:
-        """Return the image of a robot and the arrows of its velocities. Shape: (height, width, 3)."""
-        data.qpos[:] = moment.qpos
-        mujoco.mj_forward(self.model, data)
-        renderer.update_scene(data, camera.look_at(data.xpos[self.trunk]))
-        add_velocities(renderer.scene, data, self.trunk, moment.command, moment.velocity, size)
-        return renderer.render()
 
 
 class SimulationRecorder(VideoRecorder):
@@ -135,13 +119,13 @@ class SimulationRecorder(VideoRecorder):
             layout = Layout(**description["terrain"])
             ground = Ground(layout, HeightGrid(layout.heights(), layout.horizontal_scale, layout.corner))
             model = drawn_model(robot.file, ground)
-        super().__init__(model, robot.trunk, 1.0 / description["timing"]["control_frequency"], ground)
+        super().__init__(Drawing(model, ground, robot.trunk), 1.0 / description["timing"]["control_frequency"])
         self._simulation = simulation
 
     def add_step(self) -> None:
         """Record the state after a control step."""
         simulation, robot = self._simulation, self._simulation.robot
-        self.steps.append([Moment(robot.data.qpos.copy(), simulation.command.copy(), robot.planar_velocity())])
+        self.steps.append([np.array([row]) for row in (robot.data.qpos, simulation.command, robot.planar_velocity())])
 
 
 class TaskRecorder(VideoRecorder):
@@ -149,8 +133,7 @@ class TaskRecorder(VideoRecorder):
 
     def __init__(self, task: LeggedRobot, num_worlds: int = 1) -> None:
         """Prepare to record the first worlds of a task; a single one is that with the fastest command at the start."""
-        model, ground = drawn_task(task)
-        super().__init__(model, TRUNK, task.dt, ground)
+        super().__init__(Drawing.of_task(task), task.dt)
         self._task = task
         self._worlds = list(range(num_worlds)) if num_worlds > 1 else []
 
@@ -159,47 +142,42 @@ class TaskRecorder(VideoRecorder):
         task = self._task
         self._worlds = self._worlds or [int(task.commands[:, :2].norm(dim=1).argmax())]
         tensors = (task.sim.qpos, task.commands, task.state.planar_velocity())
-        parts = [tensor[self._worlds].double().cpu().numpy() for tensor in tensors]
-        self.steps.append([Moment(*moment) for moment in zip(*parts, strict=True)])
+        self.steps.append([tensor[self._worlds].double().cpu().numpy() for tensor in tensors])
 
 
 def show_in_tensorboard(video: Path, iterations: int) -> None:
     """Add a video as a gif to the images of a run in tensorboard, as events in the video's folder."""
-    import imageio
-    from PIL import Image
-    from tensorboard.compat.proto.event_pb2 import Event
+    import imageio.v3
     from tensorboard.compat.proto.summary_pb2 import Summary
-    from tensorboard.summary.writer.event_file_writer import EventFileWriter
+    from torch.utils.tensorboard.writer import FileWriter
 
-    reader: Any = imageio.get_reader(video)
-    with reader:
-        duration = 1000.0 * STRIDE / reader.get_meta_data()["fps"]  # of a frame of the gif [ms]
-        images = [Image.fromarray(frame[::2, ::2]) for number, frame in enumerate(reader) if number % STRIDE == 0]
-    gif = io.BytesIO()
-    images[0].save(gif, "GIF", save_all=True, append_images=images[1:], duration=duration, loop=0)
-    size = {"width": images[0].width, "height": images[0].height, "colorspace": 3}
-    value = Summary.Value(tag="video", image=Summary.Image(**size, encoded_image_string=gif.getvalue()))
-    writer = EventFileWriter(str(video.parent))
-    writer.add_event(Event(wall_time=time.time(), step=iterations, summary=Summary(value=[value])))
+    shown = itertools.islice(imageio.v3.imiter(video, plugin="FFMPEG"), None, None, STRIDE)
+    frames = np.stack([frame[::2, ::2].copy() for frame in shown])
+    duration = 1000.0 * STRIDE / imageio.v3.immeta(video, plugin="FFMPEG")["fps"]  # of a frame of the gif [ms]
+    gif = imageio.v3.imwrite("<bytes>", frames, extension=".gif", duration=duration, loop=0)
+    size = {"height": frames.shape[1], "width": frames.shape[2], "colorspace": 3}
+    value = Summary.Value(tag="video", image=Summary.Image(**size, encoded_image_string=gif))
+    writer = FileWriter(str(video.parent))
+    writer.add_summary(Summary(value=[value]), iterations)
     writer.close()
 
 
-def velocity_rows(time: float, moment: Moment) -> list[Row]:
+def velocity_rows(time: float, command: np.ndarray, velocity: np.ndarray) -> list[Row]:
     """Return the text of a single robot: time [s], command, velocity."""
-    vectors = (moment.command, moment.velocity)
-    command, velocity = ([f"{round(float(value), 2) + 0.0:+.2f}" for value in vector] for vector in vectors)  # no -0.00
+    rounded = (np.round(row, 2) + 0.0 for row in (command, velocity))  # no -0.00
+    wanted, actual = ([f"{value:+.2f}" for value in row] for row in rounded)
     return [
         ("plain", [f"{time:.2f} s", "v_x", "v_y", "yaw"]),
-        ("command", ["command", *command]),
-        ("velocity", ["actual", *velocity]),
+        ("command", ["command", *wanted]),
+        ("velocity", ["actual", *actual]),
         ("plain", ["", "m/s", "m/s", "rad/s"]),
     ]
 
 
-def speed_rows(moment: Moment) -> list[Row]:
+def speed_rows(command: np.ndarray, velocity: np.ndarray) -> list[Row]:
     """Return the short text of a tile: horizontal speeds, commanded and actual."""
-    command, actual = (f"{np.linalg.norm(vector[:2]):.2f} m/s" for vector in (moment.command, moment.velocity))
-    return [("command", ["command", command]), ("velocity", ["actual", actual])]
+    wanted, actual = (f"{np.linalg.norm(vector[:2]):.2f} m/s" for vector in (command, velocity))
+    return [("command", ["command", wanted]), ("velocity", ["actual", actual])]
 
 
 def add_text(image: np.ndarray, rows: list[Row]) -> np.ndarray:

@@ -2,51 +2,78 @@
 
 from __future__ import annotations
 
+import functools
 import html
+import math
+import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
+import viser
+from viser._messages import RunJavascriptMessage
+
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
-from legged_torque.viewer.access import Guard, GuardedServer
-from legged_torque.viewer.controls import Controls
-from legged_torque.viewer.ground import Ground, drawn_task
+from legged_torque.viewer.access import GuardedServer
+from legged_torque.viewer.drawing import Drawing, Ground
 from legged_torque.viewer.plots import WIDTH, Plots
-from legged_torque.viewer.ports import free_port
-from legged_torque.viewer.poses import commanded_pose
-from legged_torque.viewer.recording import Recording, notify
 from legged_torque.viewer.scene import Scene
-from legged_torque.viewer.session import Session
+from legged_torque.viewer.session import AS_LOADED, FASTEST, SLOWEST, Command, Session
+from legged_torque.viewer.video import VideoRecorder
 
 FRAME_INTERVAL = 1.0 / 30.0  # seconds between drawings of the robots
 PLOT_INTERVAL = 0.2  # seconds between drawings of the plots and the status
-RED, COLOR = "#e03131", (47, 125, 246)  # of errors, of controls
+COLOR = (47, 125, 246)  # of controls
+NOTICE_SECONDS = 10.0  # for which notifications are shown
+MAX_SECONDS = 60.0  # of a video
+RECORD, STOP = "Record", "Stop and download"  # labels of the button
+PUSHES = {"from behind": 0.0, "from the right": 90.0, "from the front": 180.0, "from the left": -90.0}
+"""Directions of pushes from the robot's heading to its left [degrees]."""
+STEP = 0.05  # of the sliders of commands [m/s, rad/s] and weights
+KEYS = '<div class="lt-keys">or hold W A S D, arrows, or a gamepad\'s sticks</div>'
+COMMANDS = {"x [m/s]": "forward", "y [m/s]": "to the left", "yaw [rad/s]": "turning to the left"}
+VIEW = {
+    "follow": ("camera follows", True, "keeps the followed robot in view"),
+    "others": ("all worlds", True, "draw the other worlds too"),
+    "contacts": ("contacts", True, "points and forces, 1 m for 500 N"),
+    "collision": ("collision geoms", False, "what touches the ground in the simulator"),
+    "ghost": ("ghost", False, "where the commands of the last second lead"),
+    "scan": ("height scan", True, "where the ground is measured"),
+}
+"""What is drawn, by name: label, whether it is at first, hint."""
 
 
 class Page:
-    """Draws a session in a thread of its own, which never touches the task's tensors.
+    """Shows a session, and turns what users change in the right panel into requests to it.
 
-    If drawing fails, the error is shown on the page, and everything else goes on.
+    Everything is drawn in a thread of its own, which never touches the task's tensors. If drawing fails, the error is
+    shown on the page, and everything else goes on.
 
     Attributes:
-        guard: Decides who may use the page.
-        server: Of viser.
-        controls: The right panel.
+        server: Of viser, at its address ``url``.
+        status: Text above the controls.
     """
 
     def __init__(self, session: Session, title: str, host: str, port: int, no_renderer: str | None = None) -> None:
         """Serve the page at a port or the next free one; ``no_renderer`` is a reason why no videos can be drawn."""
-        self._session, self.guard = session, Guard(host)
-        self.server = GuardedServer(self.guard, host, free_port(host, port), title)
-        gui, task, companion = self.server.gui, session.task, session.companion
+        self._session, self._no_renderer = session, no_renderer
+        self.server = GuardedServer(host, port, title)
+        gui, drawing = self.server.gui, Drawing.of_task(session.task)
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=COLOR)
-        model, self._ground = drawn_task(task)
-        names = (session.name, companion.name) if companion else ()
-        self._scene = Scene(self.server, model, task.num_envs, task.asset.geom_names, self._ground, names)
-        self.controls = Controls(gui, session, self._scene.view, self._ground)
+        self._gui, self._ground = gui, drawing.ground
+        self._scene = Scene(self.server, session, drawing)
+        self._shown: list[tuple[Any, str, Callable[[], Any]]] = []  # controls, attributes of theirs, and their values
+        self.status = gui.add_html("")
+        self._add_controls()
         self._plots = Plots(gui, session)
-        self._recording = Recording(self.server, session, no_renderer)
+        self._recorder: VideoRecorder | None = None
+        hint = f"up to {MAX_SECONDS:.0f} s of the followed robot"
+        self._record = gui.add_button(RECORD, icon=viser.Icon.VIDEO, hint=hint)
+        self._record.on_click(lambda event: self._start_or_end_recording())
         gui.main_panel.dock_right()
         gui.main_panel.set_width(WIDTH)
         self._errors: dict[str, str] = {}  # of the last drawing, by part of the page
@@ -54,13 +81,6 @@ class Page:
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
         self._thread.start()
-
-    @property
-    def url(self) -> str:
-        """Address of the page for a browser on this machine, with the token if one is needed."""
-        host, token = self.server.get_host(), self.guard.token
-        address = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{self.server.get_port()}"
-        return f"{address}/?token={token}" if token else address
 
     def close(self) -> None:
         """Stop drawing and serving."""
@@ -73,12 +93,12 @@ class Page:
         next_plots = 0.0
         while not self._closed.wait(FRAME_INTERVAL):
             self._attempt("scene", self._draw_scene)
-            self._attempt("recording", self._recording.update)
+            self._attempt("recording", self._record_steps)
             if time.perf_counter() >= next_plots:
                 next_plots = time.perf_counter() + PLOT_INTERVAL
                 with self.server.atomic():
                     self._attempt("plots", self._plots.update)
-                    self._attempt("controls", self.controls.update)
+                    self._attempt("controls", self._update_controls)
                     self._attempt("status", self._draw_status)
 
     def _attempt(self, part: str, draw: Callable[[], None]) -> None:
@@ -93,37 +113,221 @@ class Page:
                 traceback.print_exc()
 
     def _draw_scene(self) -> None:
-        """Draw the robots."""
-        session, snapshot = self._session, self._session.snapshot
-        if snapshot:
-            companion = session.companion.snapshot if session.companion else None
-            ghost = commanded_pose(list(session.history) or [snapshot], session.task.dt)
-            self._scene.update(snapshot, session.world, ghost, companion.qpos[0] if companion else None)
+        """Draw the robots, with what users want to see."""
+        self._scene.update({name for name, box in self._boxes.items() if box.value})
+
+    def _update_controls(self) -> None:
+        """Show the session's values, unless a choice has not been carried out yet."""
+        if any(session and session.requests for session in (self._session, self._session.companion)):
+            return
+        for control, attribute, value in self._shown:
+            now = value()
+            if isinstance(control, viser.GuiSliderHandle):
+                now = round(min(max(now, control.min), control.max), 2)
+            if getattr(control, attribute) != now:  # each change is a message to the browsers
+                setattr(control, attribute, now)
 
     def _draw_status(self) -> None:
-        """Write the status, and show a new error of the session as a notification, too."""
-        message = self._session.message
-        self.controls.status.content = status_html(self._session, self._ground, list(self._errors.values()))
+        """Write checkpoint, time, companion, tile on rough ground, errors and message; notify of a new error."""
+        session, message = self._session, self._session.message
+        running = "paused" if session.is_paused else f"{session.pacer.rate:.2f} x real time"
+        lines = [
+            f"<b>model_{session.checkpoint}</b>, after {session.trained_steps / 1e6:,.1f} million steps",
+            f"{session.sim_time:.1f} s simulated, {running}, {session.falls} falls",
+        ]
+        if other := session.companion:
+            lines.append(f"companion: <b>{html.escape(other.name)}</b>, model_{other.checkpoint}, {other.falls} falls")
+        if self._ground and session.snapshot and session.snapshot.tile:
+            lines.append(self._ground.tile_text(*session.snapshot.tile))
+        lines += [f'<span class="lt-error">{html.escape(error)}</span>' for error in self._errors.values()]
+        kind = "lt-error" if message.is_error else ""
+        lines.append(f'<span class="{kind}">{html.escape(message.text) or "&nbsp;"}</span>')
+        self.status.content = f'<div class="lt-status">{"<br>".join(lines)}</div>'
         if message.is_error and message is not self._message_shown:
-            notify(self.server, "That did not work", message.text)
+            self._notify("That did not work", message.text)
         self._message_shown = message
 
+    def _notify(self, title: str, text: str) -> None:
+        """Show an error in all browsers."""
+        for client in self.server.get_clients().values():
+            client.add_notification(title, text, color="red", auto_close_seconds=NOTICE_SECONDS)
 
-def status_html(session: Session, ground: Ground | None, errors: list[str]) -> str:
-    """Return the status line by line: checkpoint, time, companion, tile on rough ground, errors, last message."""
-    running = "paused" if session.is_paused else f"{session.real_time:.2f} x real time"
-    lines = [
-        f"<b>model_{session.checkpoint}</b>, after {session.trained_steps / 1e6:,.1f} million steps",
-        f"{session.sim_time:.1f} s simulated, {running}, {session.falls} falls",
-    ]
-    if other := session.companion:
-        lines.append(f"companion: <b>{html.escape(other.name)}</b>, model_{other.checkpoint}, {other.falls} falls")
-    if ground and session.snapshot and session.snapshot.tile:
-        lines.append(ground.tile_text(*session.snapshot.tile))
-    lines += [f'<span style="color:{RED}">{html.escape(error)}</span>' for error in errors]
-    color = RED if session.message.is_error else "inherit"
-    lines.append(f'<span style="color:{color}">{html.escape(session.message.text) or "&nbsp;"}</span>')
-    return f'<div style="font-size:13px;line-height:1.5;padding:4px 12px">{"<br>".join(lines)}</div>'
+    # ---- controls ----------------------------------------------------------------------------------------------------
+
+    def _add_controls(self) -> None:
+        """Add all controls."""
+        gui, session = self._gui, self._session
+        with gui.add_folder("Command"):
+            self._add_command()
+        with gui.add_folder("Time"):
+            self._bind(gui.add_checkbox("pause", False), lambda: session.is_paused, session.set_paused)
+            speed = gui.add_slider("speed [x]", SLOWEST, FASTEST, 0.1, FASTEST, hint="1 is real time")
+            self._bind(speed, lambda: session.pacer.speed, session.set_speed)
+            reset = gui.add_button("Reset", icon=viser.Icon.ROTATE, hint="a new episode in every world")
+            reset.on_click(lambda event: session.reset())
+        with gui.add_folder("Push"):
+            direction = gui.add_dropdown("push", tuple(PUSHES), hint="in the robot's frame")
+            hint = "added to the trunk's velocity at once"
+            strength = gui.add_slider("strength [m/s]", 0.1, 2.0, 0.1, 0.8, hint=hint)
+            push = gui.add_button("Push", icon=viser.Icon.ARROW_BIG_RIGHT)
+            push.on_click(lambda event: session.push(math.radians(PUSHES[direction.value]), strength.value))
+        with gui.add_folder("Run"):
+            self._add_checkpoint("checkpoint", session)
+            newest = gui.add_checkbox("follow training", False, hint="load each new checkpoint as soon as it is saved")
+            self._bind(newest, lambda: session.follows_newest, session.follow_newest)
+            if session.companion:
+                self._add_checkpoint("companion", session.companion)
+            hint = "random parameters, pushes and noise; rebuilds the worlds"
+            presets = (AS_LOADED, *session.task.cfg.perturbations())
+            perturbation = gui.add_dropdown("perturbation", presets, hint=hint)
+            self._bind(perturbation, lambda: session.perturbation, session.set_perturbation)
+        if session.mixing:
+            with gui.add_folder("Mixing weights"):
+                automatic = gui.add_checkbox("as in training", True, hint="the weights at this point of the training")
+                sliders = [gui.add_slider(name.replace("_", " "), 0.0, 1.0, STEP, 0.0) for name in session.mixing]
+                values = (lambda: list(session.mixing.values()), automatic, lambda: session.chosen_mixing is None)
+                self._bind_sliders(sliders, *values, session.set_mixing)
+        if self._ground:
+            with gui.add_folder("Tile"):
+                self._add_tile(self._ground)
+        with gui.add_folder("View"):
+            self._add_view()
+
+    def _bind(self, control: viser.GuiInputHandle, value: Callable[[], Any], request: Callable[[Any], None]) -> None:
+        """Show a value of the session in a control, and request what users choose."""
+        self._shown.append((control, "value", value))
+        control.on_update(lambda event: request(control.value) if event.client else None)  # a user has changed it
+
+    def _bind_sliders(
+        self,
+        sliders: Sequence[viser.GuiInputHandle],
+        values: Callable[[], Sequence[float]],
+        automatic: viser.GuiInputHandle,
+        is_automatic: Callable[[], bool],
+        request: Callable[[Any], None],
+    ) -> None:
+        """Request the values of sliders, or None when a checkbox is ticked."""
+
+        def choose(value: object) -> None:
+            request(tuple(slider.value for slider in sliders))
+
+        self._bind(automatic, is_automatic, lambda value: request(None) if value else choose(value))
+        for place, slider in enumerate(sliders):
+            self._bind(slider, functools.partial(lambda place: values()[place], place), choose)
+
+    def _add_command(self) -> None:
+        """Add the commanded velocities. Moving a slider ends random commands."""
+        gui, session, ranges = self._gui, self._session, self._session.task.cfg.commands.ranges
+        random = gui.add_checkbox("random", True, hint="drawn as in training, for each world")
+        limits = (ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw)
+        sliders = [
+            gui.add_slider(label, low, max(high, low + STEP), STEP, low, hint=hint)
+            for (label, hint), (low, high) in zip(COMMANDS.items(), limits, strict=True)
+        ]
+
+        def command() -> Sequence[float]:
+            drawn = session.snapshot.commands[session.world].tolist() if session.snapshot else (0.0, 0.0, 0.0)
+            return session.command or drawn
+
+        def steer(shares: Command) -> None:
+            pairs = zip(sliders, shares, strict=True)
+            x, y, yaw = (share * (slider.max if share > 0.0 else -slider.min) for slider, share in pairs)
+            session.set_command((x, y, yaw))
+
+        self._bind_sliders(sliders, command, random, lambda: session.command is None, session.set_command)
+        gui.add_html(KEYS)
+        gui.add_button("Stand still", icon=viser.Icon.HAND_STOP).on_click(lambda event: steer((0.0, 0.0, 0.0)))
+        field = gui.add_vector3("steering", (0.0, 0.0, 0.0), visible=False)  # set by held keys and a gamepad
+
+        @field.on_update
+        async def changed(event: viser.GuiEvent) -> None:  # viser calls coroutines in the order of the changes
+            if all(abs(share) <= 1.0 for share in field.value):
+                steer(field.value)
+
+        script = Path(__file__).with_name("page.js").read_text().replace("FIELD", field._impl.uuid)
+        gui._websock_interface.queue_message(RunJavascriptMessage(script))  # as viser itself does for Plotly
+
+    def _add_checkpoint(self, label: str, session: Session) -> None:
+        """Add the choice of a session's checkpoint."""
+        control = self._gui.add_dropdown(label, (str(session.checkpoint),), hint="iterations of the training")
+
+        def options() -> tuple[str, ...]:
+            return tuple(map(str, sorted({*session.checkpoints, session.checkpoint})))
+
+        def choose(value: str) -> None:
+            session.follow_newest(False)
+            session.load_checkpoint(int(value))
+
+        self._shown.append((control, "options", options))
+        self._bind(control, lambda: str(session.checkpoint), choose)
+
+    def _add_tile(self, ground: Ground) -> None:
+        """Add the tile of the followed robot."""
+        gui, session, kinds, last = self._gui, self._session, ground.layout.kinds(), ground.layout.num_rows - 1
+        names = tuple(dict.fromkeys(kinds))
+        kind = gui.add_dropdown("kind", names, hint="moves the followed robot onto such a tile")
+        level = gui.add_slider("level", 0, max(last, 1), 1, 0, hint="the first is the easiest", disabled=last == 0)
+
+        def tile() -> tuple[int, int]:
+            return (session.snapshot and session.snapshot.tile) or (0, 0)
+
+        def move(value: object) -> None:
+            session.set_tile(level.value, kinds.index(kind.value))
+
+        self._bind(kind, lambda: kinds[tile()[1]], move)
+        self._bind(level, lambda: tile()[0], move)
+
+    def _add_view(self) -> None:
+        """Add the followed world and what is drawn."""
+        gui, session, num_envs = self._gui, self._session, self._session.task.num_envs
+        if num_envs > 1:
+            world = gui.add_dropdown("world", tuple(map(str, range(num_envs))), hint="for camera and plots")
+            self._bind(world, lambda: str(session.world), lambda value: session.follow_world(int(value)))
+        is_needed = {"others": num_envs > 1, "scan": self._ground is not None}
+        self._boxes = {
+            name: gui.add_checkbox(label, is_on, hint=hint, visible=is_needed.get(name, True))
+            for name, (label, is_on, hint) in VIEW.items()
+        }
+
+    # ---- videos of the followed robot --------------------------------------------------------------------------------
+
+    def _start_or_end_recording(self) -> None:
+        """Start, or end and draw in a thread of its own."""
+        if self._recorder:
+            recorder, self._recorder = self._recorder, None
+            threading.Thread(target=self._send_video, args=(recorder,), name="recording", daemon=True).start()
+        else:
+            self._recorded = self._session.sim_time  # time of the last step that has been recorded [s]
+            self._recorder = VideoRecorder(Drawing.of_task(self._session.task), self._session.task.dt)
+            self._record.label = STOP
+
+    def _record_steps(self) -> None:
+        """Record the new steps of the session."""
+        recorder = self._recorder
+        if recorder:
+            for one in (one for one in list(self._session.history) if one.time > self._recorded):
+                recorder.steps.append((one.qpos[[one.world]], one.commands[[one.world]], one.velocities[[one.world]]))
+                self._recorded = one.time
+            if len(recorder.steps) * self._session.task.dt > MAX_SECONDS:
+                self._start_or_end_recording()
+
+    def _send_video(self, recorder: VideoRecorder) -> None:
+        """Draw a video and send it to the browsers, or show why there is none."""
+
+        def show_progress(frame: int, total: int) -> None:
+            self._record.label = f"Drawing frame {frame} of {total}"
+
+        self._record.disabled = True
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / "walking.mp4"
+                recorder.write(file, self._no_renderer, show_progress)
+                self.server.send_file_download(file.name, file.read_bytes(), save_immediately=True)
+        except Exception as error:  # the page goes on
+            reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+            self._notify("There is no video", reason)
+        finally:
+            self._record.label, self._record.disabled = RECORD, False
 
 
 def watch(session: Session, title: str, host: str, port: int, no_renderer: str | None = None) -> None:
@@ -131,9 +335,9 @@ def watch(session: Session, title: str, host: str, port: int, no_renderer: str |
     page = Page(session, title, host, port, no_renderer)
     if page.server.get_port() != port:
         print(f"Port {port} is taken.")
-    if page.guard.token:
+    if page.server.token:
         print("Warning: other machines reach this page, unencrypted; whoever has its address can steer the robots.")
-    print(f"See it walk: {page.url} (Ctrl-C ends)", flush=True)
+    print(f"See it walk: {page.server.url} (Ctrl-C ends)", flush=True)
     try:
         with StopRequest(lambda text: session.stop()):
             session.run()

@@ -1,4 +1,4 @@
-"""How many CPU threads torch uses."""
+"""The number of CPU threads of torch."""
 
 from __future__ import annotations
 

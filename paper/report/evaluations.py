@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from legged_torque.paper.metrics import METRICS, Metric
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.metrics import METRICS, Metric
-from legged_torque.utils.plotting import read_data
+from legged_torque.utils.files import read_data
 from legged_torque.utils.runs import load_config
 
 MILLION = 1e6  # steps in a million, the unit of texts and figures
 MAX_BYTES = 50_000_000  # of a CSV file; a small compressed one may hold more than fits in memory
-CURVE_METRICS = (*METRICS, Metric("critic_gradient_norm", "", "Gradient norm of the critic", None))
+CURVE_METRICS = (*METRICS, Metric("critic_gradient_norm", "Gradient norm of the critic", None))
 """The metrics of an evaluation during training."""
-LEVEL = Metric("terrain_level", "", "Mean level of robots in training", None)
+LEVEL = Metric("terrain_level", "Mean level of robots in training", None)
 """Also recorded in an evaluation during training on rough ground."""
 METRIC_NAMES = [metric.name for metric in CURVE_METRICS]
 COLUMNS = ["steps", "seconds", *METRIC_NAMES, LEVEL.name]

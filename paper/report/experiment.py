@@ -27,7 +27,7 @@ MEASURES = {
     "track_percentage": "Tracking",
     "cost_of_transport": "Cost of transport",
 }
-"""What is shown of robots on rough ground, with its meaning."""
+"""Numbers of robots on rough ground, with their meaning."""
 
 
 @dataclass

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from legged_torque.paper.metrics import PAPER_METRICS, Metric
+from legged_torque.paper.plotting import load_pyplot
 from legged_torque.paper.report.evaluations import LEVEL
 from legged_torque.paper.report.experiment import Experiment
 from legged_torque.paper.report.figures_curves import SEED_MARK, draw_curves
 from legged_torque.paper.report.style import name_of, style
-from legged_torque.paper.values import ENVIRONMENTS, PAPER_METRICS, task_on_plane
-from legged_torque.utils.metrics import Metric
-from legged_torque.utils.plotting import load_pyplot
+from legged_torque.paper.values import ENVIRONMENTS, task_on_plane
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from legged_torque.paper.plotting import load_pyplot
 from legged_torque.paper.report.evaluations import CURVE_METRICS, LEVEL, MILLION, read_curves
 from legged_torque.paper.report.experiment import LAST_SHARE, Experiment
 from legged_torque.paper.report.style import name_of, style
 from legged_torque.paper.values import ENVIRONMENTS
-from legged_torque.utils.plotting import load_pyplot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 AXES = {"steps": (MILLION, "environment steps [millions]"), "seconds": (1.0, "time of training [s]")}
-"""What curves are drawn over: its unit, and the label of its axis."""
+"""Horizontal axes of curves: unit and label."""
 SINGLE_CURVES = ("track_percentage", "track_xy", "cost_of_transport")  # metrics shown for single trainings
 SEED_LINES = ("-.", "-", "--", ":")  # line styles of single trainings, by seed modulo four
 LABELS = {metric.name: metric.label for metric in (*CURVE_METRICS, LEVEL)}

@@ -17,14 +17,15 @@ from markdown_it import MarkdownIt
 from markupsafe import Markup
 
 from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE
-from legged_torque.experiments.times import add_up, describe, read_times
+from legged_torque.experiments.times import describe, read_times
+from legged_torque.paper.metrics import PAPER_METRICS
 from legged_torque.paper.report import tables
 from legged_torque.paper.report.evaluations import MILLION
 from legged_torque.paper.report.experiment import LAST_SHARE, Experiment, Training, is_of_paper
 from legged_torque.paper.report.figures import draw_all, file_name, planned_figures, rough_figures
 from legged_torque.paper.report.style import name_of
 from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
-from legged_torque.paper.values import ENVIRONMENTS, PAPER_METRICS, TABLE_I
+from legged_torque.paper.values import ENVIRONMENTS, TABLE_I
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import portable_path, without_machine
 
@@ -148,7 +149,7 @@ def setup_lines(experiment: Experiment) -> list[str]:
     }
     lines = [f"Devices, as named in settings and results: {', '.join(devices) or 'unknown'}"]
     lines += [f"Versions: {text}" for text in sorted(versions) or ["unknown"]]
-    lines += filter(None, [describe(add_up(read_times(run.cell.folder) for run in experiment.runs))])
+    lines += filter(None, [describe(read_times(run.cell.folder) for run in experiment.runs)])
     ends = pd.DataFrame([run.rows.iloc[-1] for run in experiment.runs if len(run.rows)])
     ends = ends[ends["seconds"] > 0.0] if len(ends) else ends
     if len(ends):

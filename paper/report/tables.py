@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from legged_torque.paper.metrics import PAPER_METRICS, Metric
 from legged_torque.paper.report.evaluations import CURVE_METRICS, METRIC_NAMES
 from legged_torque.paper.report.experiment import MEASURES, Experiment
 from legged_torque.paper.report.style import method
-from legged_torque.paper.values import MODELS, PAPER_METRICS, PAPER_TASKS, paper_column, paper_value
+from legged_torque.paper.values import MODELS, PAPER_TASKS, paper_column, paper_value
 from legged_torque.utils.config import flat
-from legged_torque.utils.metrics import Metric
 
 Rows = list[list[str]]
 SIGNIFICANT = 0.05

@@ -33,7 +33,7 @@ def write(folder, **changes):
 
 
 def test_ratios_by_hand(tmp_path):
-    """New over old, of what both have; a size that the baseline lacks has none."""
+    """Ratios are new over old, of numbers in both; a size that the baseline lacks has none."""
     baseline = Baseline(write(tmp_path), RESULT, [(4096, 24), (16384, 24)])
     compared = baseline.compare(NEW_ROW, ["update_ms", "log_ms", "physics_ms", "peak_memory_mib"])
     assert compared == [("update_ms", 60.0, 15.0, 0.25), ("physics_ms", 0.5, 0.4, 0.8)]
@@ -61,23 +61,20 @@ def test_other_settings_and_machine(tmp_path):
     ("changes", "message"),
     [
         ({"rows": [OLD_ROW | {"num_envs": 1024}]}, "has 1024 worlds x 24 steps, not 4096 worlds x 24 steps"),
-        ({"rows": [OLD_ROW | {"num_steps_per_env": 32}]}, "has 4096 worlds x 32 steps, not 4096 worlds x 24 steps"),
         ({"rows": []}, "has no sizes, not 4096 worlds x 24 steps"),
-        ({"rows": 3}, "is not a file that benchmark.py --json has written"),
         ({"rows": [3]}, "is not a file that benchmark.py --json has written"),
-        ({"rows": [{"num_envs": 4096}]}, "is not a file that benchmark.py --json has written"),
         ({"rows": [OLD_ROW | {"num_envs": [4096]}]}, "is not a file that benchmark.py --json has written"),
         ({"versions": 3}, "is not a file that benchmark.py --json has written"),
     ],
 )
 def test_files_that_do_not_fit(tmp_path, changes, message):
-    """They are refused in one line that names the file, what it has and what is asked for."""
+    """They are refused in one line with the file, its sizes and those of this run."""
     file = write(tmp_path, **changes)
     error = error_of(Baseline, file, RESULT, [(4096, 24)])
     assert f"'{file}'" in error and message in error
 
 
-@pytest.mark.parametrize("value", ["60", True, 0, -1.0, math.nan, math.inf, 10**400, [1.0]])
+@pytest.mark.parametrize("value", ["60", 0, math.nan, 10**400])
 def test_numbers_without_a_ratio(tmp_path, value):
     """They are left out."""
     file = write(tmp_path, rows=[OLD_ROW | {"update_ms": value}])
@@ -85,14 +82,10 @@ def test_numbers_without_a_ratio(tmp_path, value):
     assert [name for name, *_ in compared] == ["physics_ms"]
 
 
-@pytest.mark.parametrize(
-    ("text", "message"), [("{", "cannot read"), ("[]", "is not a file that"), (None, "cannot read")]
-)
-def test_told_before_anything_is_measured(tmp_path, text, message):
+def test_refused_before_anything_is_measured(tmp_path):
     """The script ends with status 2 and one line."""
-    if text is not None:
-        (tmp_path / "old.json").write_text(text)
+    (tmp_path / "old.json").write_text("{")
     words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--baseline=old.json"]
     result = run_here("benchmark.py", *words, root=tmp_path)
-    assert_told_in_one_line(result, message)
+    assert_told_in_one_line(result, "cannot read")
     assert result[1] == ""

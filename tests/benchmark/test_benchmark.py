@@ -1,4 +1,4 @@
-"""The benchmark: its numbers belong together, its trace opens, and sizes that do not fit do not end it."""
+"""The benchmark: consistent numbers, a trace that opens, and sizes that do not fit into memory."""
 
 import gc
 import gzip
@@ -8,12 +8,12 @@ import signal
 
 import pytest
 import torch
+from support.runners import build_runner
 from support.scripts import assert_told_in_one_line, run_here
 
 from legged_torque.benchmark import measure as benchmark
-from legged_torque.benchmark.measure import MemoryMeter, summarize
+from legged_torque.benchmark.measure import summarize
 from legged_torque.envs import LeggedRobot, task_registry
-from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import is_out_of_memory
 
 SETTINGS = {"runner.num_steps_per_env": 3, "algorithm.num_learning_epochs": 1, "algorithm.num_mini_batches": 1}
@@ -24,7 +24,7 @@ PARTS = ("rollout", "update", "log")
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """What the script prints and writes for two sizes, with a run of endurance."""
+    """Output and file of the script for two sizes, with a run of endurance."""
     root = tmp_path_factory.mktemp("root")
     words = [*SMALL, "--num_envs", "2", "4", "--endurance=4", f"--json={root / 'new' / 'numbers.json'}"]
     status, output, error = run_here("benchmark.py", *words, root=root)
@@ -34,20 +34,15 @@ def measured(tmp_path_factory):
 
 
 @pytest.fixture
-def runner(tmp_path):
+def runner(make_task, tmp_path):
     """A runner that is ready to train."""
-    env_cfg, train_cfg = task_registry.get_cfgs("a1_position")
-    env_cfg.env.num_envs = 2
-    for path, value in SETTINGS.items():
-        set_by_path(train_cfg, path, value)
-    env = task_registry.get_task_class("a1_position")(env_cfg, "cpu")
-    runner, _ = task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=tmp_path)
+    runner = build_runner(make_task, "a1_position", 2, log_root=tmp_path, **SETTINGS)
     runner.claim_log_dir({})
     return runner
 
 
 def test_numbers_belong_together(measured):
-    """What is derived follows from the milliseconds; settings given by ``--set`` are those that were measured."""
+    """Derived numbers follow from the milliseconds; settings given by ``--set`` were measured."""
     _, result = measured
     assert [row["num_envs"] for row in result["rows"]] == [2, 4]
     assert result["task"] == "a1_position" and result["set"] == CHANGES
@@ -64,27 +59,22 @@ def test_numbers_belong_together(measured):
 
 
 def test_table(measured):
-    """The table has a line for each size, fits on a screen and says what the file says."""
+    """The table fits on a screen and has a line for each size with the numbers of the file."""
     output, result = measured
     lines = output.splitlines()
     assert max(map(len, lines)) <= 140
     (head,) = (i for i, line in enumerate(lines) if line.startswith(" worlds | physics ms"))
-    titles = [cell.strip() for cell in lines[head].split("|")]
-    rows = [line for line in lines[head + 1 :] if "|" in line]
-    assert len(rows) == 2
+    rows = [line.replace(",", "") for line in lines[head + 1 :] if "|" in line]
     for line, row in zip(rows, result["rows"], strict=True):
-        cells = dict(zip(titles, (cell.strip().replace(",", "") for cell in line.split("|")), strict=True))
-        assert cells["worlds"] == str(row["num_envs"])
-        assert cells["steps/s"] == f"{row['iteration_steps_per_s']:.0f}"
-        assert cells["peak MiB"] == f"{row['peak_memory_mib']:.0f}"
-        assert cells["start-up s"] == f"{row['startup_s']:.1f}"
+        cells = [cell.strip() for cell in line.split("|")]
+        assert cells[0] == str(row["num_envs"]) and f"{row['iteration_steps_per_s']:.0f}" in cells
 
 
 def test_against_an_earlier_run(measured, tmp_path):
     """Old and new numbers are printed with their ratios; a whole training is timed on demand."""
     old = measured[1]
     more = ["runner.total_steps=12", "evaluation.interval=6", "evaluation.num_samples=4"]
-    (tmp_path / "old.json").write_text(json.dumps(old | {"set": CHANGES + more, "device": "a mill"}))
+    (tmp_path / "old.json").write_text(json.dumps(old | {"set": CHANGES + more, "device": "another GPU"}))
     words = [*SMALL, *(f"--set={change}" for change in more), "--num_envs=2", "--learn"]
     files = ["--baseline=old.json", f"--json={tmp_path / 'new.json'}"]
     status, output, error = run_here("benchmark.py", *words, *files, root=tmp_path)
@@ -94,7 +84,7 @@ def test_against_an_earlier_run(measured, tmp_path):
     (new,) = json.loads((tmp_path / "new.json").read_text())["rows"]
     assert 0 < new["learn"]["start_s"] < new["learn"]["total_s"]
     notes, table = output.split("Against old.json\n")[1].split(" worlds | ")
-    assert "its device was 'a mill', is 'CPU" in notes
+    assert "its device was 'another GPU', is 'CPU" in notes
     lines = [[cell.strip() for cell in line.split("|")] for line in table.splitlines()[1:]]
     assert [cells[1] for cells in lines][:3] == ["physics ms", "step ms", "rollout ms"] and len(lines) == 8
     ratios = {cells[1]: float(cells[4]) for cells in lines}
@@ -111,45 +101,30 @@ def test_endurance(measured):
         assert numbers["growth_mib"] == numbers["last_memory_mib"] - numbers["first_memory_mib"] >= 0
 
 
-@pytest.mark.parametrize("name", ["trace.json", "trace.json.gz"])
-def test_trace(runner, tmp_path, name):
+def test_trace(runner, tmp_path):
     """The trace is JSON that has the traced iterations with their rollouts and updates; a table has the operators."""
-    lines = benchmark.trace_iterations(runner, tmp_path / name)
-    content = (tmp_path / name).read_bytes()
-    trace = json.loads(gzip.decompress(content) if name.endswith(".gz") else content)
+    lines = benchmark.trace_iterations(runner, tmp_path / "trace.json.gz")
+    trace = json.loads(gzip.decompress((tmp_path / "trace.json.gz").read_bytes()))
     names = [event.get("name", "") for event in trace["traceEvents"]]
     assert names.count("rollout") == names.count("update") == benchmark.TRACED
     assert "aten::mm" in names and any(" aten::" in line for line in lines)
 
 
 def test_whole_iterations(runner, tmp_path, capsys):
-    """Each timed iteration is one of training: curriculum, rollout, update, and what is logged and saved."""
-    calls = {"curriculum": 0, "read": 0}
-
-    def count(name, function):
-        def counted(*args):
-            calls[name] += 1
-            return function(*args)
-
-        return counted
-
-    runner.env.update_curriculum = count("curriculum", runner.env.update_curriculum)
-    runner.env.log.read = count("read", runner.env.log.read)
+    """Each timed iteration is one of training, with its log and checkpoint."""
     numbers = []
     times = benchmark.time_iterations(runner, 2, numbers.append)
-    assert calls == {"curriculum": 3, "read": 3} and numbers == [0, 1, 2]  # one more shows when the last one ended
+    assert numbers == [0, 1, 2]  # one more shows when the last one ended
     assert runner.current_learning_iteration == 3 and int(runner.env.total_steps) == 3 * 2 * 3
-    assert len(times["iteration"]) == 2
     for i in range(2):
         assert sum(times[name][i] for name in PARTS) == pytest.approx(times["iteration"][i])
     names = {path.name.split(".")[0] for path in tmp_path.glob("*/*")}
     assert {"events", "model_3"} <= names
     assert capsys.readouterr().out == ""
-    assert "collect_rollout" not in vars(runner) and "update" not in vars(runner.alg)
 
 
 def test_interrupt(runner):
-    """Ctrl-C, which the runner takes for a wish to stop early, ends the benchmark."""
+    """Ctrl-C, at which a training would stop early, ends the benchmark."""
     with pytest.raises(KeyboardInterrupt):
         benchmark.time_iterations(runner, 5, lambda number: os.kill(os.getpid(), signal.SIGINT))
     assert runner.current_learning_iteration == 1
@@ -189,43 +164,23 @@ def test_size_that_does_not_fit(tmp_path, monkeypatch):
 
 
 def test_out_of_memory():
-    """The errors of torch, Warp and CUDA for it are known, also behind another one; others are not taken for it."""
+    """The errors of torch, Warp and CUDA for it are recognized, also behind another one; others are not."""
     for text in ("Failed to allocate 1024 bytes on device 'cuda:0'", "CUDA error: out of memory"):
         assert is_out_of_memory(RuntimeError(text))
-    try:
-        try:
-            raise torch.OutOfMemoryError("CUDA out of memory")
-        finally:
-            raise RuntimeError("operation failed due to a previous error during capture")
-    except RuntimeError as error:
-        assert is_out_of_memory(error)
-    assert is_out_of_memory(MemoryError())
+    behind = RuntimeError("operation failed due to a previous error during capture")
+    behind.__context__ = torch.OutOfMemoryError("CUDA out of memory")
+    assert is_out_of_memory(behind) and is_out_of_memory(MemoryError())
     assert not is_out_of_memory(RuntimeError("an illegal memory access was encountered"))
     assert not is_out_of_memory(ValueError("Failed to allocate"))
-
-
-def test_memory_of_a_gpu(monkeypatch):
-    """It is what the device has less than when the meter was created."""
-    free = [1000 * 2**20]
-    monkeypatch.setattr(benchmark, "prepare_device", lambda device: None)
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free[0], 2000 * 2**20))
-    meter = MemoryMeter("cuda:0")
-    assert meter.used() == 0
-    free[0] -= 300 * 2**20
-    assert meter.used() == 300
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
-        ("--num_envs 2 0", "num_envs must be from 1 to 10000000, not 0"),
         ("--rounds=0", "--rounds must be at least 1, not 0"),
         ("--endurance=-1", "--endurance must be at least 0, not -1"),
-        ("--device=cup", "unknown device 'cup'; did you mean 'cpu'?"),
-        ("--preset=papr", "unknown preset 'papr'; did you mean 'paper'?"),
         ("--set=sim.solver_iteration=3", "did you mean 'sim.solver_iterations'?"),
-        ("--set=runner.num_step_per_env=12", "did you mean 'runner.num_steps_per_env'?"),
         ("--learn --set=evaluation.interval=0", "needs evaluations during training: evaluation.interval is 0, of 110"),
         ("--num_envs 2 4 --profile=trace.json", "--profile writes one trace: give one number of worlds"),
     ],

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from legged_torque.benchmark.learning_time import first_reaching, time_training
+from legged_torque.benchmark.measure import first_reaching, time_training
 from legged_torque.utils.errors import TrainingError
 
 TRACKING = [0.4, float("nan"), 0.7, 0.6, 0.8]
@@ -21,7 +21,7 @@ time.sleep(0.2)
 
 
 def test_first_at_or_above():
-    """The first evaluation counts that is at or above the share, though a later one falls below it again."""
+    """The first evaluation at or above the share counts, although a later one falls below it again."""
     found = first_reaching(0.70, EVALUATIONS, start=5.0)
     assert found == {"share": 0.70, "steps": 3000, "training_s": 3.5, "command_s": 8.5}
     assert first_reaching(0.75, EVALUATIONS, start=5.0)["steps"] == 5000
@@ -30,7 +30,7 @@ def test_first_at_or_above():
 
 
 def test_a_process(tmp_path):
-    """The last evaluation was written when its seconds of training were over; what follows is in the total only."""
+    """The start takes the time until the last evaluation less its seconds of training; the total has all."""
     (tmp_path / "training.py").write_text(TRAINING)
     times = time_training([sys.executable, str(tmp_path / "training.py")])
     assert times["steps"] == 300 and times["start_s"] > 0.5 - 0.3 and times["total_s"] > times["start_s"] + 0.3 + 0.2

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from support.exports import TRAINING, change, export_random
+from support.exports import TRAINING, export_random
 from support.scripts import SMALL, assert_told_in_one_line, run_here
 from support.settings import TASKS, error_of, torques_in_torch
 
@@ -139,16 +139,6 @@ def test_description(exported, description):
     assert "&id" not in text and max(map(len, text.splitlines())) <= 120
 
 
-def test_torchscript_and_batches(exported):
-    """Both networks take any number of rows and agree."""
-    obs = torch.randn(5, 57, generator=torch.Generator().manual_seed(1))
-    session = Policy(exported).session
-    with torch.inference_mode():
-        expected = torch.jit.load(str(exported / "policy.pt"))(obs).numpy()
-    (actions,) = session.run(["actions"], {"obs": obs.numpy()})
-    np.testing.assert_allclose(actions, expected, atol=1e-5)
-
-
 def test_actions_that_are_not_finite(exported):
     """They are refused instead of sent, like arrays of a wrong size."""
     policy = Policy(exported)
@@ -160,20 +150,6 @@ def test_actions_that_are_not_finite(exported):
         policy.torques(np.zeros(24), np.zeros(11), np.zeros(12))
     with pytest.raises(ValueError, match="projected_gravity or quaternion"):
         policy.observation(State(np.zeros(3), np.zeros(12), np.zeros(12)), np.zeros(3))
-
-
-def test_double_precision(exported):
-    """In float64, all results are in float64 and the same."""
-    single, double = Policy(exported), Policy(exported, np.float64)
-    state = State(np.ones(3), np.full(12, 0.3), np.ones(12), projected_gravity=np.array([0.0, 0.6, -0.8]))
-    results = []
-    for policy in (single, double):
-        obs = policy.observation(state, np.ones(3))
-        actions = policy.act(obs)
-        results.append((obs, actions, policy.torques(actions, state.joint_positions, state.joint_velocities)))
-        assert {part.dtype for part in results[-1]} == {np.dtype(policy.dtype)}
-    for first, second in zip(*results, strict=True):
-        np.testing.assert_allclose(first, second, rtol=1e-5, atol=1e-5)
 
 
 def test_other_laws(make_task, tmp_path, monkeypatch):
@@ -249,8 +225,6 @@ def test_groups_of_the_actor(make_task, tmp_path, monkeypatch):
     assert description["unsupported"][0].startswith("no numpy function for the observation term 'rays'; there are")
     assert description["network"]["num_observations"] == 2 * 45 + 3
     assert description["observations"]["terms"][-1] == RAYS | {"size": 3, "clip": [-100.0, 100.0]}
-    change("observations.terms.0.group", "rays")(description)
-    assert "the terms of further groups must come after those without a group" in error_of(check, description)
     for offset, is_right in ((0.1, False), (0.2, True)):
         rays = lambda policy, state, command, offset=offset: state.joint_positions[:3] + offset  # noqa: E731
         monkeypatch.setitem(OBSERVATIONS, "rays", rays)
@@ -267,6 +241,44 @@ def test_groups_of_the_actor(make_task, tmp_path, monkeypatch):
         np.testing.assert_allclose(policy.act(seen), actions[1], rtol=1e-5, atol=1e-5)
         obs = task.step(actions)[0]
         assert not task.reset_buf[1]
+
+
+TASK = """
+import legged_torque.deploy.policy
+from legged_torque.envs import A1TorqueCfg, A1TorqueCfgPPO, ObservationTerm, TorqueRobot, task_registry
+
+class LeanRobot(TorqueRobot):
+    def observation_terms(self):
+        return [*super().observation_terms(), ObservationTerm("lean", self.lean, None, group="lean")]
+
+    def lean(self):
+        return self.projected_gravity[:, :2]
+
+task_registry.register("a1_lean", LeanRobot, A1TorqueCfg(), A1TorqueCfgPPO())
+legged_torque.deploy.policy.OBSERVATIONS["lean"] = lambda policy, state, command: state.gravity()[:2]
+"""
+
+
+def test_groups_in_the_scripts(tmp_path, monkeypatch):
+    """A group of a task file is trained, exported and run in plain MuJoCo; what cannot be exported is named."""
+    monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setitem(OBSERVATIONS, "lean", None)  # undone after the test
+    (tmp_path / "lean_robot.py").write_text(TASK)
+    words = ["--task_file=lean_robot.py", "--task=a1_lean", "--device=cpu", "--num_envs=2"]
+    words += ["--set=runner.num_steps_per_env=4", "--set=algorithm.symmetry_cfg.use_data_augmentation=false"]
+    results = []
+    for groups in ("[policy,lean]", "[lean]"):
+        actor = f"--set=obs_groups.actor={groups}"
+        assert run_here("train.py", *words, actor, "--max_iterations=1", "--logger=none", root=tmp_path)[0] == 0
+        results.append(run_here("export.py", *words, actor, f"--out={groups}", root=tmp_path))
+    assert results[0][1].endswith("'[policy,lean]' --task_file=lean_robot.py\n")
+    assert_told_in_one_line(results[1], "must be 'policy', then groups of single terms (lean), not lean")
+    simulation = ["sim2sim.py", "[policy,lean]", "--robots=1", "--steps=3"]
+    assert run_here(*simulation, words[0], root=tmp_path)[0] == 0
+    del OBSERVATIONS["lean"]
+    message = "no numpy function for the observation term 'lean'"
+    assert_told_in_one_line(run_here(*simulation, root=tmp_path), message)
 
 
 @pytest.mark.parametrize(
@@ -292,7 +304,7 @@ def test_motors_of_a_user(tmp_path):
         def apply(self, wanted, pos, vel, substep):
             return 0.5 * wanted
 
-    class WeakMotorWithWords(WeakMotor):
+    class DescribedMotor(WeakMotor):
         def describe(self):
             return {"share": 0.5}
 
@@ -300,19 +312,14 @@ def test_motors_of_a_user(tmp_path):
         def build(self, joints):
             return WeakMotor(self, joints)
 
-    class WeakCfgWithWords(MotorCfg):
+    class DescribedCfg(MotorCfg):
         def build(self, joints):
-            return WeakMotorWithWords(self, joints)
+            return DescribedMotor(self, joints)
 
     class OwnMotorsCfg(A1TorqueCfg):
         class motors:
             chain = ["ideal", "weak", "half"]
-
-            class weak(WeakCfg):
-                pass
-
-            class half(WeakCfgWithWords):
-                pass
+            weak, half = WeakCfg, DescribedCfg
 
     cfg = OwnMotorsCfg()
     cfg.env.num_envs = 3

@@ -9,16 +9,16 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.exports import XML, change, changed_xml, export_random
+from support.exports import XML, changed_xml, export_random
 from support.ground import ground_cfg
 from support.scripts import assert_told_in_one_line, run_here
-from support.settings import error_of, flatten
+from support.settings import flatten
 
 from legged_torque.deploy import ground
-from legged_torque.deploy.description import check
 from legged_torque.deploy.policy import Policy, State
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Simulation, quaternion
+from legged_torque.envs import task_registry
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.height_map import HeightMap
@@ -40,7 +40,7 @@ def exported(make_task, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def policy(exported):
-    """The policy; whoever uses it resets it."""
+    """The policy; tests reset it before they use it."""
     return Policy(exported[0])
 
 
@@ -161,7 +161,7 @@ def test_level_map_is_a_plane(policy):
 
 
 def test_slope_is_a_tilted_plane():
-    """A ball that slides and rolls down a slope of triangles feels none of their edges."""
+    """A ball that slides and rolls down a slope of triangles is not disturbed by their edges."""
     scene = "<mujoco><option timestep='0.002'/><worldbody>{}</worldbody></mujoco>"
     ball = '<geom type="sphere" size="0.02" mass="0.3" friction="0.3" solref="-1000 -80"/>'
     body = f'<body pos="-0.3 -0.2 0.2"><freejoint/>{ball}</body>'
@@ -176,6 +176,20 @@ def test_slope_is_a_tilted_plane():
         mujoco.mj_step(models[1], on_plane)
     np.testing.assert_allclose(on_map.qpos[:3], on_plane.qpos[:3], atol=1e-5)
     assert on_plane.qpos[0] > 0.2 and on_plane.ncon == 1
+
+
+def test_scan_in_a_group_of_its_own(make_task, tmp_path, monkeypatch):
+    """The actor may read the scan after its other observations; the export sees what the task sees."""
+    robot, groups = task_registry.get_task_class("a1_position"), ["policy", "scan"]
+    own_terms = robot.observation_terms
+
+    def scan_apart(task):
+        return [dataclasses.replace(t, group="scan") if t.name == "height_scan" else t for t in own_terms(task)]
+
+    monkeypatch.setattr(robot, "observation_terms", scan_apart)
+    export_random(make_task, "a1_position", tmp_path / "out", groups=groups, **ROUGH, **{"env.history_length": 2})
+    policy = Policy(tmp_path / "out")
+    assert policy.scan_points.shape == (187, 2) and policy.description["network"]["num_observations"] == 2 * 45 + 187
 
 
 # --------------------------------------------------------------------------------------------------- episodes
@@ -269,36 +283,6 @@ def test_ground_of_the_mjcf(policy, tmp_path):
 
 
 # --------------------------------------------------------------------------------------------------- mistakes
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "message"),
-    [
-        ("observations.terms.6.scan", None, "the term 'height_scan' must have an entry scan, and no other term"),
-        ("observations.terms.6.name", "command", "the term 'command' occurs more than once"),
-        ("observations.terms.6.scan.points_x", [0.0, 0.1], "the term 'height_scan' must have size 22, not 187"),
-        ("observations.terms.6.scan.limit", 0.0, "observations.terms.6.scan.limit"),
-        ("terrain.difficulty_range", [0.0, 1.5], "terrain.difficulty_range.1"),
-        ("terrain.rows", 3, "'rows' was unexpected"),
-        ("terrain.tile_size", 1.0, "terrain.tile_size: 1.0 is less than the minimum of 6"),
-    ],
-)
-def test_damaged_descriptions(policy, path, value, message):
-    """A description that does not fit is refused in one line that names the entry."""
-    damaged = copy.deepcopy(policy.description)
-    change(path, value)(damaged)
-    assert message in error_of(check, damaged)
-
-
-def test_impossible_ground(policy):
-    """Maps that cannot exist are refused when they are made."""
-    for path, value, message in (
-        ("terrain.terrain_proportions.pits", 0.5, "terrain.terrain_proportions must sum to 1, not 1.5"),
-        ("terrain.terrain_proportions.lava", 0.0, "unknown kind in terrain.terrain_proportions 'lava'"),
-    ):
-        description = copy.deepcopy(policy.description)
-        change(path, value)(description)
-        assert message in error_of(MujocoRobot, XML, description)
 
 
 def test_script(exported, tmp_path):

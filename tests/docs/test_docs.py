@@ -1,4 +1,4 @@
-"""Links between the pages lead somewhere, on the site as in the repository, and the site has every page."""
+"""Links between pages have targets, on the site as in the repository, and the site has every page."""
 
 import re
 from pathlib import Path
@@ -25,7 +25,7 @@ def anchors(page):
 
 
 def broken_links(page):
-    """Links of a page to files or headings that are not there, and of the site's pages to what the site lacks."""
+    """Links of a page to missing files or headings, and of the site's pages to files outside of the site."""
     broken = []
     for link in re.findall(r"\]\(\s*([^)\s]+)\s*\)", without_code(page)):
         if re.match(r"[a-z]+:", link):
@@ -54,6 +54,21 @@ def test_broken_links_are_found(tmp_path):
     assert broken_links(page) == bad
 
 
+def test_files_that_are_named():
+    """Every path in the documents exists, and a name followed by its file in parentheses is in that file."""
+    wrong = []
+    for page in (page for page in PAGES if page.name != "CHANGELOG.md"):
+        text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+        for name, path in re.findall(r"(?:`([\w.]+)`\s+\()?`((?:[\w.]+/)+[\w.]+\.(?:py|xml|yaml|sh))`", text):
+            folders = (ROOT, ROOT / "legged_torque", ROOT / "legged_torque/envs", ROOT / "resources", page.parent)
+            file = next((folder / path for folder in folders if (folder / path).is_file()), None)
+            if Path(path).stem in ("b1", "minidog"):  # made by the reader
+                continue
+            if not file or name.rpartition(".")[2] not in file.read_text("utf-8"):
+                wrong.append(f"{page.name}: {name} {path}")
+    assert not wrong
+
+
 def test_navigation_has_every_page():
     """The site's navigation names each page of docs/ once."""
     settings = yaml.safe_load((ROOT / "mkdocs.yml").read_text("utf-8"))
@@ -65,3 +80,12 @@ def test_navigation_has_every_page():
         return entry.values() if isinstance(entry, dict) else entry
 
     assert sorted(files(settings["nav"])) == sorted(str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md"))
+
+
+def test_sizes():
+    """Documents stay short: lines of the README and the changelog, words in all, and bytes of docs/."""
+    lines = {name: len((ROOT / name).read_text("utf-8").splitlines()) for name in ("README.md", "CHANGELOG.md")}
+    assert lines["README.md"] <= 120 and lines["CHANGELOG.md"] <= 100
+    generated = {DOCS / "reference" / "settings.md", DOCS / "reference" / "scripts.md", *DOCS.rglob("report.md")}
+    assert sum(len(page.read_text("utf-8").split()) for page in {*PAGES} - generated) <= 30_000
+    assert sum(file.stat().st_size for file in DOCS.rglob("*") if file.is_file()) <= 3_000_000

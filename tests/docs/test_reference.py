@@ -1,15 +1,15 @@
-"""The reference pages say what the code says."""
+"""The reference pages agree with the code."""
 
 import re
 import runpy
 from pathlib import Path
 
 import pytest
+from support.runners import build_runner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import to_dict
-from legged_torque.utils.options import Options
 
 REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
 
@@ -30,8 +30,8 @@ def flat(values, path=""):
 
 @pytest.mark.parametrize("page", ["settings", "scripts"])
 def test_pages_are_up_to_date(generator, page, monkeypatch):
-    """To mend it: ``python docs/reference/generate.py``."""
-    monkeypatch.chdir(REFERENCE.parents[1])  # whence examples are written
+    """If it fails: ``python docs/reference/generate.py``."""
+    monkeypatch.chdir(REFERENCE.parents[1])  # for the paths in examples
     written, made = (REFERENCE / f"{page}.md").read_text(), generator[f"{page}_page"]()
     assert written.split() == made.split()  # line breaks of --help depend on the version of Python
 
@@ -47,12 +47,11 @@ def test_every_setting_is_explained():
 
 
 def test_every_logged_number_is_explained(tmp_path, make_task):
-    """What a training writes has a row."""
+    """Every number that a training logs has a row."""
     text = (REFERENCE / "logs.md").read_text()
-    settings = ["runner.num_steps_per_env=4", "evaluation.interval=32", "evaluation.num_samples=8"]
-    _, train_cfg = task_registry.get_cfgs("a1_torque_multihead", Options(device="cpu", set=settings))
-    task = make_task("a1_torque_multihead", 4, **{"env.episode_length_s": 0.1})
-    runner, _ = task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=tmp_path)
+    settings = {"evaluation.interval": 32, "evaluation.num_samples": 8}
+    env = {"env.episode_length_s": 0.1}
+    runner = build_runner(make_task, "a1_torque_multihead", log_root=tmp_path, env=env, **settings)
     runner.claim_log_dir({})
     runner.learn(4)
     (run,) = tmp_path.iterdir()

@@ -1,4 +1,4 @@
-"""Motors, options and contacts of the A1's file; its masses and joints are tested in test_robots.py."""
+"""Joints, options and contacts of the A1's file; its masses and limits are tested in test_robots.py."""
 
 import mujoco
 import numpy as np
@@ -7,7 +7,6 @@ import pytest
 from legged_torque import resource_path
 
 A1_XML = str(resource_path("resources/robots/a1/a1.xml"))
-TORQUE_LIMIT = 33.5
 LEGS = ("FR", "FL", "RR", "RL")
 COLLISION_GEOMS = {"trunk"} | {f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh", "calf", "foot")}
 
@@ -33,18 +32,6 @@ def test_joint_dynamics(model):
         np.testing.assert_allclose(per_dof[6:, 0], value, err_msg=field)
         np.testing.assert_allclose(per_dof[6:, 1:], 0.0, err_msg=field)
     np.testing.assert_allclose(model.jnt_stiffness, 0.0)
-
-
-def test_motors_are_plain_torques(model):
-    """A control is a torque in N m on its own joint, cut at +-33.5."""
-    np.testing.assert_allclose(model.actuator_ctrlrange, [[-TORQUE_LIMIT, TORQUE_LIMIT]] * 12)
-    np.testing.assert_allclose(model.actuator_forcerange, [[-TORQUE_LIMIT, TORQUE_LIMIT]] * 12)
-    assert model.actuator_ctrllimited.all() and model.actuator_forcelimited.all()
-    data = mujoco.MjData(model)
-    data.ctrl[:] = np.linspace(-50, 50, 12)
-    mujoco.mj_forward(model, data)
-    np.testing.assert_allclose(data.qfrc_actuator[6:], np.clip(data.ctrl, -TORQUE_LIMIT, TORQUE_LIMIT))
-    np.testing.assert_allclose(data.qfrc_actuator[:6], 0.0)
 
 
 def test_options(model):
@@ -86,19 +73,3 @@ def test_folded_robot_in_the_floor(model):
     pairs = data.contact.geom[: data.ncon]
     assert (pairs == floor).any(axis=1).all()
     assert set(pairs[pairs != floor]) == set(named_geoms(model).values())
-
-
-def test_visual_geoms_can_be_dropped(model):
-    """Without its visual geoms the robot is the same machine: same masses, inertias and collision geoms."""
-    spec = mujoco.MjSpec.from_file(A1_XML)
-    spec.compiler.discardvisual = True
-    bare = spec.compile()
-    assert bare.ngeom == len(COLLISION_GEOMS) + 1 and bare.nmesh == 0
-    assert set(named_geoms(bare)) == COLLISION_GEOMS
-    for field in ("body_mass", "body_ipos", "body_inertia", "body_iquat", "body_pos", "dof_armature", "key_qpos"):
-        np.testing.assert_array_equal(getattr(bare, field), getattr(model, field), err_msg=field)
-
-
-def test_cameras(model):
-    """The cameras that recordings ask for exist."""
-    assert {model.camera(i).name for i in range(model.ncam)} == {"track", "side"}

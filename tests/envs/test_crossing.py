@@ -1,4 +1,4 @@
-"""Crossing tiles of rough ground: where robots start, when a tile is crossed, and what is counted."""
+"""Crossing tiles of rough ground: places of starts, crossings and their counts."""
 
 import math
 
@@ -33,7 +33,7 @@ def tile_of(task, world):
     return trenches[tuple(heights)]
 
 
-def test_who_crosses():
+def test_crossings():
     """Robots carried at known speeds cross if they get 4 m away in time; nothing counts after a fall or a crossing."""
     grounds = Grounds.of(["gaps", "flat"], [0.8, 0.2], FAST)
     task = make_crossing(grounds, 4)
@@ -41,7 +41,7 @@ def test_who_crosses():
     speeds = torch.tensor([0.0, 0.95, 1.05, 2.0] * 4)  # [m/s]: 4 m in 4 s need 1 m/s
     falls_at = torch.full((16,), 1000)
     falls_at[[5, 7]], falls_at[11], falls_at[14] = 60, 150, 250  # 11: after it has crossed; 14: after its trial
-    told, headings, state = [], [], {}
+    commanded, headings, state = [], [], {}
 
     def carry(obs):
         """Put robots where they are to be, 1 m high or, to let them fall, into the ground."""
@@ -52,7 +52,7 @@ def test_who_crosses():
             headings.append(2.0 * torch.atan2(z, w))
             state.update(qpos=task.sim.qpos.clone(), step=0)
         state["step"] += 1
-        told.append(task.commands.clone())
+        commanded.append(task.commands.clone())
         qpos, along = state["qpos"].clone(), speeds * state["step"] * task.dt
         qpos[:, 0] += along * headings[0].cos()
         qpos[:, 1] += along * headings[0].sin()
@@ -63,9 +63,9 @@ def test_who_crosses():
     results = {(result.kind, result.level): result for result in cross(task, carry, grounds)}
     assert state["step"] == 200  # of 0.02 s
     quarters = (headings[0] / (0.5 * math.pi)).round()
-    torch.testing.assert_close(headings[0], quarters * 0.5 * math.pi, atol=0.06, rtol=0.0)  # rolled and pitched, too
+    torch.testing.assert_close(headings[0], quarters * 0.5 * math.pi, atol=0.06, rtol=0.0)  # also rolled and pitched
     assert sorted((quarters % 4).tolist()) == [0.0] * 4 + [1.0] * 4 + [2.0] * 4 + [3.0] * 4
-    for commands in told:
+    for commands in commanded:
         whole = commands[falls_at == 1000]  # in new episodes headings are others
         torch.testing.assert_close(whole, torch.tensor(FAST).expand(12, 3), atol=0.02, rtol=0.0)
     fallen = {5, 7}
@@ -82,7 +82,7 @@ def test_who_crosses():
     assert list(results) == [("gaps", 0.2), ("gaps", 0.8), ("flat", 0.2), ("flat", 0.8)]
 
 
-def test_who_stands_does_not_cross():
+def test_standing_robots_do_not_cross():
     """Robots that hold their nominal pose neither cross nor fall, even on the steepest stairs."""
     grounds = Grounds.of(["stairs_up"], [1.0], FAST)
     task = make_crossing(grounds, 4)
@@ -95,11 +95,11 @@ def test_headings_are_kept():
     """Robots that have turned are commanded to turn back by half the angle per second, at most 1 rad/s."""
     grounds = Grounds.of(["flat"], [0.0], FAST)
     task = make_crossing(grounds, 4)
-    turned, told = torch.tensor([0.0, 0.3, -0.8, 2.5]), []
+    turned, commanded = torch.tensor([0.0, 0.3, -0.8, 2.5]), []
 
     def turn(obs):
         """Turn robots in the air, as soon as they have begun: headings are 0, 90, 180 and 270 degrees."""
-        told.append(task.commands.clone())
+        commanded.append(task.commands.clone())
         qpos = task.sim.qpos.clone()
         angle = torch.arange(4) * math.pi / 2 + turned
         qpos[:, 2], qpos[:, 3], qpos[:, 4:6], qpos[:, 6] = 2.0, (angle / 2).cos(), 0.0, (angle / 2).sin()
@@ -107,9 +107,9 @@ def test_headings_are_kept():
         return torch.zeros(4, 12)
 
     cross(task, turn, grounds)
-    torch.testing.assert_close(told[0], torch.tensor(FAST).expand(4, 3), atol=0.01, rtol=0.0)
-    torch.testing.assert_close(told[5][:, 2], torch.tensor([0.0, -0.15, 0.4, -1.0]), atol=0.01, rtol=0.0)
-    assert (told[5][:, :2] == torch.tensor(FAST[:2])).all()
+    torch.testing.assert_close(commanded[0], torch.tensor(FAST).expand(4, 3), atol=0.01, rtol=0.0)
+    torch.testing.assert_close(commanded[5][:, 2], torch.tensor([0.0, -0.15, 0.4, -1.0]), atol=0.01, rtol=0.0)
+    assert (commanded[5][:, :2] == torch.tensor(FAST[:2])).all()
 
 
 def test_a_trial_by_default():
@@ -125,8 +125,8 @@ def test_difficulties_of_rows():
     """They take the place of a range; another number of them than of rows is refused."""
     layout = Layout.of(ground_cfg(difficulties=[0.7, 0.1, 1.0]).terrain)
     assert [layout.difficulty(row) for row in range(3)] == [0.7, 0.1, 1.0]
-    told = "terrain.difficulties must be empty or one number for each row, not 2: terrain.num_rows is 3"
-    assert error_of(Layout.of, ground_cfg(difficulties=[0.7, 0.1]).terrain) == told
+    message = "terrain.difficulties must be empty or one number for each row, not 2: terrain.num_rows is 3"
+    assert error_of(Layout.of, ground_cfg(difficulties=[0.7, 0.1]).terrain) == message
 
 
 def test_random_tiles_differ():

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from support.rewards import TABLE_III
 
 MILLION = 1_000_000
 
@@ -29,15 +28,6 @@ def test_reward_curricula(make_task, name, term, start, end, t_start, t_end):
         task.total_steps.fill_(int(millions * MILLION))
         assert task.reward_weights()[index].item() == pytest.approx(0.02 * expected, rel=1e-6), millions
         assert task.curriculum_values()[f"weight_{term}"].item() == pytest.approx(expected, rel=1e-6), millions
-
-
-def test_other_weights_stay(make_task):
-    """No other weight depends on the number of steps."""
-    task = make_task("a1_torque_curriculum", 1)
-    task.total_steps.fill_(50 * MILLION)
-    weights = dict(zip(task.reward_names, task.reward_weights().tolist(), strict=True))
-    expected = TABLE_III | {"tracking_lin_vel": 2.0, "tracking_ang_vel": 1.0, "nominal_position": 1.0}
-    assert weights == pytest.approx({term: 0.02 * weight for term, weight in expected.items()}, rel=1e-6)
 
 
 def test_curricula_count_the_steps_of_all_worlds(make_task):

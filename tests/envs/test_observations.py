@@ -1,4 +1,4 @@
-"""What the policy and the critic of each task see."""
+"""Observations of policy and critic."""
 
 import math
 
@@ -68,7 +68,7 @@ def test_observation_scales(make_task):
 
 
 def test_observations_are_clipped_and_copied(make_task):
-    """Observations stay within +-100, and what a step returns is not changed by the next one."""
+    """Observations stay within +-100, and the next step does not change those that were returned."""
     task = make_task("a1_torque", 1, **IN_THE_AIR)
     task.dof_vel.copy_(torch.tensor([[5000.0, -5000.0] * 6]))
     task.compute_observations()
@@ -82,7 +82,7 @@ def test_observations_are_clipped_and_copied(make_task):
 
 
 def test_observations_follow_the_step(make_task):
-    """What a step returns describes the state after it, the action that was given and the commands in force."""
+    """A step returns the state after it, its action and the commands in force."""
     task = make_task("a1_torque", 3, **IN_THE_AIR)
     action = torch.randn(3, 12)
     policy = task.step(action)[0]["policy"]

@@ -1,4 +1,4 @@
-"""Random parameters, pushes and sensor errors: each acts as in MuJoCo, and draws follow their definition."""
+"""Random parameters, pushes and sensor errors: they act as in MuJoCo, and draws follow their definition."""
 
 import copy
 import math
@@ -7,42 +7,18 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.settings import error_of, get_cfgs
 
-from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.paper.randomization_picture import initial_state
 from legged_torque.sim.randomization import Randomization, RandomParameter
-from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
 
-RANGES = {
-    "trunk_mass": ("body_mass", (-1.0, 1.0)),
-    "trunk_com": ("body_ipos", (-0.003, 0.003)),
-    "foot_radius": ("geom_size", (0.019, 0.021)),
-    "foot_pos": ("geom_pos", (-0.0025, 0.0025)),
-    "dof_damping": ("dof_damping", (0.0, 0.2)),
-    "dof_armature": ("dof_armature", (0.008, 0.02)),
-    "dof_stiffness": ("jnt_stiffness", (0.0, 0.2)),
-    "dof_frictionloss": ("dof_frictionloss", (0.0, 0.4)),
-    "ground_friction": ("geom_friction", (0.8, 1.2)),
-    "contact_stiffness": ("geom_solref", (900.0, 1100.0)),
-    "contact_damping": ("geom_solref", (72.0, 88.0)),
-    "gravity": ("gravity", (9.51, 10.11)),
-}
-"""Field and range of the published set ``default``, for each parameter of robot and ground."""
-CONTROL = ("motor_strength", "stiffness", "damping", "joint_offset", "action_scale")
 WIDE = {
     "domain_rand.trunk_mass": {"add": [-1.0, 1.0], "scale": [0.75, 1.25]},
     "domain_rand.action_scale": {"add": [-0.03, 0.03]},
     "domain_rand.stiffness": {"add": [-3.0, 3.0], "scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]},
 }
-FIELDS = sorted({field for field, _ in RANGES.values()} | {"body_inertia"})
+FIELDS = ("body_inertia", "body_ipos", "body_mass", "dof_armature", "dof_damping", "dof_frictionloss", "geom_friction")
+FIELDS += ("geom_pos", "geom_size", "geom_solref", "gravity", "jnt_stiffness")
 ON = {"domain_rand.randomize_parameters": True}
-
-
-def only(*names):
-    """Settings that randomize these parameters and no others."""
-    return ON | {"domain_rand.keep_fixed": [name for name in (*RANGES, *CONTROL) if name not in names]}
 
 
 def edited_model(sim, world):
@@ -84,12 +60,10 @@ def move_about(task):
     sim.ctrl.copy_(8.0 * torch.randn_like(sim.ctrl))
 
 
-@pytest.mark.parametrize("name", [*RANGES, "all of them"])
-def test_worlds_move_as_their_models(make_task, name):
+def test_worlds_move_as_their_models(make_task):
     """A world with drawn parameters moves as MuJoCo's model with these numbers, and otherwise than without them."""
     ground = {"ground_friction": {"set": [0.3, 2.0]}, "contact_damping": {"set": [30.0, 130.0]}}
-    wide = WIDE | {f"domain_rand.{key}": value for key, value in ground.items()}
-    settings = ON | wide if name == "all of them" else only(name)
+    settings = ON | WIDE | {f"domain_rand.{key}": value for key, value in ground.items()}
     task = make_task("a1_torque", 12, **settings, **{"sim.solver_iterations": 50, "sim.ls_iterations": 50})
     move_about(task)
     before = task.sim.qvel.clone()
@@ -105,7 +79,7 @@ def test_worlds_move_as_their_models(make_task, name):
             getattr(plain, field)[:] = getattr(data[world], field)
         mujoco.mj_step(task.sim.mj_model, plain)
         mujoco.mj_step(edited_model(task.sim, world), data[world])
-        np.testing.assert_allclose(task.sim.qvel[world], data[world].qvel, atol=0.02 if "friction" in name else 3e-3)
+        np.testing.assert_allclose(task.sim.qvel[world], data[world].qvel, atol=3e-3)
         moved += np.abs(plain.qvel - data[world].qvel).max() > 1e-4
     assert moved >= 5 and not torch.equal(task.sim.qvel, before)
 
@@ -116,55 +90,43 @@ def test_derived_constants(make_task):
     check_constants(task.sim)
     before = {name: task.sim.field(name).clone() for name in (*FIELDS, "body_invweight0", "dof_invweight0")}
     mask = torch.tensor([True, False, True, False, False, False])
-    task.events.happen(mask)
+    task.events.apply(mask)
     for name, old in before.items():
         new = task.sim.field(name)
         assert torch.equal(new[~mask], old[~mask]), name
         assert not torch.equal(new[mask], old[mask]), name
 
 
-def test_picture_of_places(make_task):
-    """Where robots start on rough ground is drawn from the middles of their tiles."""
-    small = {"terrain.num_rows": 2, "terrain.max_init_terrain_level": 1, "terrain.border_size": 1.0}
-    task = make_task("a1_rough_position", 40, **small)
-    panel = next(panel for panel in initial_state(task) if panel.title == "init place [m]")
-    assert panel.values.shape == (40,) and 0.5 < np.abs(panel.values).max() <= 1.0 + 1e-5
-
-
 def test_distributions(make_task):
-    """Draws are uniform in their ranges (Kolmogorov-Smirnov), and no two parameters or worlds go together."""
+    """Draws are uniform in their ranges (Kolmogorov-Smirnov), and no two parameters are correlated."""
     task = make_task("a1_position", 1500, **ON, **{"domain_rand.action_scale": {"add": [-0.03, 0.03]}})
     sim, model = task.sim, task.sim.mj_model
     feet = [model.geom(name).id for name in task.foot_names]
-    samples = {
-        "trunk_mass": sim.field("body_mass")[:, 1] - model.body_mass[1],
-        "trunk_com": sim.field("body_ipos")[:, 1, 0] - model.body_ipos[1, 0],
-        "foot_radius": sim.field("geom_size")[:, feet[0], 0],
-        "foot_pos": sim.field("geom_pos")[:, feet] - torch.tensor(model.geom_pos[feet]),
-        "dof_damping": sim.field("dof_damping")[:, 6:],
-        "dof_armature": sim.field("dof_armature")[:, 6:],
-        "dof_stiffness": sim.field("jnt_stiffness")[:, 1:],
-        "dof_frictionloss": sim.field("dof_frictionloss")[:, 6:],
-        "ground_friction": sim.field("geom_friction")[:, 0, 0],
-        "contact_stiffness": -sim.field("geom_solref")[:, 0, 0],
-        "contact_damping": -sim.field("geom_solref")[:, 0, 1],
-        "gravity": -sim.field("gravity")[:, 2],
-    }
-    ranges = {name: RANGES[name][1] for name in samples}
-    samples["joint_offset"], ranges["joint_offset"] = task.joint_offset, (-0.01, 0.01)
-    samples["action_scale"], ranges["action_scale"] = task.action_scale - 0.25, (-0.03, 0.03)
-    for name, values in samples.items():
-        assert uniformity(values, *ranges[name]) < 1.0, name
-    torch.testing.assert_close(samples["contact_damping"], 72.0 + (samples["contact_stiffness"] - 900.0) * 0.08)
-    del samples["contact_damping"]  # which goes with the stiffness
-    table = torch.cat([values.double().flatten(1) if values.dim() > 1 else values.double().unsqueeze(1)
-                       for values in samples.values()], dim=1)  # fmt: skip
-    for correlations in (torch.corrcoef(table.T), torch.corrcoef(((table - table.mean(0)) / table.std(0))[:100])):
-        away = correlations - torch.diag(torch.diag(correlations))
-        assert away.abs().max() < (0.15 if len(away) == table.shape[1] else 0.65)
+    stiffness, damping = -sim.field("geom_solref")[:, 0, :2].T
+    samples = [  # of the published set "default"
+        (sim.field("body_mass")[:, 1] - model.body_mass[1], -1.0, 1.0),
+        (sim.field("body_ipos")[:, 1, 0] - model.body_ipos[1, 0], -0.003, 0.003),
+        (sim.field("geom_size")[:, feet[0], 0], 0.019, 0.021),
+        (sim.field("geom_pos")[:, feet] - torch.tensor(model.geom_pos[feet]), -0.0025, 0.0025),
+        (sim.field("dof_damping")[:, 6:], 0.0, 0.2),
+        (sim.field("dof_armature")[:, 6:], 0.008, 0.02),
+        (sim.field("jnt_stiffness")[:, 1:], 0.0, 0.2),
+        (sim.field("dof_frictionloss")[:, 6:], 0.0, 0.4),
+        (sim.field("geom_friction")[:, 0, 0], 0.8, 1.2),
+        (stiffness, 900.0, 1100.0),
+        (-sim.field("gravity")[:, 2], 9.51, 10.11),
+        (task.joint_offset, -0.01, 0.01),
+        (task.action_scale - 0.25, -0.03, 0.03),
+    ]
+    for number, (values, low, high) in enumerate(samples):
+        assert uniformity(values, low, high) < 1.0, number
+    torch.testing.assert_close(damping, 72.0 + (stiffness - 900.0) * 0.08)  # it goes with the stiffness
+    table = torch.cat([values.double().reshape(len(values), -1) for values, _, _ in samples], dim=1)
+    correlations = torch.corrcoef(table.T)
+    assert (correlations - torch.eye(len(correlations))).abs().max() < 0.15
 
 
-def test_what_goes_together(make_task):
+def test_numbers_that_are_drawn_together(make_task):
     """Inertia changes with the mass, all kinds of friction with the first, torque scale with the action scale.
 
     The radius is the same for all feet, and the trunk's centre of mass moves alike on all axes. Without their factors
@@ -187,19 +149,15 @@ def test_what_goes_together(make_task):
 
 
 def test_kept_values(make_task):
-    """In a share of the draws the joints keep their own values, all at once; all else is drawn always."""
+    """In a share of the draws the joints keep their own values, all at once; the rest is always drawn."""
     task = make_task("a1_torque", 1000, **ON, **{"domain_rand.keep_probability": 0.3})
     fields = ("dof_armature", "dof_damping", "dof_frictionloss", "jnt_stiffness")
-    kept = torch.stack(
-        [
-            (task.sim.field(name) == torch.tensor(getattr(task.sim.mj_model, name), dtype=torch.float32)).all(dim=1)
-            for name in fields
-        ]
-    )
+    own = {name: torch.tensor(getattr(task.sim.mj_model, name), dtype=torch.float32) for name in fields}
+    kept = torch.stack([(task.sim.field(name) == own[name]).all(dim=1) for name in fields])
     assert 0.25 < kept[0].float().mean() < 0.35
     assert (kept == kept[0]).all()
-    own = task.sim.mj_model.body_mass[1]
-    assert ((task.sim.field("body_mass")[:, 1] - own).abs() > 1e-5).float().mean() > 0.99
+    mass = task.sim.mj_model.body_mass[1]
+    assert ((task.sim.field("body_mass")[:, 1] - mass).abs() > 1e-5).float().mean() > 0.99
     assert (task.motor_strength != 1.0).float().mean() > 0.99
 
 
@@ -226,14 +184,6 @@ def test_critic_knows_what_was_drawn(make_task):
     values = dict(zip(sizes, seen, strict=True))
     assert values["dof_damping"].tolist() == [-1.0] * 12 and values["joint_offset"].tolist() == [0.0] * 12
     torch.testing.assert_close(values["gravity"], torch.tensor([0.0]), atol=1e-5, rtol=0)
-
-
-def test_one_seed_one_draw(make_task):
-    """The same seed draws the same parameters, another one others."""
-    draws = []
-    for seed in (5, 5, 6):
-        draws.append(make_task("a1_torque", 4, seed, **ON).sim.field("geom_friction").clone())
-    assert torch.equal(draws[0], draws[1]) and not torch.equal(draws[0], draws[2])
 
 
 def test_drawn_now_and_then(make_task):
@@ -307,49 +257,8 @@ def test_initial_velocities(make_task):
     assert uniformity(task.sim.qvel[:, :3], -0.5, 0.5) < 1.0 and uniformity(task.base_ang_vel, -0.4, 0.4) < 1.0
 
 
-class ThighMassRobot(LeggedRobot):
-    """A variant that draws one number more, or one per thigh."""
-
-    shared = True
-
-    def random_parameters(self):
-        """The masses of the thighs as well."""
-        thighs = [body for body in range(2, 14) if "thigh" in self.sim.mj_model.body(body).name]
-        more = RandomParameter("thigh_mass", "body_mass", thighs, {"scale": [0.5, 0.9]}, shared=self.shared)
-        return [*super().random_parameters(), more]
-
-
-def test_a_variant_draws_more():
-    """What a task adds is drawn, acts, is seen by the critic and mirrored, unless its mirror image is not known."""
-    cfg = get_cfgs("--set=env.num_envs=20", "--set=domain_rand.randomize_parameters=true")[0]
-    task = ThighMassRobot(cfg)
-    thighs = task.sim.field("body_mass")[:, [3, 6, 9, 12]]
-    ratio = thighs / torch.tensor(task.sim.mj_model.body_mass[[3, 6, 9, 12]], dtype=torch.float32)
-    assert (ratio == ratio[:, :1]).all() and ratio.min() > 0.5 and ratio.max() < 0.9 and ratio.std() > 0.05
-    check_constants(task.sim)
-    scaled = (ratio[:, 0] - 0.7) / 0.2
-    torch.testing.assert_close(task.get_observations()["critic"][:, -1], scaled, atol=1e-4, rtol=0)
-    assert task.mirror("critic", task.get_observations()["critic"]).shape == (20, 171)
-    ThighMassRobot.shared = False
-    assert "'thigh_mass'" in error_of(lambda: ThighMassRobot(cfg).mirror)
-
-
-@pytest.mark.parametrize("task", ["a1_position", "a1_torque_multihead"])
-def test_everything_at_once(make_task, task):
-    """With all random events on, a task runs, and worlds that fall are drawn anew."""
-    cfg = get_cfgs("--perturbation=doubled", task=task)[0]
-    settings = {f"domain_rand.{key}": value for key, value in to_dict(cfg.domain_rand).items()}
-    settings["domain_rand.resampling_probability"] = 0.05
-    world = make_task(task, 16, **settings, **{"noise.add_noise": True})
-    masses = world.sim.field("body_mass").clone()
-    for _ in range(60):
-        obs, rewards, _, _ = world.step(torch.randn(16, world.num_actions))
-        assert torch.isfinite(obs["policy"]).all() and torch.isfinite(rewards).all()
-    assert not torch.equal(world.sim.field("body_mass"), masses)
-
-
-def test_what_the_kernel_cannot_write_is_refused():
-    """Numbers of another type are refused at once, and worlds that share numbers when they are to be drawn."""
+def test_tensors_that_the_kernel_cannot_write():
+    """Numbers of another type are refused at once, a tensor without a row per world when it is drawn."""
     with pytest.raises(UserError, match="'wide' must be float32"):
         Randomization([RandomParameter("wide", torch.zeros(3, 2, dtype=torch.float64), [0], {})], {}.get, 3, "cpu")
     shared = Randomization([RandomParameter("shared", torch.ones(1, 2), [0], {})], {}.get, 3, "cpu")

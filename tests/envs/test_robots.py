@@ -70,7 +70,7 @@ def feet_of(robot):
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_figures(name):
-    """Mass matrix and feet at random poses are those of the published figures; limits and total mass as well."""
+    """Mass matrix and feet at random poses are those of the published figures; so are limits and total mass."""
     model = mujoco.MjModel.from_xml_path(str(file_of(name)))
     robot, random = PUBLISHED[name], np.random.default_rng(0)
     other, feet = published(robot), feet_of(robot)
@@ -163,7 +163,7 @@ def test_mirrored_worlds(tasks, name):
 
 
 def test_rewards_of_two_feet(tasks):
-    """Swings of up to 0.4 s beside a foot on the ground, held joints away from the nominal pose, and being alive."""
+    """Swings of up to 0.4 s with the other foot on the ground, deviations of some joints, and being alive."""
     task = tasks("g1")
     task.commands[:] = torch.tensor([0.3, 0.0, 0.0])
     task.commands[3] = 0.0

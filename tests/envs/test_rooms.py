@@ -1,4 +1,4 @@
-"""Other robots, terms, parameters and grounds: refusals by name, and new ones that need no change of tasks."""
+"""Robots, terms, parameters and grounds of a user: refusals by name, and a ground that needs no change of tasks."""
 
 import pytest
 import torch
@@ -35,8 +35,8 @@ def test_gains_by_joint():
 def test_order_of_the_pose():
     """A pose's order is that of all vectors of joints; one that the file's limbs cannot be put in is refused."""
     assert nominal_pose({"a": 1.0, "b": 2.0}, ["a", "b"]) == [1.0, 2.0]
-    told = error_of(nominal_pose, {"b": 2.0, "a": 1.0}, ["a", "b"])
-    assert "cannot be put in the order of init_state.default_joint_angles" in told and told.endswith(": a, b")
+    message = error_of(nominal_pose, {"b": 2.0, "a": 1.0}, ["a", "b"])
+    assert "cannot be put in the order of init_state.default_joint_angles" in message and message.endswith(": a, b")
 
 
 def test_robot_without_mirrored_legs(make_task):
@@ -60,7 +60,7 @@ def test_robot_without_mirrored_legs(make_task):
     ],
 )
 def test_observation_terms_that_do_not_fit(term, message):
-    """A name twice, or another number of scales or mirrored values, would shift what the networks see."""
+    """A name twice and another number of scales or mirrored values are refused."""
     name, size, *rest = term
 
     class Robot(LeggedRobot):
@@ -80,10 +80,11 @@ def test_observation_terms_that_do_not_fit(term, message):
             "'mass' is the model's 'body_mass'",
         ),
         (lambda task: RandomParameter("gain", task.p_gains, [0, 1], {}, mirror=SCALAR), "'gain' must have 2 numbers"),
+        (lambda task: RandomParameter("thigh_mass", "body_mass", [3, 6], {"scale": [0.5, 0.9]}), "'thigh_mass'"),
     ],
 )
 def test_parameters_that_do_not_fit(make, message):
-    """One that changes the model unseen, or whose mirror image has another size, is refused by name."""
+    """One that changes the model unseen, or whose mirror image is unknown or has another size, is refused by name."""
 
     class Robot(LeggedRobot):
         def random_parameters(self):
@@ -91,14 +92,14 @@ def test_parameters_that_do_not_fit(make, message):
 
     cfg = A1Cfg()
     cfg.env.num_envs, cfg.domain_rand.randomize_parameters = 2, True
-    assert message in error_of(Robot, cfg)
+    assert message in error_of(lambda: Robot(cfg).mirror)
 
 
 # ------------------------------------------------------------------------------------------------ ground
 
 
 class Raised(Plane):
-    """Ground that is 0.1 m higher than where the physics has it, which only the task is told."""
+    """Ground that is 0.1 m higher for the task than in the physics."""
 
     def height_above(self, points):
         """Return the height above it."""
@@ -117,14 +118,6 @@ def test_a_ground_comes_without_touching_tasks(make_task, monkeypatch):
     torch.testing.assert_close(task._reward_base_height(), (task.base_pos[:, 2] - 0.403).square())
     torch.testing.assert_close(task.get_observations()["critic"][:, 48], task.base_pos[:, 2] - 0.1)
     assert (task.base_pos[:, 1] == 1.0).all()
-
-
-def test_plane():
-    """Level ground at height 0."""
-    points = torch.randn(5, 3)
-    plane = Plane()
-    assert torch.equal(plane.height_above(points), points[:, 2]) and (plane.height(points) == 0.0).all()
-    assert torch.equal(plane.normal(points), torch.tensor([[0.0, 0.0, 1.0]]).expand(5, 3))
 
 
 @pytest.mark.parametrize(

@@ -43,20 +43,8 @@ def test_headings(make_task):
     torch.testing.assert_close(task.obs_buf["policy"][:, place], 0.25 * torch.tensor(expected), atol=2e-6, rtol=0)
 
 
-def test_tilted_headings(make_task):
-    """A trunk that pitches and rolls has the heading of its turn about the vertical."""
-    task = make_task("a1_rough_position", 1, **SMALL)
-    turn, pitch = (math.cos(0.4), math.sin(0.4)), (math.cos(0.3), math.sin(0.3))  # halves of 0.8 and 0.6 rad
-    quat = [turn[0] * pitch[0], -turn[1] * pitch[1], turn[0] * pitch[1], turn[1] * pitch[0]]  # yaw, then pitch
-    qpos = task.sim.qpos.clone()
-    qpos[:, 3:7] = torch.tensor(quat)
-    task.command_generator.headings.fill_(1.0)
-    task.set_state(qpos, torch.zeros_like(task.sim.qvel))
-    assert task.commands[0, 2].item() == pytest.approx(0.5 * (1.0 - 0.8), abs=1e-6)
-
-
 def test_a_held_command_has_no_heading(make_task):
-    """What a user holds is commanded as it is, and headings are followed again afterwards."""
+    """A command that a user holds is given as it is, and headings are followed again afterwards."""
     task = make_task("a1_rough_position", 3, **SMALL)
     task.command_generator.hold((0.5, -0.2, 0.3))
     task.command_generator.resample(torch.ones(3, dtype=torch.bool))
@@ -70,16 +58,12 @@ def test_a_held_command_has_no_heading(make_task):
 
 
 def test_headings_are_drawn(make_task):
-    """Headings are uniform, and a plane's commands have none."""
+    """Headings are uniform."""
     task = make_task("a1_rough_position", 2000, **SMALL)
     headings = task.command_generator.headings
     assert headings.abs().max() <= math.pi
     assert headings.mean().abs() < 4 * math.pi / math.sqrt(3 * 2000)
     assert headings.std().item() == pytest.approx(math.pi / math.sqrt(3), rel=0.05)
-    plane = make_task("a1_position", 100)
-    before = plane.commands[:, 2].clone()
-    plane.step(torch.zeros(100, 12))
-    assert (plane.commands[:, 2] == before).float().mean() > 0.9  # but for those drawn anew
 
 
 def test_places_of_starts(make_task):

@@ -1,18 +1,16 @@
-"""Mirror images: those of observations and actions against those of the physics, and what learning makes of them."""
+"""Mirror images of observations and actions, and learning from them; test_robots.py compares with the physics."""
 
 import math
 
 import pytest
 import torch
+from support.runners import build_runner
 from support.settings import get_cfgs
 from support.symmetry import mirror_joints, mirror_policy
 from tensordict import TensorDict
 from torch import nn
 
-from legged_torque import RESOURCES_DIR
-from legged_torque.envs import task_registry
 from legged_torque.envs.base.symmetry import with_mirror_images
-from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import counterparts
 
@@ -24,18 +22,8 @@ DRAWN = 117
 """Numbers of a world that may be drawn at random."""
 
 
-def mirror_qpos(qpos):
-    """The plane y = 0 reflects positions in y and turns rotations about x and z around."""
-    return torch.cat([qpos[:, :7] * torch.tensor([1.0, -1, 1, 1, -1, 1, -1]), mirror_joints(qpos[:, 7:])], dim=1)
-
-
-def mirror_qvel(qvel):
-    """Velocities are reflected as positions are; angular velocities about x and z change their sign."""
-    return torch.cat([qvel[:, :6] * torch.tensor([1.0, -1, 1, -1, 1, -1]), mirror_joints(qvel[:, 6:])], dim=1)
-
-
 def mirror_critic(obs):
-    """The policy's, then linear velocity, height, contacts of the feet, and what is drawn at random."""
+    """The policy's observations, then linear velocity, height, contacts of the feet, and random parameters."""
     policy, more, drawn = obs.split([obs.shape[1] - 8 - DRAWN, 8, DRAWN], dim=1)
     more = (more * torch.tensor([1.0, -1, 1, 1, 1, 1, 1, 1]))[:, [0, 1, 2, 3, 5, 4, 7, 6]]
     return torch.cat([mirror_policy(policy), more, mirror_drawn(drawn)], dim=1)
@@ -59,53 +47,12 @@ def mirror_drawn(drawn):
 BY_HAND = {"policy": mirror_policy, "critic": mirror_critic, "actions": mirror_joints}
 
 
-@pytest.fixture(scope="module")
-def make_symmetric(make_task, tmp_path_factory):
-    """Factory of tasks whose trunk, unlike the real one, has its mass in the middle, and that change nothing at random.
-
-    Of its worlds, the second half is the mirror image of the first one, in states of all kinds.
-    """
-    file = tmp_path_factory.mktemp("symmetric") / "a1.xml"
-    text = (RESOURCES_DIR / "robots/a1/a1.xml").read_text()
-    for old, new in (
-        ('pos="0 0.0041 -0.0005"', 'pos="0.003 0 -0.0005"'),
-        ("-3.66e-05 -6.11e-05 -2.75e-05", "0 6e-4 0"),
-    ):
-        assert old in text
-        text = text.replace(old, new)
-    file.write_text(text)
-    overrides = {
-        "asset.file": str(file),
-        "commands.resampling_probability": 0.0,
-        "asset.terminate_after_contacts_on": [],
-        "rewards.only_positive_rewards": False,
-    }
-
-    def make(name, num=32):
-        task = make_task(name, 2 * num, **overrides)
-        generator = torch.Generator().manual_seed(2)
-        sim = task.sim
-        qpos, qvel = sim.qpos[:num].clone(), torch.randn(num, 18, generator=generator)
-        qpos[:, 2] = torch.linspace(0.1, 0.4, num)
-        qpos[:, 3:7], qpos[:, 7:] = torch.tensor([1.0, 0.0, 0.0, 0.0]), task.default_dof_pos  # not what was drawn
-        qpos[:, 3:7] += 0.2 * torch.randn(num, 4, generator=generator)
-        qpos[:, 3:7] /= qpos[:, 3:7].norm(dim=1, keepdim=True)
-        qpos[:, 7:] += 0.3 * torch.randn(num, 12, generator=generator)
-        sim.qpos.copy_(torch.cat([qpos, mirror_qpos(qpos)]))
-        sim.qvel.copy_(torch.cat([qvel, mirror_qvel(qvel)]))
-        command = torch.randn(num, 3, generator=generator)
-        task.commands.copy_(torch.cat([command, command * torch.tensor([1.0, -1.0, -1.0])]))
-        return task
-
-    return make
-
-
 # --------------------------------------------------------------------------------------------------- mirror images
 
 
 @pytest.mark.parametrize("name", TASKS)
 def test_mirrored_twice(make_task, name):
-    """Mirroring is what it is by hand, is no identity, and undoes itself."""
+    """Mirroring is as by hand, no identity, and its own inverse."""
     task = make_task(name, 2)
     sizes = {key: value.shape[1] for key, value in task.get_observations().items()} | {"actions": task.num_actions}
     assert set(sizes) == set(GROUPS)
@@ -116,41 +63,8 @@ def test_mirrored_twice(make_task, name):
         assert not torch.equal(image, values) and torch.equal(task.mirror(group, image), values)
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_mirror_agrees_with_physics(make_symmetric, name):
-    """The mirror image of a world, given mirrored actions, is seen as the mirror image of what is seen of the world."""
-    task = make_symmetric(name)
-    num = task.num_envs // 2
-    generator = torch.Generator().manual_seed(3)
-    touching = 0
-    for _ in range(3):
-        actions = torch.randn(num, task.num_actions, generator=generator)
-        obs, rewards, dones, _ = task.step(torch.cat([actions, task.mirror("actions", actions)]))
-        assert not dones.any()
-        for group in ("policy", "critic"):
-            seen, image = obs[group][:num], obs[group][num:]
-            torch.testing.assert_close(image, task.mirror(group, seen), rtol=0, atol=5e-4)
-            assert ((image - seen).abs().max(dim=1).values > 0.1).all()
-        torch.testing.assert_close(mirror_qpos(task.sim.qpos[:num]), task.sim.qpos[num:], rtol=0, atol=1e-4)
-        torch.testing.assert_close(rewards[num:], rewards[:num], rtol=0, atol=1e-3)
-        assert rewards.abs().mean() > 0.01
-        touching += int(task.feet_contact.sum())
-    assert touching > num
-
-
-@pytest.mark.parametrize("name", TASKS)
-def test_torques_of_mirrored_actions(make_symmetric, name):
-    """Actions of every kind become mirrored torques in the mirrored world."""
-    task = make_symmetric(name)
-    num = task.num_envs // 2
-    actions = torch.randn(num, task.num_actions)
-    torques = task._compute_torques(torch.cat([actions, task.mirror("actions", actions)]))
-    torch.testing.assert_close(torques[num:], mirror_joints(torques[:num]))
-    assert (torques.abs().mean(dim=0) > 0.5).all()
-
-
 def test_both_or_one_of_observations_and_actions(make_task):
-    """What rsl_rl asks for: originals first, then their images; None stays None."""
+    """The result is as rsl_rl needs it: originals first, then their images; None stays None."""
     task = make_task("a1_torque_multihead", 2)
     obs = TensorDict({name: torch.randn(3, value.shape[1]) for name, value in task.get_observations().items()}, [3])
     actions = torch.randn(3, 24)
@@ -182,8 +96,7 @@ def test_counterparts():
 def make_runner(make_task):
     """Factory of runners with small networks and one update per rollout; flags by name."""
 
-    def make(name="a1_torque", log_root=None, augmentation=True, loss=False, **overrides):
-        _, train_cfg = task_registry.get_cfgs(name)
+    def make(name="a1_torque", augmentation=True, loss=False, **overrides):
         settings = {
             "runner.num_steps_per_env": STEPS,
             "runner.logger": "none",
@@ -194,11 +107,7 @@ def make_runner(make_task):
             "algorithm.symmetry_cfg.use_data_augmentation": augmentation,
             "algorithm.symmetry_cfg.use_mirror_loss": loss,
         }
-        for path, value in {**settings, **overrides}.items():
-            set_by_path(train_cfg, path, value)
-        task = make_task(name, WORLDS)
-        torch.manual_seed(0)
-        return task_registry.make_alg_runner(task, train_cfg=train_cfg, log_root=log_root)[0]
+        return build_runner(make_task, name, WORLDS, **{**settings, **overrides})
 
     return make
 
@@ -219,29 +128,22 @@ def normal_log_prob(actions, mean, std):
 
 
 @pytest.mark.parametrize("name", ["a1_torque", "a1_torque_multihead"])
-@pytest.mark.parametrize("augmentation", [True, False])
-def test_losses_of_an_update(make_runner, name, augmentation):
-    """By hand: policy and value are learned from images too; the divergence is that of the originals alone."""
-    runner = make_runner(name, augmentation=augmentation, **{"algorithm.use_clipped_value_loss": False})
+def test_losses_of_an_update(make_runner, name):
+    """By hand: policy and value are also learned from images; the divergence is that of the originals alone."""
+    runner = make_runner(name, **{"algorithm.use_clipped_value_loss": False})
     alg, batch = runner.alg, roll_out(runner)
-    obs, actions, times = batch.observations, batch.actions, 1
-    mean = alg.actor(obs).detach()
+    seen = {group: batch.observations[group] for group in ("policy", "critic")}
+    both = {group: torch.cat([values, BY_HAND[group](values)]) for group, values in seen.items()}
+    obs, actions = TensorDict(both, [2 * SAMPLES]), torch.cat([batch.actions, mirror_joints(batch.actions)])
     old_mean, std = (values.clone() for values in batch.old_distribution_params)
-    kl = (0.5 * ((mean - old_mean) / std) ** 2).sum(dim=1).mean()
-    if augmentation:
-        images = {group: BY_HAND[group](obs[group]) for group in ("policy", "critic")}
-        obs = TensorDict({group: torch.cat([obs[group], image]) for group, image in images.items()}, [2 * SAMPLES])
-        actions, times = torch.cat([actions, mirror_joints(actions)]), 2
-        image_kl = (0.5 * ((alg.actor(obs).detach()[SAMPLES:] - old_mean) / std) ** 2).sum(dim=1).mean()
-        assert abs(image_kl - kl) > 0.01 * kl
-    std = std.repeat(times, 1)
-    old_log_prob, advantages = (
-        batch.old_actions_log_prob.flatten().repeat(times),
-        batch.advantages.flatten().repeat(times),
-    )
-    ratio = torch.exp(normal_log_prob(actions, alg.actor(obs).detach(), std) - old_log_prob)
+    means = alg.actor(obs).detach()
+    kl, image_kl = ((0.5 * ((mean - old_mean) / std) ** 2).sum(dim=1).mean() for mean in means.split(SAMPLES))
+    assert abs(image_kl - kl) > 0.01 * kl
+    old_log_prob = batch.old_actions_log_prob.flatten().repeat(2)
+    advantages = batch.advantages.flatten().repeat(2)
+    ratio = torch.exp(normal_log_prob(actions, means, std.repeat(2, 1)) - old_log_prob)
     surrogate = torch.max(-advantages * ratio, -advantages * ratio.clamp(0.8, 1.2)).mean()
-    value = (alg.critic(obs).detach() - batch.returns.repeat(times, 1)).square().mean()
+    value = (alg.critic(obs).detach() - batch.returns.repeat(2, 1)).square().mean()
     losses = alg.update()
     assert losses["skipped_updates"] == 0.0
     assert losses["kl"] == pytest.approx(float(kl), rel=1e-4)
@@ -250,7 +152,7 @@ def test_losses_of_an_update(make_runner, name, augmentation):
 
 
 class Symmetrized(nn.Module):
-    """The mean of a network and of its mirror image: what a symmetric policy is."""
+    """A symmetric policy: the mean of a network and of its mirror image."""
 
     def __init__(self, network):
         """Keep the network."""
@@ -264,7 +166,7 @@ class Symmetrized(nn.Module):
 
 @pytest.mark.parametrize("augmentation", [True, False])
 def test_mirror_loss(make_runner, augmentation):
-    """It is the mean square of what mirrored observations change, and nothing for a symmetric policy."""
+    """It is the mean square of the change by mirrored observations, and 0 for a symmetric policy."""
     runner = make_runner(augmentation=augmentation, loss=True)
     alg, batch = runner.alg, roll_out(runner)
     obs, actor = batch.observations["policy"], alg.actor
@@ -301,31 +203,8 @@ def test_mirror_loss_makes_policies_symmetric(make_runner):
     assert asymmetry() < 0.3 * before
 
 
-@pytest.mark.parametrize("name", ["a1_torque", "a1_torque_multihead"])
-@pytest.mark.parametrize(("augmentation", "loss"), [(False, False), (True, False), (False, True), (True, True)])
-def test_training_with_each_flag(make_runner, tmp_path, name, augmentation, loss):
-    """Losses are finite, everything is learned, and without a flag there is no symmetry."""
-    runner = make_runner(name, tmp_path, augmentation, loss, **{"algorithm.num_mini_batches": 2})
-    assert (runner.alg.symmetry is not None) == (augmentation or loss)
-    losses, update = [], runner.alg.update
-
-    def noted_update():
-        losses.append(update())
-        return losses[-1]
-
-    runner.alg.update = noted_update
-    networks = [*runner.alg.actor.parameters(), *runner.alg.critic.parameters()]
-    before = [parameter.detach().clone() for parameter in networks]
-    runner.learn(2)
-    assert len(losses) == 2 and all(math.isfinite(value) for each in losses for value in each.values())
-    assert all(each["skipped_updates"] == 0.0 for each in losses)
-    for parameter, old in zip(networks, before, strict=True):
-        assert torch.isfinite(parameter).all() and not torch.equal(parameter, old)
-
-
-@pytest.mark.parametrize("name", TASKS)
-def test_who_learns_from_images(name):
-    """All tasks of the A1 do, unless the paper's settings are asked for."""
-    for words, expected in (((), True), (("--preset=paper",), False)):
-        symmetry = get_cfgs(*words, task=name)[1].algorithm.symmetry_cfg
-        assert symmetry.use_data_augmentation == expected and not symmetry.use_mirror_loss
+@pytest.mark.parametrize(("words", "expected"), [((), True), (("--preset=paper",), False)])
+def test_augmentation_is_the_default(words, expected):
+    """Tasks learn from mirror images, unless the paper's settings are asked for."""
+    symmetry = get_cfgs(*words, task="a1_torque")[1].algorithm.symmetry_cfg
+    assert symmetry.use_data_augmentation == expected and not symmetry.use_mirror_loss

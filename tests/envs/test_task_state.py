@@ -1,4 +1,4 @@
-"""What the task keeps from step to step, and its log."""
+"""State that a task keeps from step to step, and its log."""
 
 import mujoco
 import numpy as np
@@ -11,33 +11,44 @@ from legged_torque.learning.worlds import check_identity
 from legged_torque.terrain.tiles import TILES
 
 
-def random_rotation(rng):
-    """A random unit quaternion (w, x, y, z) and the rotation matrix that takes body into world vectors."""
-    w, x, y, z = quat = (lambda q: q / np.linalg.norm(q))(rng.normal(size=4))
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return quat, np.eye(3) + 2 * w * skew + 2 * skew @ skew
-
-
 def test_velocities_and_gravity_in_the_trunk_frame(make_task):
-    """Turned at random, velocity and gravity are the world's, turned back by the rotation matrix."""
+    """Turned at random, velocities are those of mj_objectVelocity, and gravity is the world's, turned back."""
     task, rng = make_task("a1_torque", 8), np.random.default_rng(0)
-    rotations = [random_rotation(rng) for _ in range(8)]
-    velocity, rate = rng.normal(size=(8, 3)), rng.normal(size=(8, 3))
-    task.base_quat.copy_(torch.tensor(np.array([quat for quat, _ in rotations])))
-    task.sim.qvel[:, :3] = torch.tensor(velocity)
-    task.sim.qvel[:, 3:6] = torch.tensor(rate)
+    quats = rng.normal(size=(8, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    velocities = rng.normal(size=(8, 6))
+    task.base_quat.copy_(torch.tensor(quats))
+    task.sim.qvel[:, :6] = torch.tensor(velocities)
     task.state.update()
-    for world, (quat, matrix) in enumerate(rotations):
-        np.testing.assert_allclose(task.base_lin_vel[world], matrix.T @ velocity[world], atol=2e-6)
-        np.testing.assert_allclose(task.projected_gravity[world], matrix.T @ (0, 0, -1), atol=1e-6)
-        model, local = task.sim.mj_model, np.zeros(6)
-        data = mujoco.MjData(model)
-        data.qpos[3:7], data.qvel[:3], data.qvel[3:6] = quat, velocity[world], rate[world]
+    model, local = task.sim.mj_model, np.zeros(6)
+    data, trunk = mujoco.MjData(model), model.body("trunk").id
+    for world in range(8):
+        data.qpos[3:7], data.qvel[:6] = quats[world], velocities[world]
         mujoco.mj_forward(model, data)
-        trunk = model.body("trunk").id
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, trunk, local, 1)
         np.testing.assert_allclose(task.base_ang_vel[world], local[:3], atol=2e-6)
         np.testing.assert_allclose(task.base_lin_vel[world], local[3:], atol=2e-6)
+        gravity = data.xmat[trunk].reshape(3, 3).T @ (0, 0, -1)
+        np.testing.assert_allclose(task.projected_gravity[world], gravity, atol=1e-6)
+
+
+def test_state_dict(make_task):
+    """A task that loads the state of another one has its counters and curricula, and goes on from there."""
+    task, other = make_task("a1_multihead", 2), make_task("a1_multihead", 3)
+    task.total_steps.fill_(4_321_098)
+    task.sim.qpos[1, 0] = np.nan
+    task.step(torch.zeros(2, 24))
+    state = task.state_dict()
+    task.step(torch.zeros(2, 24))  # must not change what was saved
+    other.load_state_dict(state)
+    assert other.total_steps.item() == 4_321_100 and other.num_diverged.item() == 1
+    values = {key: value.item() for key, value in other.curriculum_values().items()}
+    share = 4_321_100 / 10e6
+    expected = {"weight_tracking_lin_vel": 4 - 2 * share, "weight_tracking_ang_vel": 0.1 + 0.9 * share}
+    expected |= {"mixing_pd": 1 - 0.9 * 67 * 64_000 / 50e6, "mixing_torque": 1.0}
+    assert values == pytest.approx(expected, rel=1e-6)
+    other.step(torch.zeros(3, 24))
+    assert other.total_steps.item() == 4_321_103
 
 
 def test_air_time_grows_in_flight(make_task):

@@ -8,7 +8,7 @@ import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from support.capture import gradient_errors
-from support.rollouts import SETTINGS, parameters, random_obs
+from support.rollouts import SETTINGS, parameters, random_obs, record_rollout
 
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.multi_head import MultiHeadModel
@@ -61,19 +61,6 @@ def make(device, multi_head=False, symmetric=False, precision="TF32", **settings
     return alg
 
 
-def record(alg, seed=1):
-    """Let the algorithm act for one rollout of random numbers; return the last observations."""
-    torch.manual_seed(seed)
-    for _ in range(STEPS):
-        alg.act(random_obs(WORLDS).to(alg.device))
-        dones = torch.rand(WORLDS, device=alg.device) < 0.3
-        extras = {"time_outs": dones & (torch.rand(WORLDS, device=alg.device) < 0.5)}
-        alg.process_env_step(random_obs(WORLDS).to(alg.device), torch.randn(WORLDS, device=alg.device), dones, extras)
-    last = random_obs(WORLDS).to(alg.device)
-    alg.compute_returns(last)
-    return last
-
-
 def choose(alg, seed):
     """Let the algorithm learn from some of the samples next."""
     order = torch.randperm(STEPS * WORLDS, generator=torch.Generator().manual_seed(seed))
@@ -84,7 +71,7 @@ def choose(alg, seed):
 def test_rollout(device, precision):
     """Values, log-probabilities, returns and advantages are those of the networks, and of GAE worked out in float64."""
     alg = make(device, multi_head=True, precision=precision)
-    last, rollout = record(alg), alg.storage
+    (_, last), rollout = record_rollout(alg), alg.storage
     close = {"rtol": 2e-2, "atol": 2e-2} if precision == "bfloat16" else {"rtol": 2e-3, "atol": 2e-3}
     with torch.no_grad():
         observations = rollout.observations.flatten(0, 1)
@@ -120,7 +107,7 @@ def test_gradients(device, precision):
     close = TOLERANCES[precision]
     for kind in ({}, {"multi_head": True, "symmetric": True}):
         alg = make(device, precision=precision, max_grad_norm=1e9, clip_param=10.0, learning_rate=1e-2, **kind)
-        record(alg)
+        record_rollout(alg)
         for number in range(3):
             choose(alg, number)
             errors = gradient_errors(alg)
@@ -138,7 +125,7 @@ def test_steps_are_those_of_torch(device):
     models = (copy.deepcopy(alg.actor).double(), copy.deepcopy(alg.critic).double())
     theirs = [*models[0].parameters(), *models[1].parameters()]
     reference = torch.optim.Adam(theirs, lr=1e-3)
-    record(alg)
+    record_rollout(alg)
     for number in range(3):
         choose(alg, number)
         alg.update_graph()
@@ -155,7 +142,7 @@ def test_a_bad_sample_changes_nothing(device):
     """Of its minibatch nothing is learned, to the bit; the next one is learned from as if it had never been."""
     spoiled, healthy = (make(device, multi_head=True, symmetric=True) for _ in range(2))
     for alg in (spoiled, healthy):
-        record(alg)
+        record_rollout(alg)
     spoiled.storage.returns[0, 2] = torch.nan
     spoiled.indices.copy_(torch.arange(spoiled.batch_size))
     before = [tensor.clone() for tensor in spoiled.tensors()]
@@ -172,7 +159,7 @@ def test_the_same_bits_twice(device):
     states = []
     for _ in range(2):
         alg = make(device, multi_head=True, symmetric=True, precision="TF32" if device == "cpu" else "bfloat16")
-        record(alg)
+        record_rollout(alg)
         alg.update()
         changed = (*alg.tensors(), *alg.storage.observations.values(), alg.storage.actions, alg.losses)
         states.append([tensor.clone() for tensor in changed])

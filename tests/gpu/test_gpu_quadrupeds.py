@@ -72,7 +72,7 @@ OWN = {  # how each number of a field is changed: by a factor, or by a sum
 
 
 def test_worlds_with_parameters_of_their_own(device, a1):
-    """They move as MuJoCo's models with these numbers, and so do the others; what follows from masses is mj_setConst's.
+    """They move as MuJoCo's models with these numbers, and so do the others; inverse weights are mj_setConst's.
 
     Only the worlds of a mask are changed.
     """

@@ -10,7 +10,7 @@ WORLDS = 300
 
 
 def touch_each_other(spec):
-    """Let all parts that can touch the floor touch each other as well."""
+    """Let all parts that can touch the floor also touch each other."""
     for geom in spec.geoms:
         if geom.conaffinity and geom.name != "floor":
             geom.contype, geom.conaffinity = 2, 3

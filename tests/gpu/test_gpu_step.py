@@ -1,7 +1,7 @@
 """Control steps that replay as a CUDA graph.
 
-They compute what they do without, wait for nothing, take no memory, keep bad numbers where they are, and draw at random
-what they should.
+They compute the same as without a graph, never wait for the GPU, take no memory, keep bad numbers in their world, and
+draw random numbers of the right distributions.
 """
 
 import math
@@ -32,7 +32,7 @@ def outcome(env, step):
 
 
 def test_compiled_as_eager(device, capfd):
-    """What ``torch.compile`` makes of a step is the step but for rounding; no part of it is left uncompiled."""
+    """A step compiled by ``torch.compile`` differs by rounding only, and no part of it is left uncompiled."""
     eager, compiled = (make_env(device, *WORDS, "--set=env.episode_length_s=1")[0] for _ in range(2))
     compiled.compile()
     for env in (eager, compiled):
@@ -81,7 +81,7 @@ def test_a_thousand_steps_take_no_memory(device, walking):
 
 
 def test_bad_numbers_end_their_world(device):
-    """In a replayed step their worlds start anew without a reward; the others do not notice, to the bit."""
+    """In a replayed step their worlds start anew without a reward; the others are unchanged to the bit."""
     broken, healthy = (make_env(device, *WORDS)[0] for _ in range(2))
     worlds = torch.tensor([3, 500, WORLDS - 1], device=device)
     others = torch.ones(WORLDS, dtype=torch.bool, device=device)

@@ -38,6 +38,6 @@ def test_stopped_and_resumed(trained):
 
 
 def test_evaluation_changes_nothing(trained):
-    """A training does not notice that it is measured: only the worlds of the evaluation are not there."""
+    """Evaluations do not change a training: only the worlds of the evaluation are missing without them."""
     names = differences(trained["whole"], trained["unseen"])
     assert [name for name in names if not name.startswith("evaluations")] == ["checkpoint.infos.worlds"]

@@ -12,7 +12,6 @@ from legged_torque.envs.base.asset import load_asset
 from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import import_robot
 from legged_torque.importer.settings import settings
-from legged_torque.importer.trial import parse
 from legged_torque.utils.errors import UserError
 
 HARMFUL = ["FL_'+str(open('PWNED', 'w'))+'", "FL_&quot;+str(open('PWNED', 'w'))+&quot;", "FL_&#10;x", "FL_\\", "FL_é"]
@@ -38,7 +37,7 @@ def test_files_whose_names_are_code(tmp_path, monkeypatch):
     file = folder / 'dog\nopen("PWNED", "w")#""" --->.urdf'
     file.write_text(urdf())
     robot = import_robot(file, "dog")
-    parse(mjcf(robot), file)
+    mjcf(robot)
     parts: dict = {"__name__": "dog"}
     exec(compile(settings(robot, str(folder / "dog.xml")), "dog.py", "exec"), parts)
     assert parts["DogCfg"]().asset.file == str(folder / "dog.xml")

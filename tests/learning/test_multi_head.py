@@ -1,13 +1,10 @@
-"""The multi-head actor: its architecture counted by hand, its gradients, what it exports and what it saves."""
+"""The multi-head actor: its architecture counted by hand, its output and its gradients."""
 
-import math
 from functools import partial
 
 import numpy as np
-import onnx
 import pytest
 import torch
-from onnx.reference import ReferenceEvaluator
 from support.runners import build_runner
 from tensordict import TensorDict
 
@@ -142,35 +139,6 @@ def test_gradient_paths():
     assert of_positions["torque"] == [0.0] * 4
 
 
-@pytest.mark.parametrize(
-    "parameter",
-    ["trunk.0.weight", "trunk.2.bias", "position_head.0.weight", "position_head.2.weight", "torque_head.0.weight"],
-)
-def test_gradient_by_finite_differences(parameter):
-    """The gradient of a loss on torques alone equals central differences in double precision."""
-    torch.manual_seed(0)
-    network = MultiHeadMLP(NUM_OBS, NUM_ACTIONS, [16, 16], [8], "elu").double()
-    obs = torch.randn(5, NUM_OBS, dtype=torch.float64)
-
-    def loss():
-        return network(obs)[:, NUM_DOF:].square().sum()
-
-    values = network.get_parameter(parameter)
-    (gradient,) = torch.autograd.grad(loss(), [values])
-    step = 1e-6
-    for index in range(0, values.numel(), values.numel() // 7):
-        with torch.no_grad():
-            entry = values.view(-1)[index : index + 1]
-            numbers = []
-            for sign in (1.0, -1.0):
-                entry += sign * step
-                numbers.append(float(loss()))
-                entry -= sign * step
-        expected = (numbers[0] - numbers[1]) / (2.0 * step)
-        assert float(gradient.view(-1)[index]) == pytest.approx(expected, rel=1e-6, abs=1e-7)
-    assert float(gradient.abs().max()) > 1e-3
-
-
 def test_deterministic_output(runner):
     """The inference policy answers the same observation with the same actions, the mean of what training samples."""
     policy, obs = runner.get_inference_policy("cpu"), make_obs()
@@ -179,65 +147,6 @@ def test_deterministic_output(runner):
         policy(obs, stochastic_output=True)
     assert torch.equal(first, second)
     torch.testing.assert_close(policy.output_mean, first)
-
-
-def test_stochastic_output(actor):
-    """Samples scatter about the output by hand with the standard deviation of 1 that all actions start with."""
-    num = 20_000
-    row = make_obs(1)
-    obs = TensorDict({"policy": row["policy"].expand(num, -1)}, [num])
-    torch.manual_seed(0)
-    with torch.no_grad():
-        samples = actor(obs, stochastic_output=True).double().numpy()
-        log_prob = actor.get_output_log_prob(torch.tensor(samples)).numpy()
-    assert samples.shape == (num, NUM_ACTIONS)
-    deviations = samples - forward_by_hand(actor, row)
-    error = 5.0 / math.sqrt(num)
-    np.testing.assert_allclose(deviations.mean(axis=0), 0.0, atol=error)
-    np.testing.assert_allclose(deviations.std(axis=0), 1.0, atol=error)
-    np.testing.assert_allclose(np.corrcoef(deviations.T), np.eye(NUM_ACTIONS), atol=error)
-    expected = (-0.5 * deviations**2 - 0.5 * math.log(2.0 * math.pi)).sum(axis=1)
-    np.testing.assert_allclose(log_prob, expected, rtol=1e-3)
-
-
-def test_exported_to_torch_jit(runner, actor, tmp_path):
-    """The scripted file needs no Python class and gives the model's numbers."""
-    runner.export_policy_to_jit(str(tmp_path))
-    exported = torch.jit.load(tmp_path / "policy.pt")
-    obs = make_obs()
-    with torch.no_grad():
-        torch.testing.assert_close(exported(obs["policy"]), actor(obs), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(exported(obs["policy"]).detach(), forward_by_hand(actor, obs), rtol=1e-4, atol=1e-5)
-
-
-def test_exported_to_onnx(runner, actor, tmp_path):
-    """The ONNX file is valid and gives the model's numbers in ONNX's own reference implementation."""
-    runner.export_policy_to_onnx(str(tmp_path))
-    file = tmp_path / "policy.onnx"
-    onnx.checker.check_model(str(file))
-    session = ReferenceEvaluator(str(file))
-    obs = make_obs(3)
-    rows = [session.run(["actions"], {"obs": row.numpy()})[0] for row in obs["policy"].split(1)]
-    np.testing.assert_allclose(np.concatenate(rows), forward_by_hand(actor, obs), rtol=1e-4, atol=1e-5)
-
-
-def test_checkpoint_round_trip(make_runner, tmp_path):
-    """A saved policy is plain tensors, and a runner that has loaded it acts as the one that has saved it."""
-    saved, loaded = (make_runner(name="a1_torque_multihead", seed=seed) for seed in (1, 2))
-    with torch.no_grad():
-        saved.alg.actor.distribution.log_std_param.copy_(torch.linspace(-1.0, 1.0, NUM_ACTIONS))
-    path, obs = str(tmp_path / "model_0.pt"), make_obs()
-    expected = forward_by_hand(saved.alg.get_policy(), obs)
-    assert not np.allclose(loaded.alg.get_policy()(obs).detach(), expected, atol=1e-3)
-    saved.save(path)
-    state = torch.load(path, weights_only=True)["actor_state_dict"]
-    assert all(torch.equal(state[key], value) for key, value in saved.alg.get_policy().state_dict().items())
-    loaded.load(path)
-    policy = loaded.get_inference_policy("cpu")
-    np.testing.assert_allclose(policy(obs).detach(), expected, rtol=1e-4, atol=1e-5)
-    policy(obs, stochastic_output=True)
-    deviations = np.exp(np.linspace(-1.0, 1.0, NUM_ACTIONS))
-    np.testing.assert_allclose(policy.output_std[0].detach(), deviations, rtol=1e-5)
 
 
 @pytest.mark.parametrize(

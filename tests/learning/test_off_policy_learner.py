@@ -241,10 +241,10 @@ class Forgetful(PointMasses):
 
 def test_what_does_not_fit_is_refused():
     """The lines name the learner, the task and what is missing."""
-    told = error_of(make_trainer, learner=Deaf)
-    assert told == "algorithm.class_name: Deaf is no learner, it lacks observe"
-    told = error_of(make_trainer, task=Forgetful())
-    assert told == "TDLearner needs observations before resets, which Forgetful does not keep"
+    message = error_of(make_trainer, learner=Deaf)
+    assert message == "algorithm.class_name: Deaf is no learner, it lacks observe"
+    message = error_of(make_trainer, task=Forgetful())
+    assert message == "TDLearner needs observations before resets, which Forgetful does not keep"
 
 
 class A1TDCfgPPO(A1CfgPPO):

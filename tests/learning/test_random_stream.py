@@ -8,8 +8,7 @@ from support.random_stream import upcoming
 from support.settings import error_of, parse
 
 from legged_torque.envs import task_registry
-from legged_torque.learning.random_state import random_state, restore_random_state
-from legged_torque.utils import distributed
+from legged_torque.learning.random_state import random_state
 from legged_torque.utils.task_registry import set_seed
 
 WORDS = ["--task=a1_torque", "--num_envs=2", "--seed=3", "--set=runner.num_steps_per_env=3", "--logger=none"]
@@ -47,40 +46,6 @@ def trained(tmp_path_factory):
     return run
 
 
-def states_of(run, iteration):
-    """The random states in a checkpoint."""
-    return torch.load(run.folder / f"model_{iteration}.pt", weights_only=True)["infos"]["random_states"]
-
-
-def test_streams_go_on():
-    """A restored stream gives the same numbers of every kind, as often as it is restored."""
-    torch.manual_seed(4)
-    torch.randn(3)  # an odd number, so that one is left over of a pair
-    before = torch.get_rng_state()
-    state = random_state("cpu")
-    assert list(state) == ["cpu"] and torch.equal(torch.get_rng_state(), before)
-    expected = [torch.randn(3), torch.rand(700), torch.randint(100, (5,)), torch.randperm(9)]
-    torch.manual_seed(5)
-    for _ in range(2):
-        restore_random_state("cpu", state)
-        again = [torch.randn(3), torch.rand(700), torch.randint(100, (5,)), torch.randperm(9)]
-        assert all(torch.equal(*pair) for pair in zip(again, expected, strict=True))
-
-
-def test_a_gpu_has_a_stream_of_its_own(monkeypatch):
-    """That of the named GPU is kept and restored; a CPU ignores it, and a GPU can do without."""
-    given, kept = [], torch.arange(16, dtype=torch.uint8)
-    monkeypatch.setattr(torch.cuda, "get_rng_state", lambda device: kept + int(torch.device(device).index))
-    monkeypatch.setattr(torch.cuda, "set_rng_state", lambda state, device: given.append((device, state.tolist())))
-    state = random_state("cuda:1")
-    assert torch.equal(state["cuda"], kept + 1) and torch.equal(state["cpu"], torch.get_rng_state())
-    restore_random_state("cpu", state)
-    restore_random_state("cuda:2", {"cpu": state["cpu"]})
-    assert given == []
-    restore_random_state("cuda:2", state)
-    assert given == [("cuda:2", (kept + 1).tolist())]
-
-
 def test_resumed_runs_go_on_and_never_repeat_the_start(trained):
     """Numbers are those that came after the checkpoint was saved; the seed alone leads back to the run's start."""
     start(trained.root)
@@ -107,15 +72,6 @@ def test_loading_alone_leaves_the_stream(trained):
     assert torch.equal(torch.rand(5), trained.next)
 
 
-@pytest.mark.parametrize("iteration", [1, 2])
-def test_checkpoints_hold_one_state_per_process(trained, iteration):
-    """It is a tensor that is read without pickled code, that of the CPU where there is no GPU."""
-    (state,) = states_of(trained, iteration)
-    assert list(state) == ["cpu"] and state["cpu"].dtype == torch.uint8
-    torch.set_rng_state(state["cpu"])
-    assert torch.equal(torch.rand(5), trained.numbers[iteration])
-
-
 def test_every_process_takes_its_own(trained, monkeypatch):
     """A process takes the state of its number; one that the run did not have keeps its own numbers."""
     runner = trained.runner
@@ -134,16 +90,6 @@ def test_every_process_takes_its_own(trained, monkeypatch):
         monkeypatch.setenv("RANK", str(rank))
         runner.continue_random_numbers({"random_states": states})
         assert torch.equal(torch.rand(5), expected[rank])
-
-
-def test_states_of_all_processes_are_kept(trained, tmp_path, monkeypatch):
-    """The states of all processes are saved, in their order."""
-    others = [{"cpu": torch.full((3,), rank, dtype=torch.uint8)} for rank in range(3)]
-    monkeypatch.setattr(distributed, "gather", lambda mine: [mine, *others])
-    trained.runner.save(str(tmp_path / "model_0.pt"))
-    states = torch.load(tmp_path / "model_0.pt", weights_only=True)["infos"]["random_states"]
-    assert len(states) == 4 and torch.equal(states[0]["cpu"], torch.get_rng_state())
-    assert [state["cpu"].tolist() for state in states[1:]] == [[rank] * 3 for rank in range(3)]
 
 
 @pytest.mark.parametrize("states", [None, [{}], [{"cpu": torch.zeros(3, dtype=torch.uint8)}], 5])

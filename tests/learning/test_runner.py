@@ -3,7 +3,6 @@
 import errno
 import math
 import os
-import signal
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from support.runners import build_runner, networks
-from support.settings import COMBINATIONS, TASKS, error_of, get_cfgs
+from support.settings import COMBINATIONS, TASKS, error_of
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.envs import task_registry
@@ -128,40 +127,22 @@ def test_capture_is_a_setting(make_runner, tmp_path, capture, steps, enabled):
     ] == enabled
 
 
-def test_trainings_are_equal_if_their_seeds_are(make_runner):
-    """A seed fixes every number, to the bit, with and without ``runner.capture``."""
-    runners = [make_runner(seed=7), make_runner(seed=7, **{"runner.capture": False}), make_runner(seed=8)]
-    for runner, seed in zip(runners, (7, 7, 8), strict=True):
-        torch.manual_seed(seed)
-        runner.learn(2)
-    first, again, other = (networks(runner) for runner in runners)
-    assert all(torch.equal(again[key], value) for key, value in first.items())
-    assert not any(torch.equal(other[key], value) for key, value in first.items())
-
-
-def test_capture_on_the_command_line():
-    """``--set`` switches it off; it is on or off, nothing else."""
-    assert get_cfgs()[1].runner.capture is True
-    assert get_cfgs("--set=runner.capture=False")[1].runner.capture is False
-    assert "runner.capture" in error_of(get_cfgs, "--set=runner.capture=2")
-
-
 def test_rollout_is_stored(make_runner):
     """The storage holds what the policy saw, did and got, step by step, with the value of what a time-out cut off."""
     runner = make_runner(env={"env.episode_length_s": 0.06})
-    step, obs, told = runner.env.step, [runner.env.get_observations()], []
+    step, obs, steps_made = runner.env.step, [runner.env.get_observations()], []
 
     def noted_step(actions):
         result = step(actions)
         obs.append(result[0].clone())
-        told.append([tensor.clone() for tensor in (actions, *result[1:3], result[3]["time_outs"])])
+        steps_made.append([tensor.clone() for tensor in (actions, *result[1:3], result[3]["time_outs"])])
         return result
 
     runner.env.step = noted_step
     runner.collect_rollout()
     storage = runner.alg.storage
-    assert len(told) == STEPS and any(time_outs.any() for *_, time_outs in told)
-    for i, (actions, rewards, dones, time_outs) in enumerate(told):
+    assert len(steps_made) == STEPS and any(time_outs.any() for *_, time_outs in steps_made)
+    for i, (actions, rewards, dones, time_outs) in enumerate(steps_made):
         for group in ("policy", "critic"):
             assert torch.equal(storage.observations[group][i], obs[i][group])
         values = runner.alg.critic(obs[i]).detach().squeeze(-1)
@@ -219,9 +200,10 @@ def test_crash_while_saving(make_runner, tmp_path, monkeypatch, error, exists):
         raise error
 
     monkeypatch.setattr(os, "fsync", write_no_more)  # all is written by then, but not yet where it belongs
-    with pytest.raises(UserError if isinstance(error, OSError) else KeyboardInterrupt) as told:
+    with pytest.raises(UserError if isinstance(error, OSError) else KeyboardInterrupt) as end:
         runner.save(str(path))
-    assert isinstance(error, KeyboardInterrupt) or str(told.value) == f"cannot write '{path}': No space left on device"
+    if isinstance(error, OSError):
+        assert str(end.value) == f"cannot write '{path}': No space left on device"
     assert (path.read_bytes() if path.exists() else None) == old
     monkeypatch.undo()
     runner.save(str(path))
@@ -272,14 +254,6 @@ def test_time_of_training_goes_on(make_runner, saved, tmp_path):
     assert torch.load(folder(runner) / "model_3.pt", weights_only=True)["infos"]["seconds"] > before
 
 
-def test_checkpoint_of_plain_values(saved):
-    """A checkpoint needs no pickled code to be read, so that a foreign one cannot run any."""
-    _, path = saved
-    state = torch.load(path, weights_only=True)
-    assert {"actor_state_dict", "critic_state_dict", "optimizer_state_dict", "iter", "infos"} <= state.keys()
-    assert state["iter"] == 2 and int(state["infos"]["task"]["total_steps"]) == 2 * BATCH
-
-
 class Foreign:
     """An object that no checkpoint should hold."""
 
@@ -326,24 +300,6 @@ def test_checkpoint_of_another_kind_of_policy(make_runner, tmp_path, saved_task,
     path = tmp_path / "model_0.pt"
     make_runner(saved_task).save(str(path))
     assert error_of(make_runner(task).load, str(path)).startswith(f"checkpoint '{path}' does not fit this task: ")
-
-
-def test_signal_during_an_iteration(make_runner, tmp_path):
-    """The iteration is finished, saved, and training ends; learning can go on afterwards."""
-    runner = make_runner(log_root=tmp_path, **{"runner.logger": "none"})
-    update = runner.alg.update
-
-    def update_with_signal():
-        runner.alg.update = update
-        signal.raise_signal(signal.SIGINT)
-        return update()
-
-    runner.alg.update = update_with_signal
-    runner.learn(1000)
-    assert runner.current_learning_iteration == 1
-    assert {path.name for path in folder(runner).glob("model*")} == {"model_0.pt", "model_1.pt"}
-    runner.learn(1)
-    assert (folder(runner) / "model_2.pt").is_file()
 
 
 def test_wandb(monkeypatch, tmp_path):

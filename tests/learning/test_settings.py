@@ -7,8 +7,8 @@ from rsl_rl.utils import resolve_nn_activation
 from support.settings import error_of, get_cfgs, parse
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.base.training_config import Activation
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
-from legged_torque.learning.settings import Activation
 from legged_torque.utils.task_registry import TaskRegistry
 
 
@@ -41,7 +41,7 @@ def test_activations():
 
 
 def test_names_of_a_users_own_task():
-    """What a user's task or one of its presets names is known, for every task, and a mistake in it is told."""
+    """Names in a user's task or in one of its presets are known for every task; a mistake in one is reported."""
 
     class Cfg(A1CfgPPO):
         class critic:

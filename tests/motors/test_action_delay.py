@@ -10,7 +10,7 @@ from support.settings import error_of, get_cfgs, torques_in_torch
 from legged_torque.envs.base.validation import check_env_cfg
 
 EXCEEDED = {1: 10.83, 3: 16.27, 5: 20.52, 15: 37.70, 35: 66.62}
-"""What 1 in 1000 chi-square numbers exceeds, by degrees of freedom."""
+"""The 99.9% quantile of chi-square, by degrees of freedom."""
 
 
 def delayed(low, high, unit="physics_steps", decimation=4, **more):

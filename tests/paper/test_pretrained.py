@@ -4,7 +4,6 @@ import pytest
 import torch
 from support.gravity import CONFIGURATIONS, FEW, SMALL, STD, STEPS, TASK, words_of
 from support.gravity import made as made  # a fixture
-from support.rollouts import make_ppo, record_rollout, shift_policy, state_of
 from support.scripts import assert_told_in_one_line, contents, run_here
 from support.settings import error_of, get_cfgs
 
@@ -165,29 +164,3 @@ def test_settings_that_make_no_sense(setting, message, tmp_path):
     result = run_here("pretrain_gravity.py", "--device=cpu", "--task=a1_torque", root=tmp_path)
     assert_told_in_one_line(result, "task 'a1_torque' has no pre-training")
     assert not list(tmp_path.iterdir())
-
-
-def test_critic_warmup():
-    """While only the critic learns, it learns as ever; policy and learning rate stay. Then they move."""
-    warm, usual = (make_ppo(schedule="adaptive", desired_kl=1e-3) for _ in range(2))
-    before = state_of(warm)
-    warm.warm_up_iterations = 1
-    warm.set_progress(0, 2)
-    usual.schedule = "fixed"
-    for alg in (warm, usual):
-        record_rollout(alg)
-        shift_policy(alg, 0.2)  # as if it had moved far: this would change the learning rate
-        torch.manual_seed(5)
-        alg.update()
-    shift_policy(warm, -0.2)
-    learned, other = state_of(warm), state_of(usual)
-    for key, value in before.items():
-        torch.testing.assert_close(learned[key], other[key] if key.startswith("critic") else value)
-        assert not key.startswith("critic") or not torch.equal(learned[key], value)
-    warm.set_progress(1, 2)
-    record_rollout(warm)
-    shift_policy(warm, 0.2)
-    shifted = state_of(warm)
-    warm.update()
-    after = state_of(warm)
-    assert all(not torch.equal(after[key], shifted[key]) for key in before) and after["lr"] < shifted["lr"]

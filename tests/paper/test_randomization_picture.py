@@ -17,9 +17,8 @@ def plot(tmp_path, *words):
 @pytest.mark.parametrize(
     "words",
     [
-        ("--perturbation=none",),
+        ("--perturbation=none", "--set=motors.delay.range=[1, 4]", "--set=domain_rand.keep_fixed=[gravity]"),
         ("--task=a1_torque_multihead", "--perturbation=doubled", "--set=env.history_length=3"),
-        ("--set=motors.delay.range=[1, 4]", "--set=domain_rand.keep_fixed=[gravity, trunk_mass]"),
     ],
 )
 def test_picture(tmp_path, words):
@@ -32,18 +31,10 @@ def test_picture(tmp_path, words):
     assert 20_000 < file.stat().st_size < 400_000
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
-        ("--perturbation=hih", "unknown perturbation 'hih'; did you mean 'high'?"),
-        ("--set=domain_rand.keep_fixed=[gravitation]", "'gravitation'; did you mean 'gravity'?"),
-    ],
-)
-def test_mistakes(tmp_path, words, message):
+def test_mistakes(tmp_path):
     """They are refused in one line, with exit status 2, and nothing is written."""
-    result, _ = plot(tmp_path, words)
-    assert_told_in_one_line(result, message)
+    result, _ = plot(tmp_path, "--set=domain_rand.keep_fixed=[gravitation]")
+    assert_told_in_one_line(result, "'gravitation'; did you mean 'gravity'?")
     assert not list(tmp_path.iterdir())
 
 
@@ -52,16 +43,3 @@ def test_without_matplotlib(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     result, _ = plot(tmp_path)
     assert_told_in_one_line(result, "pip install 'legged_torque[plots]'")
-
-
-def test_unknown_format(tmp_path):
-    """A picture of an unknown format is a mistake as well."""
-    pytest.importorskip("matplotlib", reason="needs the extra: pip install -e .[plots]")
-    result, _ = plot(tmp_path, f"--out={tmp_path / 'picture.xyz'}")
-    assert_told_in_one_line(result, "picture.xyz")
-
-
-def test_out_is_needed(tmp_path):
-    """So is one without a name."""
-    result = run_here("plot.py", "randomization", "--device=cpu", root=tmp_path)
-    assert_told_in_one_line(result, "--out")

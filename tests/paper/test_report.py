@@ -23,8 +23,7 @@ from support.reports import (
     write_rows,
 )
 
-from legged_torque.experiments.times import Times, write_times
-from legged_torque.paper.report import figures
+from legged_torque.experiments.times import write_times
 from legged_torque.paper.report.evaluations import METRIC_NAMES
 from legged_torque.paper.report.experiment import read_experiment
 from legged_torque.paper.report.figures_curves import draw_curves, smoothed
@@ -32,15 +31,8 @@ from legged_torque.paper.report.report import fenced, markdown_table, to_html
 from legged_torque.paper.report.tables import welch
 
 EVIL = "</code></pre><script>alert(1)</script> <img src=http://evil.example/x.png> & `x` | **y** ![z](/etc/passwd)"
+pytestmark = pytest.mark.usefixtures("coarse")
 NAMES = ["Figure 3", "Figure 3 over seconds", "Figure 5a", "Figure 5b", "Figure 6", "Figure 7"]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def coarse():
-    """Figures of few pixels, which are drawn fast."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(figures.SETTINGS, "savefig.dpi", 20)
-        yield
 
 
 def rows_of(content):
@@ -69,7 +61,7 @@ def folder(tmp_path_factory):
     run = folder / "a1_torque-low-s1" / "2026-01-01_00-00-00"
     write_part(run, [line(i, i / 100) for i in range(10, 60, 10)], **settings["a1_torque"])
     (run.parent / "result_<script>&.json").write_text("{")
-    write_times(folder / "a1_position-low-s1", Times(110_000_000, {"gpu training": 55.0}))
+    write_times(folder / "a1_position-low-s1", {"steps": 110_000_000, "gpu training": 55.0})
     (folder / "videos").mkdir()
     for name in ("a1_torque.mp4", "a1_position.gif", "a1_other.mp4", "a1_torque.txt"):
         (folder / "videos" / name).write_bytes(name.encode())

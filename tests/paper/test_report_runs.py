@@ -4,17 +4,12 @@ import pytest
 from support.reports import Page, line, run_script, whole_run, write_grounds, write_run
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.paper.report import figures
 from legged_torque.paper.report.experiment import read_experiment
 from legged_torque.paper.report.tables import summarize
 from legged_torque.paper.report.unplanned import environment_of, ranges_of
 from legged_torque.utils.config import to_dict, update_from_dict
 
-
-@pytest.fixture(autouse=True)
-def coarse(monkeypatch):
-    """Figures of few pixels, which are drawn fast."""
-    monkeypatch.setitem(figures.SETTINGS, "savefig.dpi", 20)
+pytestmark = pytest.mark.usefixtures("coarse")
 
 
 def settings(task, seed, perturbation, ranges="default", run_name=""):
@@ -95,13 +90,6 @@ def test_report_on_runs(logs, capsys):
     assert len((logs / "report" / "grounds.csv").read_text().splitlines()) == 3
 
 
-def test_runs_in_doubled_alone(tmp_path):
-    """They have their table, although the paper trains nothing there."""
-    write_run(tmp_path / "2026-01-01_00-00-00", whole_run(0.5), settings("mine", 1, "doubled"))
-    assert run_script(tmp_path) == 0
-    assert (tmp_path / "report" / "report.md").read_text().count("| Track % [share] | `mine` | 0.5000 (1) |") == 1
-
-
 def test_runs_with_other_settings(tmp_path):
     """Runs of one task and seed that differ in settings are two, named by these; a resumed one with them stays one."""
     for day, scale, lines in ((1, -1.0, whole_run(0.5)[:3]), (2, -2.0, whole_run(0.6)), (3, -1.0, whole_run(0.7)[3:])):
@@ -114,14 +102,3 @@ def test_runs_with_other_settings(tmp_path):
     assert experiment.plan.tasks == names
     first, second = (experiment.runs_of(name, "low")[0] for name in names)
     assert len(first.rows) == len(second.rows) == 5 and len(first.configs) == 2
-
-
-def test_bars(logs):
-    """Bars have a point per seed, and no figure has a number of the paper's."""
-    experiment = read_experiment(logs)
-    table = summarize(experiment, 90e6)
-    assert list(figures.planned_figures(experiment, table)) == [*figures.CURVES, "Metrics"]
-    figure = figures.draw_bars(experiment, table, ["low", "own"], "Metrics")
-    points = [list(line.get_ydata()) for line in figure.axes[5].lines if line.get_marker() == "o"]
-    assert points == [pytest.approx([0.5, 0.6]), pytest.approx([0.4])]
-    assert "paper" not in [text.get_text() for text in figure.legends[0].get_texts()]

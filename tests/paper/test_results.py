@@ -13,15 +13,14 @@ from support.reports import HEADER, SETTINGS, line, whole_run, write_experiment,
 from support.settings import error_of
 
 from legged_torque.experiments.matrix import Cell, Matrix
+from legged_torque.paper.metrics import PAPER_METRICS
 from legged_torque.paper.report.evaluations import METRIC_NAMES, read_curves, read_evaluations
 from legged_torque.paper.report.experiment import Experiment, Training, read_experiment
 from legged_torque.paper.report.report import run_problems
-from legged_torque.paper.report.tables import best_torque, holm, summarize, verdict, welch
-from legged_torque.paper.values import ENVIRONMENTS, PAPER_METRICS, TABLE_I, paper_value
-from legged_torque.utils.metrics import METRICS
+from legged_torque.paper.report.tables import best_torque, holm, summarize, welch
+from legged_torque.paper.values import ENVIRONMENTS, TABLE_I, paper_value
 
 CELL = Cell(Path("a1_torque-low-s1"), "a1_torque", "low", 1, ("low",))
-METRIC = {metric.name: metric for metric in METRICS}
 
 
 def evaluations(*millions):
@@ -178,19 +177,6 @@ def test_holm_by_hand():
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([0.01, math.nan, 0.6, 0.7]) == pytest.approx([0.03, math.nan, 1.0, 1.0], nan_ok=True)
     assert len(holm([])) == 0 and np.isnan(holm([math.nan])).all()
-
-
-@pytest.mark.parametrize(
-    ("name", "mean", "error", "papers"),
-    [
-        ("track_percentage", 0.81, 0.01, (0.79, 0.815, 0.83)),
-        ("track_xy", 0.04, 0.01, (0.06, 0.035, 0.02)),  # low is good
-        ("collision_force", 130.0, math.nan, (131.0, 130.0, 129.0)),  # one seed: no error
-    ],
-)
-def test_verdict(name, mean, error, papers):
-    """Better or worse by more than the standard error, in the metric's own direction."""
-    assert [verdict(METRIC[name], mean, error, paper) for paper in papers] == ["✓", "≈", "✗"]
 
 
 def test_best_torque_methods():

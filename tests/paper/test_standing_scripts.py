@@ -7,7 +7,6 @@ import sys
 import matplotlib.image
 import pytest
 import torch
-from support.command import command
 from support.gravity import TASK
 from support.gravity import made as made  # a fixture
 from support.reports import line, write_run
@@ -126,16 +125,3 @@ def test_mistakes(made, tmp_path, monkeypatch):
         result, picture = plot(figure, report, tmp_path)
         assert_told_in_one_line(result, "pip install 'legged_torque[plots]'")
         assert not picture.exists()
-
-
-def test_command(tmp_path):
-    """The console command has the figures' own help, and completes their names and options."""
-    status, output, error = command("plot", "curves", "--help")
-    assert (status, error) == (0, "") and output.startswith("usage: legged-torque plot curves ")
-    for words, expected in {"plot cur": ["curves"], "plot curves --o": ["--out"]}.items():
-        offered = tmp_path / expected[0]
-        line = f"legged-torque {words}"
-        variables = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
-        variables |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(offered), "_ARGCOMPLETE_SHELL": "bash"}
-        assert command(env=variables)[0] == 0
-        assert offered.read_text().split() == expected

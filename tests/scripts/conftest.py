@@ -48,8 +48,6 @@ def root(tmp_path_factory):
     config = (run / "config.yaml").read_text()
     broken = {
         "not_yaml": "task: [a1_position",
-        "no_mapping": "walk",
-        "no_entries": "task: a1_position",
         "unknown_key": config.replace("num_envs:", "num_env:"),
         "wrong_type": config.replace("torques: -0.0002", "torques: little"),
         "no_section": re.sub(r"^env:\n(  .*\n)+", "env: 3\n", config, flags=re.MULTILINE),

@@ -113,7 +113,7 @@ MISTAKES = {
     "--terrain stairs_pu": "unknown kind of terrain 'stairs_pu'; did you mean 'stairs_up'?",
     "--terrain flat --level 0.5 1.01": "a level must be from 0 to 1, not 1.01",
     "--terrain flat --level -0.1": "a level must be from 0 to 1, not -0.1",
-    "--terrain flat --level nan": "argument --level: it must be finite, not nan",
+    "--terrain flat --level nan": "a level must be from 0 to 1, not nan",
     "--terrain flat --level": "argument --level: expected at least one argument",
     "--terrain flat --command 0 0 0": "the command must have a speed of 0.1 m/s or more and a yaw rate of 0, not 0 0 0",
     "--terrain flat --command 1 0 0.5": "a yaw rate of 0, not 1 0 0.5",
@@ -121,10 +121,8 @@ MISTAKES = {
     "--level 0.5": "--level needs --terrain",
     "--terrain flat --level 0 --set terrain.measure_heights=true": "does not fit this task",
     "--perturbation=hihg": "unknown perturbation 'hihg'; did you mean 'high'?",
-    "--checkpoint=7": "unknown checkpoint '7'; allowed: 0, 1, 2, 3",
     "--steps=0": "--steps must be at least 1, not 0",
     "--command 1 0": "argument --command: expected 3 arguments",
-    "--step=5": "unknown option '--step=5'; did you mean '--steps'?",
 }
 
 

@@ -26,10 +26,10 @@ from legged_torque.learning import checkpoint
 from legged_torque.utils.cli import Parser, options_of
 from legged_torque.utils.config import Section, flat, section_keys, to_dict
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import read_data
 from legged_torque.utils.limits import check_value, types_of
 from legged_torque.utils.options import Options
 from legged_torque.utils.plain_yaml import Dumper, parse_yaml
-from legged_torque.utils.plotting import read_data
 from legged_torque.utils.runs import load_config, save_config
 
 set_hypothesis_home_dir(Path(tempfile.gettempdir(), "hypothesis"))  # not in the repository

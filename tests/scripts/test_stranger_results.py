@@ -88,7 +88,7 @@ def test_figures(tmp_path, text):
 
 
 def test_curves_that_are_no_text(tmp_path):
-    """A compressed file that is damaged or unpacks to too much, and a field longer than any number, are told."""
+    """A compressed file that is damaged or unpacks to too much, and a field longer than any number, are reported."""
     (tmp_path / "a.csv.gz").write_bytes(b"\x1f\x8b\x08\x00" + bytes(6) + b"\xff" * 50)
     (tmp_path / "large.csv.gz").write_bytes(gzip.compress(b"\n" * 60_000_000, 1))
     (tmp_path / "a.csv").write_text("task,steps\n" + "9" * 200_000 + ",1\n")
@@ -158,7 +158,10 @@ EXPORTS = {
         "timing.decimation",
     ),
     "no number": (set_entry("episode.length", float("nan")), "episode.length is not a finite number"),
-    "another folder": (set_entry("network.file", "../out/policy.onnx"), "must be the name of a file beside it"),
+    "another folder": (
+        set_entry("network.file", "../out/policy.onnx"),
+        "must be the name of a file in the same folder",
+    ),
     "a class": (lambda d: d.update(task={"class_name": "payload:run"}), "task"),
 }
 

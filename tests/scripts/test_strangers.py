@@ -95,7 +95,7 @@ def test_checkpoint_without_an_end(run):
 
 @pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
 def test_checkpoint_of_nothing_but_lists(run, script):
-    """Lists inside of lists that no function can follow are told as well, and what is no dictionary."""
+    """Lists inside of lists that no function can follow are reported as well, and what is no dictionary."""
     with zipfile.ZipFile(run / "model_1.pt") as whole:
         parts = {name: whole.read(name) for name in whole.namelist()}
     depth = 100_000
@@ -147,7 +147,7 @@ TEXTS = {
     "long": ("# " + "x" * 1_000_000, "is nested too deeply or larger than settings are"),
     "many": ("\n".join(["a: &a0 [x]", *(f"b{i}: &a{i + 1} [{f'*a{i}, ' * 9}]" for i in range(12))]), "is nested too"),
 }
-"""YAML that runs code, or takes all of the memory or the stack, and what is told."""
+"""YAML that runs code, or takes all of the memory or the stack, and what is reported."""
 
 
 @pytest.mark.parametrize("name", TEXTS)
@@ -164,7 +164,7 @@ def test_yaml(run, tmp_path, harm, name):
 
 
 def test_names_that_are_no_names(run):
-    """Line ends and the codes of terminals are told as codes: an error stays one line."""
+    """Line ends and the codes of terminals are reported as codes: an error stays one line."""
     text = (run / "config.yaml").read_text()
     (run / "config.yaml").write_text(yaml.safe_dump(yaml.safe_load(text) | {"task": "x\nerror: \x1b[2J\u202e"}))
     assert_told_in_one_line(load_run("evaluate.py", run), r"is of task 'x\nerror: \x1b[2J\u202e', not 'a1_position'")

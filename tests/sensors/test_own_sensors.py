@@ -7,7 +7,7 @@ from support.settings import error_of
 
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.observations import ObservationTerm
-from legged_torque.envs.tasks import A1TorqueCfg
+from legged_torque.envs.tasks import A1TorqueCfg, A1TorqueCfgPPO, task_registry
 from legged_torque.sensors.config import SensorCfg
 from legged_torque.sensors.sensor import Sensor
 from legged_torque.utils.math import quat_rotate_yaw
@@ -167,6 +167,10 @@ def test_mistakes():
             return [*super().observation_terms(), ObservationTerm("more", lambda: self.commands, None, group="critic")]
 
     assert "the observation group 'critic' of 'more' exists already" in error_of(Taken, RayCfg())
+    train_cfg = A1TorqueCfgPPO()
+    train_cfg.obs_groups.actor = ["policy", "camera"]
+    refused = error_of(lambda: task_registry.make_alg_runner(make(), train_cfg=train_cfg, log_root=None))
+    assert refused.startswith("obs_groups: The MLP model only supports 1D observations") and "'camera'" in refused
 
 
 @pytest.mark.parametrize("changes", [{}, {"delay": 0.04}])
@@ -178,11 +182,11 @@ def test_final_observations(changes):
     for step in range(40):
         actions = torch.randn(5, 12, generator=torch.Generator().manual_seed(step))
         states = []
-        happen = task.events.happen
-        task.events.happen = lambda mask, run=happen, kept=states: (kept.append(task.sim.qpos.clone()), run(mask))
+        apply = task.events.apply
+        task.events.apply = lambda mask, run=apply, kept=states: (kept.append(task.sim.qpos.clone()), run(mask))
         torch.manual_seed(step)
         obs, _, dones, extras = task.step(actions)
-        task.events.happen = happen
+        task.events.apply = apply
         torch.manual_seed(step)
         expected, _, _, nothing = plain.step(actions)
         for group in ("policy", "critic", "camera"):

@@ -1,4 +1,4 @@
-"""What the fused step does not simulate, and refuses by name."""
+"""Models that the fused step refuses by name."""
 
 import mujoco
 import numpy as np

@@ -14,7 +14,7 @@ def test_orientation(make_task):
     mask = torch.arange(50) % 2 == 0
     drawn = task.events.init_angles
     before, angles = task.sim.qpos.clone(), drawn.clone()
-    task.events.happen(mask)
+    task.events.apply(mask)
     assert torch.equal(task.sim.qpos[~mask], before[~mask]) and torch.equal(
         task.events.init_angles[~mask], angles[~mask]
     )

@@ -1,4 +1,4 @@
-"""What hits a height map: nearest points of its triangles, and what must hold on any ground."""
+"""Contacts with height maps: nearest points of triangles, and properties on any ground."""
 
 import mujoco
 import numpy as np

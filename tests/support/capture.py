@@ -1,4 +1,4 @@
-"""What two trainings have done in an iteration, compared to the bit, and gradients of kernels against autograd."""
+"""Two trainings compared to the bit, iteration by iteration, and gradients of kernels against autograd."""
 
 import torch
 from support.on_device import make_runner
@@ -8,7 +8,7 @@ from legged_torque.utils.task_registry import set_seed
 
 
 def recorded(runner):
-    """Copies of the last rollout, and of what was learned from it."""
+    """Copies of the last rollout and of networks and losses after the update."""
     alg, storage = runner.alg, runner.alg.storage
     result = {f"observations {group}": value for group, value in storage.observations.items()}
     result |= {name: getattr(storage, name) for name in ("actions", "rewards", "returns", "advantages")}
@@ -18,7 +18,7 @@ def recorded(runner):
 
 
 def differences(device, iterations, *words):
-    """Train twice, with CUDA graphs and without; return what differs, and by how much, iteration by iteration.
+    """Train twice, with CUDA graphs and without; return the differences by iteration and name, and the runners.
 
     The first iteration with graphs runs as it is, the second captures them, the others replay them.
     """

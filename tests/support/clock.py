@@ -1,4 +1,4 @@
-"""Shared by tests: a clock that does not run, and waiting by the real one."""
+"""A clock that stands still, and waiting by the real one."""
 
 import time
 
@@ -17,12 +17,12 @@ class Clock:
         self.now += seconds
 
 
-def wait_for(condition, timeout=30.0):
-    """Wait until a condition holds, and return its value."""
+def wait_for(condition, timeout=120.0):
+    """Wait until a condition holds [s], and return its value."""
     end = time.monotonic() + timeout
     while time.monotonic() < end:
         value = condition()
         if value:
             return value
         time.sleep(0.05)
-    raise AssertionError(f"waited in vain for {condition.__name__}")
+    raise AssertionError(f"no end of waiting for {condition.__name__}")

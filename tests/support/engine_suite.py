@@ -21,7 +21,7 @@ USES = {
     "per_world": lambda sim: sim.field("body_mass"),
     "height_map": lambda sim: make_engine(sim.name, sim.mj_model, 1, height_map=object()),
 }
-"""What needs a capability."""
+"""Tests that need a capability."""
 
 
 def steep_capsule_touches(model, data):
@@ -99,7 +99,7 @@ class EngineSuite:
         assert len(errors) > 0.85 * 800 and in_contact > 0.5 * 800
 
     def test_worlds_do_not_interact(self):
-        """A world in contact moves bitwise alike whatever its neighbours do, not finite ones included."""
+        """A world in contact moves to the bit alike next to any neighbours, also next to one that is not finite."""
         torques, trajectories = torch.tensor(random((20, 12), -12.0, 12.0)), []
         for height in (0.15, 5.0, float("nan")):
             sim = self.scattered(2)
@@ -172,7 +172,7 @@ class EngineSuite:
 
     @pytest.mark.parametrize("worlds", [[0], [1, 3], [0, 1, 2, 3]])
     def test_reset_touches_only_masked_worlds(self, worlds):
-        """A reset puts worlds at rest into the reference pose; the others go on as if nothing had happened."""
+        """A reset puts worlds at rest into the reference pose; the others go on unchanged."""
         sim, twin = (self.scattered(4, lowest=0.1) for _ in range(2))
         torques, mask = torch.tensor(random((8, 4, 12), -12.0, 12.0)), torch.zeros(4, dtype=torch.bool)
         mask[worlds] = True
@@ -251,7 +251,7 @@ class EngineSuite:
 
     @pytest.mark.parametrize("capability", USES)
     def test_what_lacks_is_refused(self, capability):
-        """An engine's capabilities are known ones; what it lacks is refused by both names."""
+        """An engine's capabilities are known ones; one that it lacks is refused by both names."""
         sim = self.make(1)
         assert sim.capabilities <= set(CAPABILITIES)
         if capability not in sim.capabilities:

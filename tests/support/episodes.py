@@ -1,9 +1,7 @@
-"""Shared by tests: episodes."""
+"""Beginnings and ends of episodes."""
 
 HIGH_UP = {"init_state.pos": [0.0, 0.0, 50.0]}
-
-
-"""No world falls and starts anew by itself."""
+"""So high up that no world falls and starts anew by itself."""
 
 
 def time_out(task, worlds):

@@ -1,8 +1,7 @@
 """Experiments in this process, and small stand-ins for the scripts that they start."""
 
-import time
-
 import yaml
+from support.clock import wait_for as wait_for  # for the tests of experiments
 from support.scripts import run_here
 
 SMALL = {
@@ -75,15 +74,6 @@ def write(file, values):
     """Write a matrix as YAML; return the file."""
     file.write_text(yaml.safe_dump(values, sort_keys=False))
     return file
-
-
-def wait_for(condition, seconds=120):
-    """Return what a condition returns as soon as that is true."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.05)
-    return condition()
 
 
 def experiment_here(*words, tmp_path):

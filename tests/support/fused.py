@@ -1,4 +1,4 @@
-"""Shared by tests: fused."""
+"""Robots, states and references for tests of engines."""
 
 import mujoco
 import numpy as np
@@ -10,14 +10,8 @@ from legged_torque.sim.registry import make_engine
 from legged_torque.utils.mjcf import colliding_pairs, read_spec
 
 FIELDS = ("qpos", "qvel", "ctrl", "qacc_warmstart")
-
-
 AIR, FLOOR, DEEP = (1.0, 2.0), (0.05, 0.3), (-0.4, 0.1)
-
-
 """Heights of the trunk [m]: out of reach of the floor, on it, in it."""
-
-
 WALKER = """<mujoco><compiler angle="radian" autolimits="true"/>
 <option cone="pyramidal" integrator="implicitfast" impratio="10" timestep="0.004"/>
 <default><joint armature="0.02" frictionloss="0.1" damping="0.3" stiffness="4" springref="0.2" range="-1 1"/>
@@ -28,8 +22,6 @@ WALKER = """<mujoco><compiler angle="radian" autolimits="true"/>
  <geom name="tail" type="sphere" size="0.05" pos="-0.1 0 0.02" mass="1"/>
  <geom name="nose" type="box" size="0.03 0.04 0.02" pos="0.12 0 0" quat="1 0 0.3 0" mass="0.5"/>{legs}</body>
 </worldbody><actuator>{motors}</actuator></mujoco>"""
-
-
 WALKER_LEG = """<body pos="0 {y} -0.05" quat="1 0.2 0 {y}">
  <joint name="{s}1" axis="1 0 0.2" pos="0.01 0.02 0.03"/><geom name="{s}hip" type="sphere" size="0.03" mass="0.5"/>
  <body pos="0.02 0 -0.04" quat="1 0 -0.3 0"><joint name="{s}2" axis="0.1 1 0" pos="0 0 0.02" ref="0.1"/>
@@ -39,8 +31,6 @@ WALKER_LEG = """<body pos="0 {y} -0.05" quat="1 0.2 0 {y}">
    <body pos="0 0 -0.12" quat="1 0 0.2 0.1"><joint name="{s}4" axis="0.3 1 0.5" frictionloss="0" pos="0 0 -0.01"/>
     <geom name="{s}foot" type="box" size="0.05 0.03 0.015" pos="0.02 0 -0.01" quat="1 0.1 0 0" mass="0.3"/>
  </body></body></body></body>"""
-
-
 CRAB = """<mujoco><compiler angle="radian" autolimits="true"/>
 <option cone="pyramidal" integrator="Euler" impratio="10" timestep="0.004">
  <flag midphase="disable" autoreset="disable" fwdinv="enable" invdiscrete="enable"/></option>
@@ -68,8 +58,6 @@ CRAB = """<mujoco><compiler angle="radian" autolimits="true"/>
  </body></body></body></body>{legs}</body></worldbody><actuator>
  <motor joint="leg2" ctrllimited="false"/><motor joint="wheel" forcerange="-3 2"/><motor joint="leg3"/>
  <motor joint="leg1" gear="2"/></actuator></mujoco>"""
-
-
 CRAB_LEG = """<body pos="{x} 0.1 0" euler="0 0 {x}"><joint axis="0.2 -1 0" pos="0.01 0 0"/>
 <geom name="leg{x}" type="capsule" size="0.015 0.05" pos="0.08 0 -0.05" mass="0.2"/></body>"""
 

@@ -1,4 +1,4 @@
-"""Shared by tests: ground."""
+"""Small maps of rough ground, and rays of MuJoCo."""
 
 import mujoco
 import numpy as np

@@ -5,7 +5,6 @@ import datetime
 import hashlib
 import json
 import os
-import subprocess
 import time
 from collections import Counter
 from importlib.metadata import version
@@ -74,23 +73,13 @@ class Recorder:
             FILE.write_text(json.dumps(self._record(), indent=2) + "\n")
 
     def _record(self):
-        """What the file holds."""
+        """The contents of the file."""
         counts = Counter(self._outcomes.values())
         return {
             "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
             "device": f"{torch.cuda.device_count()} x {torch.cuda.get_device_name()}",
-            "driver": _said("nvidia-smi", "--id=0", "--query-gpu=driver_version", "--format=csv,noheader"),
             **{name: version(name) for name in PACKAGES},
             **{outcome: counts[outcome] for outcome in ("passed", "failed", "skipped")},
             "seconds": round(time.time() - self._start),
-            "commit": os.environ.get("GIT_COMMIT") or _said("git", "-C", str(ROOT), "rev-parse", "HEAD"),
             "fingerprint": fingerprint(),
         }
-
-
-def _said(*command):
-    """What a program prints, or None if it cannot run."""
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() or None
-    except (OSError, subprocess.CalledProcessError):
-        return None

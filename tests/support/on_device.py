@@ -1,4 +1,4 @@
-"""Simulators, tasks and trainings on a device of the test's choice, and what tests read of them."""
+"""Simulators, tasks and trainings on a device, and results of their steps."""
 
 import contextlib
 import gc
@@ -94,7 +94,7 @@ def use_graphs(env, on):
 
 @contextlib.contextmanager
 def no_waiting(device):
-    """Let torch refuse whatever waits for a GPU."""
+    """Let torch refuse operations that wait for a GPU."""
     if torch.device(device).type != "cuda":
         yield
         return

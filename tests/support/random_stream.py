@@ -1,4 +1,4 @@
-"""Shared by tests: random_stream."""
+"""The stream of random numbers."""
 
 import torch
 

@@ -13,10 +13,7 @@ from legged_torque.paper.report.evaluations import METRIC_NAMES
 from legged_torque.paper.values import TABLE_I
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "report.py"
-HEADER = (
-    "steps,iteration,seconds,track_percentage,track_xy,track_angular,collision_force,cost_of_transport,height,speed,"
-    "falls_per_minute,critic_gradient_norm"
-)
+HEADER = ",".join(["steps,iteration,seconds", *METRIC_NAMES])
 SETTINGS = {
     "env": {"env": {"num_envs": 1000}},
     "train": {"runner": {"num_steps_per_env": 1000}},  # a million steps per iteration

@@ -1,4 +1,4 @@
-"""Trainings as a user starts them, in processes of their own, and all that they leave behind, to be compared."""
+"""Trainings in processes of their own, and comparisons of their files."""
 
 import csv
 import subprocess
@@ -10,7 +10,7 @@ from support.scripts import ROOT
 from legged_torque.utils.runs import find_checkpoint
 
 TIMES = ("seconds",)
-"""What may differ between equal trainings, by name."""
+"""Names of values that may differ between equal trainings."""
 
 
 def start(folder, *words):
@@ -32,7 +32,7 @@ def finish(*processes):
 
 
 def content(folder):
-    """All that the last checkpoint below a folder holds, and the rows of all evaluations, by name."""
+    """The contents of the last checkpoint below a folder and the rows of all evaluations, by name."""
     runs = sorted(folder.glob("*/*/"))
     checkpoint = torch.load(find_checkpoint(runs[-1], None), map_location="cpu", weights_only=True)
     rows = {}
@@ -42,7 +42,7 @@ def content(folder):
 
 
 def values(content, name=""):
-    """All that nested containers hold, by name, apart from :data:`TIMES`."""
+    """All values of nested containers with their names, without :data:`TIMES`."""
     for key, part in content.items() if isinstance(content, dict) else enumerate(content):
         path = f"{name}.{key}" if name else str(key)
         if isinstance(part, (dict, list, tuple)):
@@ -52,7 +52,7 @@ def values(content, name=""):
 
 
 def differences(one, other):
-    """Names of what is not equal to the bit."""
+    """Names of values that are not equal to the bit."""
 
     def equal(value, twin):
         if isinstance(value, torch.Tensor) and isinstance(twin, torch.Tensor):

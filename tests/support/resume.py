@@ -1,4 +1,4 @@
-"""Shared by tests: resume."""
+"""Trainings in this process that are saved and resumed."""
 
 from pathlib import Path
 
@@ -11,23 +11,11 @@ from legged_torque.utils.config import to_dict
 from legged_torque.utils.task_registry import set_seed
 
 WORLDS = 6
-
-
 WORDS = ["--task=a1_torque_multihead", f"--num_envs={WORLDS}", "--perturbation=low", "--logger=none", "--seed=3"]
-
-
 WORDS += ["--set=runner.num_steps_per_env=4", "--set=algorithm.num_mini_batches=2", "--set=runner.save_interval=1"]
-
-
 WORDS += ["--set=actor.hidden_dims=[8, 8]", "--set=actor.head_hidden_dims=[8]", "--set=critic.hidden_dims=[8]"]
-
-
 WORDS += ["--set=evaluation.interval=24", "--set=evaluation.num_samples=60", "--set=env.episode_length_s=0.2"]
-
-
 WORDS += ["--set=evaluation.also=[high]", "--set=evaluation.also_from=48"]
-
-
 WORDS += ["--set=env.history_length=2", "--set=motors.delay.range=[0, 3]"]
 
 
@@ -56,6 +44,6 @@ def train(root, iterations, *words):
 
 
 def content(runner, iterations):
-    """All that a run's checkpoint holds, by name, apart from times."""
+    """The contents of a run's checkpoint by name, without times."""
     file = Path(runner.log_dir) / f"model_{iterations}.pt"
     return dict(values(torch.load(file, weights_only=True)))

@@ -1,4 +1,4 @@
-"""Shared by tests: rewards."""
+"""Table III of the paper."""
 
 TABLE_III = {  # weight without Delta t, at the start of training
     "tracking_lin_vel": 4.0,

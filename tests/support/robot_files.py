@@ -1,4 +1,4 @@
-"""Shared by tests: robot_files."""
+"""Variants of the A1's file."""
 
 import xml.etree.ElementTree as ElementTree
 
@@ -7,8 +7,6 @@ import pytest
 from legged_torque import RESOURCES_DIR
 
 A1 = RESOURCES_DIR / "robots/a1/a1.xml"
-
-
 UNITREE_ORDER = ("FL", "FR", "RL", "RR")
 
 
@@ -34,7 +32,7 @@ def shuffle_motors(root):
 
 
 def unitree_order(root):
-    """Joints FL, FR, RL, RR, motors FR, FL, RR, RL, as in Unitree's own go2.xml."""
+    """Joints FL, FR, RL, RR, motors FR, FL, RR, RL, as in Unitree's go2.xml."""
     trunk = root.find("worldbody/body")
     legs = {leg.get("name")[:2]: leg for leg in trunk.findall("body")}
     for leg in UNITREE_ORDER:

@@ -55,25 +55,27 @@ def make_ppo(kind=OnDevicePPO, steps=STEPS, worlds=WORLDS, seed=0, obs_normaliza
 
 
 def record_rollout(alg, seed=1, poison=None):
-    """Let the algorithm act for one rollout of random numbers, as a runner does; return what it got from the task."""
+    """Let the algorithm act for one rollout of random numbers; return rewards and dones, and the last observations."""
     torch.manual_seed(seed)
-    told = {"rewards": [], "dones": [], "time_outs": []}
+    num, device = alg.storage.num_envs, alg.device
+    received = {"rewards": [], "dones": [], "time_outs": []}
     for step in range(alg.storage.num_transitions_per_env):
-        obs = random_obs(alg.storage.num_envs)
+        obs = random_obs(num).to(device)
         alg.act(obs)
-        rewards = torch.randn(alg.storage.num_envs)
+        rewards = torch.randn(num)
         if poison is not None and step == poison[0]:
             rewards[poison[1]] = math.nan
-        dones = torch.rand(alg.storage.num_envs) < 0.3
-        time_outs = dones & (torch.rand(alg.storage.num_envs) < 0.5)
+        dones = torch.rand(num) < 0.3
+        time_outs = dones & (torch.rand(num) < 0.5)
         for obs_group in obs.values():
             obs_group.fill_(math.nan)  # the task reuses its buffers: a rollout that kept no copy is spoiled
-        alg.process_env_step(random_obs(alg.storage.num_envs), rewards, dones, {"time_outs": time_outs})
+        extras = {"time_outs": time_outs.to(device)}
+        alg.process_env_step(random_obs(num).to(device), rewards.to(device), dones.to(device), extras)
         for name, value in (("rewards", rewards), ("dones", dones), ("time_outs", time_outs)):
-            told[name].append(value.double().numpy())
-    last_obs = random_obs(alg.storage.num_envs)
+            received[name].append(value.double().numpy())
+    last_obs = random_obs(num).to(device)
     alg.compute_returns(last_obs)
-    return {name: np.stack(values) for name, values in told.items()}, last_obs
+    return {name: np.stack(values) for name, values in received.items()}, last_obs
 
 
 def copy_rollout(source, target, samples=None):

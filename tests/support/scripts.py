@@ -1,4 +1,4 @@
-"""Shared by tests: scripts."""
+"""Scripts in this process and in one of their own."""
 
 import contextlib
 import io
@@ -57,8 +57,6 @@ for path, *words in json.loads(sys.argv[1]):
         status = end.code or 0
     print()
     print("result:", json.dumps([status, *(name for name in sys.modules if "." not in name)]))"""
-
-
 HEAVY = {"torch", "warp", "mujoco", "mujoco_warp", "rsl_rl", "tensordict", "matplotlib"}
 """Packages that take long to import."""
 

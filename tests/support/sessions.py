@@ -1,4 +1,4 @@
-"""Shared by tests: live sessions of policies that have not been trained."""
+"""Live sessions of policies that have not been trained."""
 
 import contextlib
 import threading

@@ -1,4 +1,4 @@
-"""What the tests of settings share."""
+"""Names of all tasks, and settings by a command line."""
 
 import pytest
 
@@ -32,7 +32,7 @@ def get_cfgs(*words, task="a1_position", run_config=None):
 
 
 def error_of(function, *args, **kwargs):
-    """The line that a mistake is told with."""
+    """The line with which a mistake is refused."""
     with pytest.raises(UserError) as error:
         function(*args, **kwargs)
     assert "\n" not in str(error.value)

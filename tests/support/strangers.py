@@ -1,4 +1,4 @@
-"""Shared by tests of files that strangers have made."""
+"""Runs of strangers, and scripts that load them."""
 
 import yaml
 from support.scripts import run_here

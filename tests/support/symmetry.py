@@ -1,4 +1,4 @@
-"""Shared by tests: symmetry."""
+"""Mirror images of the A1's vectors by hand."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Shared by tests: tilted trunks."""
+"""Tilted trunks."""
 
 import mujoco
 import numpy as np

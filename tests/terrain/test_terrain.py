@@ -180,16 +180,11 @@ def test_columns_by_share():
         assert Layout.of(cfg.terrain).kinds() == legged_gym
 
 
-class RampCfg(A1Cfg):
-    """Settings with a kind of tile that the library does not have."""
+def test_a_kind_of_ones_own(monkeypatch):
+    """The page's own text: a ramp that is level up to 1 m and rises by 0.3 d from there, in a fifth of the columns.
 
-    class terrain:
-        class terrain_proportions:
-            ramp: float = 0.0
-
-
-def test_example_of_a_kind_of_ones_own(monkeypatch):
-    """The page's own text: a ramp that is level up to 1 m and rises by 0.3 d from there, in a fifth of the columns."""
+    A kind that is not in TILES, or returns what is no tile, is an error.
+    """
     monkeypatch.setitem(TILES, "ramp", None)  # to be forgotten afterwards
     page = (Path(__file__).parents[2] / "docs" / "terrain.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
@@ -199,19 +194,16 @@ def test_example_of_a_kind_of_ones_own(monkeypatch):
     assert layout.kinds().count("ramp") == 4
     slopes = np.diff(layout.tile(5, layout.kinds().index("ramp")), axis=0) / 0.05
     np.testing.assert_allclose(slopes, np.repeat([0.0, 0.15], [100, 60])[:, None].repeat(161, 1), atol=1e-9)
-
-
-def test_a_kind_of_ones_own(monkeypatch):
-    """A function in TILES is a kind; one that is not there, or returns what is no tile, is told."""
-    only = {"cfg": RampCfg(), "terrain_proportions": {"ramp": 1.0}, "difficulty_range": [0.5, 0.5]}
-    assert "unknown kind in terrain.terrain_proportions 'ramp';" in error_of(make_ground, **only)
-    monkeypatch.setitem(TILES, "ramp", lambda difficulty, rng, grid: grid.flat() + difficulty * grid.offsets()[:, None])
+    only = {"cfg": names["RampCfg"](), "terrain_proportions": {"ramp": 1.0}, "difficulty_range": [0.5, 0.5]}
     ground = make_ground(**only)
-    torch.testing.assert_close(ground.height(torch.tensor([[1.0, 0.0, 0.0]])), torch.tensor([0.5]))
-    torch.testing.assert_close(ground.normal(torch.zeros(1, 3)), torch.tensor([[-(0.2**0.5), 0.0, 0.8**0.5]]))
+    place = torch.tensor([[2.02, 0.0, 0.0]])
+    torch.testing.assert_close(ground.height(place), torch.tensor([0.15 * 2.02]))
+    torch.testing.assert_close(ground.normal(place), torch.tensor([[-0.15, 0.0, 1.0]]) / 1.0225**0.5)
     monkeypatch.setitem(TILES, "ramp", lambda difficulty, rng, grid: np.zeros(3))
     line = error_of(make_ground, **only)
     assert line == "the kind of tile 'ramp' must return finite heights of shape (121, 121)"
+    monkeypatch.delitem(TILES, "ramp")
+    assert "unknown kind in terrain.terrain_proportions 'ramp';" in error_of(make_ground, **only)
 
 
 # ---- levels ----------------------------------------------------------------------------------------------------------
@@ -266,12 +258,6 @@ def test_levels_stay_in_evaluations():
     ended = torch.ones(12, dtype=torch.bool)
     ground.end_episodes(ended, ground.origins + 5.0, torch.ones(12, 3), 20.0)
     assert torch.equal(ground.levels, before)
-
-
-def test_levels_are_kept_for_a_resume():
-    """They are the state of the ground; columns and map follow from the settings."""
-    ground = make_ground(7)
-    assert ground.state_dict() == {"levels": ground.levels}
 
 
 # ---- in a task ------------------------------------------------------------------------------------------------------

@@ -108,21 +108,6 @@ def test_shares_by_hand():
     )
 
 
-def test_peaks(monkeypatch):
-    """Operations and bytes over the time that they take."""
-    monkeypatch.setattr(roofline, "_MATRIX", {"cpu": 100})
-    monkeypatch.setattr(roofline, "_COPY", {"cpu": 1000})
-    calls = []
-
-    def seconds(function, device):
-        function()
-        calls.append(function)
-        return float(len(calls))  # 1 to 5 for the product, whose median is 3, then 6 to 10
-
-    monkeypatch.setattr(roofline, "seconds_per_call", seconds)
-    assert roofline.measure_peaks("cpu", "bfloat16") == Peaks(flop_per_s=2e6 / 3, bytes_per_s=2000 / 8)
-
-
 def test_script(tmp_path):
     """It prints three rates with their peaks, each share being the one over the other."""
     words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--rounds=1", "--set=runner.num_steps_per_env=3"]

@@ -7,12 +7,10 @@ import sys
 
 import pytest
 import torch
-from support.command import command
+from support.command import command, complete
 from support.scripts import ROOT, assert_told_in_one_line, run_here
 from support.settings import error_of, get_cfgs, parse
 
-from legged_torque.envs import task_registry
-from legged_torque.envs.base.commands import fix_command
 from legged_torque.utils.cli import Parser, add_task_args, option_words, run_script, script_command
 from legged_torque.utils.options import Options
 
@@ -36,21 +34,13 @@ def test_command_without_a_script():
     assert_told_in_one_line(command("trian"), "unknown command 'trian'; did you mean 'train'?")
 
 
-def complete(line, env):
-    """What a shell offers after a line."""
-    pytest.importorskip("argcomplete")
-    variables = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
-    variables |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(env), "_ARGCOMPLETE_SHELL": "bash"}
-    status, _, error = command(env=variables)
-    assert status == 0, error
-    return env.read_text().split()
-
-
 def test_completion(tmp_path):
-    """Names of scripts, then options and tasks of a script."""
+    """Names of scripts, then options and tasks of a script, and figures and their options."""
     assert complete("legged-torque pl", tmp_path / "1")[0] == "play"
     assert complete("legged-torque train --task_", tmp_path / "2") == ["--task_file"]
     assert complete("legged-torque train --task a1_torque_mul", tmp_path / "3") == ["a1_torque_multihead"]
+    assert complete("legged-torque plot cur", tmp_path / "4") == ["curves"]
+    assert complete("legged-torque plot curves --o", tmp_path / "5") == ["--out"]
 
 
 def test_command_of_other_scripts(monkeypatch, tmp_path):
@@ -69,21 +59,14 @@ def test_command_of_other_scripts(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_help_has_examples(script, tmp_path):
-    """Options are in groups, and the help ends with examples of the script itself."""
+    """Options are in groups, and the help ends with examples of the script itself, whose options exist."""
     _, output, _ = run_here(f"{script}.py", "--help", root=tmp_path)
     head, _, examples = output.partition("\nexamples:\n")
     assert all(line.startswith(f"    python {ROOT}/scripts/{script}.py") for line in examples.splitlines()) and examples
+    for option in re.findall(r"--\w+", examples) if script != "plot" else ():  # whose figures have their own
+        assert f"  {option}" in head, option
     if "--set KEY" in head:
         assert head.index("\noptions:\n") < head.index("\ntask and settings:\n") < head.index("\n  --set KEY=VALUE")
-
-
-def test_examples_are_accepted(tmp_path):
-    """The options of the examples of train.py, play.py and evaluate.py exist: their parsers take them."""
-    for script in ("train", "play", "evaluate"):
-        text = (ROOT / "scripts" / f"{script}.py").read_text().partition("Examples:\n")[2].partition('"""')[0]
-        _, output, _ = run_here(f"{script}.py", "--help", root=tmp_path)
-        for option in set(re.findall(r"--\w+", text)):
-            assert f"  {option}" in output, (script, option)
 
 
 # ---- flags of legged_gym ---------------------------------------------------------------------------------------------
@@ -110,22 +93,6 @@ def test_names_of_the_device():
     assert parser.parse_args(["--device=cpu", "--device=cuda"]).device == "cuda"
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        ("--agent=zero --load_run=x", "--agent zero has no run"),
-        ("--agent=random --viewer=web", "--agent random has no run"),
-        ("--headless --viewer=native", "--headless opens no window"),
-        ("--no_video --video=a.mp4", "--no_video prints metrics alone"),
-        ("--agent=best", "argument --agent: invalid choice: 'best'"),
-    ],
-)
-def test_play_refuses(words, told, tmp_path):
-    """What does not go together is told before anything is loaded."""
-    assert_told_in_one_line(run_here("play.py", *words.split(), root=tmp_path), told)
-    assert not list(tmp_path.iterdir())
-
-
 def test_agents(tmp_path, make_task):
     """Robots of a task act without a run: with zeros, or with other numbers from -1 to 1 in every step and world."""
     words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--steps=3", "--no_video"]
@@ -139,17 +106,6 @@ def test_agents(tmp_path, make_task):
     assert not (first == second).any()
 
 
-def test_fixed_command():
-    """All worlds get it, whenever commands are drawn."""
-    env_cfg, _ = task_registry.get_cfgs("a1_position")
-    env_cfg.env.num_envs = 3
-    fix_command(env_cfg, (0.5, -0.25, 0.125))
-    task, _ = task_registry.make_env("a1_position", Options(device="cpu"), env_cfg)
-    task.commands.zero_()
-    task.command_generator.resample(torch.ones(3, dtype=torch.bool))
-    assert task.commands.tolist() == [[0.5, -0.25, 0.125]] * 3
-
-
 def test_words_for_another_script():
     """Options that are given, each value of a list as an option of its own."""
     options = Options(task="a", task_file=["a.py", "b c.py"])
@@ -157,8 +113,25 @@ def test_words_for_another_script():
     assert option_words(options, "task_file", "seed", "set", "task") == words
 
 
-def test_a_missing_package(capsys):
-    """A package that should have come along is told in one line."""
-    with pytest.raises(SystemExit, match="2"):
-        run_script(lambda: importlib.import_module("nothing.of_this_name"))
-    assert capsys.readouterr().err == "error: 'nothing' is not installed; pip install legged_torque brings it along\n"
+def interrupt():
+    """Press Ctrl-C."""
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("main", "status", "line"),
+    [
+        (
+            lambda: importlib.import_module("nothing.of_this_name"),
+            "2",
+            "error: 'nothing' is not installed; pip",
+        ),
+        (interrupt, "130", "interrupted"),
+    ],
+)
+def test_ends_of_scripts(main, status, line, capsys):
+    """A missing package and Ctrl-C end a script with a line and a status."""
+    with pytest.raises(SystemExit, match=status):
+        run_script(main)
+    error = capsys.readouterr().err
+    assert error.startswith(line) and error.count("\n") == 1

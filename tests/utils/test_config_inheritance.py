@@ -128,21 +128,8 @@ MISTAKES = {
 
 @pytest.mark.parametrize("text", MISTAKES)
 def test_misspelt_names_are_refused(text):
-    """A name that no base has is told with the nearest one, before anything is built."""
+    """A name that no base has is reported with the nearest one, before anything is built."""
     lines = "\n".join(f" {line}" for line in text.splitlines())
     with pytest.raises(UserError) as error:
         exec(f"class V(Both):\n{lines}", globals())  # the only way to write a class from a table
     assert MISTAKES[text] in str(error.value) and "\n" not in str(error.value)
-
-
-def test_instances_do_not_share():
-    """Changing a configuration changes neither its class nor another instance."""
-
-    class Listed(Base):
-        class rewards:
-            names: list[str] = ["a"]
-
-    first, second = Listed(), Listed()
-    first.rewards.names.append("b")
-    first.control.stiffness = 0.0
-    assert second.rewards.names == Listed.rewards.names == ["a"] and second.control.stiffness == 1.0

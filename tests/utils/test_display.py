@@ -1,27 +1,20 @@
 """The display of long work: a view on a terminal, lines elsewhere, and nothing that harms the work."""
 
 import contextlib
-import fcntl
 import io
-import math
 import os
-import pty
 import re
 import signal
-import struct
-import subprocess
 import sys
-import termios
 import time
 from itertools import pairwise
 
 import pytest
-from rich.console import Console
 from support.clock import Clock
-from support.scripts import ROOT
+from support.terminal import in_a_terminal
 
 from legged_torque.learning.training_display import TrainingDisplay, blocks, read_tracking
-from legged_torque.utils.display import REDRAW_EVERY, Counter, is_terminal, read_progress, warn
+from legged_torque.utils.display import REDRAW_EVERY, Counter, is_terminal, read_progress
 
 STYLES = re.compile(r"\033\[[\d;?]*[A-Za-z]")
 NUMBERS = {"kl": 0.0123, "action_std": 0.5, "learning_rate": 1e-3, "Health/diverged_worlds": 0.0}
@@ -76,32 +69,6 @@ try:
 except KeyError as error:
     print("caught", error)
 """
-
-
-def in_a_terminal(code, columns=80, after="", close=False, **variables):
-    """Run code in a terminal of that width; once ``after`` has come, press Ctrl-C or close the terminal.
-
-    Returns:
-        Exit status, and all that the terminal has got.
-    """
-    master, slave = pty.openpty()
-    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
-    environment = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "NO_COLOR", "LINES")}
-    environment |= {"PYTHONPATH": str(ROOT), "TERM": "xterm-256color", "PYTHONUTF8": "1", **variables}
-    streams = {"stdin": slave, "stdout": slave, "stderr": slave}
-    process = subprocess.Popen([sys.executable, "-c", code], **streams, env=environment, start_new_session=True)
-    os.close(slave)
-    output = b""
-    with contextlib.suppress(OSError):  # at the end of a terminal
-        while data := os.read(master, 65536):
-            output += data
-            if after and after in output.decode(errors="replace"):
-                if close:
-                    break
-                process.send_signal(signal.SIGINT)
-                after = ""
-    os.close(master)
-    return process.wait(20), output.decode()
 
 
 def lines_of(output):
@@ -179,14 +146,6 @@ def test_errors():
     assert lines_of(output)[-1] == "caught 'of the work'" and output.count("\033[?25l") == output.count("\033[?25h")
 
 
-def test_a_number_that_cannot_be_drawn():
-    """A curve with an infinite number has no view."""
-    shown = TrainingDisplay("title", "folder", 2, 0, 32)
-    shown.add_iteration(1, 32, {**NUMBERS, **EVALUATED, "Evaluation/track_percentage": math.inf})
-    with pytest.raises((ValueError, OverflowError)):
-        Console(record=True, file=io.StringIO()).print(shown.view())
-
-
 def test_lines(capsys):
     """After the first iteration, an evaluation or ten seconds, and at the end; experiments read them."""
     clock = Clock()
@@ -249,12 +208,6 @@ def test_nothing_is_written_twice_or_to_nobody(monkeypatch, capsys):
     with TrainingDisplay("title", "folder", 2, 0, 32):
         pass
     assert capsys.readouterr().out == ""
-
-
-def test_warnings(capsys):
-    """They go to standard error, whatever is shown."""
-    warn("the disk is full")
-    assert capsys.readouterr() == ("", "Warning: the disk is full.\n")
 
 
 def test_curve():

@@ -1,17 +1,15 @@
 """Signals ask a training to stop, whenever they come."""
 
-import fcntl
 import io
 import os
-import pty
 import signal
 import subprocess
 import sys
-import termios
 import threading
-from pathlib import Path
 
 import pytest
+from support.scripts import ROOT
+from support.terminal import in_a_terminal
 
 from legged_torque.utils.interrupt import SIGNALS, StopRequest
 
@@ -28,14 +26,6 @@ def test_stop_request(number):
         signal.raise_signal(number)
         pytest.fail("the second signal did not raise")
     assert [signal.getsignal(each) for each in SIGNALS] == before
-
-
-def test_stop_request_without_a_signal():
-    """Nothing is asked, and the signals are given back."""
-    before = signal.getsignal(signal.SIGINT)
-    with StopRequest() as stop:
-        assert signal.getsignal(signal.SIGINT) != before
-    assert not stop.requested and signal.getsignal(signal.SIGINT) == before
 
 
 def test_stop_request_outside_the_main_thread():
@@ -76,49 +66,30 @@ def test_signal_while_printing(monkeypatch):
 
 
 IN_A_TERMINAL = """
-import os, sys, time
+import fcntl, os, signal, sys, termios, time
 from legged_torque.utils.interrupt import StopRequest
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)  # whose end is that of the session
+{before}
 with StopRequest() as stop:
     print("ready", flush=True)
-    while not stop.requested:
+    end = time.monotonic() + {seconds}
+    while not stop.requested and time.monotonic() < end:
         time.sleep(0.01)
-    for _ in range(3):
-        print("iteration", flush=True)  # the terminal is gone: this would fail
-    time.sleep(0.1)  # time for a second signal
-    open(sys.argv[1], "w").write(str(stop.number))
+    if stop.requested:
+        os.kill(os.getpid(), signal.SIGHUP)  # once more
+        for _ in range(3):
+            print("iteration", flush=True)  # the terminal is gone: this would fail
+os._exit(10 + stop.number)
 """
 
 
-@pytest.mark.parametrize("before", ["", "signal.signal(signal.SIGHUP, signal.SIG_IGN)"])
-def test_a_terminal_that_closes(tmp_path, before):
+@pytest.mark.parametrize(
+    ("before", "seconds", "number"), [("", 20, signal.SIGHUP), ("signal.signal(signal.SIGHUP, signal.SIG_IGN)", 0.5, 0)]
+)
+def test_a_terminal_that_closes(before, seconds, number):
     """It asks to stop, and what is printed afterwards harms nothing; under nohup it does not even ask."""
-    code = f"import signal; {before}{IN_A_TERMINAL}"
-    master, slave = pty.openpty()
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    command = [sys.executable, "-c", code, str(tmp_path / "number")]
-    streams = {"stdin": slave, "stdout": slave, "stderr": slave}
-    process = subprocess.Popen(command, **streams, env=environment, preexec_fn=take_terminal)
-    os.close(slave)
-    line = b""
-    while not line.endswith(b"\n"):  # or the terminal would close while the line is being written
-        line += os.read(master, 100)
-    assert line.strip() == b"ready"
-    os.close(master)
-    if before:
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(0.5)
-        process.terminate()
-    process.send_signal(signal.SIGHUP)
-    assert process.wait(20) == (1 if before else 0)
-    assert (tmp_path / "number").exists() != bool(before)
-    if not before:
-        assert (tmp_path / "number").read_text() == str(int(signal.SIGHUP))
-
-
-def take_terminal():
-    """Make standard input the terminal of a new session, which ends with it."""
-    os.setsid()
-    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+    code = IN_A_TERMINAL.format(before=before, seconds=seconds)
+    assert in_a_terminal(code, after="ready", close=True)[0] == 10 + number
 
 
 def test_mujoco_leaves_no_file(tmp_path):
@@ -136,7 +107,7 @@ def main():
     mujoco.mj_step(model, data)
 run_script(main)
 """
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", code]
     result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
     assert "MuJoCo: Nan, Inf or huge value in QVEL" in result.stderr and not list(tmp_path.iterdir())

@@ -126,12 +126,3 @@ def test_words(hint, words, value, problem):
     """Help and reference page say what is allowed, an error what of that a value is not."""
     assert describe(hint) == words
     assert problem in error_of(check_value, "x", value, hint)
-
-
-def test_values_in_their_types():
-    """Numbers become what their type says, in lists and dictionaries too."""
-    for value, hint, expected in [(2, float, 2.0), (1e6, int, 1_000_000), ([1, 2], Interval, [1.0, 2.0])]:
-        result = check_value("x", value, hint)
-        assert repr(result) == repr(expected)
-    assert repr(check_value("x", {"a": 1}, float | dict[str, float])) == "{'a': 1.0}"
-    assert check_value("x", None, Count | None) is None

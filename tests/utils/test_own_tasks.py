@@ -134,7 +134,7 @@ def test_places_of_files(tmp_path, monkeypatch):
 
 
 def test_installed_packages(tmp_path, capsys):
-    """Their tasks are known when they are asked for, not before; a broken package is told, and spoils nothing."""
+    """Their tasks are known when they are asked for, not before; a broken package is reported, and spoils nothing."""
     install(tmp_path, offered=REGISTER.format("their_task"), faulty="import nothing_of_this_name\n")
     task_registry.get_cfgs("a1_torque")
     assert "offered" not in sys.modules

@@ -1,4 +1,4 @@
-"""What one process does that torchrun has started, or should have, without the others."""
+"""Processes that torchrun has started, or should have, without the others."""
 
 import pytest
 import torch

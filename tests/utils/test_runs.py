@@ -83,6 +83,7 @@ def test_config_file_round_trip(task, tmp_path):
     words = ["--preset=paper", "--set=rewards.scales.torques=-1e-7", "--set=actor.hidden_dims=[8, 4]", "--run_name=7"]
     env_cfg, train_cfg = get_cfgs(*words, task=task)
     runs.save_config(tmp_path / "run", {"task": task, "env": to_dict(env_cfg), "train": to_dict(train_cfg)})
+    assert "!!" not in (tmp_path / "run" / "config.yaml").read_text()  # any program reads it
     config = runs.load_config(tmp_path / "run")
     loaded = get_cfgs(task=task, run_config=config)
     for new, old in zip(loaded, (env_cfg, train_cfg), strict=True):
@@ -99,10 +100,8 @@ def test_config_file_round_trip(task, tmp_path):
     ("text", "message"),
     [
         ("task: [a1", "is not valid YAML"),
-        ("task: a1\n\tenv: 3", "is not valid YAML"),
         ("\x00\x01", "is not valid YAML"),
         ("", "lacks the entries task, env and train"),
-        ("just words", "lacks the entries task, env and train"),
         ("- task\n- env\n- train", "lacks the entries task, env and train"),
         ("task: a1_position\nenv: {}", "lacks the entries task, env and train"),
         (None, "has no config.yaml"),
@@ -172,7 +171,7 @@ def limited_write(file, most):
 
 
 def test_a_full_disk(tmp_path):
-    """It is told by its name, and the file stays what it was."""
+    """It is reported by its name, and the file stays what it was."""
     (tmp_path / "file").write_bytes(b"old")
     line = limited_write(tmp_path / "file", 50_000)
     assert line == f"cannot write '{tmp_path / 'file'}': File too large"

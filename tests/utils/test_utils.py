@@ -1,19 +1,21 @@
 """The small helpers."""
 
 import ctypes.util
+import math
 import os
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-import yaml
-from support.settings import get_cfgs
 
 from legged_torque.envs import task_registry
-from legged_torque.utils import devices, runs
+from legged_torque.utils import devices
 from legged_torque.utils.config import to_dict
-from legged_torque.utils.math import quat_rotate_inverse
+from legged_torque.utils.files import portable_path, without_machine
+from legged_torque.utils.heading import heading
+from legged_torque.utils.math import quat_rotate_inverse, rotate_yaw, yaw
 from legged_torque.utils.options import Options, apply_options
 
 
@@ -36,6 +38,32 @@ def test_world_vectors_in_the_body_frame():
     expected = np.einsum("nji,nj->ni", quaternion_matrices(quat), vec)
     turned = quat_rotate_inverse(torch.tensor(quat), torch.tensor(vec))
     np.testing.assert_allclose(turned, expected, atol=1e-12)
+
+
+def turned(angle, tilt, about):
+    """A turn about z [rad] after a tilt [rad] about a horizontal axis at an angle ``about``: (w, x, y, z)."""
+    w, x, y = math.cos(tilt / 2), math.sin(tilt / 2) * math.cos(about), math.sin(tilt / 2) * math.sin(about)
+    cos, sin = math.cos(angle / 2), math.sin(angle / 2)
+    return np.array([cos * w, cos * x - sin * y, cos * y + sin * x, sin * w])
+
+
+@pytest.mark.parametrize("angle", [-3.0, -0.4, 0.0, 1.2, 3.1])
+@pytest.mark.parametrize("tilt", [0.0, 0.7, 2.0])
+def test_heading(angle, tilt):
+    """A tilt about a horizontal axis does not change the heading, and numpy and torch agree."""
+    quat = turned(angle, tilt, 0.9)
+    x, y, length = heading(quat)
+    assert math.atan2(y, x) == pytest.approx(angle)
+    assert (x / length, y / length) == pytest.approx((math.cos(angle), math.sin(angle)))
+    quats, one = torch.from_numpy(np.stack([quat, quat])), torch.ones(2, dtype=torch.float64)
+    torch.testing.assert_close(yaw(quats), angle * one)
+    torch.testing.assert_close(rotate_yaw(quats, one, 0.0 * one), (math.cos(angle) * one, math.sin(angle) * one))
+
+
+def test_upside_down():
+    """Without a heading, results are finite."""
+    x, y, length = heading(np.array([0.0, 1.0, 0.0, 0.0]))
+    assert (x, y) == (0.0, 0.0) and length > 0.0
 
 
 @pytest.mark.parametrize(
@@ -67,17 +95,30 @@ def test_choice_of_the_renderer(asked, installed, gpu, chosen, monkeypatch):
         assert asked is None or asked in reason
 
 
-def test_yaml_needs_no_tags(tmp_path):
-    """The configuration file is plain YAML that any program reads."""
-    env_cfg, train_cfg = get_cfgs("--run_name=x")
-    runs.save_config(tmp_path, {"task": "a1_position", "env": to_dict(env_cfg), "train": to_dict(train_cfg)})
-    text = (tmp_path / "config.yaml").read_text()
-    assert "!!" not in text and yaml.safe_load(text)["train"]["runner"]["run_name"] == "x"
-
-
 def test_options_that_are_not_given_change_nothing():
     """Scripts without training options, such as play.py, leave training settings alone."""
     env_cfg, train_cfg = task_registry.get_cfgs("a1_position")
     before = to_dict(train_cfg)
     apply_options(env_cfg, train_cfg, Options(device="cpu", num_envs=3))
     assert env_cfg.env.num_envs == 3 and to_dict(train_cfg) == before
+
+
+def test_portable_path(tmp_path, monkeypatch):
+    """Paths below the current folder become relative, others a name; relative ones stay."""
+    monkeypatch.chdir(tmp_path)
+    assert portable_path(tmp_path / "logs" / "a.pt") == "logs/a.pt"
+    assert portable_path("/elsewhere/a.pt") == "a.pt"
+    assert portable_path(Path("../logs/a.pt")) == "../logs/a.pt"
+
+
+def test_without_machine(monkeypatch, tmp_path):
+    """Paths are found in nested settings and in KEY=VALUE; everything else stays."""
+    monkeypatch.chdir(tmp_path)
+    settings = {
+        "file": "/tmp/a.pt",
+        "scale": 0.5,
+        "empty": "",
+        "names": ["a/b", "runner.file=/tmp/b.pt", "x=1/2", None],
+    }
+    expected = {"file": "a.pt", "scale": 0.5, "empty": "", "names": ["a/b", "runner.file=b.pt", "x=1/2", None]}
+    assert without_machine(settings) == expected

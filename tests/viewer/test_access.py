@@ -13,15 +13,15 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from legged_torque.utils.errors import UserError
-from legged_torque.viewer.access import Guard, GuardedServer, is_local
+from legged_torque.viewer.access import GuardedServer, is_local
 from legged_torque.viewer.ports import free_port
 
 
 @contextlib.contextmanager
-def serving(guard):
-    """A server on this machine behind a guard; gives its port."""
-    server = GuardedServer(guard, "127.0.0.1", free_port("127.0.0.1", 8440), "title")
-    yield server.get_port()
+def serving(host):
+    """A server; gives its port and its token."""
+    server = GuardedServer(host, 8440, "title")
+    yield server.get_port(), server.token
     assert server.request_share_url() is None
     server.stop()
 
@@ -51,7 +51,7 @@ def connects(port, host="127.0.0.1", origin=None, cookie=None):
 def test_only_the_page_itself_connects():
     """On this machine: the page and programs, but no page of another site, also under a name that leads here."""
     before = websockets.asyncio.server.serve
-    with serving(Guard("127.0.0.1")) as port:
+    with serving("127.0.0.1") as (port, _):
         assert websockets.asyncio.server.serve is before  # other servers are not guarded
         assert get(port) == (200, "")
         for host in ("127.0.0.1", "localhost"):
@@ -66,13 +66,12 @@ def test_only_the_page_itself_connects():
 
 def test_token():
     """For other machines: nothing without the token, which the browser keeps once the page was opened with it."""
-    guard = Guard("0.0.0.0")
-    assert len(guard.token) == 32 and guard.token != Guard("0.0.0.0").token
-    with serving(guard) as port:
-        for path in ("/", "/index.html", "/?token=", f"/?token={guard.token[:-1]}", "/?token=%C3%A4%FF"):
+    with serving("0.0.0.0") as (port, token), serving("0.0.0.0") as (_, other):
+        assert len(token) == 32 and token != other
+        for path in ("/", "/index.html", "/?token=", f"/?token={token[:-1]}", "/?token=%C3%A4%FF"):
             assert get(port, path) == (403, "")
-        assert not connects(port) and not connects(port, cookie=f"legged_torque={guard.token}")
-        status, cookie = get(port, f"/?token={guard.token}")
+        assert not connects(port) and not connects(port, cookie=f"legged_torque={token}")
+        status, cookie = get(port, f"/?token={token}")
         assert status == 200 and "HttpOnly" in cookie and "SameSite=Strict" in cookie
         kept = cookie.split(";")[0]
         assert get(port, "/index.html", Cookie=kept) == (200, "")
@@ -87,7 +86,6 @@ def test_token():
 def test_addresses_that_only_this_machine_reaches(host, expected):
     """All others need a token."""
     assert is_local(host) is expected
-    assert bool(Guard(host).token) is not expected
 
 
 def test_ports():

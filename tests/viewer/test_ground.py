@@ -9,8 +9,7 @@ import torch
 from support.ground import make_ground, rays
 
 from legged_torque.terrain.colors import NEUTRAL, color_of
-from legged_torque.viewer.ground import CLEARANCE, Ground, drawn_model, patches
-from legged_torque.viewer.mujoco_scene import DISTANCE, Camera, size_of, smoothed
+from legged_torque.viewer.drawing import CLEARANCE, DISTANCE, Camera, Ground, drawn_model, patches, size_of, smoothed
 
 XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
 KINDS = {"stairs_up": 0.25, "rough_slope": 0.25, "stepping_stones": 0.25, "pits": 0.25}
@@ -78,7 +77,7 @@ def test_picture(terrain, ground):
 
 @pytest.mark.parametrize("azimuth", np.radians([0.0, 50.0, 90.0, 180.0, 300.0]))
 def test_camera(terrain, ground, azimuth):
-    """From anywhere in a pit or beside stones, the camera of a video sees the robot; on level ground it is as ever."""
+    """From anywhere in a pit or between stones, the camera of a video sees the robot; on level ground it is as ever."""
     for row, col in ((1, 3), (1, 2), (1, 0)):
         middle = terrain.layout.origins(terrain.map.heights)[row, col]
         position = middle + 1.7 * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])

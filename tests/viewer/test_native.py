@@ -14,7 +14,7 @@ from support.sessions import new_session
 from legged_torque import SCRIPTS_DIR
 from legged_torque.utils.errors import UserError
 from legged_torque.viewer import native
-from legged_torque.viewer.ground import drawn_task
+from legged_torque.viewer.drawing import Drawing
 
 
 @pytest.fixture(scope="module")
@@ -46,33 +46,23 @@ def test_keys(session):
 
 def test_what_is_drawn(session):
     """The state of the first world, its commanded velocity as an arrow, and both velocities as numbers."""
-    model, _ = drawn_task(session.task)
-    data, texts = mujoco.MjData(model), []
+    drawing, texts = Drawing.of_task(session.task), []
     window = SimpleNamespace(
         lock=contextlib.nullcontext,
         opt=mujoco.MjvOption(),
-        user_scn=mujoco.MjvScene(model, 10),
+        user_scn=mujoco.MjvScene(drawing.model, 10),
         set_texts=texts.append,
         sync=lambda: None,
     )
     session.set_command((0.5, 0.0, 0.0))
     session.tick()
-    native.draw(session, window, model, data, 1.0, None)
-    np.testing.assert_array_equal(data.qpos, session.snapshot.qpos[0])
+    native.draw(session, window, drawing)
+    np.testing.assert_array_equal(drawing.data.qpos, session.snapshot.qpos[0])
     arrow = window.user_scn.geoms[0]
     assert arrow.type == mujoco.mjtGeom.mjGEOM_ARROW and arrow.rgba[1] > arrow.rgba[2]
     _, _, names, values = texts[0]
     rows = dict(zip(names.split("\n"), values.split("\n"), strict=True))
     assert rows["v_x [m/s]"].startswith("+0.50 ") and rows["model_0"].endswith(" x real time")
-
-
-def test_no_display(monkeypatch):
-    """Without a screen, the page is recommended."""
-    monkeypatch.setattr("sys.platform", "linux")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(UserError, match="needs a screen; --viewer web works without one"):
-        native.check_display("--viewer web")
 
 
 def test_missing_extra(monkeypatch):

@@ -16,7 +16,7 @@ def test_pacer_real_time():
         begun.append(clock.now)
         clock.now += work
     assert begun == pytest.approx([100.0 + 0.02 * i for i in range(40)])
-    assert pacer.achieved() == pytest.approx(1.0)
+    assert pacer.rate == pytest.approx(1.0)
 
 
 def test_pacer_behind():
@@ -38,4 +38,4 @@ def test_pacer_behind():
     for _ in range(60):
         pacer.wait()
         clock.now += 0.04
-    assert not clock.slept and pacer.achieved() == pytest.approx(0.5)
+    assert not clock.slept and pacer.rate == pytest.approx(0.5)

@@ -30,7 +30,12 @@ def page(request, tmp_path_factory):
 
 def status(page):
     """What stands above the controls."""
-    return page.controls.status.content
+    return page.status.content
+
+
+def control(page, label):
+    """The control with a label."""
+    return next(handle for handle in page.server.gui._gui_input_handle_from_uuid.values() if handle.label == label)
 
 
 def moves(page):
@@ -42,7 +47,7 @@ def moves(page):
 def test_page_goes_on(page):
     """Time passes, robots move, the gait has a row per foot, and there is no error."""
     wait_for(lambda: page.session.sim_time > 0.5)
-    wait_for(lambda: "e03131" not in status(page) and not status(page).count("> 0.0 s simulated"))
+    wait_for(lambda: "lt-error" not in status(page) and not status(page).count("> 0.0 s simulated"))
     assert moves(page) and not page._errors
     feet = page.session.snapshot.feet
     assert page._plots._gait.content.count("<svg") == len(feet) == len(page._plots._feet)
@@ -56,40 +61,28 @@ def test_error_of_a_part(page, monkeypatch, capsys):
 
     with monkeypatch.context() as patch:
         patch.setattr(page._plots, "update", fail)
-        wait_for(lambda: "#e03131" in status(page))
+        wait_for(lambda: "lt-error" in status(page))
         assert "plots: ValueError: a &lt;b&gt; of the plots" in status(page)
         page.session.set_command((0.25, 0.0, 0.0))
         assert moves(page)
         wait_for(lambda: page.session.command == (0.25, 0.0, 0.0))
-        random = page.controls._shown[0][0]
-        wait_for(lambda: random.value is False)
-    wait_for(lambda: "#e03131" not in status(page))
+        wait_for(lambda: control(page, "random").value is False)
+    wait_for(lambda: "lt-error" not in status(page))
     assert capsys.readouterr().err.count("Traceback") == 1  # not with every picture
 
 
 def test_controls_follow_the_session(page):
     """A choice that was refused, or made elsewhere, does not stay on the page."""
-    dropdown, session = page.controls._checkpoints[0]
+    dropdown, session = control(page, "checkpoint"), page.session
     dropdown.value = "7"
     wait_for(lambda: dropdown.value == "0")
     session.load_checkpoint(7)
-    wait_for(lambda: "model_7.pt" in status(page) and "#e03131" in status(page))
+    wait_for(lambda: "model_7.pt" in status(page) and "lt-error" in status(page))
     session.set_paused(True)
     wait_for(lambda: "paused" in status(page))
     session.set_paused(False)
     session.reset()
-    wait_for(lambda: "#e03131" not in status(page))
-
-
-def test_a_control_that_a_client_has_removed(page, capsys):
-    """A forged message can do that in viser; the page goes on and says so."""
-    slider = page.controls._shown[1][0]
-    slider._impl.removed = True
-    page.session.set_command((-0.2, 0.0, 0.0))
-    wait_for(lambda: "controls: " in status(page))
-    assert moves(page)
-    slider._impl.removed = False
-    wait_for(lambda: slider.value == -0.2)
+    wait_for(lambda: "lt-error" not in status(page))
 
 
 @pytest.mark.parametrize(("host", "is_open"), [("127.0.0.1", False), ("0.0.0.0", True)])

@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from support.tilted import tilted
 
-from legged_torque.viewer.poses import FARTHEST, SIDE, SideBySide, commanded_pose, heading
+pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
+
+from viser.transforms import SE3
+
+from legged_torque.viewer.scene import FARTHEST, SIDE, commanded_pose, moved, on_ground, side_by_side
 from legged_torque.viewer.snapshot import Snapshot
 
 NOTHING = dict.fromkeys(Snapshot.__dataclass_fields__, np.zeros(0))
@@ -18,46 +22,50 @@ def pose(x=0.0, y=0.0, yaw=0.0):
     return np.array([x, y, 0.3, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2), 0.7])
 
 
-def steps_of(command, count, reset_after=0, qpos=None):
-    """Snapshots of a robot that stays where it is, by default looking to +y; its episode starts anew after a while."""
+def heading(qpos):
+    """The angle about the world's z axis [rad] to which a robot is drawn."""
+    return on_ground(qpos).rotation().compute_yaw_radians()
+
+
+def ghost_after(command, count=80, reset_after=0, qpos=None):
+    """The ghost of a robot that stays where it is, by default looking to +y; its episode starts anew after a while."""
     rows = {"qpos": (pose(1.0, 2.0, math.pi / 2) if qpos is None else qpos)[None], "commands": np.array([command])}
     ages = [number - reset_after if number >= reset_after else number for number in range(count)]
-    return [Snapshot(**{**NOTHING, **rows, "time": i * DT, "age": age, "world": 0}) for i, age in enumerate(ages)]
-
-
-def test_heading():
-    """It is the angle by which a trunk was turned before it was tilted."""
-    assert heading(np.array([0.0, 0.0, 0.3, *tilted(2.5, 1.2)])) == pytest.approx(2.5)
+    steps = [Snapshot(**{**NOTHING, **rows, "time": i * DT, "age": age, "world": 0}) for i, age in enumerate(ages)]
+    return commanded_pose(steps, DT)
 
 
 def test_ghost_on_a_circle():
     """1 m/s and 1 rad/s for one second: an arc of radius 1 m over 1 rad, from where the robot stood, looking to +y."""
-    ghost = commanded_pose(steps_of((1.0, 0.0, 1.0), 80), DT)
+    ghost = ghost_after((1.0, 0.0, 1.0))
     assert ghost[:2] == pytest.approx([1.0 - (1.0 - math.cos(1.0)), 2.0 + math.sin(1.0)], abs=1e-3)
     assert heading(ghost) == pytest.approx(math.pi / 2 + 1.0, abs=1e-6)
     assert ghost[2] == 0.3 and ghost[7] == 0.7
 
 
 def test_ghost_of_a_tilted_robot():
-    """It walks along the heading of the task's commands."""
-    ghost = commanded_pose(steps_of((1.0, 0.0, 0.0), 80, qpos=np.array([0.0, 0.0, 0.3, *tilted(0.4), 0.7])), DT)
+    """It walks along the heading of the task's commands, the angle by which the trunk was turned before it tilted."""
+    ghost = ghost_after((1.0, 0.0, 0.0), qpos=np.array([0.0, 0.0, 0.3, *tilted(0.4), 0.7]))
     assert ghost[:2] == pytest.approx([math.cos(0.4), math.sin(0.4)])
 
 
 @pytest.mark.parametrize(("count", "reset_after", "seconds"), [(1, 0, 0.0), (21, 0, 0.4), (80, 70, 0.18)])
 def test_ghost_of_a_new_episode(count, reset_after, seconds):
     """It follows the commands from the start of the episode, and no further back than is known."""
-    ghost = commanded_pose(steps_of((0.0, 0.5, 0.0), count, reset_after), DT)
+    ghost = ghost_after((0.0, 0.5, 0.0), count, reset_after)
     assert ghost[:2] == pytest.approx([1.0 - 0.5 * seconds, 2.0])  # its left is -x
 
 
 def test_side_by_side():
     """The companion starts at the right of the first robot; its steps forward are steps along the first one's front."""
-    places, first = SideBySide(), pose(3.0, -1.0, math.pi / 2)
-    placed = places.place(first, pose(10.0, 10.0, math.pi))
-    assert placed[:2] == pytest.approx([3.0 + SIDE, -1.0]) and heading(placed) == pytest.approx(math.pi / 2)
-    placed = places.place(first, pose(9.0, 10.0, math.pi + 0.2))  # 1 m ahead, and turned to the left
-    assert placed[:2] == pytest.approx([3.0 + SIDE, 0.0]) and heading(placed) == pytest.approx(math.pi / 2 + 0.2)
-    assert placed[2] == 0.3 and placed[7] == 0.7
-    again = places.place(first, pose(10.0 - FARTHEST - 1.0, 10.0, math.pi))
-    assert again[:2] == pytest.approx([3.0 + SIDE, -1.0])  # too far away
+    own, world, placed = pose(3.0, -1.0, math.pi / 2), SE3.from_translation(np.full(3, math.inf)), []
+    for other in (
+        pose(10.0, 10.0, math.pi),
+        pose(9.0, 10.0, math.pi + 0.2),  # 1 m ahead, and turned to the left
+        pose(10.0 - FARTHEST - 1.0, 10.0, math.pi),  # too far away
+    ):
+        world = side_by_side(own, other, world)
+        placed.append(moved(other, world))
+    np.testing.assert_allclose([one[:2] for one in placed], [[3.0 + SIDE, -1.0], [3.0 + SIDE, 0.0], [3.0 + SIDE, -1.0]])
+    assert [heading(one) for one in placed] == pytest.approx([math.pi / 2, math.pi / 2 + 0.2, math.pi / 2])
+    assert placed[1][2] == 0.3 and placed[1][7] == 0.7

@@ -7,10 +7,11 @@ import threading
 import numpy as np
 import pytest
 import torch
-from support.clock import Clock
+from support.clock import Clock, wait_for
 from support.sessions import new_session
 from support.tilted import tilted
 
+from legged_torque.viewer import session as session_module
 from legged_torque.viewer.session import AS_LOADED, FASTEST, SCAN_INTERVAL, SLOWEST
 
 NUM_ENVS = 2
@@ -34,6 +35,12 @@ def ticks(session, count=1):
     """Carry out requests and step some times."""
     for _ in range(count):
         session.tick()
+
+
+def ask(request, *args, count=1):
+    """Request something of a session, and let it carry that out and step some times."""
+    request(*args)
+    ticks(request.__self__, count)
 
 
 def actor_weights(session):
@@ -67,11 +74,11 @@ def test_steps(make_session):
 
 def test_rewards_of_a_last_step(make_session):
     """Where an episode ends, the terms are still those of the step, weighted and per second."""
-    session, _ = make_session("a1_torque", **{"env.episode_length_s": 0.06})
+    session, _ = make_session("a1_torque", **{"env.episode_length_s": 0.06, "rewards.only_positive_rewards": False})
     ticks(session, 3)
     assert session.task.episode_length_buf[0] == 0 and session.snapshot.falls == 0
     total = session.task.rew_buf[0].item() / session.task.dt
-    assert session.snapshot.rewards.sum() == pytest.approx(total, rel=1e-4)
+    assert total < 0.0 and session.snapshot.rewards.sum() == pytest.approx(total, rel=1e-4)
 
 
 def test_command(make_session):
@@ -80,12 +87,10 @@ def test_command(make_session):
     session.set_command((0.5, -0.25, 0.75))
     assert session.command is None  # only requested
     ticks(session, 2)
-    session.reset()
-    ticks(session, 2)
+    ask(session.reset, count=2)
     assert session.command == (0.5, -0.25, 0.75) and not session.requests
     np.testing.assert_array_equal(session.snapshot.commands, [[0.5, -0.25, 0.75]] * NUM_ENVS)
-    session.set_command(None)
-    ticks(session, 4)
+    ask(session.set_command, None, count=4)
     drawn = session.task.commands
     assert drawn.abs().max() <= 1.0 and len(drawn.unique()) == 3 * NUM_ENVS
 
@@ -94,12 +99,10 @@ def test_command(make_session):
 def test_push(make_session, angle, expected):
     """A push adds a velocity along the trunk's heading, to which it has been turned before it was tilted."""
     session, _ = make_session()
-    session.set_paused(True)
-    session.tick()
+    ask(session.set_paused, True)
     session.task.base_quat.copy_(torch.from_numpy(tilted(yaw=0.4)))
     before = session.task.sim.qvel.clone()
-    session.push(angle, 1.5)
-    ticks(session, 2)
+    ask(session.push, angle, 1.5, count=2)
     change = session.task.sim.qvel - before
     assert change[:, 2:].abs().max() == 0.0
     direction = torch.tensor([math.cos(expected), math.sin(expected)])
@@ -114,12 +117,10 @@ def test_pause_and_reset(make_session):
     qpos, sim_time = session.task.sim.qpos.clone(), session.sim_time
     ticks(session, 3)
     assert session.is_paused and session.sim_time == sim_time and torch.equal(session.task.sim.qpos, qpos)
-    session.reset()
-    session.tick()
+    ask(session.reset)
     torch.testing.assert_close(session.task.base_pos[:, 2], torch.full((NUM_ENVS,), 0.4))
     assert session.task.episode_length_buf.tolist() == [0] * NUM_ENVS
-    session.set_paused(False)
-    session.tick()
+    ask(session.set_paused, False)
     assert session.sim_time > sim_time
 
 
@@ -129,16 +130,13 @@ def test_mixing(make_session):
     trained = session.task.mixing.clone()
     assert session.mixing == pytest.approx({"position_residual": trained[0].item(), "torque": 1.0})
     assert 0.0 < trained[0] < 1.0
-    session.set_mixing((0.25, 0.5))
-    session.tick()
-    assert session.task.mixing.tolist() == [0.25, 0.5] and session.is_mixing_set
+    ask(session.set_mixing, (0.25, 0.5))
+    assert session.task.mixing.tolist() == [0.25, 0.5] and session.chosen_mixing
     session.set_perturbation("low")
-    session.load_checkpoint(0)
-    session.tick()
+    ask(session.load_checkpoint, 0)
     assert session.task.mixing.tolist() == [0.25, 0.5] and list(session.mixing.values()) == [0.25, 0.5]
-    session.set_mixing(None)
-    session.tick()
-    assert session.task.mixing[0] > trained[0] and not session.is_mixing_set  # checkpoint 0 is an earlier one
+    ask(session.set_mixing, None)
+    assert session.task.mixing[0] > trained[0] and session.chosen_mixing is None  # checkpoint 0 is an earlier one
 
 
 def test_companion(make_session):
@@ -150,16 +148,13 @@ def test_companion(make_session):
         session.tick()
         np.testing.assert_array_equal(other.snapshot.commands[0], session.snapshot.commands[0])
         assert other.sim_time == session.sim_time and int(other.task.episode_length_buf[0]) == count
-    session.set_paused(True)
-    ticks(session, 2)
+    ask(session.set_paused, True, count=2)
     assert other.sim_time == session.sim_time
     before = other.task.sim.qvel[0, :2].clone()
     session.set_paused(False)
-    session.push(0.0, 5.0)
-    session.tick()
+    ask(session.push, 0.0, 5.0)
     assert (other.task.sim.qvel[0, :2] - before).norm() > 3.0
-    session.reset()
-    session.tick()
+    ask(session.reset)
     assert int(other.task.episode_length_buf[0]) == 1
     other.load_checkpoint(0)
     session.tick()
@@ -171,13 +166,11 @@ def test_checkpoints(make_session, tmp_path):
     session, clock = make_session()
     ticks(session, 2)
     before = actor_weights(session)
-    session.load_checkpoint(0)
-    session.tick()
+    ask(session.load_checkpoint, 0)
     assert (session.checkpoint, session.trained_steps) == (0, 10_000_000) and "model_0" in session.message.text
     assert not torch.equal(actor_weights(session), before)
     assert session.task.episode_length_buf.min() == 3  # no reset
-    session.load_checkpoint(1)
-    session.tick()
+    ask(session.load_checkpoint, 1)
     assert torch.equal(actor_weights(session), before)
     make_session(steps=(0, 0, 30_000_000))
     shutil.copy(tmp_path / "a1_torque_multihead_3" / "model_2.pt", tmp_path / "a1_torque_multihead_2")
@@ -186,8 +179,7 @@ def test_checkpoints(make_session, tmp_path):
     clock.now += SCAN_INTERVAL
     session.tick()
     assert session.checkpoints == (0, 1, 2) and session.checkpoint == 1
-    session.follow_newest(True)
-    ticks(session, 2)
+    ask(session.follow_newest, True, count=2)
     assert (session.checkpoint, session.trained_steps) == (2, 30_000_000)
 
 
@@ -206,8 +198,7 @@ def test_broken_checkpoint(make_session, tmp_path, content):
         shutil.copy(tmp_path / "a1_torque_2" / "model_1.pt", file)
     session.tick()
     weights, steps = actor_weights(session), int(session.task.total_steps)
-    session.load_checkpoint(3)
-    session.tick()
+    ask(session.load_checkpoint, 3)
     text = session.message.text
     assert session.message.is_error and "model_3.pt" in text and "\n" not in text
     session.follow_newest(True)
@@ -225,21 +216,17 @@ def test_perturbation(make_session):
     """The task is rebuilt with the preset, with command and counters kept; a wrong name changes nothing."""
     session, _ = make_session()
     old = session.task
-    assert session.perturbations()[0] == AS_LOADED and "high" in session.perturbations()
     session.set_command((0.5, 0.0, 0.0))
-    session.set_perturbation("high")
-    ticks(session, 2)
+    ask(session.set_perturbation, "high", count=2)
     task = session.task
     assert task is not old and task.cfg.domain_rand.push_robots and not old.cfg.domain_rand.push_robots
     assert session.perturbation == "high" and int(task.total_steps) == 20_000_000
     np.testing.assert_array_equal(session.snapshot.commands, [[0.5, 0.0, 0.0]] * NUM_ENVS)
     assert len(session.history) == 2
-    session.set_perturbation("hihg")
-    session.tick()
+    ask(session.set_perturbation, "hihg")
     assert session.message.is_error and "did you mean 'high'" in session.message.text
     assert session.task is task and session.perturbation == "high"
-    session.set_perturbation(AS_LOADED)
-    session.tick()
+    ask(session.set_perturbation, AS_LOADED)
     assert not session.task.cfg.domain_rand.push_robots and session.perturbation == AS_LOADED
 
 
@@ -255,8 +242,7 @@ def test_tiles(make_session):
     np.testing.assert_allclose(snapshot.scan[:, :2].mean(axis=0), snapshot.qpos[0, :2], atol=1e-5)
     other = session.task.sim.qpos[1].clone()
     session.set_paused(True)
-    session.set_tile(2, 1)
-    session.tick()
+    ask(session.set_tile, 2, 1)
     task = session.task
     assert ground.levels.tolist() == [2, 1] and ground.columns.tolist() == [1, 1]
     middle = torch.tensor([6.0, 3.0, -2 / 3 + 0.4])  # of a pit in the last of three rows and the second of two columns
@@ -264,25 +250,21 @@ def test_tiles(make_session):
     assert torch.equal(task.sim.qpos[1], other) and task.episode_length_buf.tolist() == [0, 3]
     session.set_tile(99, -1)
     session.set_perturbation("low")
-    session.set_paused(False)
-    ticks(session, 2)
+    ask(session.set_paused, False, count=2)
     assert session.task is not task and session.task.terrain.levels.tolist() == [2, 1]
     assert session.task.terrain.columns.tolist() == [0, 1] and session.snapshot.tile == (2, 0)
 
 
-def test_no_tiles_on_a_plane(make_session):
-    """There are none to choose, and nothing is scanned."""
-    session, _ = make_session("a1_torque")
-    session.set_tile(0, 0)
-    session.tick()
-    assert session.message.is_error and session.snapshot.tile is None and session.snapshot.scan.shape == (0, 3)
-
-
-def test_requests_from_other_threads(make_session):
+def test_requests_from_other_threads(make_session, monkeypatch):
     """Many threads may ask while another one steps; every request is carried out, in that thread."""
     session, _ = make_session("a1_torque")
-    pushes, push = [], session.task.sim.push
-    session.task.sim.push = lambda *args: (pushes.append(threading.current_thread()), push(*args))
+    pushes, rotate = [], session_module.quat_rotate_yaw
+
+    def watched(*args):
+        pushes.append(threading.current_thread())
+        return rotate(*args)
+
+    monkeypatch.setattr(session_module, "quat_rotate_yaw", watched)
     stepping = threading.Thread(target=session.run)
     stepping.start()
     asking = [threading.Thread(target=lambda: [session.push(0.0, 0.0) for _ in range(10)]) for _ in range(3)]
@@ -290,51 +272,47 @@ def test_requests_from_other_threads(make_session):
         thread.start()
     for thread in asking:
         thread.join()
-    session.set_paused(True)
-    while not session.is_paused:
-        pass
+    wait_for(lambda: not session.requests)
     session.stop()
     stepping.join(timeout=10)
     assert not stepping.is_alive() and pushes == 30 * [stepping]
 
 
-def test_unexpected_errors(make_session, capsys):
-    """A request that fails in a way that nobody has thought of is reported, and the robots walk on."""
+def test_unexpected_errors(make_session, monkeypatch, capsys):
+    """A request that cannot be carried out, for a known reason or another, is reported, and the robots walk on."""
     session, _ = make_session("a1_torque")
-    session.task.sim.push = None
-    session.push(0.0, 1.0)
-    ticks(session, 2)
+    ask(session.set_tile, 0, 0)
+    assert session.message.text == "there are no tiles on a plane" and session.snapshot.tile is None
+    monkeypatch.setattr(session_module, "quat_rotate_yaw", None)
+    ask(session.push, 0.0, 1.0, count=2)
     assert session.message.is_error and "TypeError: 'NoneType'" in session.message.text
-    assert len(session.history) == 2 and "Traceback" in capsys.readouterr().err
+    assert len(session.history) == 3 and "Traceback" in capsys.readouterr().err
 
 
 def test_speed(make_session):
     """The speed stays within its limits, and the clock shows it."""
     session, clock = make_session("a1_torque")
     for asked, speed in ((0.5, 0.5), (0.0, SLOWEST), (9.0, FASTEST)):
-        session.set_speed(asked)
-        session.tick()
+        ask(session.set_speed, asked)
         start = clock.now
         ticks(session, 3)
-        assert session.speed == speed == pytest.approx(3 * session.task.dt / (clock.now - start))
+        assert session.pacer.speed == speed == pytest.approx(3 * session.task.dt / (clock.now - start))
 
 
 @pytest.mark.parametrize("number", [math.nan, -math.inf, 1e30])
 def test_numbers_that_no_slider_sends(make_session, number):
     """A forged page may send them: they are refused, and nothing changes."""
     session, _ = make_session()
-    session.set_paused(True)
-    session.tick()
+    ask(session.set_paused, True)
     mixing, velocities = session.mixing, session.task.sim.qvel.clone()
     asked = {
-        "a command": lambda: session.set_command((0.1, number, 0.0)),
-        "a push": lambda: session.push(0.0, number),
-        "a speed": lambda: session.set_speed(number),
-        "a weight": lambda: session.set_mixing([0.5, number]),
+        "a command": (session.set_command, (0.1, number, 0.0)),
+        "a push": (session.push, 0.0, number),
+        "a speed": (session.set_speed, number),
+        "a weight": (session.set_mixing, [0.5, number]),
     }
-    for what, ask in asked.items():
-        ask()
-        session.tick()
+    for what, words in asked.items():
+        ask(*words)
         assert session.message.text.startswith(what) and session.message.is_error
-    assert (session.command, session.speed, session.mixing, session.is_mixing_set) == (None, 1.0, mixing, False)
+    assert (session.command, session.pacer.speed, session.mixing, session.chosen_mixing) == (None, 1.0, mixing, None)
     assert torch.equal(session.task.sim.qvel, velocities) and session.task.commands.isfinite().all()

@@ -17,8 +17,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from legged_torque.utils.errors import UserError
 from legged_torque.viewer import video
-from legged_torque.viewer.mujoco_scene import add_velocities
-from legged_torque.viewer.video import Moment, TaskRecorder, VideoRecorder, add_text
+from legged_torque.viewer.drawing import Drawing
+from legged_torque.viewer.video import TaskRecorder, VideoRecorder, add_text
 
 XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
 
@@ -30,19 +30,19 @@ reason = choose_offscreen_renderer()
 if reason:
     sys.exit("no renderer: " + reason)
 import mujoco, numpy as np
-from legged_torque.viewer.video import Moment, VideoRecorder
+from legged_torque.viewer.drawing import Drawing
+from legged_torque.viewer.video import VideoRecorder
 model = mujoco.MjModel.from_xml_path(sys.argv[1])
 qpos = model.key_qpos[0] if model.nkey else model.qpos0
-recorder, frames = VideoRecorder(model, 1, 0.02), []
-recorder.steps = 5 * [[Moment(qpos, np.array([0.5, i, 0.0]), np.zeros(3)) for i in range(int(sys.argv[3]))]]
-recorder.write(Path(sys.argv[2]), lambda *frame: frames.append(frame))
+recorder, frames = VideoRecorder(Drawing(model), 0.02), []
+robots = int(sys.argv[3])
+recorder.steps = 5 * [[np.tile(qpos, (robots, 1)), np.ones((robots, 3)), np.zeros((robots, 3))]]
+recorder.write(Path(sys.argv[2]), None, lambda *frame: frames.append(frame))
 assert frames == [(1, 3), (2, 3), (3, 3)], frames
 """
 
 
-def moment(command=(0.5, -0.25, 0.0), velocity=(0.3, 0.4, -0.001)):
-    """What a robot does, its state being of no interest."""
-    return Moment(np.zeros(19), np.array(command), np.array(velocity))
+VELOCITIES = np.array([[0.5, -0.25, 0.0], [0.3, 0.4, -0.001]])  # commanded and actual
 
 
 @pytest.mark.parametrize(("robots", "width", "height"), [(1, 960, 540), (4, 1280, 720)])
@@ -75,7 +75,7 @@ def test_frames(tmp_path, robots, width, height):
 def test_overlay_is_readable(gray):
     """Text is bright on dark whatever is behind it, and only the corner changes."""
     image = np.full((270, 480, 3), gray, np.uint8)
-    rows = video.velocity_rows(1.0, moment())
+    rows = video.velocity_rows(1.0, *VELOCITIES)
     result = add_text(image, rows)
     assert (image == gray).all() and result.shape == image.shape and result.dtype == np.uint8
     ys, xs = np.nonzero((result != gray).any(axis=2))
@@ -86,10 +86,10 @@ def test_overlay_is_readable(gray):
 
 def test_numbers():
     """Time, command and velocity with two digits, without the flicker of a negative zero."""
-    words = [row for _, row in video.velocity_rows(3.14159, moment())]
+    words = [row for _, row in video.velocity_rows(3.14159, *VELOCITIES)]
     assert words[0] == ["3.14 s", "v_x", "v_y", "yaw"]
     assert words[1:3] == [["command", "+0.50", "-0.25", "+0.00"], ["actual", "+0.30", "+0.40", "+0.00"]]
-    assert [row for _, row in video.speed_rows(moment())] == [["command", "0.56 m/s"], ["actual", "0.50 m/s"]]
+    assert [row for _, row in video.speed_rows(*VELOCITIES)] == [["command", "0.56 m/s"], ["actual", "0.50 m/s"]]
 
 
 def test_recorded_worlds(make_task):
@@ -104,25 +104,23 @@ def test_recorded_worlds(make_task):
             recorder.add_step()
         task.commands[:, 0] = 0.2  # the robot of the video stays the same
     for recorder, worlds in ((one, [3]), (four, [0, 1, 2, 3])):
-        assert recorder.model.body(recorder.trunk).name == "trunk"
-        for number, moments in enumerate(recorder.steps):
-            assert len(moments) == len(worlds)
-            for world, kept in zip(worlds, moments, strict=True):
-                np.testing.assert_array_equal(kept.qpos, task.sim.qpos[world].double().numpy())
-                assert kept.command[0] == pytest.approx([-0.9 if world == 3 else 0.1, 0.2][number])
-                velocity = [*task.base_lin_vel[world, :2].tolist(), float(task.base_ang_vel[world, 2])]
-                assert kept.velocity == pytest.approx(velocity)
+        assert recorder.drawing.model.body(recorder.drawing.trunk).name == "trunk"
+        for step, forward in zip(recorder.steps, (-0.9, 0.2), strict=True):
+            qpos, command, velocity = step
+            np.testing.assert_array_equal(qpos, task.sim.qpos[worlds].double().numpy())
+            assert command[-1, 0] == pytest.approx(forward)
+            np.testing.assert_allclose(velocity[:, :2], task.base_lin_vel[worlds, :2].numpy())
+            np.testing.assert_allclose(velocity[:, 2], task.base_ang_vel[worlds, 2].numpy())
 
 
 def test_arrows_of_velocities():
     """Commanded and actual velocity of a trunk that is turned to the left by a quarter; 0 has none."""
     body = "<body pos='0 0 1'><freejoint/><geom size='0.1'/></body>"
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
-    data, scene = mujoco.MjData(model), mujoco.MjvScene(model, 10)
-    data.qpos[3:] = np.sqrt([0.5, 0.0, 0.0, 0.5])
-    mujoco.mj_forward(model, data)
-    add_velocities(scene, data, 1, np.array([1.0, 0.0, 0.3]), np.array([0.0, 0.5, 0.0]), 1.0)
-    add_velocities(scene, data, 1, np.zeros(3), np.zeros(3), 1.0)
+    drawing, scene = Drawing(model), mujoco.MjvScene(model, 10)
+    drawing.move(np.array([0.0, 0.0, 1.0, *np.sqrt([0.5, 0.0, 0.0, 0.5])]))
+    drawing.add_velocities(scene, np.array([1.0, 0.0, 0.3]), np.array([0.0, 0.5, 0.0]))
+    drawing.add_velocities(scene, np.zeros(3), np.zeros(3))
     ways = [geom.mat[:, 2] for geom in scene.geoms[: scene.ngeom]]
     np.testing.assert_allclose(ways, [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]], atol=1e-6)
     assert scene.geoms[0].size[2] == pytest.approx(2.0 * scene.geoms[1].size[2])
@@ -131,8 +129,10 @@ def test_arrows_of_velocities():
 def test_missing_extra(monkeypatch, tmp_path):
     """Without an encoder the extra is named."""
     monkeypatch.setitem(sys.modules, "imageio", None)
+    recorder = VideoRecorder(None, 0.02)
+    recorder.steps = [[np.zeros((1, 19)), *VELOCITIES[:, None]]]
     with pytest.raises(UserError, match=r"videos need the extra: pip install 'legged_torque\[video\]'"):
-        VideoRecorder(None, 1, 0.02).write(tmp_path / "out.mp4")
+        recorder.write(tmp_path / "out.mp4", None)
 
 
 def test_videos_in_tensorboard(tmp_path):

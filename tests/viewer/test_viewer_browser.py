@@ -124,10 +124,10 @@ def open_page(browser, url):
 @pytest.fixture(scope="module")
 def opened(browser, page):
     """The browser with the page, for which it needs the token once."""
-    address = page.url.partition("?token=")[0]
+    address = page.server.url.partition("?token=")[0]
     browser.get(address)
     assert "with its token" in text_of(browser)
-    open_page(browser, page.url)
+    open_page(browser, page.server.url)
     open_page(browser, address)
     return browser
 
@@ -240,7 +240,7 @@ def test_phone(opened, page):
     """On a narrow screen the robot is seen above the controls."""
     size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
     opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    open_page(opened, page.url)
+    open_page(opened, page.server.url)
     wait_for(lambda: share(opened, is_dark, 0.0, 1.0, bottom=0.4) > 0.01)
     opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
     assert not complaints(opened)
@@ -263,7 +263,7 @@ def test_rough_ground(browser, tmp_path):
     with running(session), serving(session) as page:
         session.set_command((0.0, 0.0, 0.0))
         walk(session, 0.1)
-        open_page(browser, page.url)
+        open_page(browser, page.server.url)
         wait_for(is_seen)
         assert "discrete_obstacles, level 0 (difficulty 0.20)" in text_of(browser)
         type_into(browser, "level", "1")

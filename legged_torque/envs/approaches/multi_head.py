@@ -35,7 +35,7 @@ class MultiHeadRobot(TorqueRobot):
         super()._init_buffers()
         settings = self.cfg.control.mixing
         self._mixing_curriculum = LinearCurriculum([settings.pd, settings.torque], self.device)
-        self.mixing = self._tensor([0.0, 0.0])
+        self.mixing = torch.zeros(2, device=self.device)
         self.update_curriculum()
 
     def action_terms(self) -> list[ActionTerm]:

@@ -45,7 +45,7 @@ STEPS = 4  # control steps at 200 Hz of one at 50 Hz
 class MultiHeadTwoRatesCfg(MultiHeadCfg):
     """Settings of multi-head control with torques at 200 Hz and positions at 50 Hz, the paper's future work.
 
-    What happens by chance in a control step is as frequent in time as at 50 Hz.
+    Random events are as frequent in time as at 50 Hz.
     """
 
     class commands:

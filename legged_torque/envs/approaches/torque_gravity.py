@@ -18,7 +18,7 @@ class TorqueGravityCfgPPO(TorqueCfgPPO):
         num_steps: Count = 50  # control steps,
         num_rounds: Count = 4  # round 1: the controller acts; later rounds: the current policy (DAgger)
         max_mean_torque: Positive = 30.0  # [N m] pairs with a larger mean absolute torque are dropped, as in the paper
-        max_residual: Positive = 3.0  # likewise: what contacts cannot give of the wanted wrench, as share of the weight
+        max_residual: Positive = 3.0  # [weights] largest part of the wanted wrench that contacts cannot give
         held_out: Share = 0.1  # share of the configurations that only measure the learned policy
         num_epochs: Count = 4  # per round, through all pairs so far
         batch_size: Count = 4096  # pairs per gradient step

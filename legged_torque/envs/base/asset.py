@@ -10,7 +10,8 @@ import numpy as np
 
 from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.envs.base.robot_checks import floor_problems, foot_notes, pose_problems
+from legged_torque.envs.base.robot_checks import floor_problems, foot_notes, mirror_problem, pose_problems
+from legged_torque.envs.base.symmetry import RobotSymmetry
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching
 from legged_torque.sim.robot_file import model_problems, spec_problems, use_plain_motors
 from legged_torque.terrain.terrain import Terrain
@@ -51,6 +52,15 @@ class Asset:
     def dof_axes(self) -> np.ndarray:
         """Return the axes of the joints in the trunk's frame, all angles being 0. Shape: (num_dof, 3)."""
         return joint_axes(self.mj_model)[1:]
+
+    def symmetry(self, mirrored_legs: Sequence[Sequence[str]]) -> RobotSymmetry:
+        """Return which joints and feet are mirror images of each other, given pairs of legs, right and left."""
+        axes = self.dof_axes().tolist()
+        symmetry = RobotSymmetry(mirrored_legs, self.dof_names, axes, self.foot_names, self.foot_of)
+        if symmetry.joints and symmetry.foot_geoms:
+            problem = mirror_problem(self.mj_model, symmetry.joints, symmetry.foot_geoms, self.foot_names)
+            symmetry.refuse(problem)
+        return symmetry
 
 
 def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:

@@ -95,7 +95,7 @@ class BaseTask(VecEnv):
     def reset(self, world: int | None = None) -> TensorDict:
         """Start a new episode in every world, or in a single one, and return the observations.
 
-        A single one is for viewers: the others are observed once more, and random events may happen there.
+        A single one is for viewers: the others are observed once more, and random events may occur there.
         """
         self.state.reset_buf.fill_(world is None)
         if world is not None:

@@ -30,7 +30,7 @@ class UniformCommands:
     Attributes:
         values: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
         headings: Where trunks shall turn to with ``commands.heading_command`` [rad]. Shape: (num_envs,).
-        low, span: Lowest command, and what is from there to the highest; likewise of headings. Shapes: (4,).
+        low, span: Lowest v_x, v_y, yaw rate and heading, and the widths of their ranges. Shapes: (4,).
     """
 
     def __init__(self, settings: type[LeggedRobotCfg.commands], state: RobotState) -> None:

@@ -28,26 +28,23 @@ from legged_torque.envs.base.random_parameters import (
 )
 from legged_torque.envs.base.reward_terms import RewardTerms
 from legged_torque.envs.base.rewards import Rewards
-from legged_torque.envs.base.robot_checks import mirror_problem, range_notes
+from legged_torque.envs.base.robot_checks import range_notes
 from legged_torque.envs.base.state import RobotState
-from legged_torque.envs.base.symmetry import Mirror, RobotSymmetry
+from legged_torque.envs.base.symmetry import Mirror
 from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.motors.chain import MotorChain
 from legged_torque.motors.joints import Joints
 from legged_torque.sensors.sensors import Sensors
-from legged_torque.sim.engine import require
 from legged_torque.sim.health import Health
-from legged_torque.sim.model import indices_matching
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.sim.registry import engine_class, make_engine
 from legged_torque.terrain import make_terrain
 from legged_torque.utils.config import section_keys
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import joint_limits
 
-OUTSIDE_KERNEL = "torques are computed in torch, outside of the physics kernel, which makes steps slower"
-"""What a task says that overrides ``_compute_torques`` or has motors without a Warp function."""
+OUTSIDE_KERNEL = "torques are computed in torch, outside of the physics kernel: training is about 5% slower on a GPU"
+"""Note of tasks that override ``_compute_torques`` or have motors without a Warp function."""
 
 
 class LeggedRobot(RewardTerms, BaseTask):
@@ -66,7 +63,6 @@ class LeggedRobot(RewardTerms, BaseTask):
         motors: The chain of motors.
         sensors: Sensors by name.
         torque_limits: Lowest and highest torques [N m]. Shape: (2, num_dof).
-        dof_pos_limits: Soft limits of the joints [rad]. Shape: (num_dof, 2).
         notes: What a user should know of this robot with these settings, a line each.
     """
 
@@ -157,8 +153,7 @@ class LeggedRobot(RewardTerms, BaseTask):
     def check_termination(self) -> None:
         """End episodes whose trunk touches the ground, whose state diverged, or whose time is over."""
         state = self.state
-        touching = state.contacts[:, self.termination_contact_indices].any(dim=1)
-        ended = touching | state.diverged
+        ended = state.contacts[:, self.termination_contact_indices].any(dim=1) | state.diverged
         time_out = state.episode_length >= self.max_episode_length
         state.reset_buf.copy_(ended | time_out)
         state.time_out_buf.copy_(time_out & ~ended)
@@ -238,11 +233,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         state.update_feet_air_time()
 
     def _end_episodes(self) -> None:
-        """Set levels; torch only.
-
-        This is a part by itself: with the sum over worlds of :meth:`_update_sums`, it would run on one processor of a
-        GPU.
-        """
+        """Set levels; torch only. Compiled with the sums over worlds, it would run on one processor of a GPU."""
         ended = self.state.reset_buf & ~self.state.diverged  # where broken worlds have got to says nothing
         self.terrain.end_episodes(ended, self.base_pos, self.commands, self.cfg.env.episode_length_s)
 
@@ -257,7 +248,7 @@ class LeggedRobot(RewardTerms, BaseTask):
 
     def _reset_worlds(self) -> None:
         """Put the worlds of ``reset_buf`` where an episode starts; elsewhere draw anew what is due, and push."""
-        self.events.happen(self.state.reset_buf)
+        self.events.apply(self.state.reset_buf)
 
     def compute_observations(self) -> None:
         """Write the observations of this moment."""
@@ -315,40 +306,24 @@ class LeggedRobot(RewardTerms, BaseTask):
         """Load robot and ground, and build the simulator."""
         cfg, sim = self.cfg, self.cfg.sim
         self.terrain = make_terrain(cfg.terrain, self.num_envs, self.device)
-        engine = engine_class(sim.engine)
-        if cfg.domain_rand.randomize_parameters:
-            require(engine, "per_world", "domain_rand.randomize_parameters")
-        if cfg.asset.self_collisions:
-            require(engine, "self_collision", "asset.self_collisions")
-        height_map = self.terrain.map if "height_map" in engine.capabilities else None  # others find it in their model
+        has_map = "height_map" in engine_class(sim.engine).capabilities
+        height_map = self.terrain.map if has_map else None  # other engines find it in their model
         self.asset = load_asset(cfg, None if height_map else self.terrain)
-        model = self.asset.mj_model
-        limits = (sim.solver_iterations, sim.ls_iterations)
-        self.sim = make_engine(sim.engine, model, self.num_envs, self.device, *limits, height_map)
+        worlds, limits = (self.num_envs, self.device), (sim.solver_iterations, sim.ls_iterations)
+        self.sim = make_engine(sim.engine, self.asset.mj_model, *worlds, *limits, height_map)
         self.dof_names, self.foot_names = self.asset.dof_names, self.asset.foot_names
         self.num_dof = len(self.dof_names)
-        axes, names = self.asset.dof_axes().tolist(), (self.foot_names, self.asset.foot_of)
-        self.symmetry = RobotSymmetry(cfg.asset.mirrored_legs, self.dof_names, axes, *names)
-        if self.symmetry.joints and self.symmetry.foot_geoms:
-            problem = mirror_problem(model, self.symmetry.joints, self.symmetry.foot_geoms, self.foot_names)
-            self.symmetry.refuse(problem)
+        self.symmetry = self.asset.symmetry(cfg.asset.mirrored_legs)
         self.notes = [*self.asset.notes, *self.sim.notes]
 
     def _init_buffers(self) -> None:
         """Allocate constants of the controller and of the rewards; approaches add their own."""
-        cfg, model = self.cfg, self.asset.mj_model
-        pose = nominal_pose(cfg.init_state.default_joint_angles, self.dof_names)
-        self.control = ControlParameters(cfg.control, self.dof_names, pose, self.num_envs, self.device)
-        self.torque_limits = self._tensor(model.actuator_forcerange.T)
-        ranges = self._tensor(joint_limits(model)[1:])
-        middle = ranges.mean(dim=1, keepdim=True).nan_to_num()  # of joints without a range
-        self.dof_pos_limits = middle + cfg.rewards.soft_dof_pos_limit * (ranges - middle)
-        places = (self.asset.penalized, self.asset.terminating)
-        self.penalized_contact_indices, self.termination_contact_indices = (
-            torch.tensor(chosen, dtype=torch.long, device=self.device) for chosen in places
-        )
-        held = indices_matching(self.dof_names, cfg.rewards.held_joints, "joint in rewards.held_joints")
-        self.held_joints = self._tensor([float(joint in held) for joint in range(self.num_dof)])
+        pose = nominal_pose(self.cfg.init_state.default_joint_angles, self.dof_names)
+        self.control = ControlParameters(self.cfg.control, self.dof_names, pose, self.num_envs, self.device)
+        limits = self.asset.mj_model.actuator_forcerange.T
+        self.torque_limits = torch.tensor(limits, dtype=torch.float32, device=self.device)
+        self.termination_contact_indices = torch.tensor(self.asset.terminating, dtype=torch.long, device=self.device)
+        self._init_reward_buffers(self.asset, self.device)
 
     def _init_state(self) -> None:
         """Build control law, state, motors and sensors."""
@@ -363,7 +338,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.state = RobotState(self.sim, self.terrain, asset.feet, asset.foot_of, self.num_actions, self.dt)
         self._use_attributes_of(self.state)
         self._given_actions, self._wanted_torques = torch.zeros_like(self.actions), torch.zeros_like(self.dof_vel)
-        armature = self._tensor(asset.mj_model.dof_armature[6:])
+        armature = torch.tensor(asset.mj_model.dof_armature[6:], dtype=torch.float32, device=self.device)
         clock = (cfg.sim.dt, cfg.control.decimation)
         self.motors = MotorChain(cfg.motors, Joints(self.dof_names, self.torque_limits, armature, self.actions, *clock))
         self.motor_strength = self.motors.strength
@@ -420,10 +395,5 @@ class LeggedRobot(RewardTerms, BaseTask):
 
     def _use_attributes_of(self, owner: RobotState | ControlParameters) -> None:
         """Have the tensors of an object as attributes, too."""
-        for name, value in vars(owner).items():
-            if isinstance(value, Tensor) and not name.startswith("_"):
-                setattr(self, name, value)
-
-    def _tensor(self, values: Any) -> Tensor:
-        """Return values as a float tensor on the task's device."""
-        return torch.as_tensor(values, dtype=torch.float32, device=self.device).clone()
+        tensors = {name: value for name, value in vars(owner).items() if isinstance(value, Tensor)}
+        self.__dict__.update({name: value for name, value in tensors.items() if not name.startswith("_")})

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from legged_torque.envs.base.older_runs import RENAMED, converted, is_older
-from legged_torque.learning.settings import Activation, TrainingCfg
+from legged_torque.envs.base.training_config import Activation, TrainingCfg
 from legged_torque.motors.config import DelayCfg, IdealCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
 from legged_torque.utils.errors import UserError
@@ -59,8 +59,8 @@ class LeggedRobotCfg(BaseConfig):
     class asset:  # the robot, and which of its geoms mean what
         file: str = ""  # MJCF, absolute or below resources/
         foot_name: str = "foot"  # collision geoms whose name contains this are feet, those of one body a single one
-        penalize_contacts_on: list[str] = []  # likewise: those of the collision term
-        terminate_after_contacts_on: list[str] = []  # likewise: those that end an episode
+        penalize_contacts_on: list[str] = []  # parts of the names of geoms whose contacts the collision term counts
+        terminate_after_contacts_on: list[str] = []  # parts of the names of geoms whose contacts end an episode
         mirrored_legs: list[list[str]] = []  # pairs [right, left] of names of legs, with which names of parts begin
         max_dof_vel: NotNegative = 0.0  # [rad/s] highest speed of the joints
         self_collisions: bool = False  # whether parts of the robot collide with each other, where its file lets them
@@ -91,10 +91,10 @@ class LeggedRobotCfg(BaseConfig):
         class terrain_proportions:  # share of the columns of each kind; together 1
             flat: Share = 0.0  # level
             smooth_slope_up: Share = 0.05  # up to 0.4
-            smooth_slope_down: Share = 0.05  # likewise
+            smooth_slope_down: Share = 0.05  # down to -0.4
             rough_slope: Share = 0.1  # the same, and random heights
             stairs_up: Share = 0.35  # steps of 0.05 to 0.23 m
-            stairs_down: Share = 0.25  # likewise
+            stairs_down: Share = 0.25  # the same, downwards
             discrete_obstacles: Share = 0.2  # blocks and hollows of up to 0.25 m
             waves: Share = 0.0  # crests of up to 0.3 m
             stepping_stones: Share = 0.0  # of 1.58 to 0.08 m, with holes between them
@@ -189,7 +189,7 @@ class LeggedRobotCfg(BaseConfig):
         decimation: Annotated[int, Limits(1, 1000)] = 4  # physics steps per control step: 50 Hz
         refresh_torques: bool = True  # whether torques are computed anew at every physics step
         stiffness: Gains = 0.0  # [N m/rad] Kp; of all joints, or by a part of their names
-        damping: Gains = 0.0  # [N m s/rad] Kd, likewise
+        damping: Gains = 0.0  # [N m s/rad] Kd; of all joints, or by a part of their names
         action_scale: Positive = 0.25  # [rad] per unit of a position action
         torque_scale: Positive = 1.0  # [N m] per unit of a torque action
 

@@ -1,4 +1,4 @@
-"""How well a policy walks in a task, and how well at which commands."""
+"""Metrics of a walking policy, in all and by command."""
 
 from __future__ import annotations
 

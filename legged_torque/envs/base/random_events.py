@@ -50,7 +50,7 @@ class RandomEvents:
         chances = [cfg.commands.resampling_probability, settings.resampling_probability]
         self._chances = wp.vec4(*chances, settings.push_probability * settings.push_robots, PUSH_ADDED)
 
-    def happen(self, is_new: Tensor) -> None:
+    def apply(self, is_new: Tensor) -> None:
         """Begin episodes: draw states and delays, and clear what the simulator kept, in the worlds of ``is_new``.
 
         There, and where chance says so, draw commands and parameters; push where chance says so. Shape: (num_envs,),

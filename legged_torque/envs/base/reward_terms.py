@@ -6,9 +6,12 @@ import torch
 from torch import Tensor
 
 from legged_torque.envs.base.actions import ControlParameters
+from legged_torque.envs.base.asset import Asset
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.state import RobotState
 from legged_torque.envs.base.symmetry import RobotSymmetry
+from legged_torque.sim.model import indices_matching
+from legged_torque.utils.mjcf import joint_limits
 
 STANDING_COMMAND = 0.1  # norm of a command [m/s, rad/s] up to which robots may stand
 STUMBLING = 5.0
@@ -22,9 +25,16 @@ class RewardTerms:
     state: RobotState
     control: ControlParameters
     symmetry: RobotSymmetry
-    dof_pos_limits: Tensor
-    held_joints: Tensor
-    penalized_contact_indices: Tensor
+
+    def _init_reward_buffers(self, asset: Asset, device: str) -> None:
+        """Allocate what the terms compare with: soft limits of the joints [rad], and parts by number."""
+        ranges = torch.tensor(joint_limits(asset.mj_model)[1:], dtype=torch.float32, device=device)
+        middle = ranges.mean(dim=1, keepdim=True).nan_to_num()  # of joints without a range
+        self.dof_pos_limits = middle + self.cfg.rewards.soft_dof_pos_limit * (ranges - middle)
+        self.penalized_contact_indices = torch.tensor(asset.penalized, dtype=torch.long, device=device)
+        held = indices_matching(asset.dof_names, self.cfg.rewards.held_joints, "joint in rewards.held_joints")
+        self.held_joints = torch.zeros(len(asset.dof_names), device=device)
+        self.held_joints[held] = 1.0
 
     def _reward_tracking_lin_vel(self) -> Tensor:
         """exp(-gamma |v*_xy - v_xy|^2), velocities in the trunk's frame [m/s]."""

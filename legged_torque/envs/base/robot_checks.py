@@ -59,7 +59,7 @@ def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, fo
         missed = np.linalg.norm(own - image, axis=1)
         if missed.max() > MIRROR_TOLERANCE:
             worst = foot_names[int(missed.argmax())]
-            return f"mirrored angles put '{worst}' {missed.max():.3g} m beside the mirror image of its counterpart"
+            return f"mirrored angles put '{worst}' {missed.max():.3g} m away from the mirror image of its counterpart"
     return ""
 
 

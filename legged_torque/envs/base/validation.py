@@ -11,9 +11,7 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     """Raise a UserError that names the first setting of a task that makes no sense, alone or with others."""
     cfg.check()
     if cfg.sim.engine not in ("fused", "mujoco_warp"):
-        from legged_torque.sim.registry import engine_class  # takes seconds, which only other engines are worth
-
-        engine_class(cfg.sim.engine)
+        _check_engine(cfg)
     for pair in cfg.asset.mirrored_legs:
         if len(pair) != 2:
             raise UserError(f"asset.mirrored_legs must be pairs [right, left], not {pair}")
@@ -33,6 +31,18 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
             "motors.delay.unit must be control_steps, since control.refresh_torques is off: torques are computed once "
             "per control step"
         )
+
+
+def _check_engine(cfg: LeggedRobotCfg) -> None:
+    """Refuse an engine of a user's that lacks what the settings need."""
+    from legged_torque.sim.engine import require  # takes seconds, which only such engines are worth
+    from legged_torque.sim.registry import engine_class
+
+    engine = engine_class(cfg.sim.engine)
+    if cfg.domain_rand.randomize_parameters:
+        require(engine, "per_world", "domain_rand.randomize_parameters")
+    if cfg.asset.self_collisions:
+        require(engine, "self_collision", "asset.self_collisions")
 
 
 def _check_map(cfg: LeggedRobotCfg) -> None:

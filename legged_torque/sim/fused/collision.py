@@ -87,7 +87,7 @@ def make_contact(model: Model, world: int, point: Point, pose: Pose, dist: float
 
 @wp.func
 def half_size(model: Model, world: int, geom: int, cylinders: bool) -> wp.vec3:
-    """Return the half sizes of a geom, the units of its points; ``cylinders`` is whether it may be one."""
+    """Return the half sizes of a geom, the units of its points; ``cylinders``: whether it may be one."""
     size = of_world(model.geom_size, world, geom)
     half = size
     if model.geom_type[geom] == CAPSULE:
@@ -127,7 +127,7 @@ def find_contacts(
 ) -> int:
     """Write the contacts of a branch with the floor from index ``first`` on and return how many there are.
 
-    ``cylinders`` is whether the robot has any: a constant, which keeps their code out of kernels for others.
+    ``cylinders``: whether the robot has any, a constant, which keeps their code out of kernels for others.
     """
     normal = contacts.normal
     count = int(0)

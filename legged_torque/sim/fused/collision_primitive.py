@@ -139,7 +139,7 @@ def sphere_box(a: Shape, b: Shape) -> PairContacts:
 
 @wp.func
 def capsule_capsule(a: Shape, b: Shape) -> PairContacts:
-    """Return the contacts of two capsules: one, or if parallel, one at each end of their overlap."""
+    """Return the contacts of two capsules: one, or one at each end of their overlap if parallel."""
     u, v, apart = axis_of(a), axis_of(b), b.pos - a.pos
     out = PairContacts()
     if are_parallel(u, v):

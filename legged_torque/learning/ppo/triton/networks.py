@@ -7,7 +7,7 @@ other. All widths are multiples of :data:`ALIGNMENT`, with zeros in between.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from rsl_rl.modules import MLP
@@ -18,9 +18,9 @@ from legged_torque.learning.multi_head import MultiHeadMLP
 ALIGNMENT = 64  # columns and rows of weights; what a matrix product reads at a time
 
 
-def aligned(size: int) -> int:
-    """Return the next multiple of :data:`ALIGNMENT`."""
-    return -(-size // ALIGNMENT) * ALIGNMENT
+def aligned(size: int, step: int = ALIGNMENT) -> int:
+    """Return the next multiple of a step."""
+    return -(-size // step) * step
 
 
 @dataclass(eq=False)
@@ -66,58 +66,44 @@ class Layer:
         return sum(aligned(source.size) for source in self.sources)
 
 
-@dataclass(eq=False)
-class Network:
-    """A network as layers, in the order in which they are computed."""
+def mlp_layers(
+    module: MLP, sources: Sequence[Columns], first_output: int | None, into: Block | None = None
+) -> list[Layer]:
+    """Return the layers of an MLP that reads ``sources``; the last one writes ``into`` a block if one is given.
 
-    inputs: Columns
-    num_outputs: int
-    layers: list[Layer] = field(default_factory=list)
-
-    def outputs(self) -> list[Columns]:
-        """Return where the outputs are written, in their order."""
-        last = [layer for layer in self.layers if layer.first_output is not None]
-        return [layer.target for layer in sorted(last, key=lambda layer: layer.first_output or 0)]
-
-    def add(
-        self, module: MLP, sources: Sequence[Columns], first_output: int | None, into: Block | None = None
-    ) -> Columns:
-        """Add the layers of an MLP that reads ``sources``; return what the last one writes, ``into`` a block if given.
-
-        ``first_output`` is as in :class:`Layer`, for the last one.
-        """
-        linears = [part for part in module if isinstance(part, nn.Linear)]
-        ends_linear = isinstance(module[-1], nn.Linear)
-        for i, linear in enumerate(linears):
-            is_last = i == len(linears) - 1
-            block = into if into and is_last else Block()
-            target = block.columns(linear.out_features, elu=not (is_last and ends_linear))
-            self.layers.append(Layer(linear, sources, target, first_output if is_last else None))
-            sources = [target]
-        return sources[0]
+    ``first_output`` is as in :class:`Layer`, for the last one.
+    """
+    layers = []
+    linears = [part for part in module if isinstance(part, nn.Linear)]
+    ends_linear = isinstance(module[-1], nn.Linear)
+    for linear in linears:
+        is_last = linear is linears[-1]
+        block = into if into and is_last else Block()
+        target = block.columns(linear.out_features, elu=not (is_last and ends_linear))
+        layers.append(Layer(linear, sources, target, first_output if is_last else None))
+        sources = [target]
+    return layers
 
 
-def read_network(module: nn.Module, first_output: int = 0) -> Network | None:
-    """Return the layers of an rsl_rl ``MLP`` or of our ``MultiHeadMLP`` with ELUs; None of any other network.
+def read_network(module: nn.Module, first_output: int = 0) -> list[Layer]:
+    """Return the layers of an rsl_rl ``MLP`` or of our ``MultiHeadMLP`` with ELUs; none of any other network.
 
-    ``first_output`` is the column of its first output among those of all networks.
+    They are in the order in which they are computed; the first one reads the inputs. ``first_output`` is the column of
+    the network's first output among those of all networks.
     """
     parts = [part for part in module.modules() if not list(part.children())]
     if not all(isinstance(part, nn.Linear) or (isinstance(part, nn.ELU) and part.alpha == 1.0) for part in parts):
-        return None
+        return []
     if isinstance(module, MLP):
-        first, last = module[0], module[-1]
-        if not (isinstance(first, nn.Linear) and isinstance(last, nn.Linear)):
-            return None
-        network = Network(Block().columns(first.in_features), last.out_features)
-        network.add(module, [network.inputs], first_output)
-        return network
+        if not (isinstance(module[0], nn.Linear) and isinstance(module[-1], nn.Linear)):
+            return []
+        return mlp_layers(module, [Block().columns(module[0].in_features)], first_output)
     if isinstance(module, MultiHeadMLP):
-        first, positions, torques = module.trunk[0], module.position_head[-1], module.torque_head[-1]
-        network = Network(Block().columns(first.in_features), positions.out_features + torques.out_features)
         seen = Block()  # by the torque head
-        features = network.add(module.trunk, [network.inputs], None, seen)
-        angles = network.add(module.position_head, [features], first_output, seen)
-        network.add(module.torque_head, [features, angles], first_output + positions.out_features)
-        return network
-    return None
+        trunk = mlp_layers(module.trunk, [Block().columns(module.trunk[0].in_features)], None, seen)
+        features = trunk[-1].target
+        position_head = mlp_layers(module.position_head, [features], first_output, seen)
+        angles = position_head[-1].target
+        torque_head = mlp_layers(module.torque_head, [features, angles], first_output + angles.size)
+        return [*trunk, *position_head, *torque_head]
+    return []

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+import triton
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
@@ -15,8 +17,8 @@ from torch import Tensor
 
 from legged_torque.learning.ppo.torch_ppo import TorchPPO
 from legged_torque.learning.ppo.triton import products, samples, steps
-from legged_torque.learning.ppo.triton.memory import NUMBERS, SAMPLES, TILE, LearningWorkspace, Parameters, Workspace
-from legged_torque.learning.ppo.triton.networks import ALIGNMENT, Network, read_network
+from legged_torque.learning.ppo.triton.memory import NUMBERS, SAMPLES, TILE, Memory
+from legged_torque.learning.ppo.triton.networks import ALIGNMENT, Columns, aligned, read_network
 from legged_torque.sim.compiled import keep_kernels
 from legged_torque.utils import distributed
 from legged_torque.utils.progress import torch_compiles
@@ -29,10 +31,8 @@ def shows_compilation(method: Callable) -> Callable:
 
     @functools.wraps(method)
     def call(self: TritonPPO, *args: Any) -> Any:
-        if method.__name__ in self.compiled:
-            return method(self, *args)
-        self.compiled.add(method.__name__)
-        with torch_compiles():
+        with contextlib.nullcontext() if method.__name__ in self.compiled else torch_compiles():
+            self.compiled.add(method.__name__)
             return method(self, *args)
 
     return call
@@ -57,19 +57,14 @@ class TritonPPO(TorchPPO):
         self.compiled: set[str] = set()  # methods whose kernels have been compiled
         self.product_dtype = torch.bfloat16 if self.use_mixed_precision else torch.float32
         self._models = (actor, critic)
-        actor_network = read_network(actor.mlp)
-        assert actor_network, "has_kernels has read it"
-        critic_network = read_network(critic.mlp, actor_network.num_outputs)
-        assert critic_network, "has_kernels has read it"
-        self._networks = networks = (actor_network, critic_network)
-        layers = [layer for network in networks for layer in network.layers]
+        size = storage.actions.shape[-1]
+        networks = (read_network(actor.mlp), read_network(critic.mlp, size))
         self._std = self._deviation_settings()
-        self._packed = Parameters(actor, critic, layers, self._std[0], self.product_dtype)
-        self._acting = Workspace(networks, self._packed, storage.num_envs)
         self._num_samples = self.batch_size * (2 if self.symmetry else 1)
-        self._learning = LearningWorkspace(networks, self._packed, self._num_samples)
-        self._places = self._learning.output_places(networks)
-        size, flat = storage.actions.shape[-1], self._packed.flat
+        sizes = (self._num_samples, storage.num_envs)
+        self._memory = Memory(self._models, networks, self._std[0], self.product_dtype, *sizes)
+        self._places = self._memory.output_places()
+        flat = self._memory.flat
         self._gradient = flat.new_zeros(len(flat) + NUMBERS)
         self._numbers = self._gradient[len(flat) :]  # value loss, surrogate loss, entropy, KL divergence
         self._moments, self._squares = flat.new_zeros(2, len(flat)).unbind()
@@ -95,10 +90,9 @@ class TritonPPO(TorchPPO):
         actions = storage.actions[step]
         noise = torch.randn_like(actions)
         written = (actions, self._means[step], self._stds, storage.actions_log_prob[step], storage.values[step])
-        shape, columns = actions.shape, _power_of_two(actions.shape[1])
-        samples.act[(-(-shape[0] // samples.ROWS),)](
-            self._acting.outputs, noise, *self._std[:3], *written, *shape,
-            IS_LOG=self._std[3], ROWS=samples.ROWS, COLUMNS=columns,
+        samples.act[(triton.cdiv(len(actions), samples.ROWS),)](
+            self._memory.outputs, noise, *self._std[:3], *written, *actions.shape,
+            IS_LOG=self._std[3], ROWS=samples.ROWS, COLUMNS=triton.next_power_of_2(actions.shape[1]),
         )  # fmt: skip
         return actions
 
@@ -119,8 +113,8 @@ class TritonPPO(TorchPPO):
         """Compute returns and advantages (GAE), these of mean 0 and deviation 1 over the rollout."""
         storage = self.storage
         self._run_networks(obs)
-        last_values = self._acting.outputs[: storage.num_envs, -1].contiguous()
-        samples.generalized_advantages[(-(-storage.num_envs // GAE_WORLDS),)](
+        last_values = self._memory.outputs[: storage.num_envs, -1].contiguous()
+        samples.generalized_advantages[(triton.cdiv(storage.num_envs, GAE_WORLDS),)](
             storage.rewards, storage.dones, storage.values, last_values, storage.returns, storage.advantages,
             storage.num_transitions_per_env, storage.num_envs, self.gamma, self.lam, WORLDS=GAE_WORLDS, num_warps=2,
         )  # fmt: skip
@@ -136,16 +130,16 @@ class TritonPPO(TorchPPO):
     @shows_compilation
     def update_minibatch(self) -> None:
         """Take one gradient step on the samples of ``indices``."""
-        work = self._learning
-        for network, model, maps in zip(self._networks, self._models, self._maps, strict=True):
+        memory = self._memory
+        for inputs, model, maps in zip(memory.inputs, self._models, self._maps, strict=True):
             groups = [self.storage.observations[group].flatten(0, 1) for group in model.obs_groups]
-            self._observe(work, network, groups, maps)
-        self._forward(work)
+            self._observe(inputs, groups, memory.rows, maps)
+        self._forward(memory.rows)
         self._write_losses()
-        for table in work.backward:
-            arguments = (work.values, work.gradients, self._packed.weights, work.sums, work.sums.shape[1], table)
+        for table in memory.backward:
+            arguments = (memory.values, memory.gradients, memory.weights, memory.sums, memory.sums.shape[1], table)
             settings = {"SAMPLES": SAMPLES} | products.BACKWARD
-            self._product(products.input_gradient, arguments, work.rows // SAMPLES, settings)
+            self._product(products.input_gradient, arguments, memory.rows // SAMPLES, settings)
         self._weight_gradients()
         if self.is_multi_gpu:
             distributed.average([self._gradient])
@@ -153,13 +147,14 @@ class TritonPPO(TorchPPO):
 
     def round_weights(self) -> None:
         """Prepare the weights for the products, after something else than a gradient step has changed them."""
-        parameters = self._packed
-        arrays = (parameters.flat, parameters.weights, parameters.source, len(parameters.flat))
-        steps.round_weights[(-(-len(parameters.flat) // steps.BLOCK),)](*arrays, BLOCK=steps.BLOCK)
+        memory = self._memory
+        size = len(memory.flat)
+        grid = (triton.cdiv(size, steps.BLOCK),)
+        steps.round_weights[grid](memory.flat, memory.weights, memory.source, size, BLOCK=steps.BLOCK)
 
     def gradients(self) -> list[Tensor]:
         """Return the gradients of the last minibatch before they were clipped, in the order of the parameters."""
-        return self._packed.views(self._gradient)
+        return self._memory.views(self._gradient)
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Load as :class:`TorchPPO` does, into the memory of the kernels."""
@@ -169,11 +164,11 @@ class TritonPPO(TorchPPO):
 
     def tensors(self) -> list[Tensor]:
         """Return the parameters, both moments and the number of steps."""
-        return [self._packed.flat, self._moments, self._squares, self._adam_steps.view(1)]
+        return [self._memory.flat, self._moments, self._squares, self._adam_steps.view(1)]
 
     def _share_optimizer_state(self) -> None:
         """Take over the state of the optimizer, and let it be views of what the kernels use."""
-        moments, squares = self._packed.views(self._moments), self._packed.views(self._squares)
+        moments, squares = self._memory.views(self._moments), self._memory.views(self._squares)
         for parameter, moment, square in zip(self._parameters, moments, squares, strict=True):
             state = self.optimizer.state[parameter] or {"exp_avg": 0.0, "exp_avg_sq": 0.0, "step": 0.0}
             moment.copy_(torch.as_tensor(state["exp_avg"]))
@@ -183,31 +178,33 @@ class TritonPPO(TorchPPO):
 
     def _run_networks(self, obs: TensorDict) -> None:
         """Compute the outputs of actor and critic in all worlds."""
-        for network, model in zip(self._networks, self._models, strict=True):
-            self._observe(self._acting, network, [obs[group] for group in model.obs_groups], None)
-        self._forward(self._acting)
+        rows = aligned(self.storage.num_envs, SAMPLES)
+        for inputs, model in zip(self._memory.inputs, self._models, strict=True):
+            self._observe(inputs, [obs[group] for group in model.obs_groups], rows, None)
+        self._forward(rows)
 
-    def _observe(self, work: Workspace, network: Network, groups: Sequence[Tensor], maps: Any) -> None:
+    def _observe(self, inputs: Columns, groups: Sequence[Tensor], num_rows: int, maps: Any) -> None:
         """Write the inputs of a network: groups of observations, with mirror images if there are maps for them."""
-        column = 0
+        column, memory = 0, self._memory
         for i, group in enumerate(groups):
             order, signs = maps[i] if maps else (group, group)
-            target = (work.place(network.inputs), network.inputs.block.width, column)
+            target = (memory.place(inputs), inputs.block.width, column)
             counts = (self.batch_size, self._num_samples if maps else len(group), group.shape[1])
-            columns = _power_of_two(group.shape[1])
+            columns = triton.next_power_of_2(group.shape[1])
             rows = max(1, min(samples.ROWS, samples.NUMBERS // columns))
-            samples.observe[(work.rows // rows,)](
-                group, self.indices, order, signs, work.values, *target, *counts,
+            samples.observe[(num_rows // rows,)](
+                group, self.indices, order, signs, memory.values, *target, *counts,
                 CHOOSE=bool(maps), ROWS=rows, COLUMNS=columns,
             )  # fmt: skip
             column += group.shape[1]
 
-    def _forward(self, work: Workspace) -> None:
+    def _forward(self, num_rows: int) -> None:
         """Compute the outputs of actor and critic from their inputs."""
-        for table, has_outputs in work.forward:
-            arrays = (work.values, self._packed.weights, self._packed.flat, work.outputs, table)
+        memory = self._memory
+        for table, has_outputs in memory.forward:
+            arrays = (memory.values, memory.weights, memory.flat, memory.outputs, table)
             sizes = {"HAS_OUTPUTS": has_outputs, "SAMPLES": SAMPLES}
-            self._product(products.forward, arrays, work.rows // SAMPLES, sizes | products.FORWARD)
+            self._product(products.forward, arrays, num_rows // SAMPLES, sizes | products.FORWARD)
 
     def _product(self, kernel: Any, arguments: tuple, parts: int, settings: dict[str, int]) -> None:
         """Launch a matrix product of all tiles of a table, the last argument, for all parts of the samples."""
@@ -216,40 +213,40 @@ class TritonPPO(TorchPPO):
 
     def _write_losses(self) -> None:
         """Compute losses and their gradients by the outputs."""
-        work, storage = self._learning, self.storage
+        memory, storage = self._memory, self.storage
         size = storage.actions.shape[-1]
         policy = (storage.actions, self._means, storage.actions_log_prob)
         values = (storage.values, storage.advantages, storage.returns)
         counts = (self.batch_size, self._num_samples, size)
         weights = (self.clip_param, self.value_loss_coef, self.entropy_weight)
         places, strides, columns = self._places
-        samples.losses[(len(work.sums),)](
-            work.outputs, *self._std[:3], self._stds, self.indices, *self._action_map, *policy, *values,
-            self.actor_learns, work.gradients, places, strides, work.sums, work.sums.shape[1], columns,
+        samples.losses[(len(memory.sums),)](
+            memory.outputs, *self._std[:3], self._stds, self.indices, *self._action_map, *policy, *values,
+            self.actor_learns, memory.gradients, places, strides, memory.sums, memory.sums.shape[1], columns,
             *counts, *weights, IS_LOG=self._std[3], CLIP_VALUES=self.use_clipped_value_loss, ROWS=SAMPLES,
-            COLUMNS=_power_of_two(size), num_warps=16,
+            COLUMNS=triton.next_power_of_2(size), num_warps=16,
         )  # fmt: skip
 
     def _weight_gradients(self) -> None:
         """Compute the gradient of all parameters from those of what the layers compute."""
-        work, parameters = self._learning, self._packed
-        parts, room = work.partial.shape
-        arguments = (work.values, work.gradients, work.partial, work.rows // parts, room, work.weight_tiles)
+        memory = self._memory
+        parts, room = memory.partial.shape
+        arguments = (memory.values, memory.gradients, memory.partial, memory.rows // parts, room, memory.weight_tiles)
         self._product(products.weight_gradient, arguments, parts, products.BACKWARD)
-        size, (rows, columns) = len(parameters.flat), work.sums.shape
-        steps.sum_rows[(-(-columns // 32),)](
-            work.sums, rows, columns, parameters.destination, self._gradient, ROWS=128, COLUMNS=32, num_warps=8
+        size, (rows, columns) = len(memory.flat), memory.sums.shape
+        steps.sum_rows[(triton.cdiv(columns, 32),)](
+            memory.sums, rows, columns, memory.destination, self._gradient, ROWS=128, COLUMNS=32, num_warps=8
         )
-        steps.sum_parts[(-(-size // steps.BLOCK),)](
-            work.partial, parts, room, parameters.source, self._gradient, size, BLOCK=steps.BLOCK
+        steps.sum_parts[(triton.cdiv(size, steps.BLOCK),)](
+            memory.partial, parts, room, memory.source, self._gradient, size, BLOCK=steps.BLOCK
         )
 
     def _step(self) -> None:
         """Clip the gradients and let Adam take a step, unless they are not finite."""
-        parameters = self._packed
-        size, group = len(parameters.flat), self.optimizer.param_groups[0]
+        memory = self._memory
+        size, group = len(memory.flat), self.optimizer.param_groups[0]
         steps.sum_squares[(steps.PARTS,)](
-            self._gradient, parameters.actor_size, size, self._norms, PARTS=steps.PARTS, BLOCK=steps.BLOCK
+            self._gradient, memory.actor_size, size, self._norms, PARTS=steps.PARTS, BLOCK=steps.BLOCK
         )
         beta1, beta2 = group["betas"]
         steps.prepare_adam_step[(1,)](
@@ -258,9 +255,9 @@ class TritonPPO(TorchPPO):
             ADAPTIVE=self.schedule == "adaptive", PARTS=steps.PARTS,
         )  # fmt: skip
         decay = group["weight_decay"] if isinstance(self.optimizer, torch.optim.AdamW) else 0.0
-        steps.adam[(-(-size // steps.BLOCK),)](
-            parameters.flat, self._gradient, self._moments, self._squares, parameters.weights, parameters.source,
-            self._scalars, self.learning_rate, parameters.actor_size, size,
+        steps.adam[(triton.cdiv(size, steps.BLOCK),)](
+            memory.flat, self._gradient, self._moments, self._squares, memory.weights, memory.source,
+            self._scalars, self.learning_rate, memory.actor_size, size,
             beta1, beta2, group["eps"], decay, BLOCK=steps.BLOCK,
         )  # fmt: skip
 
@@ -285,8 +282,3 @@ def can_multiply(dtype: torch.dtype, device: str) -> bool:
     tiles = stages * (SAMPLES + TILE) * ALIGNMENT * dtype.itemsize
     properties = torch.cuda.get_device_properties(device)
     return properties.major >= 8 and tiles <= properties.shared_memory_per_multiprocessor
-
-
-def _power_of_two(size: int) -> int:
-    """Return the next power of two."""
-    return 1 << (size - 1).bit_length()

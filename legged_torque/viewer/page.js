@@ -1,16 +1,23 @@
-"""Steering with held keys and a gamepad: viser has no events for them, so a script on the page sends them."""
-
-from __future__ import annotations
-
-from collections.abc import Callable
-
-import viser
-from viser._messages import RunJavascriptMessage
-
-SCRIPT = """
+// Runs on the page, again after a lost connection: the looks of its panels, and steering with held keys and a gamepad,
+// for which viser has no events. Steering sets FIELD, an input of viser, to shares of the largest v_x, v_y and yaw rate,
+// -1 to 1, whenever held keys (W S, A D, arrows) or the sticks of a gamepad change them.
 const isRunning = Boolean(window.steering);
 window.steering = {field: "FIELD", sent: isRunning ? "" : "0,0,0"};  // after a lost connection, send again
 if (isRunning) return;
+
+document.head.insertAdjacentHTML("beforeend", `<style>
+  .lt-status { font-size: 13px; line-height: 1.5; padding: 4px 12px }
+  .lt-error { color: #e03131 }
+  .lt-keys { font-size: 12px; padding: 0 12px }
+  .lt-plot { font-size: 12px; padding: 4px 10px }
+  .lt-legend > span { margin-right: 12px; white-space: nowrap; font-weight: normal }
+  .lt-row { display: flex; align-items: center; gap: 6px; height: 17px }
+  .lt-row > :first-child { width: 52px; white-space: nowrap }
+  .lt-wide > :first-child { width: 116px }
+  .lt-row > svg { flex: 1; min-width: 0; height: 13px; background: #8882; border-radius: 2px }
+  .lt-row > :last-child { width: 58px; text-align: right; font-variant-numeric: tabular-nums }
+</style>`);
+
 const keys = {KeyW: [0, 1], ArrowUp: [0, 1], KeyS: [0, -1], ArrowDown: [0, -1], KeyA: [1, 1], KeyD: [1, -1],
               ArrowLeft: [2, 1], ArrowRight: [2, -1]};
 const held = new Set();
@@ -34,19 +41,3 @@ setInterval(() => {
   window.steering.sent = value.join();
   window.__viserMutable.sendMessage({type: "GuiUpdateMessage", uuid: window.steering.field, updates: {value}});
 }, 50);
-"""
-"""Sets a field to shares of the largest v_x, v_y and yaw rate, -1 to 1, whenever held keys (W S, A D, arrows) or the
-sticks of a gamepad change them."""
-
-
-def add_steering(gui: viser.GuiApi, steer: Callable[[tuple[float, float, float]], None]) -> None:
-    """Call a function with shares of the largest v_x, v_y and yaw rate, -1 to 1, whenever a user changes them."""
-    field = gui.add_vector3("steering", (0.0, 0.0, 0.0), visible=False)
-
-    async def changed(event: viser.GuiEvent) -> None:  # viser calls coroutines in the order of the changes
-        if all(abs(share) <= 1.0 for share in field.value):
-            steer(field.value)
-
-    field.on_update(changed)
-    script = SCRIPT.replace("FIELD", field._impl.uuid)
-    gui._websock_interface.queue_message(RunJavascriptMessage(script))  # as viser itself does for Plotly

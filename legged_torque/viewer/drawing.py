@@ -1,6 +1,6 @@
-"""Rough ground in videos and viewers: one surface of few triangles with a picture of its tiles as texture.
+"""A robot on its ground as MuJoCo draws it: rough ground as a surface of few triangles, cameras, and arrows.
 
-Needs neither torch nor Warp.
+All is scaled to the size of the robot. Needs neither torch nor Warp.
 """
 
 from __future__ import annotations
@@ -21,6 +21,18 @@ from legged_torque.utils.mjcf import loading, read_spec
 if TYPE_CHECKING:
     from legged_torque.envs.base.legged_robot import LeggedRobot
 
+TRUNK = 1  # body of the trunk in the MJCF of a task
+A1_HEIGHT = 0.485  # from the feet of the A1 to its top at zero joint angles [m]
+AZIMUTH, ELEVATION = 130.0, 18.0  # direction of a video's camera and how far it looks down [degrees]
+DISTANCE, TARGET = 1.6, 0.25  # of a video's camera to its target, height of the target; for the A1 on level ground [m]
+SMOOTHING = 0.1  # share of a change of height that is followed per frame
+JUMP = 0.6  # change of height that is followed at once [m]
+ARROW_LENGTH = 0.5  # for 1 m/s [m]
+COMMAND_HEIGHT, VELOCITY_HEIGHT = 0.24, 0.18  # of the arrows above the trunk's origin, for the A1 [m]
+MIN_SPEED = 0.05  # of a velocity with an arrow [m/s]
+COMMAND_COLOR, VELOCITY_COLOR = (0.1, 0.8, 0.2, 0.9), (0.1, 0.4, 1.0, 0.9)
+ARROW_RADIUS = 0.012  # of an arrow's shaft [m]
+
 RESOLUTION, MAX_PIXELS = 32.0, 4096  # of the picture: pixels per metre, and limit along a side
 SHADES = (1.0, 0.94, 0.85)  # brightness of a tile, of lines on it that are 1 m apart, and of its edges
 LINE_WIDTH = 1.2  # of lines and edges [pixels]
@@ -28,6 +40,98 @@ STRAIGHT = 1e-6  # largest bend between neighbouring samples of a straight line 
 MAX_CELLS = 20  # along a side of a rectangle
 CLEARANCE = 0.3  # of a camera and its line of sight above the ground [m]
 REFLECTANCE = [0.72, 0.72, 0.72, 1.0]  # of the picture in MuJoCo's light
+
+
+class Drawing:
+    """A robot on its ground, as MuJoCo draws it.
+
+    Attributes:
+        model: For drawing, with visual geoms.
+        data: The robot's present state.
+        ground: None is a plane.
+        trunk: Body that cameras follow.
+        size: See :func:`size_of`.
+    """
+
+    def __init__(self, model: mujoco.MjModel, ground: Ground | None = None, trunk: int = TRUNK) -> None:
+        """Start with all joints at zero."""
+        self.model, self.ground, self.trunk = model, ground, trunk
+        self.data, self.size = mujoco.MjData(model), size_of(model)
+
+    @classmethod
+    def of_task(cls, task: LeggedRobot) -> Drawing:
+        """Return the robot of a task on its ground, with the joints in the task's order."""
+        terrain: Any = task.terrain  # rough ground if it has a map
+        ground = Ground(terrain.layout, terrain.map) if terrain.map else None
+        return cls(drawn_model(resource_path(task.cfg.asset.file), ground, task.dof_names), ground)
+
+    def move(self, qpos: np.ndarray) -> None:
+        """Move the robot. Shape: (nq,)."""
+        self.data.qpos[:] = qpos
+        mujoco.mj_forward(self.model, self.data)
+
+    def add_velocities(self, scene: mujoco.MjvScene, command: np.ndarray, velocity: np.ndarray) -> None:
+        """Draw commanded and actual velocity above the robot.
+
+        They begin with v_x and v_y in the trunk's frame [m/s]; what follows is not drawn.
+        """
+        kind, rotation = mujoco.mjtGeom.mjGEOM_ARROW, self.data.xmat[self.trunk].reshape(3, 3)
+        for vector, color, height in (
+            (command, COMMAND_COLOR, COMMAND_HEIGHT),
+            (velocity, VELOCITY_COLOR, VELOCITY_HEIGHT),
+        ):
+            if np.hypot(*vector[:2]) < MIN_SPEED or scene.ngeom >= scene.maxgeom:
+                continue
+            start = self.data.xpos[self.trunk] + [0.0, 0.0, self.size * height]
+            geom = scene.geoms[scene.ngeom]
+            mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(color, np.float32))
+            mujoco.mjv_connector(geom, kind, ARROW_RADIUS, start, start + ARROW_LENGTH * rotation[:, :2] @ vector[:2])
+            scene.ngeom += 1
+
+
+class Camera:
+    """A video's camera: follows a robot from a fixed direction and stays above the ground."""
+
+    def __init__(self, ground: Ground | None, size: float) -> None:
+        """Prepare for a robot of a :func:`size_of`; a ground of None is a plane."""
+        self._ground, self._size = ground, size
+        self._below: float | None = None  # smoothed height of the ground [m]
+        self._height: float | None = None  # smoothed height of the camera [m]
+
+    def look_at(self, position: np.ndarray) -> mujoco.MjvCamera:
+        """Return the camera of the next frame for a trunk at a position in the world [m]. Shape: (3,)."""
+        camera, azimuth, elevation = mujoco.MjvCamera(), np.radians(AZIMUTH), np.radians(ELEVATION)
+        camera.lookat[:] = (position[0], position[1], self._size * TARGET)
+        ahead, height = self._size * DISTANCE * np.array([np.cos(elevation), np.sin(elevation)])
+        if self._ground:
+            self._below = smoothed(self._below, float(self._ground.height(position)))
+            camera.lookat[2] += self._below
+            place = camera.lookat - ahead * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+            lowest = self._ground.lowest_view(camera.lookat, place)
+            self._height = smoothed(self._height, max(camera.lookat[2] + height, lowest))
+            height = self._height - camera.lookat[2]
+        camera.azimuth, camera.elevation = AZIMUTH, -np.degrees(np.arctan2(height, ahead))
+        camera.distance = np.hypot(ahead, height)
+        return camera
+
+
+def size_of(model: mujoco.MjModel) -> float:
+    """Return the height of a robot at zero joint angles in heights of the A1, rounded to a tenth."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    moving = model.body_weldid[model.geom_bodyid] > 0
+    upward = data.geom_xmat.reshape(-1, 3, 3)[moving, 2]  # the vertical in the frames of the geoms
+    middle, half = model.geom_aabb[moving, :3], model.geom_aabb[moving, 3:]
+    heights = data.geom_xpos[moving, 2] + (upward * middle).sum(axis=1)
+    reach = (np.abs(upward) * half).sum(axis=1)
+    return max(round(float((heights + reach).max() - (heights - reach).min()) / A1_HEIGHT, 1), 0.1)
+
+
+def smoothed(before: float | None, height: float) -> float:
+    """Return the next value of a height [m] that follows another one smoothly, but jumps with new episodes."""
+    if before is None or abs(height - before) > JUMP:
+        return height
+    return before + SMOOTHING * (height - before)
 
 
 class Ground:
@@ -45,30 +149,34 @@ class Ground:
         self.layout = layout
         self._heights, self._scale = grid.heights, grid.horizontal_scale
         self._corner, size = np.array(grid.corner), np.array(grid.size)
-        first_x, last_x, first_y, last_y = patches(self._heights).T
-        rows, cols = np.stack([first_x, last_x, last_x, first_x]), np.stack([first_y, first_y, last_y, last_y])
+        rectangles = patches(self._heights)
+        rows, cols = rectangles[:, [0, 1, 1, 0]], rectangles[:, [2, 2, 3, 3]]
         samples, corners = np.unique(rows * self._heights.shape[1] + cols, return_inverse=True)
         places = np.stack(np.unravel_index(samples, self._heights.shape), axis=1) * self._scale
         self.vertices = np.column_stack([places + self._corner, self._heights.flat[samples]]).astype(np.float32)
         self.uv = (places / size).astype(np.float32)
-        triangles = corners.reshape(rows.shape)[[0, 1, 2, 0, 2, 3]]
-        self.faces = np.ascontiguousarray(triangles.T, np.int32).reshape(-1, 3)
+        self._rectangles = corners.reshape(rows.shape)
+        self.faces = self._rectangles[:, [0, 1, 2, 0, 2, 3]].astype(np.int32).reshape(-1, 3)
 
     def picture(self) -> np.ndarray:
         """Return a picture of the map from above, with a color per kind. Shape: (y, x of the world, 3), uint8."""
         layout = self.layout
         size = np.array(self._heights.shape) - 1
         per_metre = min(RESOLUTION, MAX_PIXELS / (size.max() * self._scale))
-        pixels = np.rint(size * self._scale * per_metre).astype(int)
-        places = [(np.arange(count) + 0.5) / per_metre - layout.border_size for count in pixels]
-        tiles = [np.floor(place / layout.tile_size).astype(int) for place in places]
-        shade_x, shade_y = (_shade(place, layout.tile_size, 1.0 / per_metre) for place in places)
+        tiles, shades = [], []
+        for cells in size:
+            pixels = np.arange(np.rint(cells * self._scale * per_metre))
+            place = (pixels + 0.5) / per_metre - layout.border_size  # from the first tile [m]
+            steps, half = (1.0, layout.tile_size), 0.5 * LINE_WIDTH / per_metre
+            is_line, is_edge = (np.abs((place + 0.5 * step) % step - 0.5 * step) < half for step in steps)
+            tiles.append(np.floor(place / layout.tile_size).astype(int))
+            shades.append(np.where(is_edge, 2, is_line.astype(int)))
         colors = np.array([*(color_of(kind) for kind in layout.kinds()), NEUTRAL])
         is_row = (tiles[0] >= 0) & (tiles[0] < layout.num_rows)
         is_col = (tiles[1] >= 0) & (tiles[1] < layout.num_cols)
         column = np.where(is_row & is_col[:, None], tiles[1][:, None], layout.num_cols)
-        shades = (colors[:, None] * np.array(SHADES)[:, None]).astype(np.uint8)
-        return shades[column, np.maximum(shade_x, shade_y[:, None])]
+        shaded = (colors[:, None] * np.array(SHADES)[:, None]).astype(np.uint8)
+        return shaded[column, np.maximum(shades[0], shades[1][:, None])]
 
     def tile_text(self, row: int, column: int) -> str:
         """Return the kind, level and difficulty of a tile as text."""
@@ -100,24 +208,16 @@ class Ground:
         textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ground"
         spec.add_material(name="ground", textures=textures, specular=0.05, rgba=REFLECTANCE)
         mesh = spec.add_mesh(name="ground", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-        p0, p1, p2, _, _, p3 = self.faces.reshape(-1, 6).T
-        corners = self.vertices[[p0, p1, p2, p3]].transpose(1, 0, 2)
+        corners = self.vertices[self._rectangles]
         normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
         mesh.uservert, mesh.usernormal = corners.ravel(), np.repeat(normals, 4, axis=0).ravel()  # so edges stay sharp
-        mesh.usertexcoord = self.uv[[p0, p1, p2, p3]].transpose(1, 0, 2).ravel()
-        starts = 4 * np.arange(len(p0), dtype=np.int32)[:, None]
+        mesh.usertexcoord = self.uv[self._rectangles].ravel()
+        starts = 4 * np.arange(len(corners), dtype=np.int32)[:, None]
         mesh.userface = (starts + np.array([0, 1, 2, 0, 2, 3], np.int32)).ravel()
         planes = [geom for geom in spec.worldbody.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
         floor = planes[0] if planes else spec.worldbody.add_geom()
         floor.type, floor.meshname, floor.material = mujoco.mjtGeom.mjGEOM_MESH, "ground", "ground"
         floor.pos, floor.quat, floor.contype, floor.conaffinity = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], 0, 0
-
-
-def drawn_task(task: LeggedRobot) -> tuple[mujoco.MjModel, Ground | None]:
-    """Return the model of a task's robot and ground for drawing, and the ground; None if it is a plane."""
-    terrain: Any = task.terrain  # rough ground if it has a map
-    ground = Ground(terrain.layout, terrain.map) if terrain.map else None
-    return drawn_model(resource_path(task.cfg.asset.file), ground, task.dof_names), ground
 
 
 def drawn_model(robot: Path, ground: Ground | None, joints: Sequence[str] = ()) -> mujoco.MjModel:
@@ -161,10 +261,3 @@ def patches(heights: np.ndarray) -> np.ndarray:
     goes_on &= (np.abs(np.diff(rise_first)) < STRAIGHT) & (strip[1:] % MAX_CELLS != 0)
     begins, ends = np.append(True, ~goes_on), np.append(~goes_on, True)
     return np.stack([strip[begins], strip[ends] + 1, first[begins], last[begins]], axis=1)
-
-
-def _shade(places: np.ndarray, tile_size: float, pixel: float) -> np.ndarray:
-    """Return the index in :data:`SHADES` of places along an axis; distances are from the first tile [m]."""
-    half = 0.5 * LINE_WIDTH * pixel
-    is_line, is_edge = (np.abs((places + 0.5 * step) % step - 0.5 * step) < half for step in (1.0, tile_size))
-    return np.where(is_edge, 2, is_line.astype(int))

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import io
-import json
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_whole
@@ -25,19 +24,6 @@ def load_pyplot() -> ModuleType:
     except ImportError:
         raise UserError("plots need the extra: pip install 'legged_torque[plots]'") from None
     return pyplot
-
-
-def read_data(file: Path, keys: set[str], script: str) -> dict[str, Any]:
-    """Return the JSON object with at least these keys that ``script`` has written; a UserError if it is none."""
-    if not file.is_file():  # a device might never end
-        raise UserError(f"cannot read '{file}': there is no such file")
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:  # nested too deeply
-        raise UserError(f"cannot read '{file}': {error}") from None
-    if not isinstance(data, dict) or not keys <= data.keys():
-        raise UserError(f"'{file}' is not a file that {script} has written")
-    return data
 
 
 def save_figure(figure: Figure, file: Path) -> None:

@@ -1,0 +1,39 @@
+"""Shared by tests: code in a terminal."""
+
+import contextlib
+import fcntl
+import os
+import pty
+import signal
+import struct
+import subprocess
+import sys
+import termios
+
+from support.scripts import ROOT
+
+
+def in_a_terminal(code, columns=80, after="", close=False, **variables):
+    """Run code in a terminal of that width; once ``after`` has come, press Ctrl-C or close the terminal.
+
+    Returns:
+        Exit status, and all that the terminal has got.
+    """
+    master, slave = pty.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
+    environment = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "NO_COLOR", "LINES")}
+    environment |= {"PYTHONPATH": str(ROOT), "TERM": "xterm-256color", "PYTHONUTF8": "1", **variables}
+    streams = {"stdin": slave, "stdout": slave, "stderr": slave}
+    process = subprocess.Popen([sys.executable, "-c", code], **streams, env=environment, start_new_session=True)
+    os.close(slave)
+    output = b""
+    with contextlib.suppress(OSError):  # at the end of a terminal
+        while data := os.read(master, 65536):
+            output += data
+            if after and after in output.decode(errors="replace"):
+                if close:
+                    break
+                process.send_signal(signal.SIGINT)
+                after = ""
+    os.close(master)
+    return process.wait(20), output.decode()
