@@ -72,7 +72,7 @@ def step_finder(layout: Layout) -> tuple[wp.Function, wp.Function]:
                     if scratch.selves.coupled:
                         branch.step = constraint_self.coupled_step(model, scratch.selves, world, b, joints, branch.step)
                     constraint_self.write_joints(model, scratch.selves, world, b, joints, branch.step)
-                of_rows = solver.along_step(branch, rot, step, scratch.contacts)
+                branch, of_rows = solver.along_step(branch, rot, step, scratch.contacts)
                 slopes += solver.slopes_at_start(branch, step, of_rows)
             own.store(scratch, world, i, branch)
         if wp.static(own.collide):

@@ -27,6 +27,15 @@ from legged_torque.sim.fused.types import AnyBranch, AnyColumns, AnyContacts, An
 
 
 @wp.func
+def joint_rows_times(branch: AnyBranch, a: AnyVector):
+    """Return J a of the joint rows."""
+    out = type(branch.residuals)()
+    out.friction = 1.0 * a
+    out.limit = wp.cw_mul(branch.rows.limit_sign, a)
+    return out
+
+
+@wp.func
 def contact_rows_times(
     branch: AnyBranch, rot: wp.mat33, trunk: TrunkMotion, a: AnyVector, normal: wp.vec3, contact: Contact
 ) -> vec4:
@@ -47,8 +56,9 @@ def start(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts: An
     Contacts push with the rows that are expected to push, whatever these accelerations are. That is a better start than
     the rows that push there, since small changes of velocities turn the signs of stiff rows.
     """
-    branch.rows.friction_residual = branch.acc - branch.rows.friction_reference
-    branch.rows.limit_residual = wp.cw_mul(branch.rows.limit_sign, branch.acc) - branch.rows.limit_reference
+    branch.residuals = joint_rows_times(branch, branch.acc)
+    branch.residuals.friction = branch.residuals.friction - branch.rows.friction_reference
+    branch.residuals.limit = branch.residuals.limit - branch.rows.limit_reference
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
         contact = contacts.found[k]
         motion = contact_rows_times(branch, rot, trunk_acc, branch.acc, contact_normal(contacts, k), contact)
@@ -72,11 +82,11 @@ def assemble(branch: AnyBranch, rot: wp.mat33, trunk_acc: TrunkMotion, contacts:
     gradient_lin = coupling_lin * branch.acc
     gradient_ang = coupling_ang * branch.acc
     for j in range(len(branch.acc)):
-        friction_mass, friction_x = branch.rows.friction_mass[j], branch.rows.friction_residual[j]
+        friction_mass, friction_x = branch.rows.friction_mass[j], branch.residuals.friction[j]
         gradient[j] -= friction_force(friction_mass, branch.rows.friction_loss[j], friction_x)
         if wp.abs(friction_mass * friction_x) < branch.rows.friction_loss[j]:
             hessian[j, j] += friction_mass
-        limit_mass, limit_x = branch.rows.limit_mass[j], branch.rows.limit_residual[j]
+        limit_mass, limit_x = branch.rows.limit_mass[j], branch.residuals.limit[j]
         gradient[j] -= branch.rows.limit_sign[j] * row_force(limit_mass, limit_x)
         if limit_x < 0.0:
             hessian[j, j] += limit_mass
@@ -168,20 +178,21 @@ def branch_step(branch: AnyBranch, trunk_step: TrunkMotion):
 
 @wp.func
 def along_step(branch: AnyBranch, rot: wp.mat33, trunk_step: TrunkMotion, contacts: AnyContacts):
-    """Write how residuals of contacts change along a branch's step, and return the slope of its rows' cost along it."""
-    rows = branch.rows
+    """Return a branch with the changes of its residuals along its step, and the slope of its rows' cost along it."""
+    branch.change = joint_rows_times(branch, branch.step)
     slope = float(0.0)
     for j in range(len(branch.acc)):
-        friction = friction_force(rows.friction_mass[j], rows.friction_loss[j], rows.friction_residual[j])
-        slope -= friction * branch.step[j]
-        limit = row_force(rows.limit_mass[j], rows.limit_residual[j])
-        slope -= limit * (rows.limit_sign[j] * branch.step[j])
+        friction = friction_force(
+            branch.rows.friction_mass[j], branch.rows.friction_loss[j], branch.residuals.friction[j]
+        )
+        slope -= friction * branch.change.friction[j]
+        slope -= row_force(branch.rows.limit_mass[j], branch.residuals.limit[j]) * branch.change.limit[j]
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
         contact = contacts.found[k]
         change = contact_rows_times(branch, rot, trunk_step, branch.step, contact_normal(contacts, k), contact)
         slope += contact.mass * wp.dot(wp.cw_mul(contacts.pushing[k], contacts.residual[k]), change)
         contacts.change[k] = change
-    return slope
+    return branch, slope
 
 
 @wp.func
@@ -203,13 +214,13 @@ def row_slopes(branch: AnyBranch, contacts: AnyContacts, alpha: float) -> wp.vec
     slope = float(0.0)
     curvature = float(0.0)
     for j in range(len(branch.acc)):
-        mass, loss, along = branch.rows.friction_mass[j], branch.rows.friction_loss[j], branch.step[j]
-        value = branch.rows.friction_residual[j] + alpha * along
+        mass, loss, along = branch.rows.friction_mass[j], branch.rows.friction_loss[j], branch.change.friction[j]
+        value = branch.residuals.friction[j] + alpha * along
         slope -= friction_force(mass, loss, value) * along
         if wp.abs(mass * value) < loss:
             curvature += mass * along * along
-        along = branch.rows.limit_sign[j] * branch.step[j]
-        value = branch.rows.limit_residual[j] + alpha * along
+        along = branch.change.limit[j]
+        value = branch.residuals.limit[j] + alpha * along
         if value < 0.0:
             slope += branch.rows.limit_mass[j] * value * along
             curvature += branch.rows.limit_mass[j] * along * along
@@ -245,14 +256,14 @@ def move(branch: AnyBranch, contacts: AnyContacts, alpha: float):
     """Return a branch moved by a share of the step, and how many rows changed their state on the way."""
     flips = float(0.0)
     branch.acc = branch.acc + alpha * branch.step
-    friction = branch.rows.friction_residual + alpha * branch.step
-    limit = branch.rows.limit_residual + alpha * wp.cw_mul(branch.rows.limit_sign, branch.step)
     for j in range(len(branch.acc)):
-        mass, loss, old = branch.rows.friction_mass[j], branch.rows.friction_loss[j], branch.rows.friction_residual[j]
-        flips += wp.abs(friction_state(mass * old, loss) - friction_state(mass * friction[j], loss))
-        flips += wp.where((branch.rows.limit_residual[j] < 0.0) != (limit[j] < 0.0), 1.0, 0.0)
-    branch.rows.friction_residual = friction
-    branch.rows.limit_residual = limit
+        mass, loss = branch.rows.friction_mass[j], branch.rows.friction_loss[j]
+        old, new = branch.residuals.friction[j], branch.residuals.friction[j] + alpha * branch.change.friction[j]
+        flips += wp.abs(friction_state(mass * old, loss) - friction_state(mass * new, loss))
+        old_limit, new_limit = branch.residuals.limit[j], branch.residuals.limit[j] + alpha * branch.change.limit[j]
+        flips += wp.where((old_limit < 0.0) != (new_limit < 0.0), 1.0, 0.0)
+    branch.residuals.friction = branch.residuals.friction + alpha * branch.change.friction
+    branch.residuals.limit = branch.residuals.limit + alpha * branch.change.limit
     for k in range(branch.first_contact, branch.first_contact + branch.num_contacts):
         flips += move_contact(contacts, k, alpha)
     return branch, flips

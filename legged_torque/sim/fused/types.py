@@ -93,11 +93,16 @@ def branch_types(n: int) -> BranchTypes:
         friction_mass: vector  # D, 0 without dry friction
         friction_loss: vector
         friction_reference: vector
-        friction_residual: vector  # a - a_ref
         limit_mass: vector  # D, 0 inside the range
-        limit_sign: vector  # J: +1 at the lower limit, -1 at the upper one
+        limit_sign: vector  # +1 at the lower limit, -1 at the upper one
         limit_reference: vector
-        limit_residual: vector  # J a - a_ref
+
+    @wp.struct
+    class Residuals:
+        """J a - a_ref of the joint rows, or J times a direction."""
+
+        friction: vector
+        limit: vector
 
     @wp.struct
     class Branch:
@@ -108,7 +113,9 @@ def branch_types(n: int) -> BranchTypes:
         first_contact: int  # its contacts' indices
         num_contacts: int
         acc: vector
+        residuals: Residuals
         step: vector
+        change: Residuals  # of the residuals per unit of the step
         factor: matrix  # Cholesky factor of the Hessian's block
         coupling_lin: columns  # Hessian's blocks with the trunk
         coupling_ang: columns
