@@ -19,33 +19,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from legged_torque.utils.runs import checkpoint_numbers
 
 
-def run_names(cell):
-    """The names of the run folders of a cell, in order."""
-    return sorted(path.name for path in cell.iterdir() if path.is_dir())
-
-
 @pytest.fixture(scope="module")
-def device_check():
-    """A process that reads a matrix, chooses workers, and prints what that has started; others run meanwhile."""
-    code = (
-        "from pathlib import Path; import torch, warp; from warp._src import context\n"
-        "from legged_torque.experiments.matrix import read_matrix\n"
-        "from legged_torque.experiments.local_launcher import LocalLauncher\n"
-        f"read_matrix(Path({str(ROOT / 'experiments' / 'low.yaml')!r})); LocalLauncher('auto', None)\n"
-        "print(torch.cuda.is_initialized(), context.runtime)"
-    )
-    command, environment = [sys.executable, "-c", code], os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment
-    )
-
-
-@pytest.fixture(scope="module")
-def killed(device_check, tmp_path_factory):
+def killed(tmp_path_factory):
     """A smoke experiment of one cell that was killed in the middle of its training.
 
     Returns:
-        Its file, its folder, and the run folders that there were.
+        Its file and its folder.
     """
     values = yaml.safe_load((ROOT / "experiments" / "smoke.yaml").read_text())
     values["train"] |= {"runner.total_steps": 20 * 32, "runner.save_interval": 2}
@@ -62,27 +41,24 @@ def killed(device_check, tmp_path_factory):
     os.killpg(process.pid, signal.SIGKILL)  # the training is asked to stop by the system
     process.wait()
     cell = out / "a1_torque_multihead-low-s1"
-    runs, log = run_names(cell), cell / "train.log"
-    wait_for(lambda: (cell / runs[0]).is_dir() and "Stopping after this iteration and saving" in log.read_text())
-    return file, out, runs
+    wait_for(lambda: "Stopping after this iteration and saving" in (cell / "train.log").read_text())
+    return file, out
 
 
 @pytest.fixture(scope="module")
 def finished(killed, tmp_path_factory):
     """The same experiment after the same command once more: its file, its folder and what was printed."""
-    file, out, _ = killed
+    file, out = killed
     words = [file, f"--out={out}", "--device=cpu"]
     status, output, error = experiment_here(*words, tmp_path=tmp_path_factory.mktemp("root"))
     assert (status, error) == (0, ""), output + error
     return file, out, output
 
 
-def test_killed_in_the_middle_of_training(killed, finished):
+def test_killed_in_the_middle_of_training(finished):
     """The training saves what it has; the next call goes on from there, to the right number of iterations."""
-    _, out, before = killed
-    cell = out / "a1_torque_multihead-low-s1"
-    assert len(before) == 1 and len(run_names(cell)) == 2
-    first, second = (cell / name for name in run_names(cell))
+    _, out, _ = finished
+    first, second = sorted(path for path in (out / "a1_torque_multihead-low-s1").iterdir() if path.is_dir())
     last = max(checkpoint_numbers(first))
     assert 2 <= last < 20
     state = torch.load(second / "model_20.pt", weights_only=True)
@@ -135,33 +111,22 @@ def test_dry_run(name, tmp_path):
     [
         ({"sed": [1]}, "unknown experiment key 'sed'; did you mean 'seeds'?"),
         ({"tasks": None}, "tasks must be a list of texts, not None"),
-        ({"tasks": []}, "tasks must hold different entries, one or more, not []"),
         ({"tasks": ["a1_torqe"]}, "unknown task 'a1_torqe'; did you mean 'a1_torque'?"),
-        (
-            {"tasks": ["a1_torque", "a1_torque"]},
-            "tasks must hold different entries, one or more, not ['a1_torque', 'a1_torque']",
-        ),
+        ({"seeds": [3, 3]}, "seeds must hold different entries, one or more, not [3, 3]"),
         ({"seeds": [True]}, "seeds[0] must be an integer, not True"),
         ({"seeds": [-1]}, "seed must be at least 0"),
-        ({"seeds": 3}, "seeds must be a list of integers, not 3"),
         ({"environments": ["low"]}, "environments must hold entries 'name: value'"),
-        ({"environments": {}}, "environments must hold different entries, one or more, not []"),
         ({"environments": {"lo": ["low"]}}, "unknown perturbation 'lo'; did you mean 'low'?"),
         ({"environments": {"low": ["hihg"]}}, "unknown perturbation 'hihg'; did you mean 'high'?"),
-        ({"environments": {"low": "high"}}, "environments.low must be a list of texts, not 'high'"),
         ({"ranges": "defult"}, "unknown ranges 'defult'; did you mean 'default'?"),
         ({"train": {"runner.total_step": 1}}, "config key 'runner.total_step'; did you mean 'runner.total_steps'?"),
         ({"train": {"env.num_actions": 5}}, "train.env.num_actions cannot be set: it comes from tasks"),
         ({"train": {"asset.file": "missing.xml"}}, "cannot load the robot 'missing.xml': there is no such file"),
         ({"train": {"seed": 3}}, "train.seed cannot be set: it comes from tasks"),
-        ({"train": {"evaluation.also": ["low"]}}, "train.evaluation.also cannot be set: it comes from tasks"),
         ({"evaluation": {"num_env": 3}}, "unknown evaluation key 'num_env'; did you mean 'num_envs'?"),
-        ({"grounds": {"level": [0.5]}}, "unknown grounds key 'level'; did you mean 'levels'?"),
         ({"grounds": {"levels": [0, 1.5]}}, "a level must be from 0 to 1, not 1.5"),
         ({"grounds": {"levels": []}}, "grounds.levels must hold one entry or more, not []"),
-        ({"grounds": {"kinds": "flat"}}, "grounds.kinds must be a list of texts, not 'flat'"),
         ({"grounds": {"kinds": ["falt"]}}, "unknown kind of terrain 'falt'; did you mean 'flat'?"),
-        ({"grounds": ["flat"]}, "grounds must hold entries 'name: value'"),
         ({"evaluation": {"num_steps": 0}}, "evaluation.num_steps must be at least 1, not 0"),
     ],
 )
@@ -197,7 +162,15 @@ def test_mistakes_in_the_command_line(words, message, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_no_device_is_touched(device_check):
+def test_no_device_is_touched():
     """Reading a matrix and choosing workers starts neither CUDA nor Warp: GPUs belong to the trainings."""
-    output, error = device_check.communicate(timeout=300)
-    assert (device_check.returncode, output) == (0, "False None\n"), error
+    code = (
+        "from pathlib import Path; import torch, warp; from warp._src import context\n"
+        "from legged_torque.experiments.matrix import read_matrix\n"
+        "from legged_torque.experiments.local_launcher import LocalLauncher\n"
+        "read_matrix(Path('experiments/low.yaml')); LocalLauncher('auto', None)\n"
+        "print(torch.cuda.is_initialized(), context.runtime)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=environment)
+    assert (done.returncode, done.stdout) == (0, "False None\n"), done.stderr

@@ -53,17 +53,6 @@ def test_order_and_commands(stage, tmp_path):
     assert "8 of 8 cells done, " in output and "time left unknown" in output and " left\n" in output
 
 
-def test_a_damaged_checkpoint_does_not_block_its_cell(stage, tmp_path):
-    """Training goes on from the one before, here from the start, and the cell is done afterwards."""
-    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
-    assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
-    (damaged,) = (out / "a1_torque-low-s1").glob("*/model_*")
-    damaged.write_bytes(b"PK")
-    (out / "a1_torque-low-s1" / "result_high.json").unlink()
-    assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
-    assert trained(stage).count("a1_torque-low-s1") == 2 and (out / "a1_torque-low-s1" / "result_high.json").is_file()
-
-
 def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
     """It is tried once more; the exit status is 1, the last lines of its log are shown.
 
@@ -116,8 +105,7 @@ def test_steps_that_only_seem_to_succeed(stage, tmp_path, behaviour, message):
     assert any(" from 2" in line for line in trained(stage)) == (behaviour == "early")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stop(stage, tmp_path, number):
+def test_stop(stage, tmp_path):
     """Trainings save before this process ends with status 130, and go on the next time."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (stage / "behaviour").write_text("slow")
@@ -125,7 +113,7 @@ def test_stop(stage, tmp_path, number):
     def stop():
         """Send the signal when the training is under way."""
         wait_for(lambda: any("iteration 3 of 4" in log.read_text() for log in out.glob("*/train.log")))
-        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGINT)
 
     thread = threading.Thread(target=stop)
     thread.start()
@@ -145,17 +133,9 @@ def test_a_cell_that_another_process_works_on(stage, tmp_path):
     """It is left for later, reported once, and begun when the other process lets it go."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (out / "a1_position-low-s1").mkdir(parents=True)
-    lock = (out / "a1_position-low-s1" / "lock").open("a")
+    lock, other = (out / "a1_position-low-s1" / "lock").open("a"), out / "a1_torque-low-s1" / "result_high.json"
     fcntl.flock(lock, fcntl.LOCK_EX)
-
-    def release():
-        """Let go when the other cell is done."""
-        wait_for((out / "a1_torque-low-s1" / "result_high.json").is_file)
-        time.sleep(0.1)
-        assert trained(stage) == ["a1_torque-low-s1"]
-        lock.close()
-
-    thread = threading.Thread(target=release)
+    thread = threading.Thread(target=lambda: (wait_for(other.is_file), lock.close()))
     thread.start()
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     thread.join()
@@ -183,23 +163,20 @@ def test_two_experiments_share_a_folder(stage, tmp_path):
     [
         ({"train": {"runner.total_steps": 64}}, "train.runner.total_steps is 64, was 128; give another --out"),
         ({"train": {}}, "train.runner.total_steps is not set, was 128"),
-        ({"train": SMALL["train"] | {"env.num_envs": 2}}, "train.env.num_envs is 2, was not set"),
         ({"evaluation": {"num_steps": 100}}, "evaluation.num_steps is 100, was 2000"),
-        ({"tasks": ["a1_torque", "a1_multihead"]}, "tasks had a1_position as well"),
         ({"environments": {"low": ["low"]}}, "environments.low had high as well"),
-        ({"environments": {"high": ["low", "high"]}}, "environments had low as well"),
         ({"seeds": [2]}, "seeds had 1 as well"),
     ],
 )
-@pytest.mark.parametrize("words", [[], ["--dry-run"]], ids=["run", "dry run"])
-def test_changed_settings_are_refused(change, message, words, tmp_path):
+def test_changed_settings_are_refused(change, message, tmp_path):
     """A folder holds results of the same settings only."""
     out = tmp_path / "out"
     out.mkdir()
     write(out / "experiment.yaml", SMALL)
     file, before = write(tmp_path / "m.yaml", SMALL | change), contents(out)
-    result = experiment_here(file, f"--out={out}", "--device=cpu", *words, tmp_path=tmp_path)
-    assert_told_in_one_line(result, message)
+    for words in ([], ["--dry-run"]):
+        result = experiment_here(file, f"--out={out}", "--device=cpu", *words, tmp_path=tmp_path)
+        assert_told_in_one_line(result, message)
     assert contents(out) == before
 
 
@@ -223,8 +200,6 @@ def test_lost_and_broken_results_are_made_again(stage, tmp_path):
     lost, broken = out / "a1_position-low-s1" / "result_high.json", out / "a1_torque-low-s1" / "result_low.json"
     lost.unlink()
     broken.write_text('{"half": ')
-    listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1].splitlines()
-    assert listed == ["a1_position-low-s1: evaluate in high", "a1_torque-low-s1: evaluate in low"]
     status, output, error = experiment_here(*words, tmp_path=tmp_path)
     assert (status, error) == (0, "") and output.count(" took ") == 2 and len(trained(stage)) == 2
     assert json.loads(lost.read_text())["perturbation"] == "high"
@@ -258,8 +233,6 @@ def test_tiles_are_crossed_after_training(stage, tmp_path):
     file, out = write(tmp_path / "m.yaml", values), tmp_path / "out"
     words = [file, f"--out={out}", "--device=cpu"]
     (stage / "behaviour").write_text("measure evaluations.csv evaluations_high.csv")
-    listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1]
-    assert listed == "a1_torque-low-s1: train, evaluate in low, high, rough ground\n"
     assert experiment_here(*words, tmp_path=tmp_path)[0] == 0
     cell = out / "a1_torque-low-s1"
     log, result = (cell / "evaluate.log").read_text(), cell / "grounds.json"
