@@ -20,7 +20,7 @@ from legged_torque.experiments import matrix as experiment
 from legged_torque.experiments import run as experiment_run
 from legged_torque.experiments.local_launcher import GPU_JOBS, LocalLauncher
 from legged_torque.experiments.matrix import CellState, read_matrix
-from legged_torque.experiments.run import ExperimentRun, time_left
+from legged_torque.experiments.run import ExperimentRun
 
 
 @pytest.fixture
@@ -72,18 +72,14 @@ def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
     assert trained(stage) == [failed, failed, other, failed]
 
 
-@pytest.mark.parametrize("behaviour", ["killed once", "killed"])
-def test_a_training_that_is_killed_is_tried_again(stage, tmp_path, behaviour):
-    """It goes on from its last checkpoint, in the same call; if that does not help, the cell is given up."""
+def test_a_training_that_is_killed_is_tried_again(stage, tmp_path):
+    """It goes on from its last checkpoint, in the same call."""
     file, out = write(tmp_path / "m.yaml", SMALL | {"tasks": ["a1_torque"]}), tmp_path / "out"
-    (stage / "behaviour").write_text(behaviour)
+    (stage / "behaviour").write_text("killed once")
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert "a1_torque-low-s1: training was ended by signal 9; it will be tried again | " in output
     assert trained(stage) == ["a1_torque-low-s1", "a1_torque-low-s1 from 2"]
-    if behaviour == "killed":
-        assert status == 1 and error.startswith("a1_torque-low-s1: training from iteration 2 on was ended by signal 9")
-    else:
-        assert (status, error) == (0, "") and (out / "a1_torque-low-s1" / "result_high.json").is_file()
+    assert (status, error) == (0, "") and (out / "a1_torque-low-s1" / "result_high.json").is_file()
 
 
 @pytest.mark.parametrize(
@@ -323,30 +319,17 @@ def test_device_time(stage, tmp_path):
     """Two that share a device count half each; steps are those of the trainings; all calls are added up."""
     (stage / "behaviour").write_text("slow")
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
-    words = [file, f"--out={out}", "--device=cpu"]
-    thread = threading.Thread(target=lambda: (time.sleep(1.5), os.kill(os.getpid(), signal.SIGTERM)))
-    thread.start()
-    start = time.monotonic()
-    status, _, _ = experiment_here(*words, "--jobs=2", tmp_path=tmp_path)
+    words, start = [file, f"--out={out}", "--device=cpu"], time.monotonic()
+    threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGTERM)).start()
+    assert experiment_here(*words, "--jobs=2", tmp_path=tmp_path)[0] == 130
     took = time.monotonic() - start
-    thread.join()
-    cells = [out / f"{task}-low-s1" for task in SMALL["tasks"]]
-    first = [json.loads((cell / "times.json").read_text()) for cell in cells]
-    assert status == 130 and [times["steps"] for times in first] == [3 * 2 * 5] * 2
-    shares = [times["seconds"]["cpu training"] for times in first]
-    assert shares[0] == pytest.approx(shares[1], abs=0.1) and 0.5 < sum(shares) < took
     (stage / "behaviour").write_text("")
-    status, output, _ = experiment_here(*words, tmp_path=tmp_path)
-    second = [json.loads((cell / "times.json").read_text()) for cell in cells]
-    assert status == 0 and [times["steps"] for times in second] == [4 * 2 * 5] * 2
-    assert all(b["seconds"]["cpu training"] > a["seconds"]["cpu training"] for a, b in zip(first, second, strict=True))
-    assert all(times["seconds"].keys() == {"cpu training", "cpu evaluation"} for times in second)
+    files = [out / f"{task}-low-s1" / "times.json" for task in SMALL["tasks"]]
+    first = [json.loads(file.read_text()) for file in files]
+    output = experiment_here(*words, tmp_path=tmp_path)[1]
+    second = [json.loads(file.read_text()) for file in files]
+    assert [times["steps"] for times in first + second] == [3 * 2 * 5] * 2 + [4 * 2 * 5] * 2
+    shares, sums = ([times["seconds"]["cpu training"] for times in each] for each in (first, second))
+    assert shares[0] == pytest.approx(shares[1], abs=0.1) and 0.5 < sum(shares) < took
+    assert all(more > less for more, less in zip(sums, shares, strict=True))
     assert re.search(r"of CPU time for training; 80 steps of training, \d+ per second of their device time\n", output)
-
-
-def test_time_left():
-    """It is the mean duration of a finished cell, times the cells that are left, over those worked on at a time."""
-    assert time_left([], 5, 1) is None
-    assert time_left([10.0, 20.0], 4, 2) == 30.0
-    assert time_left([10.0], 1.5, 4) == 10.0 and time_left([10.0], 0.5, 4) == 5.0
-    assert time_left([10.0], 0, 4) == 0.0

@@ -2,7 +2,6 @@
 
 import re
 import shutil
-import signal
 from pathlib import Path
 
 import pytest
@@ -22,12 +21,6 @@ def without_seconds(lines):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """A run of four iterations."""
-    return train(tmp_path_factory.mktemp("whole"), 4)
-
-
-@pytest.fixture(scope="module")
 def half(tmp_path_factory):
     """A run of two iterations, whose folder stays as it is."""
     return train(tmp_path_factory.mktemp("half"), 2)
@@ -39,13 +32,20 @@ def copied(half, tmp_path):
     return Path(shutil.copytree(half.log_dir, tmp_path / "run"))
 
 
-def test_two_and_two_are_four(whole, half, tmp_path):
-    """Networks, moments, random numbers, worlds and evaluations are the same bits."""
-    resumed = start(tmp_path, "--resume", f"--load_run={half.log_dir}")
+def go_on(half, folder, whole, *words):
+    """Resume a run of two iterations; return the runner after two more, with the bits of a run of four."""
+    resumed = start(folder, *words, "--resume", f"--load_run={half.log_dir}")
     resumed.claim_log_dir({})
     resumed.learn(2, init_at_random_ep_len=True)
     first, second = content(whole, 4), content(resumed, 4)
     assert len(first) > 100 and first["infos.worlds"] and not differences(first, second)
+    return resumed
+
+
+def test_two_and_two_are_four(half, tmp_path):
+    """Networks, moments, random numbers, worlds and evaluations are the same bits."""
+    whole = train(tmp_path / "whole", 4)
+    resumed = go_on(half, tmp_path / "resumed", whole)
     for name, count in {"evaluations.csv": 4, "evaluations_high.csv": 3}.items():
         rows = [(Path(runner.log_dir) / name).read_text().splitlines() for runner in (whole, half, resumed)]
         assert len(rows[0]) == count + 1  # with the header
@@ -65,11 +65,7 @@ def test_two_and_two_are_four_elsewhere(tmp_path, name):
     """The other engine, ranges that change everything often, and a map with levels keep nothing else."""
     words = OTHERS[name]
     whole, half = (train(tmp_path / folder, count, *words) for folder, count in (("whole", 4), ("half", 2)))
-    resumed = start(tmp_path / "resumed", *words, "--resume", f"--load_run={half.log_dir}")
-    resumed.claim_log_dir({})
-    resumed.learn(2, init_at_random_ep_len=True)
-    first, second = content(whole, 4), content(resumed, 4)
-    assert first["infos.worlds"] and not differences(first, second)
+    go_on(half, tmp_path / "resumed", whole, *words)
 
 
 @pytest.mark.parametrize("ends_at", ["worlds_3.pt", "model_3.pt"])
@@ -171,18 +167,6 @@ def test_a_damaged_checkpoint_is_passed_over(copied, capsys, how):
         assert "model_2.pt' is not a readable checkpoint" in error_of(start, None, *words)
 
 
-def test_a_damaged_run_is_passed_over(half, tmp_path, capsys):
-    """If the newest run has nothing but damaged checkpoints, the one before is taken, and a line says so."""
-    folder = tmp_path / "a1_torque_multihead"
-    for name in ("2026-01-01", "2026-01-02"):
-        shutil.copytree(half.log_dir, folder / name)
-    for file in folder.glob("2026-01-02/*.pt"):
-        file.write_bytes(b"")
-    runner = start(None, "--resume", f"--log_root={tmp_path}")
-    assert f"Newer checkpoints than '{folder / '2026-01-01' / 'model_2.pt'}' are damaged" in capsys.readouterr().out
-    assert runner.current_learning_iteration == 2
-
-
 BAD = {
     "actor_state_dict": lambda state: next(iter(state["actor_state_dict"].values())).fill_(torch.nan),
     "optimizer_state_dict": lambda state: state["optimizer_state_dict"]["state"][3]["exp_avg_sq"].fill_(torch.inf),
@@ -205,6 +189,16 @@ def test_numbers_that_are_none(copied, name):
     assert not differences(before, runner.alg.actor.state_dict())
 
 
+def test_a_damaged_run_is_passed_over(half, tmp_path, capsys):
+    """If the newest run has nothing but damaged checkpoints, the one before is taken, and a line says so."""
+    runs = [shutil.copytree(half.log_dir, tmp_path / "a1_torque_multihead" / f"2026-01-0{day}") for day in (1, 2)]
+    for file in runs[1].glob("*.pt"):
+        file.write_bytes(b"")
+    runner = start(None, "--resume", f"--log_root={tmp_path}")
+    assert f"Newer checkpoints than '{runs[0] / 'model_2.pt'}' are damaged" in capsys.readouterr().out
+    assert runner.current_learning_iteration == 2
+
+
 def test_what_killed_processes_have_left_is_removed(copied):
     """Those of processes that run are not touched."""
     dead, alive = copied / "model_3.pt.999999999.part", copied / "model_3.pt.1.part"
@@ -212,21 +206,6 @@ def test_what_killed_processes_have_left_is_removed(copied):
         file.touch()
     start(None, "--resume", f"--load_run={copied}")
     assert not dead.exists() and alive.exists()
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-def test_every_signal_saves(tmp_path, number):
-    """Training ends after the iteration, saves, and knows what has stopped it."""
-    runner = start(tmp_path)
-    runner.claim_log_dir({})
-    update = runner.alg.update
-    runner.alg.update = lambda: (signal.raise_signal(number), update())[1]
-    runner.learn(5)
-    assert (runner.stopped_by, runner.current_learning_iteration) == (number, 1)
-    assert (Path(runner.log_dir) / "model_1.pt").is_file()
-    runner.alg.update = update
-    runner.learn(1)
-    assert (runner.stopped_by, runner.current_learning_iteration) == (0, 2)
 
 
 @pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), RuntimeError("broken")])

@@ -120,21 +120,6 @@ def test_rollout_is_stored(make_runner):
     assert not torch.equal(obs[0]["policy"], obs[1]["policy"])
 
 
-def test_mixing_weights_change_between_rollouts_only(make_runner):
-    """Every physics step of a rollout uses the weights of eq. 1 at its start."""
-    runner = make_runner(env={"control.mixing.pd.t_end": 100, "control.mixing.update_interval": 1})
-    compute, used = runner.env._compute_torques, []
-
-    def noted_compute(actions):
-        used.append(float(runner.env.mixing[0]))
-        return compute(actions)
-
-    runner.env._compute_torques = noted_compute
-    runner.learn(3)
-    expected = [1.0 - BATCH * iteration / 100 for iteration in range(3) for _ in range(STEPS * 4)]
-    assert used == pytest.approx(expected, rel=1e-6)
-
-
 @pytest.mark.parametrize("interval", [2, 5])
 def test_checkpoints_are_saved_at_every_interval(make_runner, tmp_path, interval):
     """They carry the number of finished iterations; first and last are always there, and nothing half-written."""
@@ -144,14 +129,6 @@ def test_checkpoints_are_saved_at_every_interval(make_runner, tmp_path, interval
     assert files == {f"model_{n}.pt" for n in range(4) if n % interval == 0 or n == 3} | {"worlds_3.pt"}
     for path in tmp_path.glob("*/model_*.pt"):
         assert torch.load(path, weights_only=True)["iter"] == int(path.stem.removeprefix("model_"))
-
-
-def test_without_a_folder_nothing_is_written(make_runner, tmp_path, monkeypatch):
-    """A runner without a log folder trains, and leaves no file behind."""
-    monkeypatch.chdir(tmp_path)
-    runner = make_runner()
-    runner.learn(1)
-    assert runner.current_learning_iteration == 1 and not list(tmp_path.iterdir())
 
 
 def test_time_of_training_goes_on(make_runner, tmp_path):

@@ -27,7 +27,7 @@ from support.runners import build_runner, networks
 
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.multi_head import MultiHeadModel
-from legged_torque.learning.ppo import OnDevicePPO, has_kernels
+from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, has_kernels
 
 pytest.importorskip("triton", reason="Triton is there for Linux only")
 if os.environ.get("TRITON_INTERPRET") != "1":
@@ -122,6 +122,10 @@ def test_gradients_are_those_of_autograd(kind):
             for own, other in zip(parameters(fused).values(), parameters(plain).values(), strict=True):
                 own.copy_(other)
         fused.round_weights()
+    surrogates = []
+    for plain.clip_param in (0.02, 10.0):
+        surrogates.append(float(plain.loss()[1][LOSS_NAMES.index("surrogate")]))
+    assert surrogates[0] != pytest.approx(surrogates[1], rel=1e-3)  # ratios have been clipped
 
 
 @pytest.mark.parametrize("optimizer", ["adam", "adamw"])
