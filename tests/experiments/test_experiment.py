@@ -92,16 +92,14 @@ def test_what_is_done_is_not_done_again(finished, tmp_path):
     assert " of CPU time for training; 640 steps of training, " in spent
 
 
-@pytest.mark.parametrize("name", ["paper", "hard", "low", "smoke", "rough"])
-def test_dry_run(name, tmp_path):
+@pytest.mark.parametrize(("name", "cells"), {"paper": 84, "hard": 28, "low": 12, "smoke": 2, "rough": 16}.items())
+def test_dry_run(name, cells, tmp_path):
     """The experiments of this repository are valid; ``--dry-run`` lists their cells and touches nothing."""
     out = tmp_path / "out"
     file = ROOT / "experiments" / f"{name}.yaml"
     status, output, error = experiment_here(file, f"--out={out}", "--dry-run", "--device=cpu", tmp_path=tmp_path)
     assert (status, error) == (0, "") and not out.exists()
-    assert len(output.splitlines()) == {"paper": 84, "hard": 28, "low": 12, "smoke": 2, "rough": 16}[name]
-    first = "a1_rough_position" if name == "rough" else "a1_position"
-    assert output.splitlines()[0].startswith(f"{first}-low-s1: train, evaluate in low")
+    assert len(output.splitlines()) == cells
     assert output.count(", rough ground\n") == (16 if name == "rough" else 0)
     assert ("a1_multihead-high_frequency-s4: train, evaluate in high_frequency, doubled" in output) == (name == "paper")
 
@@ -122,10 +120,8 @@ def test_dry_run(name, tmp_path):
         ({"train": {"runner.total_step": 1}}, "config key 'runner.total_step'; did you mean 'runner.total_steps'?"),
         ({"train": {"env.num_actions": 5}}, "train.env.num_actions cannot be set: it comes from tasks"),
         ({"train": {"asset.file": "missing.xml"}}, "cannot load the robot 'missing.xml': there is no such file"),
-        ({"train": {"seed": 3}}, "train.seed cannot be set: it comes from tasks"),
         ({"evaluation": {"num_env": 3}}, "unknown evaluation key 'num_env'; did you mean 'num_envs'?"),
         ({"grounds": {"levels": [0, 1.5]}}, "a level must be from 0 to 1, not 1.5"),
-        ({"grounds": {"levels": []}}, "grounds.levels must hold one entry or more, not []"),
         ({"grounds": {"kinds": ["falt"]}}, "unknown kind of terrain 'falt'; did you mean 'flat'?"),
         ({"evaluation": {"num_steps": 0}}, "evaluation.num_steps must be at least 1, not 0"),
     ],
@@ -148,13 +144,11 @@ def test_mistakes_in_the_file(change, message, tmp_path):
         (["{file}", "--device=cpu", "--mps"], "--mps is for GPUs, and this experiment would run on the CPU"),
         (["{file}", "--device=cuda:99"], "there is no device 'cuda:99'"),
         (["{broken}"], "is not valid YAML"),
-        (["{text}"], "environments and seeds, and may hold tasks, environments, seeds, ranges, train,"),
-        (["{half}"], "must hold the keys tasks, environments and seeds"),
     ],
 )
 def test_mistakes_in_the_command_line(words, message, tmp_path):
     """They are refused in one line, too."""
-    texts = {"file": yaml.safe_dump(SMALL), "broken": "tasks: [", "text": "run all", "half": "tasks: [a1_torque]"}
+    texts = {"file": yaml.safe_dump(SMALL), "broken": "tasks: ["}
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
     words = [word.format(**{name: tmp_path / name for name in texts}) for word in words]

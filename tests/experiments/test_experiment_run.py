@@ -20,7 +20,7 @@ from legged_torque.experiments import matrix as experiment
 from legged_torque.experiments import run as experiment_run
 from legged_torque.experiments.local_launcher import GPU_JOBS, LocalLauncher
 from legged_torque.experiments.matrix import CellState, read_matrix
-from legged_torque.experiments.run import ExperimentRun
+from legged_torque.experiments.run import ExperimentRun, time_left
 
 
 @pytest.fixture
@@ -118,10 +118,7 @@ def test_stop(stage, tmp_path):
     assert (status, error) == (130, "interrupted\n") and "Stopping: " in output and "0 of 2 cells are done." in output
     assert max(path.name for path in out.glob("*/*/model_*")) == "model_3.pt"
     (stage / "behaviour").write_text("")
-    words = [file, f"--out={out}", "--device=cpu"]
-    listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1].splitlines()
-    assert listed[0] == "a1_position-low-s1: resume after 3 of 4 iterations, evaluate in low, high"
-    assert experiment_here(*words, tmp_path=tmp_path)[0] == 0
+    assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
     assert trained(stage) == ["a1_position-low-s1", "a1_position-low-s1 from 3", "a1_torque-low-s1"]
 
 
@@ -277,7 +274,8 @@ def test_display(stage, tmp_path):
 @pytest.fixture
 def places(stage, tmp_path, monkeypatch):
     """Start evaluations of a launcher: their devices, and the variables by which they see one GPU and some cores."""
-    shown = "import os; print(*map(os.environ.get, ('CUDA_VISIBLE_DEVICES', 'OMP_NUM_THREADS')))"
+    names = ("CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
+    shown = f"import os; print('{{}} {{}}\\n'.format(*map(os.environ.get, {names})), end='')"  # in one piece
     (stage / "evaluate.py").write_text(shown + "\nwhile not os.path.exists('ended'): pass")
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
@@ -333,3 +331,10 @@ def test_device_time(stage, tmp_path):
     assert shares[0] == pytest.approx(shares[1], abs=0.1) and 0.5 < sum(shares) < took
     assert all(more > less for more, less in zip(sums, shares, strict=True))
     assert re.search(r"of CPU time for training; 80 steps of training, \d+ per second of their device time\n", output)
+
+
+def test_time_left():
+    """It is the mean duration of a finished cell, times the cells that are left, over those worked on at a time."""
+    assert time_left([], 5, 1) is None
+    assert time_left([10.0, 20.0], 4, 2) == 30.0
+    assert time_left([10.0], 1.5, 4) == 10.0

@@ -146,24 +146,19 @@ def test_random_numbers_of_its_own(make_runner, noted):
     assert len(set(notes[0][0].task.episode_length_buf.tolist())) > 1
 
 
-@pytest.mark.parametrize(("chosen", "expected"), [("", "low"), ("high", "high")])
-def test_environment_of_the_evaluation(make_runner, noted, chosen, expected):
-    """``evaluation.perturbation`` holds in its worlds alone; without, they are perturbed as those of the training."""
-    runner = make_runner(perturbation="low", **{"evaluation.perturbation": chosen, "evaluation.interval": 16})
-    runner.learn(1)
-    assert noted[-1].task is not runner.env
-    for task, name in ((noted[-1].task, expected), (runner.env, "low")):
-        assert all(get(task.cfg, path) == value for path, value in perturb(name).items())
+@pytest.mark.parametrize(("chosen", "expected"), [("", "low"), ("doubled", "doubled")])
+def test_environments(make_runner, noted, chosen, expected):
+    """Worlds are perturbed as those of the training unless ``evaluation.perturbation`` says otherwise.
 
-
-def test_further_environments(make_runner, noted):
-    """They are measured from their step on, in worlds of their own, and logged apart."""
+    Further environments are measured from their step on, in worlds of their own, and logged apart.
+    """
     also = {"evaluation.also": ["high", "none"], "evaluation.also_from": 30, "evaluation.interval": 16}
-    runner = make_runner(perturbation="low", **also, **{"runner.logger": "tensorboard"})
+    also |= {"evaluation.perturbation": chosen, "runner.logger": "tensorboard"}
+    runner = make_runner(perturbation="low", **also)
     runner.learn(3)
     tasks = [notes[0].task for notes in by_evaluation(noted, runner.env)]
     assert [tasks.index(task) for task in tasks] == [0, 0, 2, 3, 0, 2, 3]
-    for task, name in zip(tasks[1:4], ("low", "high", "none"), strict=True):
+    for task, name in zip([runner.env, *tasks[1:4]], ("low", expected, "high", "none"), strict=True):
         assert all(get(task.cfg, path) == value for path, value in perturb(name).items())
     rows = {name: rows_of(runner, f"evaluations{name}.csv") for name in ("", "_high", "_none")}
     assert [[row["steps"] for row in each] for each in rows.values()] == [[16, 32, 48], [32, 48], [32, 48]]

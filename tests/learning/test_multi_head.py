@@ -63,8 +63,6 @@ def test_layers_of_the_paper(make_runner, name):
     for part, shapes in SHAPES.items():
         weights = [tuple(v.shape) for k, v in state.items() if k.startswith(f"mlp.{part}.") and k.endswith("weight")]
         assert weights == shapes
-        biases = [tuple(v.shape) for k, v in state.items() if k.startswith(f"mlp.{part}.") and k.endswith("bias")]
-        assert biases == [shape[:1] for shape in shapes]
     counted = sum(rows * columns + rows for shapes in SHAPES.values() for rows, columns in shapes)
     assert sum(value.numel() for value in state.values()) == counted + NUM_ACTIONS  # and a deviation per action
     critic = [tuple(v.shape) for k, v in runner.alg.critic.state_dict().items() if k.endswith("weight")]

@@ -69,10 +69,9 @@ class TDLearner:
             wanted = rewards + GAMMA * (1.0 - ended) * following
         critic_loss = (self.critic(torch.cat([obs, actions], dim=1)) - wanted).square().mean()
         actor_loss = -self.critic(torch.cat([obs, self.actor({"policy": obs})], dim=1)).mean()
-        for loss, optimizer in zip((critic_loss, actor_loss), reversed(self.optimizers), strict=True):
-            parameters = [p for group in optimizer.param_groups for p in group["params"]]
-            for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
-                parameter.grad = gradient
+        for loss, model in ((actor_loss, self.actor), (critic_loss, self.critic)):
+            model.zero_grad()
+            loss.backward(inputs=list(model.parameters()))
         for optimizer in self.optimizers:
             optimizer.step()
         for old, new in zip(self.target.parameters(), self.critic.parameters(), strict=True):
@@ -83,9 +82,8 @@ class TDLearner:
         return self.actor
 
     def parts(self):
-        return {"actor": self.actor, "critic": self.critic, "target": self.target} | dict(
-            zip(("actor_optimizer", "critic_optimizer"), self.optimizers, strict=True)
-        )
+        names = ("actor", "critic", "target", "actor_optimizer", "critic_optimizer")
+        return dict(zip(names, (self.actor, self.critic, self.target, *self.optimizers), strict=True))
 
     def state_dict(self):
         state = {name: copy.deepcopy(part.state_dict()) for name, part in self.parts().items()}
@@ -217,21 +215,11 @@ def test_two_and_two_are_four(tmp_path):
         assert whole[name].keys() and all(torch.equal(value, resumed[name][key]) for key, value in whole[name].items())
 
 
-class Deaf(TDLearner):
-    """A learner without one of the methods."""
-
-    observe = property()
-
-
-class Forgetful(PointMasses):
-    """A task that has only the observations after resets."""
-
-    keep_final_observations = property()
-
-
 def test_what_does_not_fit_is_refused():
     """The lines name the learner, the task and what is missing."""
-    message = error_of(make_trainer, learner=Deaf)
+    deaf = type("Deaf", (TDLearner,), {"observe": property()})
+    message = error_of(make_trainer, learner=deaf)
     assert message == "algorithm.class_name: Deaf is no learner, it lacks observe"
-    message = error_of(make_trainer, task=Forgetful())
+    forgetful = type("Forgetful", (PointMasses,), {"keep_final_observations": property()})
+    message = error_of(make_trainer, task=forgetful())
     assert message == "TDLearner needs observations before resets, which Forgetful does not keep"

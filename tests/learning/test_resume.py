@@ -117,8 +117,17 @@ def damage(file):
     file.write_bytes(data)
 
 
+def other_processes(run):
+    """Make the run one of two processes."""
+    worlds = torch.load(run / "worlds_2.pt", weights_only=True)
+    state = torch.load(run / "model_2.pt", weights_only=True)
+    state["infos"]["worlds"] = checkpoint.write(run / "worlds_2.pt", {**worlds, "processes": worlds["processes"] * 2})
+    torch.save(state, run / "model_2.pt")
+
+
 HIGH = "--set=evaluation.perturbation=high"
 ANEW = {
+    "another number": (other_processes, [], "2 processes have trained, now there are 1."),
     "another setting": (lambda run: None, ["--set=control.stiffness=21"], "control.stiffness is 21.0, was 20.0"),
     "evaluated elsewhere": (lambda run: None, [HIGH], "evaluation.perturbation is high"),
     "an older one": (lambda run: None, ["--checkpoint=1"], "only the last checkpoint of a run keeps them"),
@@ -139,19 +148,6 @@ def test_worlds_start_anew(copied, tmp_path, capsys, case):
     assert int(runner.env.episode_length_buf.max()) == 0
     runner.learn(1, init_at_random_ep_len=True)
     assert runner.current_learning_iteration == (2 if case == "an older one" else 3)
-
-
-def test_another_number_of_processes(copied, capsys):
-    """A line says so, as for another setting."""
-    file, model = copied / "worlds_2.pt", copied / "model_2.pt"
-    content = torch.load(file, weights_only=True)
-    digest = checkpoint.write(file, {**content, "processes": content["processes"] * 2})
-    state = torch.load(model, weights_only=True)
-    state["infos"]["worlds"] = digest
-    torch.save(state, model)
-    capsys.readouterr()
-    start(None, "--resume", f"--load_run={copied}")
-    assert "anew: 2 processes have trained, now there are 1." in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("how", [damage, lambda file: file.write_bytes(file.read_bytes()[:-9]), Path.unlink])

@@ -8,14 +8,12 @@ import os
 
 import pytest
 import torch
-from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from support.rollouts import (
     POISONS,
     SETTINGS,
     SIZES,
-    copy_rollout,
     make_ppo,
     parameters,
     poison,
@@ -64,7 +62,7 @@ def make(kind=TritonPPO, multi_head=False, symmetric=False, seed=0, std_type="lo
         function = "legged_torque.envs.base.symmetry:with_mirror_images"
         settings["symmetry_cfg"] = {"data_augmentation_func": function, "use_data_augmentation": True}
         settings["symmetry_cfg"] |= {"use_mirror_loss": False, "env": Mirrored()}
-    assert kind is PPO or has_kernels(OnDevicePPO(actor, critic, storage, **{**SETTINGS, **settings}))
+    assert has_kernels(OnDevicePPO(actor, critic, storage, **{**SETTINGS, **settings}))
     return kind(actor, critic, storage, **{**SETTINGS, **settings})
 
 
@@ -148,19 +146,6 @@ def test_steps_are_those_of_torch(optimizer):
         torch.testing.assert_close(own.double(), other, rtol=1e-5, atol=1e-7)
 
 
-def test_whole_updates_are_those_of_rsl_rl():
-    """One epoch of stock rsl_rl on the same rollout, with minibatches that hold the same samples."""
-    plain, fused = pair(num_mini_batches=1)
-    stock = make(PPO, num_mini_batches=1)
-    copy_rollout(plain.storage, stock.storage)
-    expected, actual = stock.update(), fused.update()
-    for name in ("value", "surrogate", "entropy"):
-        assert actual[name] == pytest.approx(expected[name], rel=1e-3, abs=1e-5)
-    for own, other in zip(parameters(fused).values(), parameters(stock).values(), strict=True):
-        far = (own - other).abs() > 2e-4  # where a gradient is all but 0, rounding decides the first step's direction
-        assert far.float().mean() < 0.01
-
-
 def test_learning_rate_follows_the_divergence():
     """As without fused kernels: after the policy has moved far, it falls by 1.5, annealed too, and its bounds hold."""
     algorithms = pair(schedule="adaptive", learning_rate=1e-2, desired_kl=0.01, annealing_start=0.5)
@@ -207,9 +192,10 @@ def test_the_critic_learns_alone():
         assert torch.equal(value, before[name]) == name.startswith("actor")
 
 
-def test_checkpoints_go_both_ways():
-    """Torch continues from a checkpoint of the kernels, and the other way round; both then agree."""
-    first = make()
+@pytest.mark.parametrize("kind", [OnDevicePPO, TritonPPO])
+def test_checkpoints_go_both_ways(kind):
+    """Torch and the kernels continue from a checkpoint of either, and agree afterwards."""
+    first = make(kind)
     record_rollout(first)
     choose([first], 0)
     first.update_minibatch()
@@ -223,10 +209,6 @@ def test_checkpoints_go_both_ways():
     fused.update_minibatch()
     for own, other in zip(parameters(fused).values(), parameters(plain).values(), strict=True):
         torch.testing.assert_close(own, other, rtol=1e-3, atol=2e-5)
-    back = make()
-    back.load_state_dict(plain.state_dict())
-    for own, other in zip(parameters(back).values(), parameters(plain).values(), strict=True):
-        assert torch.equal(own, other)
 
 
 def own(part):
@@ -244,7 +226,7 @@ WITHOUT = {
 
 
 def test_what_has_no_kernels_is_left_to_torch():
-    """Algorithms with other parts are known beforehand."""
+    """Algorithms with other parts are known beforehand; torch's operations work without mixed precision."""
     for name, change in WITHOUT.items():
         alg = make_ppo()
         assert has_kernels(alg)
@@ -252,7 +234,8 @@ def test_what_has_no_kernels_is_left_to_torch():
         assert not has_kernels(alg), name
     for settings in ({"obs_normalization": True}, {"normalize_advantage_per_mini_batch": True}):
         assert not has_kernels(make_ppo(**settings))
-    alg = make(OnDevicePPO, symmetric=True)
+    alg = make(OnDevicePPO, symmetric=True, use_mixed_precision=True)
+    assert alg.product_dtype == torch.float32
     alg.symmetry.use_mirror_loss = True
     assert not has_kernels(alg)
 
@@ -278,8 +261,3 @@ def test_a_training_with_kernels(make_task, tmp_path, monkeypatch):
     assert type(plain.alg) is OnDevicePPO and plain.current_learning_iteration == 2
     assert all(torch.equal(value, networks(runner)[name]) for name, value in networks(plain).items())
     plain.learn(1)
-
-
-def test_mixed_precision_is_that_of_the_kernels():
-    """An algorithm that works with torch's operations says that it does without."""
-    assert make(OnDevicePPO, use_mixed_precision=True).product_dtype == torch.float32
