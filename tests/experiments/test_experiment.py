@@ -19,33 +19,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from legged_torque.utils.runs import checkpoint_numbers
 
 
-def run_names(cell):
-    """The names of the run folders of a cell, in order."""
-    return sorted(path.name for path in cell.iterdir() if path.is_dir())
-
-
 @pytest.fixture(scope="module")
-def device_check():
-    """A process that reads a matrix, chooses workers, and prints what that has started; others run meanwhile."""
-    code = (
-        "from pathlib import Path; import torch, warp; from warp._src import context\n"
-        "from legged_torque.experiments.matrix import read_matrix\n"
-        "from legged_torque.experiments.local_launcher import LocalLauncher\n"
-        f"read_matrix(Path({str(ROOT / 'experiments' / 'low.yaml')!r})); LocalLauncher('auto', None)\n"
-        "print(torch.cuda.is_initialized(), context.runtime)"
-    )
-    command, environment = [sys.executable, "-c", code], os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment
-    )
-
-
-@pytest.fixture(scope="module")
-def killed(device_check, tmp_path_factory):
+def killed(tmp_path_factory):
     """A smoke experiment of one cell that was killed in the middle of its training.
 
     Returns:
-        Its file, its folder, and the run folders that there were.
+        Its file and its folder.
     """
     values = yaml.safe_load((ROOT / "experiments" / "smoke.yaml").read_text())
     values["train"] |= {"runner.total_steps": 20 * 32, "runner.save_interval": 2}
@@ -62,27 +41,24 @@ def killed(device_check, tmp_path_factory):
     os.killpg(process.pid, signal.SIGKILL)  # the training is asked to stop by the system
     process.wait()
     cell = out / "a1_torque_multihead-low-s1"
-    runs, log = run_names(cell), cell / "train.log"
-    wait_for(lambda: (cell / runs[0]).is_dir() and "Stopping after this iteration and saving" in log.read_text())
-    return file, out, runs
+    wait_for(lambda: "Stopping after this iteration and saving" in (cell / "train.log").read_text())
+    return file, out
 
 
 @pytest.fixture(scope="module")
 def finished(killed, tmp_path_factory):
     """The same experiment after the same command once more: its file, its folder and what was printed."""
-    file, out, _ = killed
+    file, out = killed
     words = [file, f"--out={out}", "--device=cpu"]
     status, output, error = experiment_here(*words, tmp_path=tmp_path_factory.mktemp("root"))
     assert (status, error) == (0, ""), output + error
     return file, out, output
 
 
-def test_killed_in_the_middle_of_training(killed, finished):
+def test_killed_in_the_middle_of_training(finished):
     """The training saves what it has; the next call goes on from there, to the right number of iterations."""
-    _, out, before = killed
-    cell = out / "a1_torque_multihead-low-s1"
-    assert len(before) == 1 and len(run_names(cell)) == 2
-    first, second = (cell / name for name in run_names(cell))
+    _, out, _ = finished
+    first, second = sorted(path for path in (out / "a1_torque_multihead-low-s1").iterdir() if path.is_dir())
     last = max(checkpoint_numbers(first))
     assert 2 <= last < 20
     state = torch.load(second / "model_20.pt", weights_only=True)
@@ -116,16 +92,14 @@ def test_what_is_done_is_not_done_again(finished, tmp_path):
     assert " of CPU time for training; 640 steps of training, " in spent
 
 
-@pytest.mark.parametrize("name", ["paper", "hard", "low", "smoke", "rough"])
-def test_dry_run(name, tmp_path):
+@pytest.mark.parametrize(("name", "cells"), {"paper": 84, "hard": 28, "low": 12, "smoke": 2, "rough": 16}.items())
+def test_dry_run(name, cells, tmp_path):
     """The experiments of this repository are valid; ``--dry-run`` lists their cells and touches nothing."""
     out = tmp_path / "out"
     file = ROOT / "experiments" / f"{name}.yaml"
     status, output, error = experiment_here(file, f"--out={out}", "--dry-run", "--device=cpu", tmp_path=tmp_path)
     assert (status, error) == (0, "") and not out.exists()
-    assert len(output.splitlines()) == {"paper": 84, "hard": 28, "low": 12, "smoke": 2, "rough": 16}[name]
-    first = "a1_rough_position" if name == "rough" else "a1_position"
-    assert output.splitlines()[0].startswith(f"{first}-low-s1: train, evaluate in low")
+    assert len(output.splitlines()) == cells
     assert output.count(", rough ground\n") == (16 if name == "rough" else 0)
     assert ("a1_multihead-high_frequency-s4: train, evaluate in high_frequency, doubled" in output) == (name == "paper")
 
@@ -135,33 +109,20 @@ def test_dry_run(name, tmp_path):
     [
         ({"sed": [1]}, "unknown experiment key 'sed'; did you mean 'seeds'?"),
         ({"tasks": None}, "tasks must be a list of texts, not None"),
-        ({"tasks": []}, "tasks must hold different entries, one or more, not []"),
         ({"tasks": ["a1_torqe"]}, "unknown task 'a1_torqe'; did you mean 'a1_torque'?"),
-        (
-            {"tasks": ["a1_torque", "a1_torque"]},
-            "tasks must hold different entries, one or more, not ['a1_torque', 'a1_torque']",
-        ),
+        ({"seeds": [3, 3]}, "seeds must hold different entries, one or more, not [3, 3]"),
         ({"seeds": [True]}, "seeds[0] must be an integer, not True"),
         ({"seeds": [-1]}, "seed must be at least 0"),
-        ({"seeds": 3}, "seeds must be a list of integers, not 3"),
         ({"environments": ["low"]}, "environments must hold entries 'name: value'"),
-        ({"environments": {}}, "environments must hold different entries, one or more, not []"),
         ({"environments": {"lo": ["low"]}}, "unknown perturbation 'lo'; did you mean 'low'?"),
         ({"environments": {"low": ["hihg"]}}, "unknown perturbation 'hihg'; did you mean 'high'?"),
-        ({"environments": {"low": "high"}}, "environments.low must be a list of texts, not 'high'"),
         ({"ranges": "defult"}, "unknown ranges 'defult'; did you mean 'default'?"),
         ({"train": {"runner.total_step": 1}}, "config key 'runner.total_step'; did you mean 'runner.total_steps'?"),
         ({"train": {"env.num_actions": 5}}, "train.env.num_actions cannot be set: it comes from tasks"),
         ({"train": {"asset.file": "missing.xml"}}, "cannot load the robot 'missing.xml': there is no such file"),
-        ({"train": {"seed": 3}}, "train.seed cannot be set: it comes from tasks"),
-        ({"train": {"evaluation.also": ["low"]}}, "train.evaluation.also cannot be set: it comes from tasks"),
         ({"evaluation": {"num_env": 3}}, "unknown evaluation key 'num_env'; did you mean 'num_envs'?"),
-        ({"grounds": {"level": [0.5]}}, "unknown grounds key 'level'; did you mean 'levels'?"),
         ({"grounds": {"levels": [0, 1.5]}}, "a level must be from 0 to 1, not 1.5"),
-        ({"grounds": {"levels": []}}, "grounds.levels must hold one entry or more, not []"),
-        ({"grounds": {"kinds": "flat"}}, "grounds.kinds must be a list of texts, not 'flat'"),
         ({"grounds": {"kinds": ["falt"]}}, "unknown kind of terrain 'falt'; did you mean 'flat'?"),
-        ({"grounds": ["flat"]}, "grounds must hold entries 'name: value'"),
         ({"evaluation": {"num_steps": 0}}, "evaluation.num_steps must be at least 1, not 0"),
     ],
 )
@@ -183,13 +144,11 @@ def test_mistakes_in_the_file(change, message, tmp_path):
         (["{file}", "--device=cpu", "--mps"], "--mps is for GPUs, and this experiment would run on the CPU"),
         (["{file}", "--device=cuda:99"], "there is no device 'cuda:99'"),
         (["{broken}"], "is not valid YAML"),
-        (["{text}"], "environments and seeds, and may hold tasks, environments, seeds, ranges, train,"),
-        (["{half}"], "must hold the keys tasks, environments and seeds"),
     ],
 )
 def test_mistakes_in_the_command_line(words, message, tmp_path):
     """They are refused in one line, too."""
-    texts = {"file": yaml.safe_dump(SMALL), "broken": "tasks: [", "text": "run all", "half": "tasks: [a1_torque]"}
+    texts = {"file": yaml.safe_dump(SMALL), "broken": "tasks: ["}
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
     words = [word.format(**{name: tmp_path / name for name in texts}) for word in words]
@@ -197,7 +156,15 @@ def test_mistakes_in_the_command_line(words, message, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_no_device_is_touched(device_check):
+def test_no_device_is_touched():
     """Reading a matrix and choosing workers starts neither CUDA nor Warp: GPUs belong to the trainings."""
-    output, error = device_check.communicate(timeout=300)
-    assert (device_check.returncode, output) == (0, "False None\n"), error
+    code = (
+        "from pathlib import Path; import torch, warp; from warp._src import context\n"
+        "from legged_torque.experiments.matrix import read_matrix\n"
+        "from legged_torque.experiments.local_launcher import LocalLauncher\n"
+        "read_matrix(Path('experiments/low.yaml')); LocalLauncher('auto', None)\n"
+        "print(torch.cuda.is_initialized(), context.runtime)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=environment)
+    assert (done.returncode, done.stdout) == (0, "False None\n"), done.stderr

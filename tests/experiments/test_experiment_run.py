@@ -53,17 +53,6 @@ def test_order_and_commands(stage, tmp_path):
     assert "8 of 8 cells done, " in output and "time left unknown" in output and " left\n" in output
 
 
-def test_a_damaged_checkpoint_does_not_block_its_cell(stage, tmp_path):
-    """Training goes on from the one before, here from the start, and the cell is done afterwards."""
-    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
-    assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
-    (damaged,) = (out / "a1_torque-low-s1").glob("*/model_*")
-    damaged.write_bytes(b"PK")
-    (out / "a1_torque-low-s1" / "result_high.json").unlink()
-    assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
-    assert trained(stage).count("a1_torque-low-s1") == 2 and (out / "a1_torque-low-s1" / "result_high.json").is_file()
-
-
 def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
     """It is tried once more; the exit status is 1, the last lines of its log are shown.
 
@@ -83,18 +72,14 @@ def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
     assert trained(stage) == [failed, failed, other, failed]
 
 
-@pytest.mark.parametrize("behaviour", ["killed once", "killed"])
-def test_a_training_that_is_killed_is_tried_again(stage, tmp_path, behaviour):
-    """It goes on from its last checkpoint, in the same call; if that does not help, the cell is given up."""
+def test_a_training_that_is_killed_is_tried_again(stage, tmp_path):
+    """It goes on from its last checkpoint, in the same call."""
     file, out = write(tmp_path / "m.yaml", SMALL | {"tasks": ["a1_torque"]}), tmp_path / "out"
-    (stage / "behaviour").write_text(behaviour)
+    (stage / "behaviour").write_text("killed once")
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert "a1_torque-low-s1: training was ended by signal 9; it will be tried again | " in output
     assert trained(stage) == ["a1_torque-low-s1", "a1_torque-low-s1 from 2"]
-    if behaviour == "killed":
-        assert status == 1 and error.startswith("a1_torque-low-s1: training from iteration 2 on was ended by signal 9")
-    else:
-        assert (status, error) == (0, "") and (out / "a1_torque-low-s1" / "result_high.json").is_file()
+    assert (status, error) == (0, "") and (out / "a1_torque-low-s1" / "result_high.json").is_file()
 
 
 @pytest.mark.parametrize(
@@ -116,8 +101,7 @@ def test_steps_that_only_seem_to_succeed(stage, tmp_path, behaviour, message):
     assert any(" from 2" in line for line in trained(stage)) == (behaviour == "early")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stop(stage, tmp_path, number):
+def test_stop(stage, tmp_path):
     """Trainings save before this process ends with status 130, and go on the next time."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (stage / "behaviour").write_text("slow")
@@ -125,7 +109,7 @@ def test_stop(stage, tmp_path, number):
     def stop():
         """Send the signal when the training is under way."""
         wait_for(lambda: any("iteration 3 of 4" in log.read_text() for log in out.glob("*/train.log")))
-        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGINT)
 
     thread = threading.Thread(target=stop)
     thread.start()
@@ -134,10 +118,7 @@ def test_stop(stage, tmp_path, number):
     assert (status, error) == (130, "interrupted\n") and "Stopping: " in output and "0 of 2 cells are done." in output
     assert max(path.name for path in out.glob("*/*/model_*")) == "model_3.pt"
     (stage / "behaviour").write_text("")
-    words = [file, f"--out={out}", "--device=cpu"]
-    listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1].splitlines()
-    assert listed[0] == "a1_position-low-s1: resume after 3 of 4 iterations, evaluate in low, high"
-    assert experiment_here(*words, tmp_path=tmp_path)[0] == 0
+    assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
     assert trained(stage) == ["a1_position-low-s1", "a1_position-low-s1 from 3", "a1_torque-low-s1"]
 
 
@@ -145,17 +126,9 @@ def test_a_cell_that_another_process_works_on(stage, tmp_path):
     """It is left for later, reported once, and begun when the other process lets it go."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (out / "a1_position-low-s1").mkdir(parents=True)
-    lock = (out / "a1_position-low-s1" / "lock").open("a")
+    lock, other = (out / "a1_position-low-s1" / "lock").open("a"), out / "a1_torque-low-s1" / "result_high.json"
     fcntl.flock(lock, fcntl.LOCK_EX)
-
-    def release():
-        """Let go when the other cell is done."""
-        wait_for((out / "a1_torque-low-s1" / "result_high.json").is_file)
-        time.sleep(0.1)
-        assert trained(stage) == ["a1_torque-low-s1"]
-        lock.close()
-
-    thread = threading.Thread(target=release)
+    thread = threading.Thread(target=lambda: (wait_for(other.is_file), lock.close()))
     thread.start()
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     thread.join()
@@ -183,23 +156,20 @@ def test_two_experiments_share_a_folder(stage, tmp_path):
     [
         ({"train": {"runner.total_steps": 64}}, "train.runner.total_steps is 64, was 128; give another --out"),
         ({"train": {}}, "train.runner.total_steps is not set, was 128"),
-        ({"train": SMALL["train"] | {"env.num_envs": 2}}, "train.env.num_envs is 2, was not set"),
         ({"evaluation": {"num_steps": 100}}, "evaluation.num_steps is 100, was 2000"),
-        ({"tasks": ["a1_torque", "a1_multihead"]}, "tasks had a1_position as well"),
         ({"environments": {"low": ["low"]}}, "environments.low had high as well"),
-        ({"environments": {"high": ["low", "high"]}}, "environments had low as well"),
         ({"seeds": [2]}, "seeds had 1 as well"),
     ],
 )
-@pytest.mark.parametrize("words", [[], ["--dry-run"]], ids=["run", "dry run"])
-def test_changed_settings_are_refused(change, message, words, tmp_path):
+def test_changed_settings_are_refused(change, message, tmp_path):
     """A folder holds results of the same settings only."""
     out = tmp_path / "out"
     out.mkdir()
     write(out / "experiment.yaml", SMALL)
     file, before = write(tmp_path / "m.yaml", SMALL | change), contents(out)
-    result = experiment_here(file, f"--out={out}", "--device=cpu", *words, tmp_path=tmp_path)
-    assert_told_in_one_line(result, message)
+    for words in ([], ["--dry-run"]):
+        result = experiment_here(file, f"--out={out}", "--device=cpu", *words, tmp_path=tmp_path)
+        assert_told_in_one_line(result, message)
     assert contents(out) == before
 
 
@@ -223,8 +193,6 @@ def test_lost_and_broken_results_are_made_again(stage, tmp_path):
     lost, broken = out / "a1_position-low-s1" / "result_high.json", out / "a1_torque-low-s1" / "result_low.json"
     lost.unlink()
     broken.write_text('{"half": ')
-    listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1].splitlines()
-    assert listed == ["a1_position-low-s1: evaluate in high", "a1_torque-low-s1: evaluate in low"]
     status, output, error = experiment_here(*words, tmp_path=tmp_path)
     assert (status, error) == (0, "") and output.count(" took ") == 2 and len(trained(stage)) == 2
     assert json.loads(lost.read_text())["perturbation"] == "high"
@@ -258,8 +226,6 @@ def test_tiles_are_crossed_after_training(stage, tmp_path):
     file, out = write(tmp_path / "m.yaml", values), tmp_path / "out"
     words = [file, f"--out={out}", "--device=cpu"]
     (stage / "behaviour").write_text("measure evaluations.csv evaluations_high.csv")
-    listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1]
-    assert listed == "a1_torque-low-s1: train, evaluate in low, high, rough ground\n"
     assert experiment_here(*words, tmp_path=tmp_path)[0] == 0
     cell = out / "a1_torque-low-s1"
     log, result = (cell / "evaluate.log").read_text(), cell / "grounds.json"
@@ -308,7 +274,8 @@ def test_display(stage, tmp_path):
 @pytest.fixture
 def places(stage, tmp_path, monkeypatch):
     """Start evaluations of a launcher: their devices, and the variables by which they see one GPU and some cores."""
-    shown = "import os; print(*map(os.environ.get, ('CUDA_VISIBLE_DEVICES', 'OMP_NUM_THREADS')))"
+    names = ("CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
+    shown = f"import os; print('{{}} {{}}\\n'.format(*map(os.environ.get, {names})), end='')"  # in one piece
     (stage / "evaluate.py").write_text(shown + "\nwhile not os.path.exists('ended'): pass")
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
@@ -350,24 +317,19 @@ def test_device_time(stage, tmp_path):
     """Two that share a device count half each; steps are those of the trainings; all calls are added up."""
     (stage / "behaviour").write_text("slow")
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
-    words = [file, f"--out={out}", "--device=cpu"]
-    thread = threading.Thread(target=lambda: (time.sleep(1.5), os.kill(os.getpid(), signal.SIGTERM)))
-    thread.start()
-    start = time.monotonic()
-    status, _, _ = experiment_here(*words, "--jobs=2", tmp_path=tmp_path)
+    words, start = [file, f"--out={out}", "--device=cpu"], time.monotonic()
+    threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGTERM)).start()
+    assert experiment_here(*words, "--jobs=2", tmp_path=tmp_path)[0] == 130
     took = time.monotonic() - start
-    thread.join()
-    cells = [out / f"{task}-low-s1" for task in SMALL["tasks"]]
-    first = [json.loads((cell / "times.json").read_text()) for cell in cells]
-    assert status == 130 and [times["steps"] for times in first] == [3 * 2 * 5] * 2
-    shares = [times["seconds"]["cpu training"] for times in first]
-    assert shares[0] == pytest.approx(shares[1], abs=0.1) and 0.5 < sum(shares) < took
     (stage / "behaviour").write_text("")
-    status, output, _ = experiment_here(*words, tmp_path=tmp_path)
-    second = [json.loads((cell / "times.json").read_text()) for cell in cells]
-    assert status == 0 and [times["steps"] for times in second] == [4 * 2 * 5] * 2
-    assert all(b["seconds"]["cpu training"] > a["seconds"]["cpu training"] for a, b in zip(first, second, strict=True))
-    assert all(times["seconds"].keys() == {"cpu training", "cpu evaluation"} for times in second)
+    files = [out / f"{task}-low-s1" / "times.json" for task in SMALL["tasks"]]
+    first = [json.loads(file.read_text()) for file in files]
+    output = experiment_here(*words, tmp_path=tmp_path)[1]
+    second = [json.loads(file.read_text()) for file in files]
+    assert [times["steps"] for times in first + second] == [3 * 2 * 5] * 2 + [4 * 2 * 5] * 2
+    shares, sums = ([times["seconds"]["cpu training"] for times in each] for each in (first, second))
+    assert shares[0] == pytest.approx(shares[1], abs=0.1) and 0.5 < sum(shares) < took
+    assert all(more > less for more, less in zip(sums, shares, strict=True))
     assert re.search(r"of CPU time for training; 80 steps of training, \d+ per second of their device time\n", output)
 
 
@@ -375,5 +337,4 @@ def test_time_left():
     """It is the mean duration of a finished cell, times the cells that are left, over those worked on at a time."""
     assert time_left([], 5, 1) is None
     assert time_left([10.0, 20.0], 4, 2) == 30.0
-    assert time_left([10.0], 1.5, 4) == 10.0 and time_left([10.0], 0.5, 4) == 5.0
-    assert time_left([10.0], 0, 4) == 0.0
+    assert time_left([10.0], 1.5, 4) == 10.0

@@ -17,7 +17,7 @@ ray = pytest.importorskip("ray", reason="needs the extra: pip install -e .[ray]"
 
 import legged_torque
 from legged_torque.experiments import matrix, ray_launcher
-from legged_torque.experiments.ray_node import check_versions, versions_here, write_files
+from legged_torque.experiments.ray_node import write_files
 
 FAST = {
     "health_check_initial_delay_ms": 0,
@@ -158,12 +158,3 @@ def test_files_stay_in_their_folder(name, tmp_path):
     folder = tmp_path / "out"
     assert "would be written to" in error_of(write_files, folder, {"good": b"1", name: b"2"})
     assert not list(tmp_path.iterdir())
-
-
-def test_versions():
-    """The first difference is named."""
-    here = versions_here()
-    assert {"torch", "mujoco-warp", "code of legged_torque"} <= here.keys()
-    check_versions("m", here, dict(here))
-    message = error_of(check_versions, "m", here, here | {"torch": "1"})
-    assert message == f"the machine m has torch 1, this one has {here['torch']}"

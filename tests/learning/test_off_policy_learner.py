@@ -1,7 +1,6 @@
-"""An off-policy learner from outside the package, in a task from outside the package and in one of its own."""
+"""An off-policy learner from outside the package, in a task from outside the package."""
 
 import copy
-from pathlib import Path
 
 import torch
 from rsl_rl.modules import MLP
@@ -9,11 +8,7 @@ from rsl_rl.utils.logger import Logger
 from support.settings import error_of
 from tensordict import TensorDict
 
-from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.learning.trainer import Trainer
-from legged_torque.utils.options import Options
-from legged_torque.utils.task_registry import TaskRegistry
 
 GAMMA, BATCH, CAPACITY = 0.9, 64, 100
 
@@ -74,10 +69,9 @@ class TDLearner:
             wanted = rewards + GAMMA * (1.0 - ended) * following
         critic_loss = (self.critic(torch.cat([obs, actions], dim=1)) - wanted).square().mean()
         actor_loss = -self.critic(torch.cat([obs, self.actor({"policy": obs})], dim=1)).mean()
-        for loss, optimizer in zip((critic_loss, actor_loss), reversed(self.optimizers), strict=True):
-            parameters = [p for group in optimizer.param_groups for p in group["params"]]
-            for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
-                parameter.grad = gradient
+        for loss, model in ((actor_loss, self.actor), (critic_loss, self.critic)):
+            model.zero_grad()
+            loss.backward(inputs=list(model.parameters()))
         for optimizer in self.optimizers:
             optimizer.step()
         for old, new in zip(self.target.parameters(), self.critic.parameters(), strict=True):
@@ -88,9 +82,8 @@ class TDLearner:
         return self.actor
 
     def parts(self):
-        return {"actor": self.actor, "critic": self.critic, "target": self.target} | dict(
-            zip(("actor_optimizer", "critic_optimizer"), self.optimizers, strict=True)
-        )
+        names = ("actor", "critic", "target", "actor_optimizer", "critic_optimizer")
+        return dict(zip(names, (self.actor, self.critic, self.target, *self.optimizers), strict=True))
 
     def state_dict(self):
         state = {name: copy.deepcopy(part.state_dict()) for name, part in self.parts().items()}
@@ -210,64 +203,23 @@ def test_no_update_before_it_is_due(tmp_path):
 
 def test_two_and_two_are_four(tmp_path):
     """A training that was resumed has the same bits as one that never stopped, the replay buffer included."""
-
-    def train(folder, iterations, resume=None):
+    for folder, iterations in (("whole", 4), ("half", 2), ("resumed", 2)):
         torch.manual_seed(3)
         trainer = make_trainer(tmp_path / folder)
-        if resume:
-            trainer.resume(str(resume))
+        if folder == "resumed":
+            trainer.resume(str(tmp_path / "half" / "model_2.pt"))
         trainer.learn(iterations)
-        return torch.load(tmp_path / folder / "model_4.pt", weights_only=True) if iterations == 4 or resume else None
-
-    whole = train("whole", 4)
-    train("half", 2)
-    resumed = train("resumed", 2, tmp_path / "half" / "model_2.pt")
+    whole, resumed = (torch.load(tmp_path / name / "model_4.pt", weights_only=True) for name in ("whole", "resumed"))
     assert resumed["iter"] == whole["iter"] == resumed["count"] // 8 == 4
     for name in ("actor", "critic", "target", "buffer"):
         assert whole[name].keys() and all(torch.equal(value, resumed[name][key]) for key, value in whole[name].items())
 
 
-class Deaf(TDLearner):
-    """A learner without one of the methods."""
-
-    observe = property()
-
-
-class Forgetful(PointMasses):
-    """A task that has only the observations after resets."""
-
-    keep_final_observations = property()
-
-
 def test_what_does_not_fit_is_refused():
     """The lines name the learner, the task and what is missing."""
-    message = error_of(make_trainer, learner=Deaf)
+    deaf = type("Deaf", (TDLearner,), {"observe": property()})
+    message = error_of(make_trainer, learner=deaf)
     assert message == "algorithm.class_name: Deaf is no learner, it lacks observe"
-    message = error_of(make_trainer, task=Forgetful())
+    forgetful = type("Forgetful", (PointMasses,), {"keep_final_observations": property()})
+    message = error_of(make_trainer, task=forgetful())
     assert message == "TDLearner needs observations before resets, which Forgetful does not keep"
-
-
-class A1TDCfgPPO(A1CfgPPO):
-    """Settings of a training whose learner is the one of this file."""
-
-    class algorithm:
-        class_name = f"{__name__}:TDLearner"
-
-
-def test_it_learns_in_a_task_of_the_package(tmp_path):
-    """Named by a registered task, it is trained, evaluated, saved and loaded like PPO."""
-    registry = TaskRegistry()
-    registry.register("a1_td", LeggedRobot, A1Cfg(), A1TDCfgPPO())
-    changes = ["runner.num_steps_per_env=8", "evaluation.interval=48", "evaluation.num_samples=6", "seed=2"]
-    options = Options(device="cpu", num_envs=3, set=changes, logger="none")
-    _, train_cfg = registry.get_cfgs("a1_td", options)
-    env, _ = registry.make_env("a1_td", options)
-    runner, _ = registry.make_alg_runner(env, "a1_td", train_cfg=train_cfg, log_root=tmp_path)
-    runner.learn(4, init_at_random_ep_len=True)
-    assert isinstance(runner.alg, TDLearner)
-    assert len((Path(runner.log_dir) / "evaluations.csv").read_text().splitlines()) == 3
-    loaded, _ = registry.make_alg_runner(env, "a1_td", train_cfg=train_cfg, log_root=None)
-    loaded.load(f"{runner.log_dir}/model_4.pt", {"actor": True})
-    obs = env.get_observations()
-    actions = [each.get_inference_policy()(obs) for each in (runner, loaded)]
-    assert torch.equal(*actions) and actions[0].shape == (3, 12) and loaded.current_learning_iteration == 4
