@@ -112,17 +112,13 @@ def test_crossing_tiles_after_training_on_a_plane(root, tmp_path):
 MISTAKES = {
     "--terrain stairs_pu": "unknown kind of terrain 'stairs_pu'; did you mean 'stairs_up'?",
     "--terrain flat --level 0.5 1.01": "a level must be from 0 to 1, not 1.01",
-    "--terrain flat --level -0.1": "a level must be from 0 to 1, not -0.1",
     "--terrain flat --level nan": "a level must be from 0 to 1, not nan",
-    "--terrain flat --level": "argument --level: expected at least one argument",
     "--terrain flat --command 0 0 0": "the command must have a speed of 0.1 m/s or more and a yaw rate of 0, not 0 0 0",
-    "--terrain flat --command 1 0 0.5": "a yaw rate of 0, not 1 0 0.5",
     "--terrain flat --steps=5": "--steps is not for --terrain",
     "--level 0.5": "--level needs --terrain",
     "--terrain flat --level 0 --set terrain.measure_heights=true": "does not fit this task",
     "--perturbation=hihg": "unknown perturbation 'hihg'; did you mean 'high'?",
     "--steps=0": "--steps must be at least 1, not 0",
-    "--command 1 0": "argument --command: expected 3 arguments",
 }
 
 

@@ -25,16 +25,6 @@ def test_info(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_size_of_a_cache(info, tmp_path):
-    """All files in all folders count; a name behind which there is nothing, as of a file that has gone, is no error."""
-    (tmp_path / "wp_a" / "deep").mkdir(parents=True)
-    (tmp_path / "wp_a" / "kernel.o").write_bytes(bytes(1000))
-    (tmp_path / "wp_a" / "deep" / "kernel.o").write_bytes(bytes(234))
-    assert info["size_of"](tmp_path) == 1234
-    (tmp_path / "gone").symlink_to("nowhere")
-    assert info["size_of"](tmp_path) == 1234 + len("nowhere") and info["size_of"](tmp_path / "missing") == 0
-
-
 def test_missing_extras(info, monkeypatch):
     """What is missing, or too old, is named with the command that installs it."""
     of_extras = {"video": "no-such-package>=2", "export": "numpy>=99", "viewer": "numpy"}

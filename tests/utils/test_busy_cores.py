@@ -13,7 +13,7 @@ CORES = os.cpu_count() or 1
 
 @pytest.mark.parametrize(
     ("others", "threads", "is_noted"),
-    [(CORES, 2, True), (CORES, 1, False), (0.1, CORES + 2, False), (0.0, 2, False), (CORES, CORES + 2, True)],
+    [(CORES, 2, True), (CORES, 1, False), (0.1, CORES + 2, False)],
 )
 def test_note(others, threads, is_noted, monkeypatch):
     """It is given if threads must share cores with others; a single thread waits for no other."""
@@ -22,14 +22,6 @@ def test_note(others, threads, is_noted, monkeypatch):
     assert bool(note) == is_noted
     if is_noted:
         assert f"other processes use {CORES:.1f} of {CORES} cores, and torch has {threads} threads" in note
-
-
-def test_no_counts(tmp_path, monkeypatch):
-    """Nothing is known where the system does not count, or counts something else."""
-    monkeypatch.setattr(devices, "COUNTS", tmp_path / "stat")
-    assert devices.busy_cores() == 0.0
-    (tmp_path / "stat").write_text("cpu many\n")
-    assert devices.busy_cores() == 0.0
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the counts are Linux's")

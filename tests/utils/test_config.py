@@ -17,21 +17,15 @@ from legged_torque.utils.task_registry import num_iterations
     ("path", "text", "value"),
     [
         ("rewards.scales.torques", "-1e-4", -1e-4),
-        ("rewards.scales.torques", "-3", -3.0),
         ("rewards.curriculum.tracking_lin_vel.t_end", "1e6", 1_000_000),
-        ("env.num_actions", "24", 24),
-        ("control.refresh_torques", "false", False),
         ("control.refresh_torques", "True", True),
         ("commands.ranges.lin_vel_x", "[-2, 1e-1]", [-2.0, 0.1]),
         ("asset.penalize_contacts_on", "[calf, 'thigh']", ["calf", "thigh"]),
         ("asset.penalize_contacts_on", "[]", []),
-        ("init_state.default_joint_angles.FR_hip_joint", "-0.2", -0.2),
         ("asset.foot_name", "1e3", "1e3"),
         ("actor.hidden_dims", "[64, 32]", [64, 32]),
-        ("runner.run_name", "7", "7"),
         ("runner.run_name", "a=b", "a=b"),
         ("runner.run_name", "1:30", "1:30"),
-        ("seed", "7", 7),
         ("seed", "017", 17),
         ("actor.distribution_cfg.init_std", "2", 2.0),
     ],
@@ -61,18 +55,12 @@ def test_last_override_wins():
             "rewards.scales.torqes=1",
             "key 'rewards.scales.torqes'; did you mean 'rewards.scales.torques'? allowed: rewards",
         ),
-        ("rewards.scale.torques=1", "unknown config key 'rewards.scale'; did you mean 'rewards.scales'?"),
         ("reward.scales.torques=1", "unknown config section 'reward'; did you mean 'rewards'?"),
-        ("sed=1", "unknown config section 'sed'; did you mean 'seed'?"),
         ("init_state.default_joint_angles.FR_hip=0", "did you mean 'init_state.default_joint_angles.FR_hip_joint'?"),
         ("rewards.scales.torques.x=1", "config key 'rewards.scales.torques' is a value, it has no entry 'x'"),
         ("rewards.scales=1", "config key 'rewards.scales' is a section with entries"),
         ("env.num_envs", "--set takes KEY=VALUE, not 'env.num_envs'"),
         ("env.num_envs=2.5", "env.num_envs must be an integer, not 2.5"),
-        ("env.num_envs=many", "env.num_envs must be an integer, not 'many'"),
-        ("env.num_envs=true", "env.num_envs must be an integer, not True"),
-        ("control.refresh_torques=1", "control.refresh_torques must be true or false, not 1"),
-        ("rewards.scales.torques=false", "rewards.scales.torques must be a number, not False"),
         ("commands.ranges.lin_vel_x=1", "commands.ranges.lin_vel_x must be a list of numbers, not 1"),
         ("commands.ranges.lin_vel_x=[a, 1]", "commands.ranges.lin_vel_x[0] must be a number, not 'a'"),
         ("env.num_envs=[4", "the value '[4' is not valid YAML"),
@@ -157,33 +145,19 @@ def test_thorough_preset(task):
     assert [to_dict(cfg) for cfg in (env_cfg, train_cfg)] == [to_dict(cfg) for cfg in thorough]
 
 
-LAYERS = [
-    ("--preset=paper", {"env.num_envs": 16, "algorithm.clip_param": 0.1, "seed": 1, "runner.logger": "tensorboard"}),
-    ("run", {"env.num_envs": 5, "algorithm.clip_param": 0.3, "seed": 5, "runner.logger": "none"}),
-    ("--num_envs=6 --seed=6 --logger=tensorboard", {"env.num_envs": 6, "seed": 6, "runner.logger": "tensorboard"}),
-    ("--set=env.num_envs=7 --set=seed=7 --set=algorithm.clip_param=0.7", {"env.num_envs": 7, "seed": 7}),
-]
-
-
-@pytest.mark.parametrize("count", range(len(LAYERS) + 1))
-def test_precedence(count):
+def test_precedence():
     """A preset yields to a resumed run's settings, these to options, and options to ``--set``."""
-    expected = {"env.num_envs": 64, "algorithm.clip_param": 0.2, "seed": 1, "runner.logger": "tensorboard"}
-    words, run_config = [], None
-    for text, values in LAYERS[:count]:
-        expected |= values
-        if text == "run":
-            env_cfg, train_cfg = task_registry.get_cfgs("a1_position")
-            env_cfg.env.num_envs, train_cfg.seed = 5, 5
-            train_cfg.algorithm.clip_param, train_cfg.runner.logger = 0.3, "none"
-            run_config = {"env": to_dict(env_cfg), "train": to_dict(train_cfg)}
-        else:
-            words = [*text.split(), *words]  # the order on the command line does not matter
-    if count == len(LAYERS):
-        expected["algorithm.clip_param"] = 0.7
-    env_cfg, train_cfg = get_cfgs(*words, run_config=run_config)
-    found = {path: get(env_cfg if path.startswith("env.") else train_cfg, path) for path in expected}
-    assert found == expected
+    env_cfg, train_cfg = get_cfgs()
+    env_cfg.env.num_envs, train_cfg.seed, train_cfg.algorithm.clip_param = 5, 5, 0.3
+    run = {"env": to_dict(env_cfg), "train": to_dict(train_cfg)}
+    for words, run_config, expected in (
+        (["--preset=paper"], None, (16, 0.1, 1)),
+        (["--preset=paper"], run, (5, 0.3, 5)),
+        (["--preset=paper", "--num_envs=6"], run, (6, 0.3, 5)),
+        (["--set=env.num_envs=7", "--set=seed=7", "--preset=paper", "--num_envs=6", "--seed=6"], run, (7, 0.3, 7)),
+    ):
+        env_cfg, train_cfg = get_cfgs(*words, run_config=run_config)
+        assert (env_cfg.env.num_envs, train_cfg.algorithm.clip_param, train_cfg.seed) == expected
 
 
 def test_number_of_worlds_suits_the_device(monkeypatch):

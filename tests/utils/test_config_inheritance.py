@@ -100,26 +100,9 @@ def test_named_bases_change_nothing():
     assert Explicit.control.damping == 9.0 and Explicit.control.mixing.start == 30.0
 
 
-def test_a_section_of_another_configuration():
-    """What it names comes before what is inherited, and behind what it says itself."""
-
-    class Other(Base):
-        class control:
-            stiffness = 60.0
-            damping = 61.0
-
-    class Mixed(Robot):
-        class control(Other.control):
-            damping = 62.0
-
-    assert (Mixed.control.stiffness, Mixed.control.damping, Mixed.control.mixing.end) == (60.0, 62.0, 40.0)
-
-
 MISTAKES = {
     "class control: stifness = 1.0": "setting or section of V.control 'stifness'; did you mean 'stiffness'?",
-    "class control(Robot.control): stifness = 1.0": "of V.control 'stifness'; did you mean 'stiffness'?",
     "class contrl: stiffness = 1.0": "setting or section of V 'contrl'; did you mean 'control'?",
-    "class control:\n  class mixin: start = 1.0": "of V.control 'mixin'; did you mean 'mixing'?",
     "class control:\n  class mixing: stat = 1.0": "of V.control.mixing 'stat'; did you mean 'start'?",
     "control = 3": "V.control is a setting, but in Both it is a section",
     "class rewards:\n  class scale: a = 1": "V.rewards.scale is a section, but in Approach.rewards it is a setting",

@@ -1,11 +1,8 @@
 """The display of long work: a view on a terminal, lines elsewhere, and nothing that harms the work."""
 
-import contextlib
 import io
-import os
 import re
 import signal
-import sys
 import time
 from itertools import pairwise
 
@@ -123,13 +120,6 @@ def test_ctrl_c():
     assert lines[-1] == "The run is here" and "iteration 20 of" not in output
 
 
-def test_a_terminal_that_is_gone():
-    """The work goes on to its end without a view."""
-    code = TRAINING.replace("sys.exit(stop.number)", "sys.exit(7)").replace("if stop.requested", "if False")
-    code = code.replace('print("The run is here")', "")
-    assert in_a_terminal(code, after="ready", close=True)[0] == 7
-
-
 def test_counter_on_a_terminal():
     """A bar that is gone in the end; a counter inside of it has none."""
     status, output = in_a_terminal(COUNTING, columns=60)
@@ -162,7 +152,8 @@ def test_lines(capsys):
     assert lines[1].endswith("; tracking 0.500 (best 0.500); falls 1.5 per minute")
     assert read_progress("\n".join(lines)) == ("iteration", 15, 40, "0:00:25")
     assert read_tracking(lines[0]) == "" and read_tracking("\n".join(lines)) == "0.500"
-    assert read_progress("nothing") is None
+    days = "iteration 2 of 400, 1 day, 0:13:20, 1 day, 20:13:20 left"
+    assert read_progress(days) == ("iteration", 2, 400, "1 day, 20:13:20") and read_progress("nothing") is None
 
 
 def test_lines_of_a_counter(capsys):
@@ -177,39 +168,6 @@ def test_lines_of_a_counter(capsys):
     assert read_progress(f"a line\n{texts[1]}; more") == ("evaluating, step", 5, 10, "0:00:30")
 
 
-def test_long_times(capsys):
-    """Days are read too."""
-    clock = Clock()
-    with TrainingDisplay("title", "folder", 400, 0, 32, clock=clock) as shown:
-        clock.sleep(86_400.0)
-        for i in (1, 2):
-            clock.sleep(400.0)
-            shown.add_iteration(i, 32 * i, NUMBERS)
-    last = capsys.readouterr().out.splitlines()[-1]
-    assert last.startswith("iteration 2 of 400, 1 day, 0:13:20, 1 day, 20:13:20 left")
-    assert read_progress(last) == ("iteration", 2, 400, "1 day, 20:13:20")
-
-
-def test_nothing_is_written_twice_or_to_nobody(monkeypatch, capsys):
-    """A pipe that is not read is reported once; a quiet display and one without news are silent."""
-    read, write = os.pipe()
-    os.close(read)
-    with open(write, "w") as stream, monkeypatch.context() as patch:
-        patch.setattr(sys, "stdout", stream)
-        with TrainingDisplay("title", "folder", 2, 0, 32) as shown:
-            with pytest.raises(BrokenPipeError):
-                shown.add_iteration(1, 32, NUMBERS)
-            shown.add_iteration(2, 64, NUMBERS)
-        patch.undo()
-        with contextlib.suppress(BrokenPipeError):
-            stream.close()
-    with TrainingDisplay("title", "folder", 2, 0, 32, is_quiet=True) as quiet:
-        quiet.add_iteration(1, 32, NUMBERS)
-    with TrainingDisplay("title", "folder", 2, 0, 32):
-        pass
-    assert capsys.readouterr().out == ""
-
-
 def test_curve():
     """From the lowest to the highest; many values are averaged."""
     assert blocks([0.3]) == "▁" and blocks([0.0, 1.0, 0.5]) == "▁█▅"
@@ -221,3 +179,12 @@ def test_files_are_no_terminals(monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm")
     assert not is_terminal(io.StringIO())
+
+
+def test_quiet(capsys):
+    """A quiet display and one without news are silent."""
+    with TrainingDisplay("title", "folder", 2, 0, 32, is_quiet=True) as quiet:
+        quiet.add_iteration(1, 32, NUMBERS)
+    with TrainingDisplay("title", "folder", 2, 0, 32):
+        pass
+    assert capsys.readouterr().out == ""

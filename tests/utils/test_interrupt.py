@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 
 import pytest
 from support.scripts import ROOT
@@ -28,34 +27,17 @@ def test_stop_request(number):
     assert [signal.getsignal(each) for each in SIGNALS] == before
 
 
-def test_stop_request_outside_the_main_thread():
-    """Another thread cannot take over signals, and works without."""
-    results = []
-
-    def work():
-        with StopRequest() as stop:
-            results.append((stop.requested, signal.getsignal(signal.SIGINT)))
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert results == [(False, signal.getsignal(signal.SIGINT))]
-
-
 def test_signal_while_printing(monkeypatch):
     """A signal that arrives while a line is being written asks to stop like any other."""
 
     class Terminal(io.RawIOBase):
         """Takes Ctrl-C while it writes the first time."""
 
-        written = b""
-
         def writable(self):
             return True
 
         def write(self, data):
-            if not self.written:
-                self.written = bytes(data)
+            if not stop.requested:
                 signal.raise_signal(signal.SIGINT)
             return len(data)
 

@@ -48,19 +48,6 @@ def test_processes_that_torchrun_has_not_started(second_of_two):
     assert error_of(distributed.join, "cpu").startswith("WORLD_SIZE is 2, but torchrun has not started this process")
 
 
-def test_processes_that_do_not_meet(second_of_two):
-    """Where the first process should be nobody answers: one line, no traceback."""
-    second_of_two.setenv("MASTER_ADDR", "127.0.0.1")
-    second_of_two.setenv("MASTER_PORT", "1")
-
-    def give_up(*_args, **_kwargs):
-        raise torch.distributed.DistNetworkError("The client socket has timed out\nwith a trace")
-
-    second_of_two.setattr(torch.distributed, "init_process_group", give_up)  # minutes later
-    line = error_of(distributed.join, "cpu")
-    assert line == "the 2 processes do not find each other: The client socket has timed out"
-
-
 def test_processes_with_other_settings(second_of_two):
     """The first setting that differs is told."""
     second_of_two.setattr(distributed, "gather", lambda mine: [mine, {**mine, "env.env.num_envs": 3}])
@@ -68,9 +55,3 @@ def test_processes_with_other_settings(second_of_two):
     assert line.endswith("must have the same settings: env.env.num_envs is 3 in process 1, but 2 in the first one")
     second_of_two.setattr(distributed, "gather", lambda mine: [mine, dict(mine)])
     distributed.check_same({"task": "t", "weight": float("nan")})
-
-
-def test_one_process_asks_nobody():
-    """Without other processes, a condition is what it is."""
-    assert distributed.any_process(True, "cpu") and not distributed.any_process(False, "cpu")
-    assert (distributed.world_size(), distributed.rank(), distributed.local_rank()) == (1, 0, 0)

@@ -6,9 +6,7 @@ import time
 
 import pytest
 import warp as wp
-from rich.text import Text
 
-from legged_torque.utils.display import Display
 from legged_torque.utils.progress import COMPILING, TORCH_COMPILES, CompileProgress, torch_compiles
 
 OURS, OTHERS = f"_p{os.getpid()}_t7", "_p1_t7"
@@ -72,21 +70,6 @@ def test_torch_compiles_as_well(progress):
     with torch_compiles():
         look(progress, 3)
     assert lines(progress) == [f"{COMPILING}: 0 modules, 2 s"] and not TORCH_COMPILES.is_set()
-
-
-def test_a_view_has_the_line(progress, cache, monkeypatch):
-    """On the same terminal, while kernels are compiled."""
-    shown = Display("step", 2)
-    monkeypatch.setattr(Display, "shown", shown)
-    monkeypatch.setattr(progress._stream, "isatty", lambda: True, raising=False)
-    look(progress, 3, [cache / f"wp_a{OURS}"])
-    assert shown.activity == f"{COMPILING}: 1 modules, 3 s" and lines(progress) == []
-    assert Text(shown.activity, "yellow") in shown.view().renderables
-    look(progress, 1)
-    assert shown.activity == ""
-    shown.activity = "evaluating"
-    look(progress, 1)
-    assert shown.activity == "evaluating"
 
 
 def test_the_thread(cache):
