@@ -1,5 +1,6 @@
 """Results and exports of strangers: what does not belong together is refused, and what they hold never runs."""
 
+import gzip
 import shutil
 
 import pytest
@@ -78,6 +79,13 @@ def test_figures(tmp_path, text):
         words = (figure, "theirs.json", "--out=figure.png")
         assert_told_in_one_line(run_here("plot.py", *words, root=tmp_path), "theirs.json'")
     assert not (tmp_path / "figure.png").exists()
+
+
+def test_curves_that_unpack_to_too_much(tmp_path):
+    """A compressed file does not take all of the memory."""
+    (tmp_path / "large.csv.gz").write_bytes(gzip.compress(b"\n" * 60_000_000, 1))
+    result = run_here("plot.py", "curves", "large.csv.gz", "--out=figure.png", root=tmp_path)
+    assert_told_in_one_line(result, "cannot read 'large.csv.gz'")
 
 
 # ------------------------------------------------------------------------------------------------- exports

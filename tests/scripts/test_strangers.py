@@ -171,17 +171,13 @@ def test_names_that_are_no_names(run):
 
 
 def test_checkpoint_of_another_task(run, trained):
-    """It is refused by its task's name; an old one, which names none, is judged by the shapes of its weights."""
+    """It is refused by its task's name."""
     state = torch.load(trained["a1_torque"] / "model_1.pt", weights_only=True)
     checkpoint.write(run / "model_1.pt", state)
     before = contents(run.parents[2])
     for script in LOADING:
         assert_told_in_one_line(load_run(script, run), "is of task 'a1_torque', not 'a1_position'")
     assert contents(run.parents[2]) == before
-    del state["infos"]["task_name"]
-    checkpoint.write(run / "model_1.pt", state)
-    status, _, error = load_run("evaluate.py", run)
-    assert (status, error) == (0, "")
 
 
 def test_weights_of_a_pretrained_policy(tmp_path, make_task):

@@ -7,17 +7,9 @@ import pytest
 from support.settings import COMBINATIONS, TASKS, error_of, flatten, get, get_cfgs
 
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.config import Section, section_keys, set_by_path, to_dict
+from legged_torque.utils.config import Section, set_by_path, to_dict
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.limits import Count, Interval, Limits, Positive, check_value, describe, types_of
-
-
-def sections(section, path=""):
-    """A section and all below it, with their paths."""
-    yield path, section
-    for key in section_keys(section):
-        if isinstance(getattr(section, key), Section):
-            yield from sections(getattr(section, key), f"{path}{key}.")
+from legged_torque.utils.limits import Count, Interval, Limits, Positive, check_value, describe
 
 
 def with_bad_number(value, bad):
@@ -27,15 +19,6 @@ def with_bad_number(value, bad):
     if isinstance(value, list):
         return [bad] * len(value) if value and isinstance(value[0], (int, float)) else None
     return bad if isinstance(value, (int, float)) and not isinstance(value, bool) else None
-
-
-@pytest.mark.parametrize("task", TASKS + COMBINATIONS)
-def test_every_setting_has_a_type(task):
-    """It stands beside the default, in the class or one of its bases."""
-    for cfg in get_cfgs(task=task):
-        for path, section in sections(cfg):
-            settings = [key for key in section_keys(section) if not isinstance(getattr(section, key), Section)]
-            assert set(settings) <= types_of(type(section)).keys(), path
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30, True, "text", [], {}])

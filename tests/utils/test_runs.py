@@ -89,9 +89,7 @@ def test_config_file_round_trip(task, tmp_path):
         assert {key: type(value) for key, value in new.items()} == {key: type(value) for key, value in old.items()}
     assert config["task"] == task
     assert config["versions"]["numpy"] == np.__version__
-    assert {"python", "torch", "legged_torque", "mujoco", "mujoco-warp", "warp-lang", "rsl-rl-lib"} <= config[
-        "versions"
-    ].keys()
+    assert {"python", "torch", "legged_torque", "mujoco", "warp-lang", "rsl-rl-lib"} <= config["versions"].keys()
 
 
 @pytest.mark.parametrize(
