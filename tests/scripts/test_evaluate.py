@@ -5,7 +5,7 @@ import re
 
 import pytest
 import torch
-from support.evaluations import note_steps, read_rows
+from support.evaluations import note_steps
 from support.scripts import assert_told_in_one_line, contents, run_here
 from torch.nn.functional import elu, linear
 
@@ -30,20 +30,6 @@ def evaluate(root, file, *words):
     status, output, error = run_here("evaluate.py", *TASK, f"--json={file}", *words, root=root)
     assert (status, error) == (0, "")
     return output, json.loads(file.read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
-
-
-def test_a_resumed_run_writes_its_own_rows(root, tmp_path):
-    """They begin after the checkpoint's steps, and the file of the first run stays as it was; no logger is needed."""
-    first = next(root.glob("logs/*/*_first"))
-    text = (first / "evaluations.csv").read_text()
-    words = [f"--load_run={first}", "--checkpoint=2", "--resume", "--max_iterations=4", "--run_name=second"]
-    assert run_here("train.py", *TASK, *words, root=tmp_path)[0] == 0
-    rows = [read_rows(run / "evaluations.csv") for run in (first, *tmp_path.glob("logs/*/*_second"))]
-    assert (first / "evaluations.csv").read_text() == text
-    assert [[row["steps"] for row in each] for each in rows] == [[8, 16, 24], [24, 32]]
-    assert [row["iteration"] for row in rows[1]] == [3, 4]
-    seconds = torch.load(first / "model_2.pt", weights_only=True)["infos"]["seconds"]
-    assert rows[1][0]["seconds"] >= float(f"{seconds:.6g}") > 0.0
 
 
 def test_a_seed_fixes_every_number(root, tmp_path):

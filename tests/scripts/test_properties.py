@@ -26,7 +26,7 @@ from legged_torque.learning import checkpoint
 from legged_torque.utils.cli import Parser, options_of
 from legged_torque.utils.config import Section, flat, section_keys, to_dict
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.limits import check_value, types_of
+from legged_torque.utils.limits import types_of
 from legged_torque.utils.options import Options
 from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 from legged_torque.utils.runs import load_config, save_config
@@ -135,14 +135,6 @@ def test_settings(data):
         env, train = map(to_dict, cfgs)
         again = task_registry.get_cfgs(task, Options(), {"task": task, "env": env, "train": train})
         assert list(map(to_dict, again)) == [env, train]
-
-
-@try_inputs(st.data(), VALUES)
-def test_types(data, value):
-    """A value in its type stays as it is."""
-    name, _, hint, _ = data.draw(st.sampled_from(entries()))
-    checked = tried(check_value, name, value, hint)
-    assert checked is None or check_value(name, checked, hint) == checked
 
 
 @try_inputs(st.sampled_from(SCRIPTS), st.data())

@@ -14,7 +14,6 @@ import pytest
 import torch
 import yaml
 from support.scripts import ROOT, SMALL, run_here
-from support.settings import COMBINATIONS, OTHER_ROBOTS, ROUGH, TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers
@@ -78,13 +77,6 @@ def test_learning_curve(root, tmp_path):
     assert [point["steps"] for point in curve["points"]] == [0, 8, 16]
     assert (curve["task"], curve["seed"], curve["evaluation"]["seed"]) == ("a1_position", 1, 1001)
     assert all(math.isfinite(value) for point in curve["points"] for value in point.values())
-
-
-def test_list_of_tasks(tmp_path):
-    """``train.py --list`` prints the names of all tasks, one a line, and writes nothing."""
-    names = [*TASKS, *COMBINATIONS, *ROUGH, *OTHER_ROBOTS, ""]
-    assert run_here("train.py", "--list", root=tmp_path) == (0, "\n".join(names), "")
-    assert not list(tmp_path.iterdir())
 
 
 def test_nobody_reads_on(tmp_path):

@@ -43,22 +43,14 @@ def test_names_in_a_run(run, harm, setting):
     assert contents(run.parents[2]) == before
 
 
-@pytest.mark.parametrize("name", ["OnPolicyRunner", "rsl_rl.runners:OnPolicyRunner", "payload.run", "os:system", 5, ""])
-def test_other_names(run, harm, name):
-    """Neither is one that rsl_rl or Python has, whatever would be done with it."""
-    edit_config(run, runner__class_name=name)
-    (run / "model_1.pt").write_bytes(pickle.dumps(Payload(harm)))
-    for script in LOADING:
-        assert_told_in_one_line(load_run(script, run), "runner.class_name")
-
-
 def test_names_on_the_command_line(harm):
     """They are refused with the nearest one that is known."""
     for setting in NAMES:
         assert f"unknown {setting} 'payload:run'" in error_of(get_cfgs, f"--set={setting}=payload:run")
     assert "did you mean 'MLPModel'? allowed: MLPModel, " in error_of(get_cfgs, "--set=actor.class_name=MPLModel")
-    told = error_of(get_cfgs, "--set=actor.class_name=os:system")
-    assert told.endswith("register a task to add one")
+    for name in ("OnPolicyRunner", "rsl_rl.runners:OnPolicyRunner", "payload.run", "os:system", "5"):
+        assert "runner.class_name" in error_of(get_cfgs, f"--set=runner.class_name={name}")
+    assert error_of(get_cfgs, "--set=actor.class_name=os:system").endswith("register a task to add one")
 
 
 @pytest.mark.parametrize("words", [[], ["--dry-run"]])
@@ -197,17 +189,11 @@ def test_weights_of_a_pretrained_policy(tmp_path, make_task):
         assert all(torch.equal(value, after[key]) for key, value in before.items())
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        ("--experiment_name=..", "runner.experiment_name must be a name"),
-        ("--run_name=..", "runner.run_name must be a name"),
-        ("--log_root=", "empty"),
-    ],
-)
-def test_folders(tmp_path, words, told):
+def test_folders(tmp_path):
     """What is kept stays below the folder of logs, and an empty name is none."""
     root = tmp_path / "root"
     root.mkdir()
-    assert_told_in_one_line(run_here("train.py", *SMALL, words, root=root), told)
+    told = {"--experiment_name=..": "runner.experiment_name must be", "--run_name=..": "runner.run_name must be"}
+    for word, message in {**told, "--log_root=": "empty"}.items():
+        assert_told_in_one_line(run_here("train.py", *SMALL, word, root=root), message)
     assert os.listdir(tmp_path) == ["root"] and not os.listdir(root)

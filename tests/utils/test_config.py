@@ -43,11 +43,6 @@ def test_overrides(path, text, value):
         assert {key for key in old if new.get(key) != old[key]} <= {path} and new.keys() == old.keys()
 
 
-def test_last_override_wins():
-    """Overrides are applied from left to right."""
-    assert get_cfgs("--set=seed=1", "--set=env.num_envs=5", "--set=seed=2")[1].seed == 2
-
-
 @pytest.mark.parametrize(
     ("item", "message"),
     [
@@ -117,23 +112,9 @@ def test_paper_preset_is_table_ii(task, device, monkeypatch):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_parallel_preset_is_the_default(task):
-    """Section 7 (c) of the design: 4096 worlds on a GPU, rollouts of 24 steps, an adaptive learning rate."""
+    """Naming it changes nothing."""
     default, named = get_cfgs(task=task), get_cfgs("--preset=parallel", task=task)
     assert [to_dict(cfg) for cfg in default] == [to_dict(cfg) for cfg in named]
-    env_cfg, train_cfg = task_registry.get_cfgs(task)
-    expected = {
-        "runner.num_steps_per_env": 24,
-        "algorithm.num_mini_batches": 4,
-        "algorithm.learning_rate": 1e-3,
-        "algorithm.schedule": "adaptive",
-        "algorithm.desired_kl": 0.02,
-        "algorithm.lam": 0.95,
-        "algorithm.max_grad_norm": 1.0,
-        "algorithm.clip_param": 0.2,
-        "runner.total_steps": 110_000_000,
-    }
-    assert env_cfg.env.num_envs == 4096
-    assert {path: get(train_cfg, path) for path in expected} == expected
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -146,7 +127,7 @@ def test_thorough_preset(task):
 
 
 def test_precedence():
-    """A preset yields to a resumed run's settings, these to options, and options to ``--set``."""
+    """A preset yields to a resumed run's settings, these to options, options to ``--set``, of which the last counts."""
     env_cfg, train_cfg = get_cfgs()
     env_cfg.env.num_envs, train_cfg.seed, train_cfg.algorithm.clip_param = 5, 5, 0.3
     run = {"env": to_dict(env_cfg), "train": to_dict(train_cfg)}
@@ -154,7 +135,11 @@ def test_precedence():
         (["--preset=paper"], None, (16, 0.1, 1)),
         (["--preset=paper"], run, (5, 0.3, 5)),
         (["--preset=paper", "--num_envs=6"], run, (6, 0.3, 5)),
-        (["--set=env.num_envs=7", "--set=seed=7", "--preset=paper", "--num_envs=6", "--seed=6"], run, (7, 0.3, 7)),
+        (
+            ["--set=seed=8", "--set=env.num_envs=7", "--set=seed=7", "--preset=paper", "--num_envs=6", "--seed=6"],
+            run,
+            (7, 0.3, 7),
+        ),
     ):
         env_cfg, train_cfg = get_cfgs(*words, run_config=run_config)
         assert (env_cfg.env.num_envs, train_cfg.algorithm.clip_param, train_cfg.seed) == expected

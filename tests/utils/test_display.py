@@ -10,7 +10,7 @@ import pytest
 from support.clock import Clock
 from support.terminal import in_a_terminal
 
-from legged_torque.learning.training_display import TrainingDisplay, blocks, read_tracking
+from legged_torque.learning.training_display import TrainingDisplay, read_tracking
 from legged_torque.utils.display import REDRAW_EVERY, Counter, is_terminal, read_progress
 
 STYLES = re.compile(r"\033\[[\d;?]*[A-Za-z]")
@@ -91,8 +91,6 @@ def test_panel(columns, variables):
     text = " ".join(re.sub(r" +", " ", line.strip("│ ")) for line in panel)
     for part in ("iteration 20 of 20 ", " 100% 0:00:0", "0:00:00 left", "steps 180", "reward 1.25", "KL 0.0123"):
         assert part in text
-    for part in ("episode length 4.5 s", "noise 0.50", "learning rate 1.0e-03", "falls 1.5 per minute"):
-        assert part in text
     for part in ("tracking 0.475 (best 0.475)", "trend +0.250 ▁▂", "diverged worlds 40", "skipped updates 20"):
         assert part in text
     for part in ("weight_of_a_reward_with_a_long_name 0.25,", "mixing_of_a_long_name 0.75", "warnings: 1, last: some"):
@@ -118,6 +116,11 @@ def test_ctrl_c():
     above = [before for before, line in pairwise(lines) if line.startswith(text)]
     assert status == signal.SIGINT and above and all(line.startswith("│ iteration") for line in above)
     assert lines[-1] == "The run is here" and "iteration 20 of" not in output
+
+
+def test_a_terminal_that_closes():
+    """It asks to stop, and what is drawn and printed afterwards harms nothing."""
+    assert in_a_terminal(TRAINING, after="ready", close=True)[0] == signal.SIGHUP
 
 
 def test_counter_on_a_terminal():
@@ -166,12 +169,6 @@ def test_lines_of_a_counter(capsys):
     texts = [f"evaluating, step {i} of 10, 0:00:{t}, 0:00:{left} left" for i, t, left in ((3, 12, 42), (5, 24, 30))]
     assert capsys.readouterr().err.splitlines() == texts
     assert read_progress(f"a line\n{texts[1]}; more") == ("evaluating, step", 5, 10, "0:00:30")
-
-
-def test_curve():
-    """From the lowest to the highest; many values are averaged."""
-    assert blocks([0.3]) == "▁" and blocks([0.0, 1.0, 0.5]) == "▁█▅"
-    assert blocks([i // 10 for i in range(120)]) == "▁▂▂▃▄▄▅▅▆▇▇█"
 
 
 def test_files_are_no_terminals(monkeypatch):

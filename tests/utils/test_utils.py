@@ -1,11 +1,14 @@
-"""The small helpers."""
+"""The small helpers: vectors and headings, renderers, busy cores, paths."""
 
 import ctypes.util
 import math
 import os
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -16,25 +19,15 @@ from legged_torque.utils.heading import heading
 from legged_torque.utils.math import quat_rotate_inverse, rotate_yaw, yaw
 
 
-def quaternion_matrices(quat):
-    """Rotation matrices of quaternions (w, x, y, z)."""
-    w, x, y, z = quat.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
-
-
 def test_world_vectors_in_the_body_frame():
-    """A vector is turned by the transposed rotation matrix."""
+    """Turned back into the world by MuJoCo, they are what they were."""
     rng = np.random.default_rng(1)
-    quat, vec = rng.normal(size=(50, 4)), rng.normal(size=(50, 3))
-    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
-    expected = np.einsum("nji,nj->ni", quaternion_matrices(quat), vec)
-    turned = quat_rotate_inverse(torch.tensor(quat), torch.tensor(vec))
-    np.testing.assert_allclose(turned, expected, atol=1e-12)
+    quats, vectors = rng.normal(size=(50, 4)), rng.normal(size=(50, 3))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    in_body, in_world = quat_rotate_inverse(torch.tensor(quats), torch.tensor(vectors)).numpy(), np.empty(3)
+    for quat, vector, turned_back in zip(quats, vectors, in_body, strict=True):
+        mujoco.mju_rotVecQuat(in_world, turned_back, quat)
+        np.testing.assert_allclose(in_world, vector, atol=1e-12)
 
 
 def turned(angle, tilt, about):
@@ -86,6 +79,28 @@ def test_choice_of_the_renderer(asked, installed, gpu, chosen, monkeypatch):
     else:
         assert "is not installed" in reason and "apt-get install libosmesa6" in reason and "\n" not in reason
         assert asked is None or asked in reason
+
+
+CORES = os.cpu_count() or 1
+
+
+@pytest.mark.parametrize(
+    ("others", "threads", "is_noted"), [(CORES, 2, True), (CORES, 1, False), (0.1, CORES + 2, False)]
+)
+def test_note_of_busy_cores(others, threads, is_noted, monkeypatch):
+    """It is given if threads must share cores with others; a single thread waits for no other."""
+    monkeypatch.setattr(devices, "busy_cores", lambda: others)
+    assert ("other processes use" in (devices.busy_cores_note(threads) or "")) == is_noted
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the counts are Linux's")
+def test_busy_cores(monkeypatch):
+    """A process that computes without end is seen."""
+    monkeypatch.setattr(devices, "SECONDS", 1.0)
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as other:
+        others = devices.busy_cores()
+        other.kill()
+    assert others > 0.4
 
 
 def test_portable_path(tmp_path, monkeypatch):
