@@ -98,7 +98,6 @@ MISTAKES = {
     "--terrain flat --steps=5": "--steps is not for --terrain",
     "--level 0.5": "--level needs --terrain",
     "--terrain flat --level 0 --set terrain.measure_heights=true": "does not fit this task",
-    "--perturbation=hihg": "unknown perturbation 'hihg'; did you mean 'high'?",
     "--steps=0": "--steps must be at least 1, not 0",
 }
 

@@ -30,9 +30,6 @@ NAMES = (
 """Settings that name classes and functions."""
 
 
-# ------------------------------------------------------------------------------------------------- names of code
-
-
 @pytest.mark.parametrize("setting", NAMES)
 def test_names_in_a_run(run, harm, setting):
     """A class or function that no registered task names is refused by every script before it is imported."""
@@ -62,9 +59,6 @@ def test_names_in_an_experiment(tmp_path, harm, words):
     result = run_here("experiment.py", "theirs.yaml", "--device=cpu", *words, root=tmp_path)
     assert_told_in_one_line(result, "unknown actor.class_name 'payload:run'")
     assert contents(tmp_path) == before
-
-
-# ------------------------------------------------------------------------------------------------- files that run code
 
 
 @pytest.mark.parametrize("script", LOADING)
@@ -157,9 +151,6 @@ def test_names_that_are_no_names(run):
     text = (run / "config.yaml").read_text()
     (run / "config.yaml").write_text(yaml.safe_dump(yaml.safe_load(text) | {"task": "x\nerror: \x1b[2J\u202e"}))
     assert_told_in_one_line(load_run("evaluate.py", run), r"is of task 'x\nerror: \x1b[2J\u202e', not 'a1_position'")
-
-
-# ------------------------------------------------------------------------------------------------- mixed up files
 
 
 def test_checkpoint_of_another_task(run, trained):

@@ -31,9 +31,6 @@ def tile(name, difficulty, seed=0):
     return TILES[name](difficulty, np.random.default_rng(seed), GRID)
 
 
-# ---- the surface -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", TILES)
 def test_surface_is_that_of_mujocos_hfield(name):
     """Heights and normals of every kind of tile are those that rays find, in both precisions."""
@@ -64,9 +61,6 @@ def test_place_of_the_map():
     assert surface.height(outside).tolist() == [1.0, 121.0, 16.0, 64.0]
     broken = torch.tensor([[torch.nan, 2.5, 0.0], [0.0, -torch.inf, torch.nan]])
     assert surface.height(broken).isfinite().all() and surface.normal(broken).isfinite().all()
-
-
-# ---- tiles, by hand --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", TILES)
@@ -108,15 +102,10 @@ def test_roughness():
     np.testing.assert_allclose(rough[2::4, ::4], 0.5 * (coarse[1:] + coarse[:-1]), atol=1e-12)
 
 
-def test_obstacles():
-    """Heights are all or half of 0.05 + 0.2 d, above or below; there are some."""
-    for seed in range(5):
-        heights = np.unique(tile("discrete_obstacles", 0.5, seed))
-        np.testing.assert_allclose(np.abs(heights) / 0.15, [1.0, 0.5, 0.0, 0.5, 1.0], atol=1e-9)
-
-
-def test_waves_stones_gaps_and_pits():
-    """Sizes at known difficulties: crests, sides of stones and holes, widths of trenches, depths of pits."""
+def test_other_tiles():
+    """Sizes at known difficulties: obstacles, crests, sides of stones and holes, widths of trenches, depths of pits."""
+    obstacles = np.unique(tile("discrete_obstacles", 0.5))
+    np.testing.assert_allclose(obstacles / 0.15, [-1.0, -0.5, 0.0, 0.5, 1.0], atol=1e-9)  # of 0.05 + 0.2 d
     assert tile("waves", 1.0).max() == pytest.approx(0.3, abs=0.01) and (tile("waves", 0.0) == 0.0).all()
     for difficulty, side, hole in ((0.0, 32, 1), (0.5, 16, 2), (0.9, 4, 2)):  # 1.575, 0.825, 0.225 m; 0.05, 0.1 m
         row = tile("stepping_stones", difficulty)[:, 0]
@@ -127,9 +116,6 @@ def test_waves_stones_gaps_and_pits():
         assert (row < 0.0).sum() == cells and (row[:31] == 0.0).all() and (row[31 : 31 + cells] == -1.0).all()
     pit = tile("pits", 0.3)
     assert pit[MIDDLE + 40, MIDDLE - 40] == pit[MIDDLE, MIDDLE] == -0.3 and pit[MIDDLE + 41, MIDDLE] == 0.0
-
-
-# ---- the map ---------------------------------------------------------------------------------------------------------
 
 
 def test_map_repeats_and_its_seed_matters():
@@ -199,9 +185,6 @@ def test_a_kind_of_ones_own(monkeypatch):
     assert "unknown kind in terrain.terrain_proportions 'ramp';" in error_of(make_ground, **only)
 
 
-# ---- levels ----------------------------------------------------------------------------------------------------------
-
-
 def test_worlds_are_spread():
     """Columns are shared evenly; levels are the first ones with the curriculum, all without it."""
     ground = make_ground(12)
@@ -241,9 +224,6 @@ def test_levels_stay_in_evaluations():
     ended = torch.ones(12, dtype=torch.bool)
     ground.end_episodes(ended, ground.origins + 5.0, torch.ones(12, 3), 20.0)
     assert torch.equal(ground.levels, before)
-
-
-# ---- in a task ------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -297,9 +277,6 @@ def test_levels_and_places_in_episodes(make_rough_task):
     task.step(torch.zeros(4, 12))
     assert task.reset_buf.tolist() == [True, True, False, False] and task.terrain.levels.tolist() == [1, 2, 0, 1]
     assert (task.base_pos - task.terrain.origins)[:, :2].abs().max() < 0.1  # the others have not been moved
-
-
-# ---- mistakes --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

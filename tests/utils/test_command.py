@@ -1,8 +1,8 @@
 """The console command, completion by the shell, the layout of ``--help`` and the flags that legged_gym's users know."""
 
-import importlib
 import re
 import sys
+from unittest.mock import Mock
 
 import pytest
 from support.command import command, complete
@@ -43,12 +43,9 @@ def test_completion(tmp_path):
 def test_command_of_other_scripts(monkeypatch, tmp_path):
     """What a script prints for the user to type is how the script itself was started."""
     monkeypatch.setattr(sys, "argv", ["scripts/train.py"])
-    monkeypatch.chdir(ROOT)
-    assert script_command("play") == "python scripts/play.py"
-    monkeypatch.chdir(tmp_path)
-    assert script_command("play") == f"python {ROOT}/scripts/play.py"  # as it can be typed there
-    monkeypatch.setattr(sys, "argv", ["legged-torque train"])
-    assert script_command("play") == "legged-torque play"
+    for folder, words in {ROOT: "python scripts/play.py", tmp_path: f"python {ROOT}/scripts/play.py"}.items():
+        monkeypatch.chdir(folder)
+        assert script_command("play") == words
     monkeypatch.setattr("legged_torque.utils.cli.SCRIPTS_DIR", ROOT / "legged_torque" / "scripts")
     monkeypatch.setattr(sys, "argv", ["train.py"])
     assert script_command("play") == "python -m legged_torque.scripts.play"
@@ -91,9 +88,16 @@ def test_agents(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_missing_package(capsys):
-    """It ends a script with the line that installs it."""
-    with pytest.raises(SystemExit, match="2"):
-        run_script(lambda: importlib.import_module("nothing.of_this_name"))
+@pytest.mark.parametrize(
+    ("reason", "status", "line"),
+    [
+        (ModuleNotFoundError(name="nothing"), "2", "error: 'nothing' is not installed; pip"),
+        (KeyboardInterrupt(), "130", "interrupted"),
+    ],
+)
+def test_ends_of_scripts(reason, status, line, capsys):
+    """A missing package and Ctrl-C end a script with a line and a status."""
+    with pytest.raises(SystemExit, match=status):
+        run_script(Mock(side_effect=reason))
     error = capsys.readouterr().err
-    assert error.startswith("error: 'nothing' is not installed; pip") and error.count("\n") == 1
+    assert error.startswith(line) and error.count("\n") == 1

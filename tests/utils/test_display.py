@@ -58,10 +58,9 @@ from legged_torque.utils.display import Counter
 class Broken(Counter):
     def view(self):
         raise ValueError("a name that cannot be drawn")
-with Broken("step", 2) as counter:
-    counter.add()
 try:
-    with Counter("step", 2):
+    with Broken("step", 2) as counter:
+        counter.add()
         raise KeyError("of the work")
 except KeyError as error:
     print("caught", error)

