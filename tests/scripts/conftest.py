@@ -49,7 +49,6 @@ def root(tmp_path_factory):
     broken = {
         "not_yaml": "task: [a1_position",
         "unknown_key": config.replace("num_envs:", "num_env:"),
-        "wrong_type": config.replace("torques: -0.0002", "torques: little"),
         "no_section": re.sub(r"^env:\n(  .*\n)+", "env: 3\n", config, flags=re.MULTILINE),
     }
     for name, text in broken.items():
@@ -58,8 +57,7 @@ def root(tmp_path_factory):
         (copy / "config.yaml").write_text(text)
     (shutil.copytree(run, root / "logs" / "no_config" / run.name) / "config.yaml").unlink()
     checkpoint = (run / "model_2.pt").read_bytes()
-    for name, content in {"text": b"this is no checkpoint\n", "half": checkpoint[: len(checkpoint) // 2]}.items():
-        copy = shutil.copytree(run, root / "logs" / f"{name}_checkpoint" / run.name)
-        for number in (0, 1, 2):
-            (copy / f"model_{number}.pt").write_bytes(content)
+    copy = shutil.copytree(run, root / "logs" / "half_checkpoint" / run.name)
+    for number in (0, 1, 2):
+        (copy / f"model_{number}.pt").write_bytes(checkpoint[: len(checkpoint) // 2])
     return root

@@ -2,7 +2,6 @@
 
 import importlib.metadata
 import runpy
-import subprocess
 
 import numpy as np
 import pytest
@@ -25,16 +24,6 @@ def test_info(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_size_of_a_cache(info, tmp_path):
-    """All files in all folders count; a name behind which there is nothing, as of a file that has gone, is no error."""
-    (tmp_path / "wp_a" / "deep").mkdir(parents=True)
-    (tmp_path / "wp_a" / "kernel.o").write_bytes(bytes(1000))
-    (tmp_path / "wp_a" / "deep" / "kernel.o").write_bytes(bytes(234))
-    assert info["size_of"](tmp_path) == 1234
-    (tmp_path / "gone").symlink_to("nowhere")
-    assert info["size_of"](tmp_path) == 1234 + len("nowhere") and info["size_of"](tmp_path / "missing") == 0
-
-
 def test_missing_extras(info, monkeypatch):
     """What is missing, or too old, is named with the command that installs it."""
     of_extras = {"video": "no-such-package>=2", "export": "numpy>=99", "viewer": "numpy"}
@@ -44,14 +33,3 @@ def test_missing_extras(info, monkeypatch):
     assert "missing no-such-package: pip install 'legged_torque[video]'" in lines["video"]
     assert "missing numpy>=99" in lines["export"] and f"(here {np.__version__})" in lines["export"]
     assert lines["viewer"].split()[1] == lines["plots"].split()[1] == "ok"
-
-
-def test_gpus_that_cannot_be_used(info, monkeypatch):
-    """A driver with a torch for the CPU is reported."""
-    monkeypatch.setattr(torch.version, "cuda", None)
-    done = subprocess.CompletedProcess([], 0, "NVIDIA H200, 580.1, 143771 MiB\n")
-    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: done)
-    lines = info["gpus"]()
-    assert lines[0].startswith("NVIDIA H200, 580.1") and "install one for CUDA to use the GPU" in lines[1]
-    done.stdout = ""
-    assert info["gpus"]() == ["none with a driver of NVIDIA", "torch is a build for the CPU"]

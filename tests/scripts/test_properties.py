@@ -26,8 +26,7 @@ from legged_torque.learning import checkpoint
 from legged_torque.utils.cli import Parser, options_of
 from legged_torque.utils.config import Section, flat, section_keys, to_dict
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.files import read_data
-from legged_torque.utils.limits import check_value, types_of
+from legged_torque.utils.limits import types_of
 from legged_torque.utils.options import Options
 from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 from legged_torque.utils.runs import load_config, save_config
@@ -43,7 +42,7 @@ LEAVES = st.none() | st.booleans() | NUMBERS | st.floats() | st.text(max_size=8)
 VALUES = st.recursive(LEAVES, lambda part: st.lists(part, max_size=4) | st.dictionaries(st.text(max_size=4), part))
 YAML = st.text("[]{}:,-&*!<>|'\"#%@?~=. \n\tab01eE_", max_size=40)
 TEXTS = YAML | st.text(max_size=20) | VALUES.map(lambda value: yaml.safe_dump(value, allow_unicode=True))
-PLACES = st.floats(0.0, 1.0, exclude_max=True)
+PLACES = st.floats(0.0, 1.0, exclude_max=True) | st.floats(0.95, 1.0, exclude_max=True)
 
 
 def like(value):
@@ -138,14 +137,6 @@ def test_settings(data):
         assert list(map(to_dict, again)) == [env, train]
 
 
-@try_inputs(st.data(), VALUES)
-def test_types(data, value):
-    """A value in its type stays as it is."""
-    name, _, hint, _ = data.draw(st.sampled_from(entries()))
-    checked = tried(check_value, name, value, hint)
-    assert checked is None or check_value(name, checked, hint) == checked
-
-
 @try_inputs(st.sampled_from(SCRIPTS), st.data())
 def test_command_lines(script, data):
     """Options with any values, and other words, are parsed, and the settings that they ask for are made."""
@@ -201,10 +192,3 @@ def test_experiments(tmp_path, key, value):
     file.write_text(yaml.safe_dump(SMALL | {key: value}), "utf-8", "surrogatepass")
     tried(read_plan, file)
     assert list(tmp_path.iterdir()) == [file]
-
-
-@try_inputs(TEXTS | VALUES.map(repr))
-def test_data_of_figures(tmp_path, text):
-    """JSON that a figure is drawn from, or anything else."""
-    (tmp_path / "data.json").write_text(text, "utf-8", "surrogatepass")
-    tried(read_data, tmp_path / "data.json", {"points"}, "evaluate.py")

@@ -14,7 +14,6 @@ import pytest
 import torch
 import yaml
 from support.scripts import ROOT, SMALL, run_here
-from support.settings import COMBINATIONS, OTHER_ROBOTS, ROUGH, TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers
@@ -41,23 +40,12 @@ def test_run_folder(root):
     """A run leaves its checkpoints, events and settings, in a folder named by its time and name."""
     (run,) = (root / "logs" / "a1_position").glob("*_good")
     assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_good", run.name)
-    assert {path.name.split(".tfevents")[0] for path in run.iterdir() if path.is_file()} == {
-        "model_0.pt",  # so that the training can be watched at once
-        "model_1.pt",
-        "model_2.pt",
-        "worlds_2.pt",
-        "events.out",
-        "config.yaml",
-    }
+    files = {path.name.split(".tfevents")[0] for path in run.iterdir() if path.is_file()}
+    models = {"model_0.pt", "model_1.pt", "model_2.pt"}  # the first so that the training can be watched at once
+    assert files == models | {"worlds_2.pt", "events.out", "config.yaml"}
     config = yaml.safe_load((run / "config.yaml").read_text())
-    assert (config["task"], config["preset"], config["device"], config["max_iterations"]) == (
-        "a1_position",
-        "parallel",
-        "cpu",
-        2,
-    )
-    assert config["env"]["env"]["num_envs"] == 2 and config["train"]["runner"]["num_steps_per_env"] == 4
-    assert torch.__version__.startswith(config["versions"]["torch"])
+    expected = {"task": "a1_position", "preset": "parallel", "device": "cpu", "max_iterations": 2}
+    assert expected.items() <= config.items() and config["env"]["env"]["num_envs"] == 2
 
 
 def test_resume_in_a_folder_by_its_path(root, tmp_path):
@@ -75,9 +63,7 @@ def test_resume_in_a_folder_by_its_path(root, tmp_path):
     assert files == {"config.yaml", "model_1.pt", "model_2.pt", "worlds_2.pt"}
     state = torch.load(new / "model_2.pt", weights_only=True)
     assert (state["iter"], state["infos"]["total_timesteps"]) == (2, 2 * 2 * 4)
-    config = yaml.safe_load((new / "config.yaml").read_text())
-    train = config["train"]
-    assert (config["max_iterations"], config["preset"]) == (2, "parallel")
+    train = yaml.safe_load((new / "config.yaml").read_text())["train"]
     assert (train["seed"], train["runner"]["logger"], train["runner"]["num_steps_per_env"]) == (9, "none", 4)
 
 
@@ -91,13 +77,6 @@ def test_learning_curve(root, tmp_path):
     assert [point["steps"] for point in curve["points"]] == [0, 8, 16]
     assert (curve["task"], curve["seed"], curve["evaluation"]["seed"]) == ("a1_position", 1, 1001)
     assert all(math.isfinite(value) for point in curve["points"] for value in point.values())
-
-
-def test_list_of_tasks(tmp_path):
-    """``train.py --list`` prints the names of all tasks, one a line, and writes nothing."""
-    names = [*TASKS, *COMBINATIONS, *ROUGH, *OTHER_ROBOTS, ""]
-    assert run_here("train.py", "--list", root=tmp_path) == (0, "\n".join(names), "")
-    assert not list(tmp_path.iterdir())
 
 
 def test_nobody_reads_on(tmp_path):
@@ -133,8 +112,6 @@ def test_train_stop_resume_play(tmp_path):
     settings = {
         "runner.num_steps_per_env": 4,
         "env.episode_length_s": 0.06,  # three steps: there are rewards of whole episodes to print
-        "control.mixing.update_interval": 8,
-        "control.mixing.pd.t_end": 400,
     }
     changes = [f"--set={key}={value}" for key, value in settings.items()]
     process = start("train.py", *task, *changes, "--num_envs=2", "--max_iterations=100000", root=tmp_path)
@@ -164,14 +141,10 @@ def test_train_stop_resume_play(tmp_path):
     assert int(state["infos"]["task"]["total_steps"]) == (count + 2) * 8
     for number in (count, count + 1):
         assert f"Learning iteration {number}/{count + 2}" in output
-        assert re.search(rf"Curriculum/mixing_pd: {max(0.0, 1.0 - number * 8 / 400):.4f}", output)
-    for name in ("Steps per second", "ETA", "Mean reward", "Tracking/error_xy", "Tracking/error_yaw"):
-        assert output.count(f"{name}:") == 2
-    for name in ("Curriculum/weight_tracking_lin_vel", "Curriculum/mixing_torque", "Health/diverged_worlds"):
+    for name in ("Steps per second", "Mean reward", "Tracking/error_xy", "Health/diverged_worlds"):
         assert output.count(f"{name}:") == 2
     configs = [yaml.safe_load((run / "config.yaml").read_text()) for run in (first, second)]
     assert configs[0]["env"] == configs[1]["env"] and configs[0]["train"] == configs[1]["train"]
-    assert configs[1]["env"]["env"]["num_envs"] == 2 and torch.__version__.startswith(configs[1]["versions"]["torch"])
 
     status, output, error = run_here("play.py", *task, "--num_envs=2", "--steps=10", root=tmp_path)
     assert status == 0 and "Traceback" not in error

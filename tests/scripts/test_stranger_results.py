@@ -1,8 +1,6 @@
 """Results and exports of strangers: what does not belong together is refused, and what they hold never runs."""
 
 import gzip
-import json
-import os
 import shutil
 
 import pytest
@@ -36,10 +34,8 @@ def results(trained, tmp_path):
 
 
 CONFIGS = [
-    {"task": "a1_position", "env": "many", "train": [1]},
     {"task": ["a"], "env": {"env": {"num_envs": "9"}}, "train": {"runner": {"num_steps_per_env": [1]}}},
-    {"task": {}, "env": {"env": {"num_envs": 1e300}}, "train": {"seed": {}, "runner": 3}, "max_iterations": "x"},
-    {"task": "t", "env": {}, "train": {"actor": {"class_name": "payload:run"}}, "versions": ["payload"]},
+    {"task": {}, "env": "many", "train": {"seed": {}, "actor": {"class_name": "payload:run"}}, "versions": ["x"]},
 ]
 
 
@@ -71,10 +67,8 @@ def test_experiment_names_other_folders(results, tmp_path):
     "text",
     [
         "[" * 2000 + "]" * 2000,
-        '{"task": "a", "seed": 1, "points": 5}',
         '{"task": "a", "seed": Infinity, "points": [{"steps": 1}]}',
-        '{"task": {}, "seed": 1, "points": [{"steps": Infinity}]}',
-        '{"task": "a", "seed": [], "points": [[]]}',
+        '{"task": {}, "seed": [], "points": [[]]}',
         '{"histograms": [], "settings": 1, "rms_error": {}, "standing": {}}',
     ],
 )
@@ -87,24 +81,11 @@ def test_figures(tmp_path, text):
     assert not (tmp_path / "figure.png").exists()
 
 
-def test_curves_that_are_no_text(tmp_path):
-    """A compressed file that is damaged or unpacks to too much, and a field longer than any number, are reported."""
-    (tmp_path / "a.csv.gz").write_bytes(b"\x1f\x8b\x08\x00" + bytes(6) + b"\xff" * 50)
+def test_curves_that_unpack_to_too_much(tmp_path):
+    """A compressed file does not take all of the memory."""
     (tmp_path / "large.csv.gz").write_bytes(gzip.compress(b"\n" * 60_000_000, 1))
-    (tmp_path / "a.csv").write_text("task,steps\n" + "9" * 200_000 + ",1\n")
-    for name in ("a.csv.gz", "large.csv.gz", "a.csv"):
-        result = run_here("plot.py", "curves", name, "--out=figure.png", root=tmp_path)
-        assert_told_in_one_line(result, f"cannot read '{name}'")
-
-
-def test_figure_named_like_a_folder(tmp_path):
-    """A figure is not written beside a folder, under a name that was not given."""
-    points = [{"steps": 1} | {metric.name: 0.5 for metric in CURVE_METRICS}]
-    (tmp_path / "curve.json").write_text(json.dumps({"task": "a", "seed": 1, "points": points}))
-    (tmp_path / "figures").mkdir()
-    result = run_here("plot.py", "curves", "curve.json", "--out=figures", root=tmp_path)
-    assert_told_in_one_line(result, "cannot write 'figures'")
-    assert sorted(os.listdir(tmp_path)) == ["curve.json", "figures"]
+    result = run_here("plot.py", "curves", "large.csv.gz", "--out=figure.png", root=tmp_path)
+    assert_told_in_one_line(result, "cannot read 'large.csv.gz'")
 
 
 # ------------------------------------------------------------------------------------------------- exports
@@ -121,46 +102,15 @@ def exported(trained, tmp_path_factory):
     return folder
 
 
-def swap_terms(description):
-    """Two terms of the same size change places, so that all sizes fit."""
-    terms = description["observations"]["terms"]
-    terms[0], terms[1] = terms[1], terms[0]
-
-
-def reorder_joints(description):
-    """The joints from the last to the first, which no size tells."""
-    description["joint_order"].reverse()
-
-
-def set_entry(path, value):
-    """A change of one entry by its dotted path."""
-    *sections, key = path.split(".")
-
-    def change(description):
-        for section in sections:
-            description = description[section]
-        description[key] = value
-
-    return change
-
-
 EXPORTS = {
-    "swapped terms": (swap_terms, "was exported with other observations"),
-    "swapped joints": (reorder_joints, "was exported with other joint_order"),
-    "another scale": (lambda d: d["actions"]["terms"][0].update(scale=5.0), "was exported with other actions"),
-    "another pose": (set_entry("nominal_pose.FR_hip_joint", 0.2), "was exported with other nominal_pose"),
-    "huge limits": (set_entry("torque_limits.FR_hip_joint", [-1e30, 1e30]), "torque_limits.FR_hip_joint."),
-    "huge speed": (set_entry("initial_state.joint_velocity", [0.0, 1e30]), "initial_state.joint_velocity.1"),
+    "swapped terms": (lambda d: d["observations"]["terms"].reverse(), "was exported with other observations"),
+    "swapped joints": (lambda d: d["joint_order"].reverse(), "was exported with other joint_order"),
+    "huge speed": (lambda d: d["initial_state"].update(joint_velocity=[0.0, 1e30]), "initial_state.joint_velocity.1"),
     "huge whole number": (lambda d: d["commands"].update(lin_vel_x=[0, 10**300]), "commands.lin_vel_x.1"),
     "huger one": (lambda d: d["commands"].update(lin_vel_x=[0, 10**400]), "larger than settings are"),
     "endless steps": (
         lambda d: d["timing"].update(decimation=10**8, control_frequency=1e-6, physics_frequency=100.0),
         "timing.decimation",
-    ),
-    "no number": (set_entry("episode.length", float("nan")), "episode.length is not a finite number"),
-    "another folder": (
-        set_entry("network.file", "../out/policy.onnx"),
-        "must be the name of a file in the same folder",
     ),
     "a class": (lambda d: d.update(task={"class_name": "payload:run"}), "task"),
 }

@@ -30,9 +30,6 @@ NAMES = (
 """Settings that name classes and functions."""
 
 
-# ------------------------------------------------------------------------------------------------- names of code
-
-
 @pytest.mark.parametrize("setting", NAMES)
 def test_names_in_a_run(run, harm, setting):
     """A class or function that no registered task names is refused by every script before it is imported."""
@@ -43,37 +40,25 @@ def test_names_in_a_run(run, harm, setting):
     assert contents(run.parents[2]) == before
 
 
-@pytest.mark.parametrize("name", ["OnPolicyRunner", "rsl_rl.runners:OnPolicyRunner", "payload.run", "os:system", 5, ""])
-def test_other_names(run, harm, name):
-    """Neither is one that rsl_rl or Python has, whatever would be done with it."""
-    edit_config(run, runner__class_name=name)
-    (run / "model_1.pt").write_bytes(pickle.dumps(Payload(harm)))
-    for script in LOADING:
-        assert_told_in_one_line(load_run(script, run), "runner.class_name")
-
-
 def test_names_on_the_command_line(harm):
     """They are refused with the nearest one that is known."""
     for setting in NAMES:
         assert f"unknown {setting} 'payload:run'" in error_of(get_cfgs, f"--set={setting}=payload:run")
     assert "did you mean 'MLPModel'? allowed: MLPModel, " in error_of(get_cfgs, "--set=actor.class_name=MPLModel")
-    told = error_of(get_cfgs, "--set=actor.class_name=os:system")
-    assert told.endswith("register a task to add one")
+    for name in ("OnPolicyRunner", "rsl_rl.runners:OnPolicyRunner", "payload.run", "os:system", "5"):
+        assert "runner.class_name" in error_of(get_cfgs, f"--set=runner.class_name={name}")
+    assert error_of(get_cfgs, "--set=actor.class_name=os:system").endswith("register a task to add one")
 
 
 @pytest.mark.parametrize("words", [[], ["--dry-run"]])
-@pytest.mark.parametrize("setting", NAMES)
-def test_names_in_an_experiment(tmp_path, harm, setting, words):
+def test_names_in_an_experiment(tmp_path, harm, words):
     """The description of an experiment is refused before anything is started or written, and its listing as well."""
     matrix = {"tasks": ["a1_position"], "environments": {"none": ["none"]}, "seeds": [1]}
-    (tmp_path / "theirs.yaml").write_text(yaml.safe_dump(matrix | {"train": {setting: "payload:run"}}))
+    (tmp_path / "theirs.yaml").write_text(yaml.safe_dump(matrix | {"train": {"actor.class_name": "payload:run"}}))
     before = contents(tmp_path)
     result = run_here("experiment.py", "theirs.yaml", "--device=cpu", *words, root=tmp_path)
-    assert_told_in_one_line(result, f"unknown {setting} 'payload:run'")
+    assert_told_in_one_line(result, "unknown actor.class_name 'payload:run'")
     assert contents(tmp_path) == before
-
-
-# ------------------------------------------------------------------------------------------------- files that run code
 
 
 @pytest.mark.parametrize("script", LOADING)
@@ -141,10 +126,8 @@ TEXTS = {
     "merges": (BOMB, "is not valid YAML"),
     "python": ("!!python/object/apply:payload.run []", "is not valid YAML"),
     "deep": ("[" * 1000 + "]" * 1000, "is nested too deeply"),
-    "less_deep": ("[" * 60 + "]" * 60, "is nested too deeply"),
     "itself": ("&a [*a]", "is nested too deeply"),
     "huge": (f"a: {'9' * 1000}", "is nested too deeply or larger"),
-    "long": ("# " + "x" * 1_000_000, "is nested too deeply or larger than settings are"),
     "many": ("\n".join(["a: &a0 [x]", *(f"b{i}: &a{i + 1} [{f'*a{i}, ' * 9}]" for i in range(12))]), "is nested too"),
 }
 """YAML that runs code, or takes all of the memory or the stack, and what is reported."""
@@ -170,59 +153,38 @@ def test_names_that_are_no_names(run):
     assert_told_in_one_line(load_run("evaluate.py", run), r"is of task 'x\nerror: \x1b[2J\u202e', not 'a1_position'")
 
 
-# ------------------------------------------------------------------------------------------------- mixed up files
-
-
 def test_checkpoint_of_another_task(run, trained):
-    """It is refused by its task's name; an old one, which names none, is judged by the shapes of its weights."""
+    """It is refused by its task's name."""
     state = torch.load(trained["a1_torque"] / "model_1.pt", weights_only=True)
     checkpoint.write(run / "model_1.pt", state)
     before = contents(run.parents[2])
     for script in LOADING:
         assert_told_in_one_line(load_run(script, run), "is of task 'a1_torque', not 'a1_position'")
     assert contents(run.parents[2]) == before
-    del state["infos"]["task_name"]
-    checkpoint.write(run / "model_1.pt", state)
-    status, _, error = load_run("evaluate.py", run)
-    assert (status, error) == (0, "")
 
 
-@pytest.mark.parametrize("damage", ["empty", "missing", "shape", "nan", "text", "more"])
-def test_weights_of_a_pretrained_policy(tmp_path, make_task, damage):
+def test_weights_of_a_pretrained_policy(tmp_path, make_task):
     """Names, shapes and numbers are those of the actor, or else it stays as it was; the first one is named."""
     env = make_task("a1_torque_gravity", num_envs=2)
     runner, _ = task_registry.make_alg_runner(env, "a1_torque_gravity", log_root=None)
     before = {name: value.clone() for name, value in runner.alg.actor.state_dict().items()}
     weights = {name: value + 1.0 for name, value in before.items()}
-    name = next(name for name in weights if "mlp" in name and name.endswith("weight"))
-    if damage == "empty":
-        weights, name = {}, next(iter(name for name in before if not name.startswith("distribution")))
-    elif damage == "missing":
-        del weights[name]
-    elif damage == "more":
-        weights["other"], name = torch.zeros(3), "other"
-    else:
-        value = {"shape": weights[name].T.contiguous(), "nan": weights[name] * float("nan"), "text": "0.5"}[damage]
-        weights[name] = value
-    checkpoint.write(tmp_path / "policy.pt", {"actor_state_dict": weights, "spaces": {}, "report": {}})
-    told = error_of(start_from, runner, tmp_path / "policy.pt")
-    assert "policy.pt' " in told and name in told
-    after = runner.alg.actor.state_dict()
-    assert all(torch.equal(value, after[name]) for name, value in before.items())
+    name = "mlp.0.weight"
+    others = {key: value for key, value in weights.items() if key != name}
+    bad = [weights[name].T.contiguous(), weights[name] * float("nan"), "0.5"]
+    for damaged in (others, *(weights | {name: value} for value in bad), weights | {"other": torch.zeros(3)}):
+        checkpoint.write(tmp_path / "policy.pt", {"actor_state_dict": damaged, "spaces": {}, "report": {}})
+        told = error_of(start_from, runner, tmp_path / "policy.pt")
+        assert "policy.pt' " in told and ("other" if "other" in damaged else name) in told
+        after = runner.alg.actor.state_dict()
+        assert all(torch.equal(value, after[key]) for key, value in before.items())
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        ("--experiment_name=..", "runner.experiment_name must be a name"),
-        ("--experiment_name=.", "runner.experiment_name must be a name"),
-        ("--run_name=..", "runner.run_name must be a name"),
-        ("--log_root=", "empty"),
-    ],
-)
-def test_folders(tmp_path, words, told):
+def test_folders(tmp_path):
     """What is kept stays below the folder of logs, and an empty name is none."""
     root = tmp_path / "root"
     root.mkdir()
-    assert_told_in_one_line(run_here("train.py", *SMALL, words, root=root), told)
+    told = {"--experiment_name=..": "runner.experiment_name must be", "--run_name=..": "runner.run_name must be"}
+    for word, message in {**told, "--log_root=": "empty"}.items():
+        assert_told_in_one_line(run_here("train.py", *SMALL, word, root=root), message)
     assert os.listdir(tmp_path) == ["root"] and not os.listdir(root)

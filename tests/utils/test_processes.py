@@ -1,5 +1,7 @@
 """Processes that torchrun has started, or should have, without the others."""
 
+from unittest.mock import Mock
+
 import pytest
 import torch
 from support.settings import error_of, parse
@@ -42,23 +44,15 @@ def test_length_of_a_training(second_of_two):
     assert torch.equal(torch.rand(3), drawn)
 
 
-def test_processes_that_torchrun_has_not_started(second_of_two):
-    """A stray WORLD_SIZE is told in one line."""
+def test_processes_without_the_others(second_of_two):
+    """A stray WORLD_SIZE, and a first process that does not answer, are reported in one line."""
     second_of_two.delenv("MASTER_ADDR", raising=False)
     assert error_of(distributed.join, "cpu").startswith("WORLD_SIZE is 2, but torchrun has not started this process")
-
-
-def test_processes_that_do_not_meet(second_of_two):
-    """Where the first process should be nobody answers: one line, no traceback."""
     second_of_two.setenv("MASTER_ADDR", "127.0.0.1")
     second_of_two.setenv("MASTER_PORT", "1")
-
-    def give_up(*_args, **_kwargs):
-        raise torch.distributed.DistNetworkError("The client socket has timed out\nwith a trace")
-
-    second_of_two.setattr(torch.distributed, "init_process_group", give_up)  # minutes later
-    line = error_of(distributed.join, "cpu")
-    assert line == "the 2 processes do not find each other: The client socket has timed out"
+    late = Mock(side_effect=torch.distributed.DistNetworkError("The client has timed out\nwith a trace"))
+    second_of_two.setattr(torch.distributed, "init_process_group", late)
+    assert error_of(distributed.join, "cpu") == "the 2 processes do not find each other: The client has timed out"
 
 
 def test_processes_with_other_settings(second_of_two):
@@ -68,9 +62,3 @@ def test_processes_with_other_settings(second_of_two):
     assert line.endswith("must have the same settings: env.env.num_envs is 3 in process 1, but 2 in the first one")
     second_of_two.setattr(distributed, "gather", lambda mine: [mine, dict(mine)])
     distributed.check_same({"task": "t", "weight": float("nan")})
-
-
-def test_one_process_asks_nobody():
-    """Without other processes, a condition is what it is."""
-    assert distributed.any_process(True, "cpu") and not distributed.any_process(False, "cpu")
-    assert (distributed.world_size(), distributed.rank(), distributed.local_rank()) == (1, 0, 0)

@@ -7,13 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import yaml
-from support.settings import COMBINATIONS, TASKS, error_of, flatten, get_cfgs
+from support.settings import error_of, flatten, get_cfgs
 
-from legged_torque.envs import task_registry
 from legged_torque.utils import runs
-from legged_torque.utils.config import to_dict, update_from_dict
+from legged_torque.utils.config import to_dict
 from legged_torque.utils.files import write_whole
 
 
@@ -31,17 +29,11 @@ def log_root(tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize(
-    ("load_run", "name"),
-    [
-        (None, "2026-01-02_00-00-00_wide"),
-        ("2026-01-01_00-00-00", "2026-01-01_00-00-00"),
-        ("{root}/2026-01-03_00-00-00", "2026-01-03_00-00-00"),
-    ],
-)
-def test_find_run(log_root, load_run, name):
+def test_find_run(log_root):
     """The newest run that has a checkpoint, one by its name, or one by its path."""
-    assert runs.find_run(log_root, load_run and load_run.format(root=log_root)) == log_root / name
+    assert runs.find_run(log_root, None) == log_root / "2026-01-02_00-00-00_wide"
+    assert runs.find_run(log_root, "2026-01-01_00-00-00") == log_root / "2026-01-01_00-00-00"
+    assert runs.find_run(log_root, f"{log_root}/2026-01-03_00-00-00") == log_root / "2026-01-03_00-00-00"
 
 
 def test_find_run_that_does_not_exist(log_root):
@@ -52,12 +44,11 @@ def test_find_run_that_does_not_exist(log_root):
         assert str(folder) in error_of(runs.find_run, folder, None)
 
 
-@pytest.mark.parametrize(("number", "name"), [(None, "model_10.pt"), (9, "model_9.pt"), (2, "model_2.pt")])
-def test_find_checkpoint(log_root, number, name):
+def test_find_checkpoint(log_root):
     """The last checkpoint is that of the highest number, not that of the last name."""
     run = log_root / "2026-01-01_00-00-00"
-    assert runs.find_checkpoint(run, number) == run / name
-    assert runs.checkpoint_numbers(run) == [2, 9, 10]
+    assert runs.find_checkpoint(run, None) == run / "model_10.pt"
+    assert runs.find_checkpoint(run, 2) == run / "model_2.pt"
 
 
 def test_find_checkpoint_that_does_not_exist(log_root):
@@ -69,15 +60,7 @@ def test_find_checkpoint_that_does_not_exist(log_root):
     assert error_of(runs.find_checkpoint, empty, None) == f"there is no checkpoint in '{empty}'"
 
 
-def test_run_folders_sort_by_time(tmp_path):
-    """A new run's folder is named by its time, then by its name, and is not created yet."""
-    plain, named = runs.new_run_dir(tmp_path, ""), runs.new_run_dir(tmp_path, "wide")
-    assert plain.parent == named.parent == tmp_path and not any(tmp_path.iterdir())
-    assert plain.name > "2026-01-01_00-00-00" and len(plain.name) == len("2026-01-01_00-00-00")
-    assert named.name.startswith(plain.name[:10]) and named.name.endswith("_wide")
-
-
-@pytest.mark.parametrize("task", TASKS + COMBINATIONS)
+@pytest.mark.parametrize("task", ["a1_position", "a1_torque_gravity_multihead"])
 def test_config_file_round_trip(task, tmp_path):
     """What a run has written gives the same settings again, of the same types; versions of all packages are there."""
     words = ["--preset=paper", "--set=rewards.scales.torques=-1e-7", "--set=actor.hidden_dims=[8, 4]", "--run_name=7"]
@@ -91,17 +74,14 @@ def test_config_file_round_trip(task, tmp_path):
         assert new == old
         assert {key: type(value) for key, value in new.items()} == {key: type(value) for key, value in old.items()}
     assert config["task"] == task
-    assert torch.__version__.startswith(config["versions"]["torch"])
     assert config["versions"]["numpy"] == np.__version__
-    assert {"python", "legged_torque", "mujoco", "mujoco-warp", "warp-lang", "rsl-rl-lib"} <= config["versions"].keys()
+    assert {"python", "torch", "legged_torque", "mujoco", "warp-lang", "rsl-rl-lib"} <= config["versions"].keys()
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("task: [a1", "is not valid YAML"),
         ("\x00\x01", "is not valid YAML"),
-        ("", "lacks the entries task, env and train"),
         ("- task\n- env\n- train", "lacks the entries task, env and train"),
         ("task: a1_position\nenv: {}", "lacks the entries task, env and train"),
         (None, "has no config.yaml"),
@@ -113,22 +93,6 @@ def test_broken_config_file(text, message, tmp_path):
         (tmp_path / "config.yaml").write_text(text)
     line = error_of(runs.load_config, tmp_path)
     assert message in line and str(tmp_path) in line
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"env": {"num_env": 3}}, "unknown config key 'env.num_env'; did you mean 'env.num_envs'?"),
-        ({"rewards": {"scales": {"torques": "x"}}}, "rewards.scales.torques must be a number, not 'x'"),
-        ({"rewards": {"scales": 3}}, "config key 'rewards.scales' is a section with entries"),
-        ({"rewards": None}, "config key 'rewards' is a section with entries"),
-        ({3: 4}, "unknown config key '3'"),
-    ],
-)
-def test_config_that_does_not_fit(values, message):
-    """Entries of a resumed run that do not exist or have another type are refused by name."""
-    cfg, _ = task_registry.get_cfgs("a1_position")
-    assert message in error_of(update_from_dict, cfg, values)
 
 
 def test_runs_of_the_same_second_do_not_share_a_folder(tmp_path):
@@ -151,29 +115,15 @@ def test_no_run_is_without_its_settings(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) != [runs.claim_run_dir(tmp_path / "run", {})] == list(tmp_path.iterdir())
 
 
-def test_a_file_instead_of_a_folder(tmp_path):
-    """What cannot be written is named in one line."""
-    (tmp_path / "logs").touch()
-    line = error_of(runs.claim_run_dir, tmp_path / "logs" / "run", {})
-    assert line.startswith(f"cannot write '{tmp_path / 'logs' / 'run'}") and line.endswith(": Not a directory")
-    line = error_of(runs.claim_run_dir, tmp_path / ("x" * 300), {})
-    assert line.endswith(": File name too long")
-
-
-def limited_write(file, most):
-    """Write 100000 bytes where a file may have only so many, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
-    try:
-        return error_of(write_whole, file, b"1" * 100_000)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 def test_a_full_disk(tmp_path):
     """It is reported by its name, and the file stays what it was."""
     (tmp_path / "file").write_bytes(b"old")
-    line = limited_write(tmp_path / "file", 50_000)
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limit[1]))
+    try:
+        line = error_of(write_whole, tmp_path / "file", b"1" * 100_000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert line == f"cannot write '{tmp_path / 'file'}': File too large"
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
 
@@ -184,15 +134,3 @@ def test_a_device_is_not_replaced(tmp_path):
     link.symlink_to("/dev/null")
     write_whole(link, b"1")
     assert link.is_symlink() and link.read_bytes() == b"" and Path("/dev/null").is_char_device()
-
-
-def test_a_config_file_that_was_cut_off(tmp_path):
-    """None of its beginnings is taken for the whole file."""
-    env_cfg, train_cfg = get_cfgs()
-    runs.save_config(tmp_path, {"task": "a1_position", "env": to_dict(env_cfg), "train": to_dict(train_cfg)})
-    file = tmp_path / "config.yaml"
-    text = file.read_text()
-    assert runs.load_config(tmp_path)["task"] == "a1_position"
-    for end in [*range(0, len(text), 97), *range(text.index("\nversions"), len(text))]:
-        file.write_text(text[:end])
-        assert str(file) in error_of(runs.load_config, tmp_path)
