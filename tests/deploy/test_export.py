@@ -106,17 +106,6 @@ def test_parity(make_task, tmp_path, name, settings):
         assert obs["policy"].shape[1] == 3 * (33 + task.num_actions + (name == TWO_RATES))  # and its phase
 
 
-@pytest.mark.parametrize(("name", "end"), [("a1_torque_multihead", 0.0), ("a1_multihead", 0.1)])
-def test_mixing_weights(make_task, tmp_path, name, end):
-    """The description holds the mixing weights of the checkpoint, by hand from eq. 1."""
-    export_random(make_task, name, tmp_path / "out")
-    terms = read_yaml(tmp_path / "out")["actions"]["terms"]
-    theta = 1.0 + (end - 1.0) * (20_000_000 // 64_000 * 64_000) / 50e6
-    assert [term["name"] for term in terms] == ["position_residual", "torque"]
-    assert [term["mixing_weight"] for term in terms] == pytest.approx([theta, 1.0])
-    assert 0.5 < theta < 0.7
-
-
 def test_description(exported, description):
     """The files are complete, the numbers those of the A1, and the schema accepts them."""
     assert sorted(path.name for path in exported.iterdir()) == ["policy.onnx", "policy.pt", "policy.yaml"]
@@ -127,12 +116,8 @@ def test_description(exported, description):
     assert description["gains"]["stiffness"]["FL_calf_joint"] == 20.0
     assert description["torque_limits"]["FL_calf_joint"] == [-33.5, 33.5]
     assert [term["size"] for term in description["observations"]["terms"]] == [3, 3, 3, 12, 12, 24]
-    assert description["timing"] == {
-        "control_frequency": 50.0,
-        "physics_frequency": 200.0,
-        "decimation": 4,
-        "refresh_torques": True,
-    }
+    timing = {"control_frequency": 50.0, "physics_frequency": 200.0, "decimation": 4, "refresh_torques": True}
+    assert description["timing"] == timing
     assert description["training"] == TRAINING
     assert description["unsupported"] == [] and description["pushes"] == {"set_factor": 1.1}
     text = (exported / "policy.yaml").read_text()
@@ -285,7 +270,6 @@ def test_groups_in_the_scripts(tmp_path, monkeypatch):
     ("change", "message"),
     [
         ({"obs_groups": ["critic"]}, "must be 'policy', then groups of single terms (here none), not critic"),
-        ({"obs_groups": ["policy", "critic"]}, "(here none), not policy, critic"),
         ({"obs_groups_2d": ["camera", "depth"]}, "policies that see images cannot be exported: camera, depth"),
         ({"is_recurrent": True}, "only policies without memory can be exported"),
     ],
@@ -352,7 +336,7 @@ def test_nominal_settings():
     assert cfg.motors.delay.range == [0, 0]
 
 
-@pytest.mark.parametrize("package", ["onnx", "onnxruntime", "jsonschema"])
+@pytest.mark.parametrize("package", ["onnx", "jsonschema"])
 def test_missing_extras(make_task, exported, tmp_path, monkeypatch, package):
     """A package that is not installed is named with its extra, on export and when the policy is run."""
     task = make_task("a1_torque", num_envs=3)
@@ -378,9 +362,5 @@ def test_script(tmp_path):
     assert f"exported to logs/a1_position/{run.name}/exported_2" in output
     assert f"scripts/sim2sim.py logs/a1_position/{run.name}/exported_2\n" in output
     policy = Policy(run / "exported_2")
-    assert policy.description["training"] == {
-        "run": run.name,
-        "checkpoint": "model_2.pt",
-        "iterations": 2,
-        "total_steps": 16,
-    }
+    training = {"run": run.name, "checkpoint": "model_2.pt", "iterations": 2, "total_steps": 16}
+    assert policy.description["training"] == training

@@ -96,11 +96,10 @@ def test_scan_by_rays(policy, robot):
 
 
 def test_heights_are_needed(policy):
-    """A policy that sees the ground is not run without it, nor with heights of other places."""
-    state = State(np.zeros(3), np.zeros(12), np.zeros(12), quaternion=np.array([1.0, 0, 0, 0]))
-    for heights in (None, np.zeros(186)):
-        with pytest.raises(ValueError, match="a state needs 187 heights above the ground, at scan_places"):
-            policy.observation(dataclasses.replace(state, heights=heights), np.zeros(3))
+    """A policy that sees the ground is not run with heights of other places."""
+    state = State(np.zeros(3), np.zeros(12), np.zeros(12), quaternion=np.array([1.0, 0, 0, 0]), heights=np.zeros(186))
+    with pytest.raises(ValueError, match="a state needs 187 heights above the ground, at scan_places"):
+        policy.observation(state, np.zeros(3))
 
 
 def test_motion_is_the_task_s(exported, policy, robot):
@@ -235,15 +234,6 @@ def test_headings(policy, robot):
     assert fixed.command.tolist() == [0.5, 0.0, -0.2]
 
 
-def test_height_is_above_the_ground(policy, robot):
-    """The metric is the trunk's height above the ground below it, wherever that is."""
-    simulation = Simulation(policy, robot)
-    for seed in range(3):
-        steps, *_, height, _, falls = simulation.run(60, seed)
-        assert (steps, falls) == (60.0, 0.0) and 0.25 < height / steps < 0.35
-    assert np.ptp(robot.origins[:, 2]) > 0.5
-
-
 # --------------------------------------------------------------------------------------------------- other grounds
 
 
@@ -297,8 +287,6 @@ def test_script(exported, tmp_path):
         assert note in json.loads(file.read_text())["notes"][0]
     result = run_here("sim2sim.py", *words, "--contacts=none", root=tmp_path)
     assert_told_in_one_line(result, "argument --contacts: invalid choice: 'none'")
-    result = run_here("sim2sim.py", *words, "--terrain", "stair_up", root=tmp_path)
-    assert_told_in_one_line(result, "unknown kind of terrain 'stair_up'; did you mean 'stairs_up'?")
     result = run_here("sim2sim.py", *words, "--terrain", "pits", "--level", "0.5", "1.5", root=tmp_path)
     assert_told_in_one_line(result, "a level must be from 0 to 1, not 1.5")
     assert_told_in_one_line(run_here("sim2sim.py", *words, "--level=0.5", root=tmp_path), "--level needs --terrain")
