@@ -82,9 +82,7 @@ def test_learning_curves(tmp_path):
     [
         ("none.csv", None, "cannot read"),
         ("other.json", '{"task": "a1_torque"}', "is not a file that evaluate.py has written"),
-        ("half.json", '{"task": "a1_torque", "seed": 1, "points": [{"track_xy": 1}]}', "has no column 'steps'"),
         ("wrong.json", '{"task": "a1_torque", "seed": 1, "points": [{"steps": 1, "speed": "x"}]}', "row 0 of"),
-        ("twice.csv", "steps,steps,task\n1,2,a\n", "two columns of the same name"),
         ("text.csv.gz", "no gzip", "cannot read"),
         ("evaluations.csv", f"{HEADER}\n", "has no config.yaml"),
     ],
