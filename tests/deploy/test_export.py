@@ -137,58 +137,34 @@ def test_actions_that_are_not_finite(exported):
         policy.observation(State(np.zeros(3), np.zeros(12), np.zeros(12)), np.zeros(3))
 
 
-def test_other_laws(make_task, tmp_path, monkeypatch):
-    """A task with torques or observations of its own: the networks are exported, and policy.yaml says what differs."""
+def test_torques_of_a_user(make_task, tmp_path, monkeypatch):
+    """The network of a task with torques of its own is exported, and policy.yaml says what differs."""
     onnxruntime, robot = pytest.importorskip("onnxruntime"), task_registry.get_task_class("a1_position")
-    own_torques, own_terms = robot._compute_torques, robot.observation_terms
-
-    def shifted_terms(task):
-        first, *others = own_terms(task)
-        return [dataclasses.replace(first, value=lambda: task.projected_gravity + 0.1), *others]
-
-    changes = {
-        "torques": ("_compute_torques", lambda task, actions: 1.1 * own_torques(task, actions)),
-        "observations": ("observation_terms", shifted_terms),
-    }
-    for name, attribute in changes.items():
-        with monkeypatch.context() as patch:
-            patch.setattr(robot, *attribute)
-            _, model = export_random(make_task, "a1_position", tmp_path / name, supported=False)
-        (problem,) = read_yaml(tmp_path / name)["unsupported"]
-        assert re.fullmatch(rf"the {name} of LeggedRobot differ by \S+ from those of the terms in policy.yaml", problem)
-        assert f"can only be run by its task: {problem}" in error_of(Policy, tmp_path / name)
-        obs = torch.randn(3, 45, generator=torch.Generator().manual_seed(1))
-        (actions,) = onnxruntime.InferenceSession(tmp_path / name / "policy.onnx").run(None, {"obs": obs.numpy()})
-        with torch.inference_mode():
-            np.testing.assert_allclose(actions, model.as_jit()(obs).numpy(), atol=1e-5)
+    own_torques = robot._compute_torques
+    monkeypatch.setattr(robot, "_compute_torques", lambda task, actions: 1.1 * own_torques(task, actions))
+    _, model = export_random(make_task, "a1_position", tmp_path / "out", supported=False)
+    (problem,) = read_yaml(tmp_path / "out")["unsupported"]
+    assert re.fullmatch(r"the torques of LeggedRobot differ by \S+ from those of the terms in policy.yaml", problem)
+    assert f"can only be run by its task: {problem}" in error_of(Policy, tmp_path / "out")
+    obs = torch.randn(3, 45, generator=torch.Generator().manual_seed(1))
+    (actions,) = onnxruntime.InferenceSession(tmp_path / "out" / "policy.onnx").run(None, {"obs": obs.numpy()})
+    with torch.inference_mode():
+        np.testing.assert_allclose(actions, model.as_jit()(obs).numpy(), atol=1e-5)
 
 
-OWN_TERMS = {
-    "observation term 'depth_image'": (
-        "observation_terms",
-        lambda terms: lambda task: [*terms(task), ObservationTerm("depth_image", lambda: task.dof_pos[:, :7], None)],
-    ),
-    "action term 'impedance'": (
-        "action_terms",
-        lambda terms: lambda task: [dataclasses.replace(terms(task)[0], name="impedance")],
-    ),
-}
-
-
-@pytest.mark.parametrize("name", OWN_TERMS)
-def test_terms_of_a_user(make_task, tmp_path, monkeypatch, name):
+def test_action_term_of_a_user(make_task, tmp_path, monkeypatch):
     """Without a numpy function, a term is named in policy.yaml and the file is not run; with one, it is supported."""
-    robot, (method, change) = task_registry.get_task_class("a1_position"), OWN_TERMS[name]
-    monkeypatch.setattr(robot, method, change(getattr(robot, method)))
+    robot = task_registry.get_task_class("a1_position")
+    own_terms = robot.action_terms
+    monkeypatch.setattr(robot, "action_terms", lambda task: [dataclasses.replace(own_terms(task)[0], name="impedance")])
     export_random(make_task, "a1_position", tmp_path / "out", supported=False)
     (problem,) = read_yaml(tmp_path / "out")["unsupported"]
-    assert problem.startswith(f"no numpy function for the {name}; there are ")
+    assert problem.startswith("no numpy function for the action term 'impedance'; there are ")
     assert problem in error_of(Policy, tmp_path / "out")
     assert_told_in_one_line(run_here("sim2sim.py", str(tmp_path / "out"), root=tmp_path), problem)
-    monkeypatch.setitem(OBSERVATIONS, "depth_image", lambda policy, state, command: state.joint_positions[:7])
     monkeypatch.setitem(ACTIONS, "impedance", ACTIONS["position_residual"])
     export_random(make_task, "a1_position", tmp_path / "out")
-    assert Policy(tmp_path / "out").act(np.zeros(45 + 7 * (method == "observation_terms"))).shape == (12,)
+    assert Policy(tmp_path / "out").act(np.zeros(45)).shape == (12,)
     monkeypatch.undo()
     assert error_of(Policy, tmp_path / "out") == f"'{tmp_path / 'out'}': {problem}"
 

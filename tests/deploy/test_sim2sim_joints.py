@@ -105,13 +105,15 @@ def test_geoms(policy, changed):
 
 
 def test_all_problems_are_reported(policy, changed):
-    """Actuators that are not motors are reported together, and so are missing joints."""
+    """Actuators that are not motors are reported together, and so are missing joints; the trunk must be free."""
     message = error_of(MujocoRobot, changed(servo(3, 7)), policy.description)
     assert "must be a motor, ctrl its torque; one is a servo" in message and "(FL_hip_joint, RR_thigh_joint)" in message
     renamed = [setting(f".//joint[@name='{leg}_calf_joint']", name=f"{leg}_knee") for leg in ("RR", "RL")]
     motors = [setting(f".//motor[@joint='{leg}_calf_joint']", joint=f"{leg}_knee") for leg in ("RR", "RL")]
     message = error_of(MujocoRobot, changed(*renamed, *motors), policy.description)
     assert "'RR_calf_joint'" in message and "'RL_calf_joint'" in message
+    fixed = changed(lambda root: root.find("worldbody/body").remove(root.find(".//freejoint")))
+    assert "one free joint" in error_of(MujocoRobot, fixed, policy.description)
 
 
 def test_self_collision(policy, changed):

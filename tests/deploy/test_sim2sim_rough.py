@@ -1,7 +1,6 @@
 """An exported policy on rough ground in plain MuJoCo: what it sees, where it starts and how it moves is the task's."""
 
 import copy
-import dataclasses
 import json
 import math
 
@@ -18,7 +17,6 @@ from legged_torque.deploy import ground
 from legged_torque.deploy.policy import Policy, State
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Simulation, quaternion
-from legged_torque.envs import task_registry
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.height_map import HeightMap
@@ -175,20 +173,6 @@ def test_slope_is_a_tilted_plane():
         mujoco.mj_step(models[1], on_plane)
     np.testing.assert_allclose(on_map.qpos[:3], on_plane.qpos[:3], atol=1e-5)
     assert on_plane.qpos[0] > 0.2 and on_plane.ncon == 1
-
-
-def test_scan_in_a_group_of_its_own(make_task, tmp_path, monkeypatch):
-    """The actor may read the scan after its other observations; the export sees what the task sees."""
-    robot, groups = task_registry.get_task_class("a1_position"), ["policy", "scan"]
-    own_terms = robot.observation_terms
-
-    def scan_apart(task):
-        return [dataclasses.replace(t, group="scan") if t.name == "height_scan" else t for t in own_terms(task)]
-
-    monkeypatch.setattr(robot, "observation_terms", scan_apart)
-    export_random(make_task, "a1_position", tmp_path / "out", groups=groups, **ROUGH, **{"env.history_length": 2})
-    policy = Policy(tmp_path / "out")
-    assert policy.scan_points.shape == (187, 2) and policy.description["network"]["num_observations"] == 2 * 45 + 187
 
 
 # --------------------------------------------------------------------------------------------------- episodes

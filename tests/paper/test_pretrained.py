@@ -130,19 +130,10 @@ def test_what_does_not_fit_is_refused(made):
     check_making(file, train_cfg)  # settings of a training that starts from it
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("num_steps=0", "pretraining.num_steps must be at least 1, not 0"),
-        ("num_configurations=3", "pretraining.num_rounds is 4, more than there are configurations"),
-        ("controller.nonsense=1", "unknown config key 'pretraining.controller.nonsense'"),
-    ],
-)
-def test_settings_that_make_no_sense(setting, message, tmp_path):
+def test_settings_that_make_no_sense(tmp_path):
     """They are refused by their names before anything is made, and so is a task without pre-training."""
-    few = words_of(num_configurations=8, num_steps=1, num_epochs=1, held_out=0.5)  # soon over if it were not refused
-    result = run_here("pretrain_gravity.py", *SMALL, *few, f"--set=pretraining.{setting}", root=tmp_path)
-    assert_told_in_one_line(result, message)
+    result = run_here("pretrain_gravity.py", *SMALL, *words_of(num_configurations=3), root=tmp_path)
+    assert_told_in_one_line(result, "pretraining.num_rounds is 4, more than there are configurations")
     result = run_here("pretrain_gravity.py", "--device=cpu", "--task=a1_torque", root=tmp_path)
     assert_told_in_one_line(result, "task 'a1_torque' has no pre-training")
     assert not list(tmp_path.iterdir())

@@ -10,15 +10,13 @@ import pandas as pd
 import pytest
 from scipy import stats
 from support.reports import HEADER, SETTINGS, line, whole_run, write_experiment, write_part, write_run
-from support.settings import error_of
 
 from legged_torque.experiments.matrix import Cell, Matrix
-from legged_torque.paper.metrics import PAPER_METRICS
 from legged_torque.paper.report.evaluations import METRIC_NAMES, read_curves, read_evaluations
 from legged_torque.paper.report.experiment import Experiment, Training, read_experiment
 from legged_torque.paper.report.report import run_problems
 from legged_torque.paper.report.tables import best_torque, holm, summarize, welch
-from legged_torque.paper.values import ENVIRONMENTS, TABLE_I, paper_value
+from legged_torque.paper.values import TABLE_I
 
 CELL = Cell(Path("a1_torque-low-s1"), "a1_torque", "low", 1, ("low",))
 
@@ -29,18 +27,6 @@ def evaluations(*millions):
 
 
 # ----------------------------------------------------------------------------------------------------- reading
-
-
-def test_values_of_the_paper():
-    """Table I is whole: five metrics of four models in four environments, at the places where they are printed."""
-    models = dict.fromkeys(task for _, task in TABLE_I)
-    assert list(TABLE_I) == [(metric.name, task) for metric in PAPER_METRICS for task in models] and len(models) == 4
-    assert all(len(values) == len(ENVIRONMENTS) == 4 for values in TABLE_I.values())
-    assert paper_value("a1_torque_curriculum", "low", "track_percentage") == 0.7866
-    assert paper_value("a1_multihead", "doubled", "cost_of_transport") == 0.8611
-    assert paper_value("a1_torque_multihead", "high_frequency", "collision_force") == 157.3
-    for missing in (("a1_torque", "low", "track_xy"), ("a1_position", "none", "track_xy"), ("a1_position", "low", "x")):
-        assert paper_value(*missing) is None
 
 
 def test_rows_of_a_run(tmp_path):
@@ -75,23 +61,6 @@ def test_learning_curves(tmp_path):
             assert rows["steps"].tolist() == [1_000_000, 2_000_000]
             assert rows["track_percentage"].tolist() == pytest.approx([0.1, 0.2])
             assert rows["height"].isna().tolist() == [False, name != "curve.json"]
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("none.csv", None, "cannot read"),
-        ("other.json", '{"task": "a1_torque"}', "is not a file that evaluate.py has written"),
-        ("wrong.json", '{"task": "a1_torque", "seed": 1, "points": [{"steps": 1, "speed": "x"}]}', "row 0 of"),
-        ("text.csv.gz", "no gzip", "cannot read"),
-        ("evaluations.csv", f"{HEADER}\n", "has no config.yaml"),
-    ],
-)
-def test_files_without_curves(tmp_path, name, content, message):
-    """They are refused by their name."""
-    if content is not None:
-        (tmp_path / name).write_text(content)
-    assert message in error_of(read_curves, tmp_path / name)
 
 
 def test_parts_are_merged(tmp_path):

@@ -20,9 +20,9 @@ SMALL = {
 }
 
 
-def make_runner(tmp_path, task="a1_position", perturbation="none", **changes):
+def make_runner(tmp_path, task="a1_position", **changes):
     """A runner with small networks and two worlds that has collected a rollout."""
-    env_cfg, train_cfg = task_registry.get_cfgs(task, Options(device="cpu", num_envs=2, perturbation=perturbation))
+    env_cfg, train_cfg = task_registry.get_cfgs(task, Options(device="cpu", num_envs=2))
     for path, value in {**SMALL, **changes}.items():
         set_by_path(train_cfg, path, value)
     env = task_registry.get_task_class(task)(env_cfg, "cpu")
@@ -61,25 +61,9 @@ def test_update_by_hand(tmp_path):
     assert roofline.update_bytes(alg) == 4 * expected - 12 * 2 * 2 * activations * 2
 
 
-def test_samples_that_no_minibatch_has(tmp_path):
-    """Six samples in four minibatches of one: two of each epoch are left out."""
-    alg = make_runner(tmp_path, **{"algorithm.num_mini_batches": 4}).alg
-    assert roofline.samples(alg) == 2 * 4
-
-
-def test_own_parameters(tmp_path):
-    """An A1 alone: 67 floats read, 55 written, and 17 sensors of 4 once in a control step.
-
-    Random parameters add the rows that the kernel reads; the free joint's are not read.
-    """
+def test_physics_by_hand(tmp_path):
+    """An A1 without parameters of its own: 67 floats read, 55 written, and 17 sensors of 4 once in a control step."""
     assert roofline.physics_bytes(make_runner(tmp_path).env.sim, 4) == 4 * 2 * (4 * (67 + 55) + 17 * 4)
-    sim = make_runner(tmp_path, perturbation="low").env.sim
-    shared = 4 * (4 * (67 + 55) + 17 * 4)
-    of_bodies = 14 * (3 + 1 + 3 + 2)  # centre of mass, mass, inertia, inverse weights
-    of_joints = 12 * (1 + 1 + 1 + 1 + 1)  # stiffness, damping, armature, friction, inverse weight
-    of_geoms = 18 * (3 + 3 + 3 + 2)  # place, size, friction, stiffness and damping of contacts
-    own = 4 * 4 * (3 + of_bodies + of_joints + of_geoms)
-    assert roofline.physics_bytes(sim, 4) == 2 * (shared + own)
 
 
 def test_script(tmp_path):
