@@ -201,23 +201,6 @@ def test_episodes_start_on_tiles(policy, robot):
     assert robot.has_fallen() and math.isinf(robot.height())
 
 
-def test_headings(policy, robot):
-    """Yaw rates turn to a heading the shorter way, half of what is left per second, within their range."""
-    simulation = Simulation(policy, robot)
-    simulation.run(0, 1)
-    for heading, angle, rate in ((3.0, -3.0, -0.5 * (2 * math.pi - 6.0)), (1.0, 0.2, 0.4), (0.0, 3.0, -1.0)):
-        robot.reset(np.zeros(3), quaternion(0.1, 0.0, angle), policy.nominal_pose, STILL)
-        simulation._heading = heading
-        simulation._follow_heading()
-        assert simulation.command[2] == pytest.approx(rate, abs=0.02)
-    robot.reset(robot.origins[0] + [0.0, 0.0, 0.4], quaternion(0, 0, 0), policy.nominal_pose, STILL)
-    robot.velocity[0] = 0.25
-    assert simulation._finish_step(np.array([0.5, 0.0, 0.3]))[1] == 0.5, "tracking does not count the yaw rate"
-    fixed = Simulation(policy, robot, command=(0.5, 0.0, -0.2))
-    fixed.run(2, 1)
-    assert fixed.command.tolist() == [0.5, 0.0, -0.2]
-
-
 # --------------------------------------------------------------------------------------------------- other grounds
 
 

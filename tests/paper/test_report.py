@@ -2,10 +2,8 @@
 
 import base64
 import csv
-import gzip
 import io
 import re
-import sys
 
 import pandas as pd
 import pytest
@@ -25,8 +23,7 @@ from support.reports import (
 
 from legged_torque.experiments.times import write_times
 from legged_torque.paper.report.evaluations import METRIC_NAMES
-from legged_torque.paper.report.experiment import read_experiment
-from legged_torque.paper.report.figures_curves import draw_curves, smoothed
+from legged_torque.paper.report.figures_curves import smoothed
 from legged_torque.paper.report.report import fenced, markdown_table, to_html
 from legged_torque.paper.report.tables import welch
 
@@ -103,14 +100,6 @@ def test_table(report):
         assert list(map(float, rows[key][:2])) == pytest.approx([mean, error]) and rows[key][2:] == others
     assert rows["a1_torque", "low", "track_percentage"] == ["0.5", "", "1", ""]
     assert rows["a1_multihead", "low", "track_percentage"] == ["", "", "0", "0.7669"]
-
-
-def test_evaluations(report):
-    """All evaluations during training are in one table, whose bytes do not depend on the time."""
-    content = (report / "evaluations.csv.gz").read_bytes()
-    evaluations = rows_of(gzip.decompress(content))
-    assert list(evaluations[0]) == ["task", "environment", "seed", "steps", "seconds", *METRIC_NAMES]
-    assert len(evaluations) == 4 * 5 + 2 * 3 + 5 and content[4:8] == bytes(4)
 
 
 def test_text(text, folder):
@@ -199,30 +188,7 @@ def test_mistakes(tmp_path, capsys, plan, words, message):
     assert not (tmp_path / "out").exists()
 
 
-def test_without_the_extra(folder, tmp_path, monkeypatch, capsys):
-    """One line names the extra that a report needs, and nothing is written."""
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    assert run_script(folder, "--out", tmp_path / "out") == 2
-    assert capsys.readouterr().err == "error: reports need the extra: pip install 'legged_torque[plots]'\n"
-    assert not (tmp_path / "out").exists()
-
-
 # -------------------------------------------------------------------------------------------------------- figures
-
-
-def test_curves(folder):
-    """A panel per environment; lines end at the last evaluation, with a cross if training is not finished."""
-    for over, end in {"steps": 110.0, "seconds": 110.5}.items():
-        figure = draw_curves(read_experiment(folder), "track_percentage", "Figure 3", over=over)
-        assert [text.get_text() for text in figure.legends[0].get_texts()] == ["PD", "Default torque"]
-        low, _ = figure.axes
-        lines = {each.get_label(): each for each in low.lines if each.get_label()[0] != "_"}
-        assert [max(lines[name].get_xdata()) for name in ("PD", "Default torque")] == [end, end - 60.0]
-        assert lines["PD"].get_ydata()[-1] == pytest.approx(0.8)
-        (cross,) = (each for each in low.lines if each.get_marker() == "x" and len(each.get_xdata()))
-        assert list(cross.get_xdata()) == [end - 60.0]
-        points = [each.get_ydata().tolist() for each in low.lines if each.get_marker() == "o"]
-        assert pytest.approx(points[0]) == [0.725, 0.825]  # of each seed, those at 100 and 110 million
 
 
 def test_running_medians():

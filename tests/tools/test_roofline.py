@@ -1,7 +1,6 @@
 """FLOP and bytes of update and physics: as PyTorch counts them, and as counted by hand."""
 
 import pytest
-import torch
 from support.scripts import run_here
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -45,20 +44,6 @@ def test_flop_as_pytorch_counts_them(tmp_path, task, changes):
     with FlopCounterMode(display=False) as counter:
         alg.update()
     assert roofline.update_flop(alg) == counter.get_total_flops() > 0
-
-
-def test_update_by_hand(tmp_path):
-    """2 worlds x 3 steps x 2 epochs, each sample with its mirror image."""
-    alg = make_runner(tmp_path).alg
-    actor_inputs, critic_inputs = (model.obs_dim for model in (alg.actor, alg.critic))
-    # of a sample: observations, 12 actions and their means, value, return, advantage, logarithm of the probability
-    stored = actor_inputs + critic_inputs + 2 * 12 + 4
-    activations = (8 + 6 + 12) + (7 + 5 + 1)
-    weights = (actor_inputs + 1) * 8 + 9 * 6 + 7 * 12 + 12 + (critic_inputs + 1) * 7 + 8 * 5 + 6
-    expected = 12 * (stored + 2 * 2 * activations) + 4 * 2 * 3 * weights
-    assert roofline.update_bytes(alg) == 4 * expected
-    alg.product_dtype = torch.bfloat16  # halves the activations, nothing else
-    assert roofline.update_bytes(alg) == 4 * expected - 12 * 2 * 2 * activations * 2
 
 
 def test_physics_by_hand(tmp_path):

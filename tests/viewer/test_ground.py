@@ -9,7 +9,7 @@ import torch
 from support.ground import make_ground, rays
 
 from legged_torque.terrain.colors import NEUTRAL, color_of
-from legged_torque.viewer.drawing import CLEARANCE, DISTANCE, Camera, Ground, drawn_model, patches, size_of, smoothed
+from legged_torque.viewer.drawing import CLEARANCE, DISTANCE, Camera, Ground, drawn_model, patches, size_of
 
 XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
 KINDS = {"stairs_up": 0.25, "rough_slope": 0.25, "stepping_stones": 0.25, "pits": 0.25}
@@ -99,11 +99,3 @@ def test_camera_sees_robots_of_every_size(robot, top, size):
     feet, head = (np.arctan2(z - up, -away) - elevation for z in (0.0, top))
     half = 0.5 * np.radians(model.vis.global_.fovy)
     assert -0.9 * half < feet < 0.0 < head < 0.9 * half and head - feet > 0.4 * half
-
-
-def test_cameras_follow_smoothly():
-    """A step lifts a camera little by little; a robot that starts anew is seen at once."""
-    heights = [None]
-    for ground in (0.0, 0.2, 0.2, 2.0):
-        heights.append(smoothed(heights[-1], ground))
-    assert heights[1] == 0.0 < heights[2] < heights[3] < 0.1 and heights[4] == 2.0

@@ -246,11 +246,7 @@ def test_requests_from_other_threads(make_session, monkeypatch):
     """Many threads may ask while another one steps; every request is carried out, in that thread."""
     session, _ = make_session("a1_torque")
     pushes, rotate = [], session_module.quat_rotate_yaw
-
-    def watched(*args):
-        pushes.append(threading.current_thread())
-        return rotate(*args)
-
+    watched = lambda *args: pushes.append(threading.current_thread()) or rotate(*args)  # noqa: E731
     monkeypatch.setattr(session_module, "quat_rotate_yaw", watched)
     stepping = threading.Thread(target=session.run)
     stepping.start()

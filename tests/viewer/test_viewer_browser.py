@@ -6,7 +6,6 @@ for all tests, and sessions are paused, except where something must move: then n
 
 import contextlib
 import ctypes.util
-import functools
 import importlib.util
 import io
 import os
@@ -215,17 +214,6 @@ def test_steering(opened, session):
     drawn = session.snapshot.commands[0]
     np.testing.assert_array_equal(session.companion.snapshot.commands[0], drawn)
     wait_for(lambda: float(control(opened, "x [m/s]").get_attribute("value")) == pytest.approx(drawn[0], abs=0.006))
-
-
-def test_layers(opened, page):
-    """Collision geoms are drawn in purple and the ghost in green, once they are wanted."""
-    purple = functools.partial(share, opened, lambda red, green, blue: (red > green + 10) & (blue > green + 10))
-    green = functools.partial(share, opened, lambda red, green, blue: (green > red + 10) & (green > blue + 5))
-    for label, color in (("collision geoms", purple), ("ghost", green)):
-        before = color()
-        click(opened, control(opened, label))
-        wait_for(lambda color=color, before=before: color() > before + 0.002)
-        click(opened, control(opened, label))
 
 
 def test_recording_without_a_renderer(opened, page):
