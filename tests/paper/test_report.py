@@ -22,7 +22,7 @@ from support.reports import (
 )
 
 from legged_torque.experiments.times import write_times
-from legged_torque.paper.report.evaluations import METRIC_NAMES
+from legged_torque.paper.report.evaluations import METRIC_NAMES, read_curves
 from legged_torque.paper.report.figures_curves import smoothed
 from legged_torque.paper.report.report import fenced, markdown_table, to_html
 from legged_torque.paper.report.tables import welch
@@ -100,6 +100,12 @@ def test_table(report):
         assert list(map(float, rows[key][:2])) == pytest.approx([mean, error]) and rows[key][2:] == others
     assert rows["a1_torque", "low", "track_percentage"] == ["0.5", "", "1", ""]
     assert rows["a1_multihead", "low", "track_percentage"] == ["", "", "0", "0.7669"]
+
+
+def test_evaluations(report):
+    """All evaluations during training are in one table, from which curves can be drawn."""
+    table = read_curves(report / "evaluations.csv.gz")
+    assert len(table) == 4 * 5 + 2 * 3 + 5 and set(table["environment"]) == {"low", "high_frequency", "doubled"}
 
 
 def test_text(text, folder):

@@ -1,6 +1,5 @@
 """Results of experiments: what is read from files, means over seeds, and tests of differences."""
 
-import gzip
 import json
 import math
 from pathlib import Path
@@ -44,23 +43,16 @@ def test_rows_of_a_run(tmp_path):
 
 
 def test_learning_curves(tmp_path):
-    """Every kind of file gives task, seed and evaluations; a report's file has those of many trainings."""
-    lines = [line(1, 0.1), line(2, 0.2, height="")]
+    """Files of runs and of evaluate.py give task, seed and evaluations."""
+    lines = [line(1, 0.1), line(2, 0.2)]
     write_run(tmp_path / "run", lines, {"task": "a1_torque", "env": {}, "train": {"seed": 3}, "versions": {}})
-    points = [{"steps": 1e6 * i, **dict.fromkeys(METRIC_NAMES, float(i)), "track_percentage": 0.1 * i} for i in (1, 2)]
+    points = [{"steps": 1e6 * i, **dict.fromkeys(METRIC_NAMES, 1.0 * i), "track_percentage": 0.1 * i} for i in (1, 2)]
     (tmp_path / "curve.json").write_text(json.dumps({"task": "a1_torque", "seed": 3, "points": points}))
-    rows = [f"a1_torque,{name},3,{text}" for name in ("low", "high") for text in lines]
-    text = "\n".join([f"task,environment,seed,{HEADER}", *rows]) + "\n"
-    (tmp_path / "evaluations.csv.gz").write_bytes(gzip.compress(text.encode()))
-    files = {"run/evaluations.csv": [""], "curve.json": [""], "evaluations.csv.gz": ["low", "high"]}
-    for name, environments in files.items():
+    for name in ("run/evaluations.csv", "curve.json"):
         table = read_curves(tmp_path / name)
         assert set(table["task"]) == {"a1_torque"} and set(table["seed"]) == {3}
-        assert list(dict.fromkeys(table["environment"])) == environments
-        for _, rows in table.groupby("environment"):
-            assert rows["steps"].tolist() == [1_000_000, 2_000_000]
-            assert rows["track_percentage"].tolist() == pytest.approx([0.1, 0.2])
-            assert rows["height"].isna().tolist() == [False, name != "curve.json"]
+        assert table["steps"].tolist() == [1_000_000, 2_000_000]
+        assert table["track_percentage"].tolist() == pytest.approx([0.1, 0.2])
 
 
 def test_parts_are_merged(tmp_path):

@@ -72,14 +72,8 @@ def test_pretraining(made, tmp_path):
 def test_randomization(tmp_path):
     """It is an image that can be read, of what is drawn and what is not."""
     picture = tmp_path / "new" / "picture.png"
-    words = [
-        "--device=cpu",
-        "--num_envs=12",
-        f"--out={picture}",
-        "--task=a1_torque_multihead",
-        "--perturbation=doubled",
-    ]
-    words += ["--set=motors.delay.range=[1, 4]", "--set=domain_rand.keep_fixed=[gravity]"]
+    words = ["--task=a1_torque_multihead", "--perturbation=doubled", "--device=cpu", "--num_envs=12"]
+    words += [f"--out={picture}", "--set=motors.delay.range=[1, 4]", "--set=domain_rand.keep_fixed=[gravity]"]
     assert run_here("plot.py", "randomization", *words, root=tmp_path) == (0, "", "")
     height, width, _ = matplotlib.image.imread(picture).shape
     assert 1000 < width < 2500 and 1000 < height < 2500

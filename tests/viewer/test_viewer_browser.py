@@ -224,16 +224,6 @@ def test_recording_without_a_renderer(opened, page):
     wait_for(lambda: "no renderer in tests" in text_of(opened))
 
 
-def test_phone(opened, page):
-    """On a narrow screen the robot is seen above the controls."""
-    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
-    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    open_page(opened, page.server.url)
-    wait_for(lambda: share(opened, is_dark, 0.0, 1.0, bottom=0.4) > 0.01)
-    opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert not complaints(opened)
-
-
 def test_rough_ground(browser, tmp_path):
     """The ground is drawn in the color of its kind, with the points of the scan; a level chosen on the page counts."""
     terrain = LeggedRobotCfg.terrain()
