@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 import yaml
-from support.exports import change, export_random
+from support.exports import change
 from support.scripts import assert_told_in_one_line, run_here
 from support.settings import error_of
 
@@ -19,41 +19,20 @@ GROUND = dataclasses.asdict(Layout.of(LeggedRobotCfg.terrain()))
 DAMAGE = [
     ("format_version", 2, "format_version"),
     ("task", None, "'task' is a required property"),
+    ("gains.stiffness.FR_knee_joint", 1.0, "unknown joint in gains.stiffness of"),
     ("gain", {}, "'gain' was unexpected"),
-    ("nominal_pose.FR_knee_joint", 0.1, "unknown joint in nominal_pose of"),
     ("nominal_pose.FR_hip_joint", None, "nominal_pose lacks the joint 'FR_hip_joint'"),
-    ("nominal_pose.FR_hip_joint", "left", "nominal_pose.FR_hip_joint: 'left' is not of type 'number'"),
     ("nominal_pose.FR_hip_joint", float("nan"), "nominal_pose.FR_hip_joint is not a finite number"),
-    ("nominal_pose.FR_hip_joint", 0.1, "exported with other nominal_pose than those of its policy.yaml"),
     ("joint_order.0", "FR_thigh_joint", "non-unique"),
-    ("joint_order.0", "FR_knee_joint", "did you mean"),
     ("gains.stiffness.FR_hip_joint", -1.0, "less than the minimum"),
-    ("gains.damping.FR_hip_joint", None, "gains.damping lacks the joint 'FR_hip_joint'"),
-    ("torque_limits.FR_hip_joint", [33.5], "torque_limits.FR_hip_joint"),
     ("torque_limits.FR_hip_joint", [33.5, -33.5], "must be [lowest, highest]"),
-    ("observations.terms.2.name", 3, "observations.terms.2.name"),
     ("observations.terms.2.scale", [2.0, 2.0], "exported with other observations than those of its policy.yaml"),
-    ("observations.terms.0.group", "rays", "exported with other observations than those of its policy.yaml"),
-    ("observations.terms.4", None, "exported with other observations than those of its policy.yaml"),
-    ("actions.terms.1", None, "exported with other actions than those of its policy.yaml"),
     ("actions.clip", [1.0, -1.0], "exported with other actions than those of its policy.yaml"),
-    (
-        "network.num_observations",
-        114,
-        "[57]), ('actions', [24])], not [('obs', [114])",
-    ),
+    ("network.num_observations", 114, "[57]), ('actions', [24])], not [('obs', [114])"),
     ("network.sha256", 64 * "0", "is not the network that was exported with its policy.yaml"),
-    ("network.file", "../policy.onnx", "network.file must be the name of a file in the same folder"),
-    ("joints", None, "'joints' is a required property"),
-    ("pushes.set_factor", -1.0, "pushes.set_factor: -1.0 is less than the minimum of 0"),
-    ("timing.decimation", 0, "timing.decimation"),
     ("timing.decimation", 4.0, "timing.decimation: 4.0 is not of type 'integer'"),
     ("timing.decimation", 5, "timing.physics_frequency is not control_frequency times decimation"),
-    ("timing.refresh_torques", "often", "timing.refresh_torques"),
-    ("commands.resampling_probability", 1.5, "commands.resampling_probability"),
-    ("terrain", GROUND | {"rows": 3}, "'rows' was unexpected"),
     ("terrain", GROUND | {"difficulty_range": [0.0, 1.5]}, "terrain.difficulty_range.1"),
-    ("terrain", GROUND | {"tile_size": 1.0}, "terrain.tile_size: 1.0 is less than the minimum of 6"),
 ]
 
 
@@ -64,14 +43,6 @@ def test_damaged_descriptions(exported, description, tmp_path, path, value, mess
     change(path, value)(damaged)
     (folder / "policy.yaml").write_text(yaml.safe_dump(damaged, sort_keys=False))
     assert message in error_of(Policy, folder)
-
-
-@pytest.mark.parametrize("text", ["task: [", "walk", "", "3"])
-def test_no_description(exported, tmp_path, text):
-    """A file that holds something else is refused."""
-    folder = shutil.copytree(exported, tmp_path / "copy")
-    (folder / "policy.yaml").write_text(text)
-    assert "policy.yaml'" in error_of(Policy, folder)
 
 
 def test_network_without_meaning(exported, description, tmp_path):
@@ -92,10 +63,10 @@ def test_network_without_meaning(exported, description, tmp_path):
     ("name", "content", "message"),
     [
         ("policy.onnx", b"network", "policy.onnx' is not a readable network"),
-        ("policy.onnx", b"", "policy.onnx' is not a readable network"),
         ("policy.onnx", None, "there is no network"),
         ("policy.yaml", None, "there is no policy.yaml in"),
         ("policy.yaml", b"\xff\xfe", "is not valid YAML"),
+        ("policy.yaml", b"3", "is not of type 'object'"),
     ],
 )
 def test_damaged_files(exported, tmp_path, name, content, message):
@@ -107,10 +78,3 @@ def test_damaged_files(exported, tmp_path, name, content, message):
     result = run_here("sim2sim.py", str(folder), "--steps=5", root=tmp_path)
     assert_told_in_one_line(result, message)
     assert result[1] == ""
-
-
-def test_another_network(exported, tmp_path, make_task):
-    """A network of the right size that is not the exported one is refused."""
-    export_random(make_task, "a1_multihead", tmp_path / "other", True)
-    shutil.copy(exported / "policy.onnx", tmp_path / "other")
-    assert "is not the network that was exported" in error_of(Policy, tmp_path / "other")

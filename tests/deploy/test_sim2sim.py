@@ -9,26 +9,13 @@ import sys
 import numpy as np
 import pytest
 import torch
-from support.exports import XML, changed_xml
+from support.exports import XML
 from support.scripts import assert_told_in_one_line, run_here
 
 from legged_torque.deploy.description import check
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Simulation, quaternion
 from legged_torque.viewer import video
-
-
-def permute(root):
-    """Legs from the last to the first, motors in an order that is neither the old one nor that of the joints."""
-    trunk = root.find("worldbody/body")
-    legs = trunk.findall("body")
-    for leg in legs:
-        trunk.remove(leg)
-    trunk.extend(reversed(legs))
-    actuator, keyframe = root.find("actuator"), root.find("keyframe")
-    motors = list(actuator)
-    actuator[:] = motors[5:] + motors[:5]
-    root.remove(keyframe)
 
 
 def random_state(seed, height=0.3):
@@ -56,31 +43,6 @@ def test_imports_neither_torch_nor_warp():
 # --------------------------------------------------------------------------------------------------- the robot
 
 
-def test_permuted_joints(policy, tmp_path):
-    """With joints and motors in another order in the MJCF, observations, torques and motion are the same."""
-    robots = [MujocoRobot(XML, policy.description), MujocoRobot(changed_xml(tmp_path, permute), policy.description)]
-    order = [robots[1].model.joint(i).name for i in range(1, 13)]
-    assert order[0] == "RL_hip_joint" and order != policy.joint_order
-    seen, torques, moved = [], [], []
-    for robot in robots:
-        assert robot.notes == []
-        robot.reset(*random_state(2))
-        for name, angle in zip(policy.joint_order, random_state(2)[2], strict=True):
-            assert robot.data.joint(name).qpos[0] == angle
-        policy.reset()
-        seen.append(policy.observation(robot.state(), [0.5, -0.2, 0.1]))
-        torques.append(policy.torques(policy.act(seen[-1]), robot.joint_positions(), robot.joint_velocities()))
-        robot.step(torques[-1])
-        for name, torque in zip(policy.joint_order, torques[-1], strict=True):
-            assert robot.data.joint(name).qfrc_actuator[0] == pytest.approx(torque)
-            assert robot.data.actuator(name.removesuffix("_joint")).force[0] == pytest.approx(torque)
-        np.testing.assert_allclose(robot.applied_torques(), torques[-1], rtol=1e-6)
-        moved.append(np.concatenate([robot.joint_positions(), robot.position, robot.quat]))
-    for pair in (seen, torques, moved):
-        np.testing.assert_allclose(pair[0], pair[1], atol=1e-6)
-    assert np.unique(np.abs(torques[0])).size == 12
-
-
 def test_physics_is_the_task_s(make_task, policy):
     """From the states of the task, the same actions lead to the same states and forces, on the ground too."""
     converged = {"sim.solver_iterations": 100, "sim.ls_iterations": 50}
@@ -106,76 +68,15 @@ def test_physics_is_the_task_s(make_task, policy):
     assert on_ground > 5
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda root: root.find(".//joint[@name='RR_calf_joint']").set("name", "RR_knee"), "'RR_calf_joint'; did you"),
-        (
-            lambda root: root.find("actuator").remove(root.find("actuator")[3]),
-            "motor in the MJCF, not 0 (FL_hip_joint)",
-        ),
-        (
-            lambda root: setattr(root.find("actuator")[3], "tag", "position"),
-            "ctrl its torque; one is a servo",
-        ),
-        (lambda root: root.find("worldbody/body").remove(root.find(".//freejoint")), "one free joint"),
-    ],
-)
-def test_robots_that_do_not_fit(exported, tmp_path, change, message):
-    """A missing joint or motor is reported before a step is taken."""
-
-    def edit(root):
-        root.remove(root.find("keyframe"))
-        change(root)
-        for motor in root.findall("actuator/*"):
-            if not root.findall(f".//joint[@name='{motor.get('joint')}']"):
-                root.find("actuator").remove(motor)
-
-    result = run_here("sim2sim.py", str(exported), f"--xml={changed_xml(tmp_path, edit)}", root=tmp_path)
-    assert_told_in_one_line(result, message)
-    assert result[1] == ""
-
-
-def test_differences(policy, tmp_path):
-    """Time step and motor limits are compared with the policy's, a floor is added, an unnamed trunk is found."""
-
-    def edit(root):
-        root.find("option").set("timestep", "0.002")
-        root.find("actuator")[1].set("ctrlrange", "-20 25")
-        root.find("worldbody").remove(root.find("worldbody/geom"))
-        trunk = root.find("worldbody/body")
-        trunk.set("name", "base")
-        del trunk.find("geom[@name='trunk']").attrib["name"]
-
-    robot = MujocoRobot(changed_xml(tmp_path, edit), policy.description)
-    assert robot.notes == [
-        "the MJCF has no floor: a plane at height 0 is added",
-        "time step: the MJCF has 0.002 s, policy.yaml's 0.005 s is used",
-        "motor limits: the MJCF has -20 to 25 N m, policy.yaml -33.5 to 33.5 N m; the tighter ones act "
-        "(FR_thigh_joint)",
-        "no geom's name contains trunk: those of 'base' end an episode",
-    ]
-    assert robot.model.opt.timestep == 0.005
-    robot.reset(*random_state(1, height=0.04))
-    robot.step(np.zeros(12))
-    assert robot.has_fallen() and robot.contact_force() > 10.0
-
-
-def test_standing_robot(policy):
-    """A robot that stands still weighs on the ground with its weight, and has not fallen."""
-    robot = MujocoRobot(XML, policy.description)
-    robot.reset([0.0, 0.0, 0.31], quaternion(0, 0, 1.0), policy.nominal_pose, (np.zeros(3), np.zeros(3), np.zeros(12)))
-    for _ in range(400):
-        robot.step(60 * (policy.nominal_pose - robot.joint_positions()) - 2 * robot.joint_velocities())
-        assert not robot.has_fallen()
-    assert robot.weight == pytest.approx(122.2, abs=0.1)
-    assert robot.contact_force() == pytest.approx(robot.weight, rel=0.1)
-    assert np.linalg.norm(robot.velocity) < 0.02
-    robot.velocity[:] = [math.cos(1.0), math.sin(1.0), 0.0]
-    np.testing.assert_allclose(robot.planar_velocity()[:2], [1.0, 0.0], atol=0.1)
-
-
 # --------------------------------------------------------------------------------------------------- metrics, events
+
+
+def test_velocity_in_the_frame_of_the_trunk(policy):
+    """A robot that is turned to the left by 1 rad and moves that way walks forwards."""
+    robot = MujocoRobot(XML, policy.description)
+    robot.reset(np.zeros(3), quaternion(0, 0, 1.0), policy.nominal_pose, (np.zeros(3), np.zeros(3), np.zeros(12)))
+    robot.velocity[:] = [math.cos(1.0), math.sin(1.0), 0.0]
+    np.testing.assert_allclose(robot.planar_velocity(), [1.0, 0.0, 0.0], atol=1e-12)
 
 
 def test_random_numbers(policy):
@@ -208,22 +109,17 @@ def test_torques_are_refreshed(policy, monkeypatch, refresh, computed):
 
 
 def test_recorder(policy):
-    """A video shows the states, commands and velocities that the robot has had."""
-    seen, robot = [], MujocoRobot(XML, policy.description)
+    """A video shows the states and commands of every step."""
+    robot = MujocoRobot(XML, policy.description)
     simulation = Simulation(policy, robot, command=(0.5, -0.1, 0.2))
     recorder = video.SimulationRecorder(simulation)
-
-    def on_step():
-        recorder.add_step()
-        velocity = [*robot.planar_velocity()[:2], robot.angular_velocity[2]]
-        seen.append((robot.data.qpos.tolist(), [0.5, -0.1, 0.2], velocity))
-
-    simulation.run(3, 1, on_step)
-    assert recorder.drawing.model is robot.model and robot.model.body(recorder.drawing.trunk).name == "trunk"
-    assert [tuple(part[0].tolist() for part in step) for step in recorder.steps] == seen
+    simulation.run(3, 1, recorder.add_step)
+    qpos, command, velocity = recorder.steps[-1]
+    assert len(recorder.steps) == 3 and qpos[0].tolist() == robot.data.qpos.tolist()
+    assert command[0].tolist() == [0.5, -0.1, 0.2] and velocity[0].tolist() == robot.planar_velocity().tolist()
 
 
-@pytest.mark.parametrize("factor", [None, 1.1, 1.5])
+@pytest.mark.parametrize("factor", [None, 1.5])
 def test_pushes(policy, monkeypatch, factor):
     """Half of the pushes add a draw to the trunk's velocity, the others set it to the training's factor times a draw.
 
@@ -287,11 +183,8 @@ def test_script(exported, tmp_path):
 
 MISTAKES = [
     ("--steps=0", "--steps must be at least 1, not 0"),
-    ("--robots=0", "--robots must be at least 1, not 0"),
-    ("--seed=-1", "--seed must be at least 0, not -1"),
     ("--push_probability=0.1", "--push_probability needs --push_velocity"),
     ("--push_velocity=1 --push_probability=2", "--push_probability must be from 0 to 1"),
-    ("--push_velocity=nan", "--push_velocity must be finite, at most 1e+09 either way, not nan"),
     ("--step=3", "unknown option '--step=3'; did you mean '--steps'?"),
     ("--viewer", "MuJoCo's window needs a screen; --video works without one"),
     ("--xml=nothing.xml", "cannot load the robot 'nothing.xml': there is no such file"),

@@ -71,6 +71,29 @@ def test_differences_of_joints(policy, changed):
     ]
 
 
+def test_differences_of_the_scene(policy, changed):
+    """Time step and motor limits are compared with the policy's, a floor is added, an unnamed trunk is found."""
+
+    def edit(root):
+        root.find("worldbody").remove(root.find("worldbody/geom"))
+        del root.find(".//geom[@name='trunk']").attrib["name"]
+
+    edits = [setting("option", timestep="0.002"), setting("worldbody/body", name="base")]
+    motor = setting(".//motor[@name='FR_thigh']", ctrlrange="-20 25")
+    robot = MujocoRobot(changed(edit, motor, *edits), policy.description)
+    assert robot.notes == [
+        "the MJCF has no floor: a plane at height 0 is added",
+        "time step: the MJCF has 0.002 s, policy.yaml's 0.005 s is used",
+        "motor limits: the MJCF has -20 to 25 N m, policy.yaml -33.5 to 33.5 N m; the tighter ones act "
+        "(FR_thigh_joint)",
+        "no geom's name contains trunk: those of 'base' end an episode",
+    ]
+    assert robot.model.opt.timestep == 0.005
+    robot.reset(np.array([0.0, 0.0, 0.04]), STATE[1], policy.nominal_pose, (np.zeros(3), np.zeros(3), np.zeros(12)))
+    robot.step(np.zeros(12))
+    assert robot.has_fallen() and robot.contact_force() > 10.0
+
+
 def test_geoms(policy, changed):
     """Geoms that should end episodes and are missing, and a robot that no view would draw."""
     hidden = setting(".//default[@class='visual']/geom", group="5")
@@ -82,13 +105,15 @@ def test_geoms(policy, changed):
 
 
 def test_all_problems_are_reported(policy, changed):
-    """Actuators that are not motors are reported together, and so are missing joints."""
+    """Actuators that are not motors are reported together, and so are missing joints; the trunk must be free."""
     message = error_of(MujocoRobot, changed(servo(3, 7)), policy.description)
     assert "must be a motor, ctrl its torque; one is a servo" in message and "(FL_hip_joint, RR_thigh_joint)" in message
     renamed = [setting(f".//joint[@name='{leg}_calf_joint']", name=f"{leg}_knee") for leg in ("RR", "RL")]
     motors = [setting(f".//motor[@joint='{leg}_calf_joint']", joint=f"{leg}_knee") for leg in ("RR", "RL")]
     message = error_of(MujocoRobot, changed(*renamed, *motors), policy.description)
     assert "'RR_calf_joint'" in message and "'RL_calf_joint'" in message
+    fixed = changed(lambda root: root.find("worldbody/body").remove(root.find(".//freejoint")))
+    assert "one free joint" in error_of(MujocoRobot, fixed, policy.description)
 
 
 def test_self_collision(policy, changed):

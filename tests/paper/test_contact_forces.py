@@ -82,26 +82,6 @@ def test_forces_are_allowed_and_optimal():
     assert (cost_and_gradient(problem, single)[0] - cost <= 0.5 * 3.0**2).all()
 
 
-@pytest.mark.parametrize(
-    ("wanted", "expected"),
-    [
-        ((0.0, 0.0, 100.0), (0.0, 0.0, 100.0)),
-        ((0.0, 0.0, 500.0), (0.0, 0.0, 160.0)),  # too much
-        ((0.0, 0.0, -50.0), (0.0, 0.0, 4.0)),  # the ground does not pull
-        ((100.0, 0.0, 50.0), (48.5294, 0.0, 80.8824)),  # onto f_x = 0.6 f_z: f_z = (0.6 x 100 + 50) / (1 + 0.6^2)
-    ],
-)
-def test_one_contact_by_hand(wanted, expected):
-    """A contact at the trunk's origin gives the nearest allowed force."""
-    grasp = grasp_matrix(torch.tensor([[[0.0, 0.0, 0.0]]], dtype=torch.float64))
-    wrench = torch.tensor([[*wanted, 0.0, 0.0, 0.0]], dtype=torch.float64)
-    solve = ForceDistribution(LIMITS, ARM, 1e-9, "cpu", torch.float64)
-    mask = torch.ones(1, 1, dtype=torch.bool)
-    forces, residual = solve(grasp, wrench, torch.zeros(1, 1, 3, dtype=torch.float64), mask, CONVERGED)
-    np.testing.assert_allclose(forces[0, 0], expected, rtol=0, atol=1e-3)
-    np.testing.assert_allclose(residual[0, :3], np.array(expected) - wanted, rtol=0, atol=1e-3)
-
-
 @pytest.mark.parametrize("limits", [(0.0, 0.0, 100.0), (0.5, -1.0, 100.0), (0.5, 10.0, 10.0)])
 def test_refuses_empty_limits(limits):
     """Limits that no force is inside of are refused."""

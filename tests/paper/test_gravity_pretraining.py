@@ -4,14 +4,13 @@ import itertools
 
 import pytest
 import torch
-from support.gravity import FEW, SMALL, STD, TASK, words_of
+from support.gravity import FEW, STD, TASK, words_of
 from support.gravity import made as made  # a fixture
 from support.settings import error_of, get_cfgs, parse
 from support.symmetry import mirror_joints, mirror_policy
 from tensordict import TensorDict
 
 from legged_torque.envs import task_registry
-from legged_torque.paper.gravity import pretraining as gravity_pretraining
 from legged_torque.paper.gravity.dynamics import RobotDynamics
 from legged_torque.paper.gravity.pretrained import read_pretrained
 from legged_torque.paper.gravity.pretraining import (
@@ -20,7 +19,6 @@ from legged_torque.paper.gravity.pretraining import (
     follow,
     learn_to_stand,
     make_controller,
-    pretrain,
     select,
     supervise,
 )
@@ -96,15 +94,7 @@ def test_report(made):
     assert report["standing"]["controller"] > 0.7 and 0.0 <= report["standing"]["policy"] <= 1.0
     given = {**FEW, "num_configurations": 41, "num_steps": 6, "seed": 1, "max_mean_torque": 30.0}
     assert {name: report["settings"][name] for name in given} == given and report["task"] == TASK
-    for line in (
-        "Round 1 of 2: following 20 configurations.",
-        "Round 2 of 2: following 21 configurations.",
-        f"Kept {kept} of 246 pairs; dropped: ",
-        f"Learned in 3 epochs: root mean square error training {training[5]:.2f} N m, held out ",
-        f"Standing after 5 s: the controller {report['standing']['controller']:.1%} and the policy ",
-        f"The policy is in {file.relative_to(root)}",
-    ):
-        assert line in output
+    assert f"Kept {kept} of 246 pairs; dropped: " in output and f"The policy is in {file.relative_to(root)}" in output
     assert read_pretrained(file)["report"] == report
     assert {path for path in root.rglob("*") if path.is_file()} == {file, root / "report.json"}
 
@@ -141,19 +131,6 @@ def test_pairs(task, controller, actor):
     torch.testing.assert_close(seen[..., 21:33], 0.05 * qvel[..., 6:])
     assert (seen[0, :, LAST_ACTION] == 0.0).all()
     torch.testing.assert_close(seen[1:, :, LAST_ACTION], given[:-1])
-
-
-def test_gains_of_the_imitated_controller(monkeypatch):
-    """Those of ``pretraining.controller`` are imitated: without damping, nothing acts in the air in the nominal pose.
-
-    With the controller's own defaults, damping and the springs of the feet would.
-    """
-    monkeypatch.setattr(gravity_pretraining, "STANDING_SECONDS", 0.1)  # not looked at here
-    changes = {"num_configurations": 12, "num_steps": 1, "num_rounds": 1, "num_epochs": 1, "held_out": 0.5}
-    words = [*SMALL, f"--task={TASK}", *words_of(**changes), "--set=domain_rand.init_dof_pos_scale=[1, 1]"]
-    words.append("--set=pretraining.controller.joint_damping=0")
-    _, report = pretrain(TASK, *get_cfgs(*words, task=TASK), "cpu")
-    assert report["histograms"]["mean_torque"]["counts"] == [12.0, *[0.0] * 49] and report["pairs"] == 12
 
 
 def test_on_rough_ground():

@@ -5,7 +5,6 @@ from support.reports import Page, line, run_script, whole_run, write_grounds, wr
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.paper.report.experiment import read_experiment
-from legged_torque.paper.report.tables import summarize
 from legged_torque.paper.report.unplanned import environment_of, ranges_of
 from legged_torque.utils.config import to_dict, update_from_dict
 
@@ -60,9 +59,6 @@ def test_runs_without_a_plan(logs):
     experiment = read_experiment(logs)
     assert not experiment.is_planned and not experiment.is_like_paper() and experiment.ranges() == "default"
     assert experiment.plan.tasks == ["mine", "mine wide", "other"] and experiment.plan.seeds == [1, 2, 7]
-    tracking = summarize(experiment, 90e6).xs("track_percentage", level="metric")
-    assert tracking["values"]["own", "mine"] == pytest.approx([0.5, 0.6]) and tracking["is_final"]["own", "mine"]
-    assert tracking["is_final"]["own", "other"] and tracking["seeds"]["own", "mine wide"] == 0
     wide = experiment.runs_of("mine wide", "low")[0]
     assert (wide.rows["steps"] / 1e6).tolist() == [10, 60, 80, 90, 100, 110]
     assert len(experiment.problems) == 1 and "'bad'" in experiment.problems[0]
@@ -83,11 +79,7 @@ def test_report_on_runs(logs, capsys):
         ["", "mine wide", "0.7000 (1)", "–"],
         ["", "other", "–", "0.4000 (1)"],
     ]
-    assert "default ranges" in text and "Table I" not in text and "no training has begun" not in text
-    assert "| `mine wide` | low | 1 | 2026-01-04_00-00-00_wide | 110 of 110 |" in text
-    assert "- the run 'bad' cannot be read: " in text and "![Metrics](metrics.png)" in text
-    assert len((logs / "report" / "table.csv").read_text().splitlines()) == 1 + 3 * 2 * 9
-    assert len((logs / "report" / "grounds.csv").read_text().splitlines()) == 3
+    assert "Table I" not in text and "no training has begun" not in text and "- the run 'bad' cannot be read: " in text
 
 
 def test_runs_with_other_settings(tmp_path):

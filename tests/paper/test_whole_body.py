@@ -102,16 +102,6 @@ def test_without_contact_only_posture_remains(task, state):
     assert (make_controller(task, 16)(*state, nothing).total.abs() <= TORQUE_LIMIT).all()
 
 
-def test_robots_that_it_cannot_control(task):
-    """The nominal pose must have as many joints as the robot, and torques need limits."""
-    with pytest.raises(UserError, match="3 joints, the robot 12"):
-        WholeBodyController(RobotDynamics(task.sim.mj_model, 1, "cpu", FEET), [0.0, 0.8, -1.5])
-    model = copy.copy(task.sim.mj_model)
-    model.actuator_forcelimited[:] = 0
-    with pytest.raises(UserError, match="one motor with a force range per joint"):
-        WholeBodyController(RobotDynamics(model, 1, "cpu", FEET), task.default_dof_pos.tolist())
-
-
 # --------------------------------------------------------------------------------------------------- standing
 
 

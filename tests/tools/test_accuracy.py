@@ -55,28 +55,13 @@ def test_no_kind_of_state_is_wrong(start, kind):
     assert accuracy.max < 1e-3 and accuracy.rms <= accuracy.p999 <= accuracy.max
 
 
-def test_worlds_that_hardly_touch_are_left_out(start):
-    """A foot within float32's rounding of the floor is not comparable; one clearly in or above it is."""
-    model, _, states = start
-    made = make_states("walking", model, states, 3, seed=0)
-    made["qpos"][:] = made["qpos"][0]
-    upright = {name: values.double().numpy() for name, values in made.items()}
-    put_on_floor(model, upright, np.array([0.0, 1e-3, -1e-3]))
-    made["qpos"] = torch.tensor(upright["qpos"]).float()  # whose rounding is what half of the spacing is about
-    assert reference_step(model, made)[1].tolist() == [False, True, True]
-
-
-@pytest.mark.parametrize(
-    ("friction", "impratio", "impedance"), [(1.0, 100.0, None), (0.35, 1000.0, None), (1.0, 1000.0, 0.99)]
-)
-def test_slopes_do_not_creep(friction, impratio, impedance):
+@pytest.mark.parametrize(("friction", "impratio"), [(1.0, 100.0), (0.35, 1000.0)])
+def test_slopes_do_not_creep(friction, impratio):
     """On a slope of 15 degrees a standing robot's feet move as far in 10 s as in plain MuJoCo, to 0.1 mm."""
     model = compiled(make_a1())
     slope = math.radians(15.0)
     model.opt.gravity[:] = 9.81 * math.sin(slope), 0.0, -9.81 * math.cos(slope)
     model.geom_friction[:, 0], model.opt.impratio = friction, impratio
-    if impedance:
-        model.geom_solimp[:, :2] = impedance
     home = model.key_qpos[0].copy()
     feet = [i for i in range(model.ngeom) if model.geom(i).name.endswith("foot")]
     data, other = mujoco.MjData(model), mujoco.MjData(model)

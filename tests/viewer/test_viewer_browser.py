@@ -6,7 +6,6 @@ for all tests, and sessions are paused, except where something must move: then n
 
 import contextlib
 import ctypes.util
-import functools
 import importlib.util
 import io
 import os
@@ -217,33 +216,12 @@ def test_steering(opened, session):
     wait_for(lambda: float(control(opened, "x [m/s]").get_attribute("value")) == pytest.approx(drawn[0], abs=0.006))
 
 
-def test_layers(opened, page):
-    """Collision geoms are drawn in purple and the ghost in green, once they are wanted."""
-    purple = functools.partial(share, opened, lambda red, green, blue: (red > green + 10) & (blue > green + 10))
-    green = functools.partial(share, opened, lambda red, green, blue: (green > red + 10) & (green > blue + 5))
-    for label, color in (("collision geoms", purple), ("ghost", green)):
-        before = color()
-        click(opened, control(opened, label))
-        wait_for(lambda color=color, before=before: color() > before + 0.002)
-        click(opened, control(opened, label))
-
-
 def test_recording_without_a_renderer(opened, page):
     """The page says why there is no video."""
     click(opened, "Record")
     wait_for(lambda: "Stop and download" in text_of(opened))
     click(opened, "Stop and download")
     wait_for(lambda: "no renderer in tests" in text_of(opened))
-
-
-def test_phone(opened, page):
-    """On a narrow screen the robot is seen above the controls."""
-    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
-    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    open_page(opened, page.server.url)
-    wait_for(lambda: share(opened, is_dark, 0.0, 1.0, bottom=0.4) > 0.01)
-    opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert not complaints(opened)
 
 
 def test_rough_ground(browser, tmp_path):
