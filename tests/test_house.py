@@ -25,23 +25,25 @@ MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 350,
     "legged_torque/deploy": 1250,
-    "legged_torque/envs": 3700,
-    "legged_torque/experiments": 1150,
-    "legged_torque/importer": 1100,
-    "legged_torque/learning": 2700,
-    "legged_torque/motors": 600,
-    "legged_torque/sensors": 210,
-    "legged_torque/sim": 4700,
-    "legged_torque/terrain": 750,
-    "legged_torque/utils": 2400,
-    "legged_torque/viewer": 2100,
-    "scripts": 1400,
-    "paper": 2800,
+    "legged_torque/envs": 4100,
+    "legged_torque/experiments": 1100,
+    "legged_torque/importer": 1050,
+    "legged_torque/learning": 2750,
+    "legged_torque/motors": 550,
+    "legged_torque/sensors": 250,
+    "legged_torque/sim": 5350,
+    "legged_torque/terrain": 700,
+    "legged_torque/utils": 2750,
+    "legged_torque/viewer": 2200,
+    "scripts": 1350,
+    "paper": 3050,
     "tools": 700,
     "tests": 20_000,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 20_000  # lines of legged_torque and scripts
+MAX_PACKAGE = (
+    23_600  # lines of legged_torque and scripts; 20,000 are the aim: lower this with every folder that shrinks
+)
 
 
 def module_name(file):
