@@ -22,8 +22,10 @@ MIRROR = {  # an order that is its own inverse, and signs
     "critic": ([1, 0, 2, 4, 3, 5, 6], [1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0]),
     "actions": ([3, 4, 5, 0, 1, 2], [-1.0, 1.0, 1.0, -1.0, 1.0, 1.0]),
 }
-TOLERANCES = {"TF32": 0.02, "bfloat16": 0.1}
-"""Largest norm of a gradient's error, in parts of the gradient's: the gradients of samples mostly cancel."""
+TOLERANCES = {"TF32": 0.04, "bfloat16": 0.1}
+"""Largest norm of a gradient's error, in parts of the gradient's: the gradients of samples mostly cancel.
+
+Up to 2.2% were seen in TF32, on an H100."""
 
 
 class Mirrored:
