@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tarfile
 import zipfile
 from pathlib import Path
 
@@ -41,8 +40,7 @@ def installed(tmp_path_factory):
         shutil.copy(ROOT / name, source)
     for name in FOLDERS:
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "*.pyc"))
-    with tarfile.open(build("sdist", source)) as archive:
-        archive.extractall(unpacked, filter="data")
+    shutil.unpack_archive(build("sdist", source), unpacked)
     (unpacked,) = unpacked.iterdir()
     with zipfile.ZipFile(build("wheel", unpacked)) as wheel:  # nothing has to be compiled: this installs it
         wheel.extractall(site)
