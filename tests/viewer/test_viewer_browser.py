@@ -267,9 +267,9 @@ def test_a_video_is_downloaded(browser, tmp_path):
             pause = control(browser, "pause")
             click(browser, pause)
             wait_for(lambda: "paused" in text_of(browser))
-            for element in ("Record", pause, pause, "Stop and download"):
+            for element, seconds in (("Record", 0.5), (pause, 2.0), (pause, 0.5), ("Stop and download", 0.5)):
                 click(browser, element)
-                time.sleep(0.5)
+                time.sleep(seconds)
             file = browser.downloads / "walking.mp4"
             wait_for(file.is_file)
         finally:
