@@ -131,6 +131,7 @@ def time_iterations(runner: OnPolicyRunner, count: int, at_start: Callable[[int]
     marks: list[float] = []  # of each iteration: start of the rollout, start and end of the update
 
     def timed_collect() -> None:
+        """Collect a rollout, and mark its start."""
         if at_start:
             at_start(len(marks) // 3)
         marks.append(time.perf_counter())
@@ -138,6 +139,7 @@ def time_iterations(runner: OnPolicyRunner, count: int, at_start: Callable[[int]
             collect()
 
     def timed_update() -> dict[str, float]:
+        """Update, and mark start and end."""
         marks.append(time.perf_counter())
         with torch.profiler.record_function("update"):
             losses = update()
@@ -171,6 +173,7 @@ def time_physics(task: LeggedRobot, rounds: int) -> tuple[float, float]:
     kept = [tensor.clone() for tensor in state]
 
     def physics() -> None:
+        """Step physics from the kept state."""
         for tensor, values in zip(state, kept, strict=True):
             tensor.copy_(values)
         for _ in range(PHYSICS_STEPS):
@@ -215,6 +218,7 @@ def measure_endurance(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -
     tenth, used = max(1, count // 10), list[float]()
 
     def look(number: int) -> None:
+        """Note the memory in use after the first tenth and at the end."""
         if number in (tenth, count):
             used.append(memory.used())
 

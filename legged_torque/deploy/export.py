@@ -240,6 +240,7 @@ def differences(task: LeggedRobot, model: MLPModel, policy: Policy) -> list[str]
     generator = torch.Generator().manual_seed(0)
 
     def draw(like: Tensor, scale: float) -> Tensor:
+        """Return normal numbers of a standard deviation ``scale``."""
         return scale * torch.randn(like.shape, generator=generator)
 
     qpos = draw(task.sim.qpos, 1.0)

@@ -1,4 +1,4 @@
-"""Height maps for tests of the fused step, and what stands on them."""
+"""Height maps for tests of the fused step, with robots on them."""
 
 from typing import NamedTuple
 

@@ -244,6 +244,7 @@ class LeggedRobotCfg(BaseConfig):
         """Return the named changes that ``--perturbation`` chooses from (paper, IV-A)."""
 
         def environment(on: bool, velocity: float = 0.0, probability: float = 0.0) -> dict:
+            """Return the changes of one environment; pushes in m/s and per control step."""
             speeds = {"init_dof_vel": 0.5 * self.asset.max_dof_vel, "init_lin_vel": 0.5, "init_ang_vel": 0.5}
             states = {name: [-speed, speed] if on else [0.0, 0.0] for name, speed in speeds.items()}
             pushes = {"push_robots": on, "push_velocity": [-velocity, velocity], "push_probability": probability}

@@ -83,6 +83,7 @@ def standard_terms(
     def term(
         name: str, value: Any, mirror: Mirroring | None, scale: Any = 1.0, error: float = 0.0, privileged: bool = False
     ) -> ObservationTerm:
+        """Return a term of the groups "policy" and "critic", with its description."""
         return ObservationTerm(name, value, mirror, scale, error, privileged, *_DESCRIPTIONS.get(name, ()))
 
     terms = [

@@ -40,6 +40,7 @@ def initial_state(
     limits = joint_limits(model)[1:].T.tolist()
 
     def drawn(name: str, field: Tensor, columns: Sequence[int], unit: str) -> RandomParameter:
+        """Return numbers that are set from the range ``name``."""
         return RandomParameter(name, field, columns, {"set": getattr(rand, name)}, unit)
 
     dof_pos = RandomParameter("dof_pos", qpos, [7 + dof for dof in dofs], {"scale": rand.init_dof_pos_scale}, "rad")
@@ -86,6 +87,7 @@ def robot_parameters(
     foot_radius = draws["foot_radius"] if are_round or "scale" not in draws["foot_radius"] else {}
 
     def of_joints(name: str, field: str, columns: Sequence[int], unit: str, add_unit: Any = 1.0) -> RandomParameter:
+        """Return a parameter with a number per joint."""
         return RandomParameter(
             name, field, columns, draws[name], unit, add_unit=add_unit, may_keep=True, mirror=joint_values
         )
@@ -134,6 +136,7 @@ def control_parameters(
     joints, mirror = range(strength.shape[1]), symmetry.joints
 
     def of_joints(name: str, field: Tensor, unit: str, least: float) -> RandomParameter:
+        """Return a parameter with one draw for all joints, and one per joint if it has such a range."""
         images = mirror.unsigned() if mirror and "scale_per_joint" in draws[name] else None
         return RandomParameter(name, field, joints, draws[name], unit, shared=True, at_least=least, mirror=images)
 
