@@ -8,6 +8,7 @@ from typing import Any
 
 from legged_torque.utils.config import section_keys, set_by_path, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.legged_gym import successor
 from legged_torque.utils.limits import Count, Number, Worlds, check_value, types_of
 
 DEFAULT_PRESET = "parallel"
@@ -105,6 +106,8 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
                 raise UserError(f"'{path}' is now '{new}{path.removeprefix(old)}'")
         section = path.split(".")[0]
         if section not in sections:
+            if replaced := successor("settings", section):
+                raise UserError(replaced)
             raise unknown_name("config section", section, sections)
         set_by_path(sections[section], path, value)
 
