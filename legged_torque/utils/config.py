@@ -41,7 +41,7 @@ class Section:
                 continue
             values = (getattr(owner, name, None) for owner in (cls, *cls.__bases__))
             found = dict.fromkeys(filter(inspect.isclass, values))
-            parts = [part for part in found if not any(o is not part and issubclass(o, part) for o in found)]
+            parts: list[Any] = [part for part in found if not any(o is not part and issubclass(o, part) for o in found)]
             if len(parts) > 1 or not issubclass(parts[0], Section):
                 bases = parts if any(issubclass(part, Section) for part in parts) else [*parts, Section]
                 names = {"__qualname__": f"{cls.__qualname__}.{name}", "__module__": cls.__module__}

@@ -1,4 +1,4 @@
-"""The curriculum of eq. 1, for many values at once and on the device."""
+"""Curricula on the device: of values, by the number of steps (eq. 1), and of commands, by how they are followed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ import torch
 from torch import Tensor
 
 from legged_torque.envs.base.legged_robot_config import LinearChange
+
+TRACKED = 0.8
+"""Share of the highest possible tracking reward beyond which ranges grow, as in legged_gym."""
+GROWTH = 0.1
+"""Share of the full ranges by which they grow."""
 
 
 class LinearCurriculum:
@@ -27,3 +32,44 @@ class LinearCurriculum:
         """Return the values after ``total_steps`` (scalar, int64). Shape: (number of values,)."""
         progress = ((total_steps - self._t_start) / self._duration).clamp(0.0, 1.0)
         return (self._start + self._change * progress).float()
+
+
+class RangeCurriculum:
+    """Ranges that grow as soon as robots track them well, as in legged_gym's ``update_command_curriculum``.
+
+    Whenever as many episodes have ended as there are worlds, their mean tracking decides. Every process of a training
+    has its own ranges.
+
+    Attributes:
+        share: Share of the full ranges; they shrink towards their number that is nearest to 0. Shape: ().
+    """
+
+    def __init__(self, start: float, low: Tensor, span: Tensor, per_world: Tensor) -> None:
+        """Start with a share of ranges, of which ``low`` and ``span`` are in use; ``per_world`` is (num_envs,)."""
+        self._low, self._span, self._full_low, self._full_span = low, span, low.clone(), span.clone()
+        self._middle = torch.zeros_like(low).clamp(low, low + span)
+        self.share = torch.full_like(low[0], start)
+        self._tracking = torch.zeros_like(per_world)  # of the episodes so far
+        self._ended = torch.zeros(2, device=low.device)  # sum of the tracking of episodes, and their number
+        self._set_ranges()
+
+    def add_step(self, tracking: Tensor, ended: Tensor) -> None:
+        """Add a step's tracking, of which a whole perfect episode has 1, and end episodes. Shapes: (num_envs,)."""
+        self._tracking.add_(tracking)
+        self._ended.add_(torch.stack([self._tracking * ended, ended.float()]).sum(dim=1))
+        self._tracking.masked_fill_(ended, 0.0)
+        sum_of_all, count = self._ended
+        is_due = count >= len(tracking)
+        grows = is_due & (sum_of_all > TRACKED * count)
+        self.share.copy_((self.share + GROWTH * grows).clamp(max=1.0))
+        self._ended.masked_fill_(is_due, 0.0)
+        self._set_ranges()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the share, and what decides on its growth."""
+        return {"share": self.share, "tracking": self._tracking, "ended": self._ended}
+
+    def _set_ranges(self) -> None:
+        """Write the ranges."""
+        self._low.copy_(torch.lerp(self._middle, self._full_low, self.share))
+        self._span.copy_(self.share * self._full_span)
