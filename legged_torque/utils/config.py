@@ -8,9 +8,9 @@ import inspect
 from typing import Any, ClassVar
 
 from legged_torque.utils.errors import UserError, collect_errors, refuse, unknown_name
-from legged_torque.utils.legged_gym import successor
 from legged_torque.utils.limits import check_value, types_of
 from legged_torque.utils.plain_yaml import parse_yaml
+from legged_torque.utils.successors import successor
 
 
 class Section:
@@ -128,10 +128,6 @@ class BaseConfig(Section):
     def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
         """Return the settings of an earlier run, as nested dictionaries, in today's layout."""
         return values
-
-    def renamed(self) -> dict[str, str]:
-        """Return the new dotted paths of settings and sections by their old ones, which users may still give."""
-        return {}
 
 
 def section_keys(section: Any) -> list[str]:

@@ -23,7 +23,7 @@ from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.buffers import copy_state
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.legged_gym import successor
+from legged_torque.utils.successors import successor
 
 
 class BaseTask(VecEnv):

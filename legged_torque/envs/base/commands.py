@@ -47,8 +47,9 @@ class UniformCommands:
         low, high = torch.tensor(limits, dtype=torch.float32, device=device).unbind(dim=1)
         self.low, self.span = low.clone(), high - low
         self.curriculum = None
-        if settings.curriculum:  # of velocities; headings have all of their range from the start
-            self.curriculum = RangeCurriculum(settings.curriculum_start, self.low[:3], self.span[:3], self.headings)
+        if settings.curriculum:  # headings have all of their range from the start
+            velocities = self.low[:3], self.span[:3]
+            self.curriculum = RangeCurriculum(settings.curriculum_start, *velocities, task.max_episode_length)
         self.hold(settings.fixed)
 
     def hold(self, command: Sequence[float] | None) -> None:
@@ -101,9 +102,8 @@ class UniformCommands:
     def add_step(self) -> None:
         """Let the curriculum see a control step, after its rewards and before its resets."""
         if self.curriculum:
-            state, longest = self.task.state, self.task.max_episode_length
-            tracking = torch.where(state.diverged, 0.0, self.task._reward_tracking_lin_vel())
-            self.curriculum.add_step(tracking / longest, state.reset_buf)
+            tracking = self.task._reward_tracking_lin_vel()
+            self.curriculum.add_step(torch.where(self.task.state.diverged, 0.0, tracking))
 
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the share of the ranges that commands are drawn from, for logging, if it changes."""

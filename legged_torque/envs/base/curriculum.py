@@ -10,7 +10,7 @@ from torch import Tensor
 from legged_torque.envs.base.legged_robot_config import LinearChange
 
 TRACKED = 0.8
-"""Share of the highest possible tracking reward beyond which ranges grow, as in legged_gym."""
+"""Share of the highest tracking reward beyond which ranges grow, as in legged_gym."""
 GROWTH = 0.1
 """Share of the full ranges by which they grow."""
 
@@ -35,39 +35,35 @@ class LinearCurriculum:
 
 
 class RangeCurriculum:
-    """Ranges that grow as soon as robots track them well, as in legged_gym's ``update_command_curriculum``.
+    """Ranges that grow as soon as robots track them well, like legged_gym's ``update_command_curriculum``.
 
-    Whenever as many episodes have ended as there are worlds, their mean tracking decides. Every process of a training
-    has its own ranges.
+    The mean over all worlds and the steps of a full episode decides. Every process of a training has its own ranges.
 
     Attributes:
         share: Share of the full ranges; they shrink towards their number that is nearest to 0. Shape: ().
     """
 
-    def __init__(self, start: float, low: Tensor, span: Tensor, per_world: Tensor) -> None:
-        """Start with a share of ranges, of which ``low`` and ``span`` are in use; ``per_world`` is (num_envs,)."""
+    def __init__(self, start: float, low: Tensor, span: Tensor, num_steps: int) -> None:
+        """Start with a share of ranges, whose tensors in use are ``low`` and ``span``; decide after ``num_steps``."""
         self._low, self._span, self._full_low, self._full_span = low, span, low.clone(), span.clone()
-        self._middle = torch.zeros_like(low).clamp(low, low + span)
+        self._middle, self._num_steps = torch.zeros_like(low).clamp(low, low + span), num_steps
         self.share = torch.full_like(low[0], start)
-        self._tracking = torch.zeros_like(per_world)  # of the episodes so far
-        self._ended = torch.zeros(2, device=low.device)  # sum of the tracking of episodes, and their number
+        self._sums = torch.zeros(2, device=low.device)  # of the mean tracking, and steps
         self._set_ranges()
 
-    def add_step(self, tracking: Tensor, ended: Tensor) -> None:
-        """Add a step's tracking, of which a whole perfect episode has 1, and end episodes. Shapes: (num_envs,)."""
-        self._tracking.add_(tracking)
-        self._ended.add_(torch.stack([self._tracking * ended, ended.float()]).sum(dim=1))
-        self._tracking.masked_fill_(ended, 0.0)
-        sum_of_all, count = self._ended
-        is_due = count >= len(tracking)
-        grows = is_due & (sum_of_all > TRACKED * count)
+    def add_step(self, tracking: Tensor) -> None:
+        """Add the tracking of a step, from 0 to 1. Shape: (num_envs,)."""
+        self._sums[0].add_(tracking.mean())
+        self._sums[1].add_(1.0)
+        is_due = self._sums[1] >= self._num_steps
+        grows = is_due & (self._sums[0] > TRACKED * self._num_steps)
         self.share.copy_((self.share + GROWTH * grows).clamp(max=1.0))
-        self._ended.masked_fill_(is_due, 0.0)
+        self._sums.masked_fill_(is_due, 0.0)
         self._set_ranges()
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the share, and what decides on its growth."""
-        return {"share": self.share, "tracking": self._tracking, "ended": self._ended}
+        return {"share": self.share, "sums": self._sums}
 
     def _set_ranges(self) -> None:
         """Write the ranges."""

@@ -14,7 +14,7 @@ from legged_torque.envs.base.actions import ActionTerm, ControlLaw, ControlParam
 from legged_torque.envs.base.asset import load_asset, nominal_pose
 from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.health import watched
-from legged_torque.envs.base.hooks import idle_methods
+from legged_torque.envs.base.hooks import check_methods
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
 from legged_torque.envs.base.random_events import RandomEvents
@@ -43,7 +43,7 @@ from legged_torque.sim.randomization import RandomParameter
 from legged_torque.sim.registry import engine_class, make_engine
 from legged_torque.terrain import make_terrain
 from legged_torque.utils.config import section_keys
-from legged_torque.utils.errors import UserError, refuse
+from legged_torque.utils.errors import UserError
 
 OUTSIDE_KERNEL = "torques are computed in torch, outside of the physics kernel: training on an H100 is up to 6% slower"
 """Note of tasks that override ``_compute_torques`` or have motors without a Warp function."""
@@ -97,9 +97,7 @@ class LeggedRobot(RewardTerms, Terminations, BaseTask):
         A UserError if a setting makes no sense or names something that does not exist.
         """
         check_env_cfg(cfg)
-        terms = {"_reward_": ("rewards.scales", section_keys(cfg.rewards.scales))}
-        terms["_termination_"] = ("terminations", section_keys(cfg.terminations))
-        refuse(list(idle_methods(type(self), LeggedRobot, terms)))
+        check_methods(type(self), LeggedRobot, cfg)
         super().__init__(cfg.env.num_envs, device)
         self.cfg = cfg
         self.dt = cfg.sim.dt * cfg.control.decimation

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from legged_torque.envs.base.commands_config import CommandsCfg
-from legged_torque.envs.base.older_runs import RENAMED, converted, is_older
+from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
 from legged_torque.motors.config import DelayCfg, IdealCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
@@ -292,10 +292,6 @@ class LeggedRobotCfg(BaseConfig):
     def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
         """Return the settings of a run of commit d8439d6 in today's layout."""
         return converted(values) if is_older(values) else values
-
-    def renamed(self) -> dict[str, str]:
-        """Return the new names of settings of commit d8439d6."""
-        return RENAMED
 
     def random_parameters(self) -> dict[str, dict[str, list[float]]]:
         """Return the ranges of all parameters of ``domain_rand``, by name."""
