@@ -65,7 +65,7 @@ def main() -> None:
     else:
         env_cfg = evaluation_cfg(run.env_cfg, run.env_cfg.env.num_envs)
         if args.command:
-            env_cfg.commands.fixed = list(args.command)
+            env_cfg.commands.fix(args.command)
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options, env_cfg)
     torch.manual_seed(args.seed)  # building and loading have drawn numbers too

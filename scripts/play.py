@@ -58,7 +58,7 @@ def main() -> None:
         show(args, run)
         return
     if args.command:
-        env_cfg.commands.fixed = list(args.command)
+        env_cfg.commands.fix(args.command)
     if run:
         from legged_torque.viewer.video import show_in_tensorboard
 

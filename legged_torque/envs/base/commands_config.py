@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pkgutil
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 from legged_torque.utils.config import Section
@@ -25,6 +26,11 @@ class CommandsCfg(Section):
         lin_vel_y: Interval = [-1.0, 1.0]  # [m/s]
         ang_vel_yaw: Interval = [-1.0, 1.0]  # [rad/s]; the limits of what turns to headings
         heading: Annotated[list[float], Limits(-3.14160, 3.14160, ordered=True)] = [-3.14159, 3.14159]  # [rad]
+
+    def fix(self, command: Sequence[float]) -> None:
+        """Leave nothing but one command: v_x, v_y [m/s] and a yaw rate [rad/s]."""
+        ranges, self.fixed = self.ranges, list(command)
+        ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw = ([value, value] for value in command)
 
     def build(self, task: Any) -> Any:
         """Return the :class:`~legged_torque.envs.base.commands.UniformCommands` of a task, or a class of that kind."""
