@@ -1,4 +1,4 @@
-"""What has become of names that people know, from legged_gym and from earlier versions."""
+"""Replacements of names that people know from legged_gym and from earlier versions."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import yaml
 
 @functools.cache
 def successors(kind: Literal["settings", "methods", "attributes"]) -> dict[str, str]:
-    """Return what one uses in place of names, in words; settings have dotted paths."""
+    """Return the replacements in words, by name; settings have dotted paths."""
     return yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text("utf-8"))[kind]
 
 
 def successor(kind: Literal["settings", "methods", "attributes"], name: str) -> str:
-    """Return in words what one uses in place of a name; empty if it never was one."""
+    """Return a sentence with the replacement of a name; empty for names that never existed."""
     new = successors(kind).get(name)
     return f"'{name}' is now {new}" if new else ""

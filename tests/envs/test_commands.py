@@ -109,11 +109,3 @@ def test_a_generator_of_ones_own(tmp_path, make_task, monkeypatch):
     torch.testing.assert_close(task.commands, torch.tensor([[0.1, 0.2, 0.3]] * 500))
     grounds = Grounds.of(["flat"], [0.0])
     assert "commands.build" in error_of(grounds.cfg, task_registry.get_cfgs("square")[0], 1)
-
-
-def test_a_fixed_command(make_task):
-    """It is the only one, from the start, also where headings are followed."""
-    task = make_task("a1_torque", 3, **OFTEN, **{"commands.fixed": [0.5, 0.0, -0.2], "commands.heading_command": True})
-    for _ in range(3):
-        torch.testing.assert_close(task.commands, torch.tensor([[0.5, 0.0, -0.2]] * 3))
-        step(task)

@@ -42,7 +42,7 @@ class BaseTask(VecEnv):
         num_processes: Processes that train together, each with as many worlds; the trainer sets it.
         keep_final_observations: Whether "final_observations" of the extras are computed, see :meth:`step`.
 
-    Tensors that a task has when it is built stay the same ones: to bind such an attribute to another is a UserError.
+    Once a task is built, its tensors must be written in place: binding such an attribute to another is a UserError.
     """
 
     sim: Engine

@@ -20,15 +20,15 @@ HEADING_GAIN = 0.5
 
 
 class UniformCommands:
-    """Draws commands uniformly, from ranges that may grow, and of some worlds that they stand.
+    """Draws commands uniformly, from ranges that may grow; a share of the robots is to stand.
 
     Inherit for a generator of your own, and override :meth:`draw`, or :meth:`follow` for commands that change with
     time. Both run inside a step and obey the rules of :class:`~legged_torque.envs.base.base_task.BaseTask`: they write
-    ``values`` in place. What they keep is a part of checkpoints if ``task.keep`` knows it.
+    ``values`` in place. Register tensors of your own with ``task.keep``, and checkpoints contain them.
 
     Attributes:
         settings: The section ``commands``.
-        task: The task, whose ``state`` is there already.
+        task: The task; its ``state`` exists already.
         values: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
         headings: Where trunks shall turn to with ``commands.heading_command`` [rad]. Shape: (num_envs,).
         is_new: Worlds in which the last step drew a command. Shape: (num_envs,), bool.
@@ -53,7 +53,7 @@ class UniformCommands:
         self.hold(settings.fixed)
 
     def hold(self, command: Sequence[float] | None) -> None:
-        """Command nothing but one velocity from the next draw on; None draws again."""
+        """Give all worlds one command from the next step on; None returns to drawn ones."""
         self._is_held.fill_(command is not None)
         self._held.copy_(torch.tensor(command or [0.0, 0.0, 0.0]))
 
@@ -65,9 +65,9 @@ class UniformCommands:
         self.update(mask)
 
     def update(self, drawn: Tensor | None = None) -> None:
-        """Make commands of uniform draws, in the worlds of ``drawn``, and what changes in time in all worlds.
+        """Finish commands after the resets of a control step: :meth:`draw` in the worlds of ``drawn``, then follow.
 
-        A control step does so after its resets. Shape: (num_envs,), bool.
+        A held command replaces all. Shape: (num_envs,), bool.
         """
         if drawn is not None:
             self.draw(drawn)
@@ -75,9 +75,9 @@ class UniformCommands:
         self.values.copy_(torch.where(self._is_held, self._held, self.values))
 
     def draw(self, mask: Tensor) -> None:
-        """Change commands that have just been drawn uniformly, in the worlds of ``mask`` alone.
+        """Change the commands in the worlds of ``mask``, which have just been drawn uniformly.
 
-        Here, small ones become 0, and some robots are to stand. Shape: (num_envs,), bool.
+        This one sets small commands to 0 and chooses robots that stand. Shape: (num_envs,), bool.
         """
         settings, planar = self.settings, self.values[:, :2]
         if settings.zero_below:
@@ -88,7 +88,7 @@ class UniformCommands:
             self._stands.copy_(torch.where(mask, stands, self._stands))
 
     def follow(self) -> None:
-        """Change commands with time, at every step: yaw rates with ``commands.heading_command``; who stands, stands.
+        """Change commands over time, at every step: yaw rates that turn to headings, and 0 for robots that stand.
 
         A yaw rate is proportional to the angle that is left to the heading, within the range of yaw rates.
         """
@@ -100,7 +100,7 @@ class UniformCommands:
             self.values.masked_fill_(self._stands.unsqueeze(1), 0.0)
 
     def add_step(self) -> None:
-        """Let the curriculum see a control step, after its rewards and before its resets."""
+        """Add a control step to the curriculum, after its rewards and before its resets."""
         if self.curriculum:
             tracking = self.task._reward_tracking_lin_vel()
             self.curriculum.add_step(torch.where(self.task.state.diverged, 0.0, tracking))

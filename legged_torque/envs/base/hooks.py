@@ -1,4 +1,4 @@
-"""Methods of task classes that nothing would ever call: legged_gym's hooks, misspelt ones, terms without a setting."""
+"""Methods of task classes that are never called: legged_gym's hooks, misspelt hooks, terms without a setting."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SIMILAR = 0.88  # share of letters from which on a method seems to be a misspelt
 
 
 def check_methods(task: type, base: type, cfg: LeggedRobotCfg) -> None:
-    """Raise a UserError that names all methods of a task class that nothing calls, and what to do instead.
+    """Raise a UserError that names all methods of a task class that are never called, and their replacements.
 
     ``base`` is the class of which all hooks are known; the settings decide which terms are in use.
     """
