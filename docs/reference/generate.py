@@ -18,7 +18,7 @@ os.environ["MUJOCO_GL"] = "disable"
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs.approaches import multi_head_config, torque_config, torque_curriculum_config, torque_gravity
-from legged_torque.envs.base import legged_robot_config
+from legged_torque.envs.base import commands_config, legged_robot_config
 from legged_torque.envs.robots import a1, anymal_c, g1, go1, go2
 from legged_torque.utils.limits import describe, types_of
 
@@ -26,6 +26,7 @@ HERE = Path(__file__).parent
 CONFIGS = (
     (legged_robot_config, "LinearChange"),
     (legged_robot_config, "LeggedRobotCfg"),
+    (commands_config, "CommandsCfg"),
     (legged_robot_config, "LeggedRobotCfgPPO"),
     (a1, "A1Cfg"),
     (a1, "A1CfgPPO"),
@@ -117,7 +118,8 @@ def settings_table(module: ModuleType, name: str, known: dict[str, str]) -> str:
     bases = ", ".join(f"`{ast.unparse(base)}`" for base in node.bases)
     text = " ".join(re.sub(r":\w+:`~?[\w.]*?(\w+)`", r"`\1`", ast.get_docstring(node) or "").replace("``", "`").split())
     table = ["| setting | default | allowed | meaning |", "|---|---|---|---|"]
-    table += rows(node, getattr(module, name), "", source, comments(source), known)
+    section = "commands." if name == "CommandsCfg" else ""
+    table += rows(node, getattr(module, name), section, source, comments(source), known)
     return "\n".join([f"## {name}", "", f"{text} Base: {bases}.", "", *table, ""])
 
 

@@ -106,6 +106,7 @@ def apply_random_events(
     low: Numbers,
     span: Numbers,
     # Out:
+    new_commands: Mask,
     new_parameters: Mask,
     commands: Rows,
     headings: Numbers,
@@ -121,7 +122,8 @@ def apply_random_events(
     drawn = wp.vec4(wp.randf(random), wp.randf(random), wp.randf(random), wp.randf(random))
     if is_new[world]:
         turn(qpos, world, angles[world, 0], angles[world, 1], angles[world, 2])
-    if is_new[world] or drawn[0] < chances[0]:
+    new_commands[world] = is_new[world] or drawn[0] < chances[0]
+    if new_commands[world]:
         draw_command(seeds[world], low, span, commands, headings, world)
     new_parameters[world] = is_new[world] or drawn[1] < chances[1]
     if drawn[2] < chances[2]:
