@@ -78,7 +78,7 @@ def main() -> None:
         measured = walk(run, env, runner, args.steps, bool(args.command))
     if args.json:
         kept, device = "as in training", device_name(env.device)
-        result = {"task": args.task, "run": portable_path(run.folder), "checkpoint": run.checkpoint.name}
+        result = {"task": run.task, "run": portable_path(run.folder), "checkpoint": run.checkpoint.name}
         result |= {"steps": runner.logger.tot_timesteps, "perturbation": args.perturbation or kept}
         result |= {"ranges": args.ranges or kept, "command": args.command, "num_envs": env.num_envs}
         result |= {"seed": args.seed, "device": device, "versions": package_versions()}

@@ -30,7 +30,7 @@ def main() -> None:
     out = args.out or run.folder / f"exported_{iterations}"
     training = {"run": run.folder.name, "checkpoint": run.checkpoint.name}
     training |= {"iterations": iterations, "total_steps": int(env.total_steps)}
-    difference, unsupported = export_policy(env, runner.alg.policy(), out, args.task, training)
+    difference, unsupported = export_policy(env, runner.alg.policy(), out, run.task, training)
     print(f"{run.checkpoint}, after {training['total_steps']:,} steps of training:")
     print(f"  exported to {out}: policy.onnx, policy.pt, policy.yaml")
     print(f"  largest difference to the checkpoint's network: {difference:.2g}")

@@ -17,6 +17,7 @@ import contextlib
 import functools
 import shlex
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.envs import task_registry
@@ -25,7 +26,7 @@ from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.devices import busy_cores_note, device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.limits import Number
-from legged_torque.utils.options import DEFAULT_PRESET, Options
+from legged_torque.utils.options import DEFAULT_PRESET, DEFAULT_TASK, Options
 from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, package_versions
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
 from legged_torque.viewer.training_viewer import TrainingViewer
@@ -59,7 +60,7 @@ def main() -> None:
 
                 use_first_run(options)
             run = task_registry.load_run(options)
-        env_cfg, train_cfg = run.env_cfg, run.train_cfg
+        env_cfg, train_cfg, options.task = run.env_cfg, run.train_cfg, run.task
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
         options.max_iterations = options.max_iterations or run.config.get("max_iterations")
         if is_first:
@@ -67,6 +68,7 @@ def main() -> None:
     elif options.load_run or options.checkpoint is not None:
         raise UserError("--load_run and --checkpoint need --resume")
     else:
+        options.task = options.task or DEFAULT_TASK
         with cli.slow_imports():
             env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     folder = experiment_dir(train_cfg, options.log_root)
@@ -106,7 +108,9 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     distributed.check_same(flat({**settings, "task": options.task, "max_iterations": total}))
     remaining = total - runner.current_learning_iteration
     if remaining < 1:
-        raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
+        done = runner.current_learning_iteration
+        more = shlex.join([*sys.argv[1:], f"--max_iterations={2 * done}"])
+        raise UserError(f"the run has all of its {done} iterations; to go on: {cli.script_command('train')} {more}")
     if is_first:
         print_notes([busy_cores_note(torch.get_num_threads()) if env.device == "cpu" else ""])
         announce(runner, options, env_cfg, train_cfg, total, viewer.page)
@@ -143,8 +147,8 @@ def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: 
 
 
 def run_words(options: Options, run_dir: str) -> str:
-    """Return the options with which other scripts find a run."""
-    return shlex.join([*cli.option_words(options, "task_file", "task"), f"--load_run={run_dir}"])
+    """Return the options with which other scripts find a run, short enough for a line of a terminal."""
+    return shlex.join([*cli.option_words(options, "task_file", "log_root"), f"--load_run={Path(run_dir).name}"])
 
 
 if __name__ == "__main__":

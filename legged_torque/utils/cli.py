@@ -23,7 +23,7 @@ from legged_torque.utils.devices import disable_renderer
 from legged_torque.utils.errors import TrainingError, UserError, is_out_of_memory, unknown_name
 from legged_torque.utils.files import write_errors
 from legged_torque.utils.limits import check_value, describe, types_of
-from legged_torque.utils.options import Options
+from legged_torque.utils.options import DEFAULT_TASK, Options
 from legged_torque.utils.task_registry import task_registry
 
 COMMAND = "legged-torque"  # the console command that runs every script
@@ -31,6 +31,7 @@ SETTINGS = ("task", "task_file", "seed", "perturbation", "ranges", "device", "se
 RUNS = ("log_root", "experiment_name", "load_run", "checkpoint")  # of scripts that keep or load runs
 TRAINING = ("max_iterations", "resume", "run_name", "preset", "logger", "verbose")  # of trainings alone
 _GROUPS = {"task and settings": (*SETTINGS, "num_envs"), "runs": RUNS, "training": TRAINING}
+_TASK_OF_RUN = f"name of the task, see train.py --list; default: that of the run; without a run {DEFAULT_TASK}"
 _SCRIPT = re.compile(r"python scripts/(\w+)\.py")
 _EXAMPLE = re.compile(r": ``(python scripts/[^`]+)``")
 
@@ -84,8 +85,11 @@ class Parser(argparse.ArgumentParser):
                 raise UserError(f"the value of {name} is empty" if name else "an argument is empty")
         namespace, unknown = self.parse_known_args(words, namespace)
         if unknown:
+            option, key = ["", "", *words[: words.index(unknown[0])]][-2:]
+            if option == "--set" and "=" not in key:
+                raise UserError(f"--set takes KEY=VALUE: give --set {key}={unknown[0]}")
             options = [option for action in self._actions for option in action.option_strings]
-            raise unknown_name("option", unknown[0], options)
+            raise unknown_name("option", unknown[0].partition("=")[0], options)
         return namespace
 
 
@@ -120,6 +124,8 @@ def add_options(parser: Parser, *names: str) -> None:
                 how["action"] = "append"
             elif hint not in (str, str | None):
                 how |= {"type": int, "help": f"{how['help']}; {describe(hint).removesuffix(' or null')}"}
+            if name == "task" and "load_run" in names:
+                how |= {"default": "", "help": _TASK_OF_RUN}
             if aliases := how.pop("aliases", ()):
                 how["action"] = _OneValue
             action = group.add_argument(f"--{name}", *aliases, **how)

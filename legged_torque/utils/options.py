@@ -11,6 +11,7 @@ from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import Count, Number, Worlds, check_value, types_of
 
 DEFAULT_PRESET = "parallel"
+DEFAULT_TASK = "a1_torque_multihead"
 
 
 def _option(text: str, default: Any = None, **how: Any) -> Any:
@@ -25,7 +26,7 @@ class Options:
     The type of a field bounds its values, see ``utils.limits``, and makes it a number, a flag or a list for argparse.
     """
 
-    task: str = _option("name of the task, see train.py --list; default: %(default)s", "a1_torque_multihead")
+    task: str = _option("name of the task, see train.py --list; default: %(default)s", DEFAULT_TASK)
     device: str = _option(
         "auto, cpu or cuda:N; auto takes the GPU if there is one, with torchrun one for each process",
         "auto",
