@@ -1,13 +1,13 @@
 """Measure a checkpoint, or all of a run.
 
-With ``--terrain`` and ``--level``, robots try to cross tiles of rough ground, once in each world: see docs/terrain.md.
-
 Examples:
-    python scripts/evaluate.py --task=a1_position                       # as in training
+    python scripts/evaluate.py                                          # the last run, as in its training
     python scripts/evaluate.py --task=a1_position --perturbation=high   # in another environment
-    python scripts/evaluate.py --task=a1_position --command 0.5 0 0.2   # with one command
-    python scripts/evaluate.py --task=a1_position --terrain all --level 0.5
-    python scripts/evaluate.py --task=a1_position --all_checkpoints     # a learning curve, for plot.py curves
+    python scripts/evaluate.py --load_run RUN --command 0.5 0 0.2       # with one command
+    python scripts/evaluate.py --terrain all --level 0.5                # on rough ground
+    python scripts/evaluate.py --all_checkpoints                        # a learning curve, for plot.py curves
+
+With ``--terrain`` and ``--level``, robots try to cross tiles of rough ground, once in each world: see docs/terrain.md.
 """
 
 from __future__ import annotations

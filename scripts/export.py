@@ -1,8 +1,8 @@
 """Export a checkpoint for a robot.
 
 Examples:
-    python scripts/export.py --task=a1_torque_multihead                     # the last run's last checkpoint
-    python scripts/export.py --task=a1_torque_multihead --load_run=RUN --checkpoint=500 --out=exported
+    python scripts/export.py                                   # the last run's last checkpoint
+    python scripts/export.py --load_run=RUN --checkpoint=500 --out=exported
 """
 
 import shlex
@@ -16,7 +16,7 @@ from legged_torque.utils import cli
 def main() -> None:
     """Load a checkpoint and write policy.onnx, policy.pt and policy.yaml; print what the latter does not describe."""
     parser = cli.Parser(__doc__)
-    cli.add_task_args(parser)
+    cli.add_options(parser, "task", "device", "set", "task_file", *cli.RUNS)
     parser.add_argument("--out", type=Path, help="folder to write; default: exported_<checkpoint> in the run's folder")
     args = parser.parse_args()
     if args.out:

@@ -1,11 +1,11 @@
 """Watch a policy walk.
 
 Examples:
-    python scripts/play.py --task=a1_torque_multihead                       # print metrics, save a video
-    python scripts/play.py --task=a1_torque_multihead --viewer web          # a page to watch and steer
-    python scripts/play.py --task=a1_torque_multihead --command 0.5 0 0.2   # a fixed command
-    python scripts/play.py --task=a1_torque_multihead --no_video            # metrics alone
-    python scripts/play.py --task=a1_torque --agent random                  # a task without a policy
+    python scripts/play.py                                  # the last run: print metrics, save a video
+    python scripts/play.py --viewer web                     # a page to watch and steer
+    python scripts/play.py --load_run RUN --command 0.5 0 0.2
+    python scripts/play.py --no_video                       # metrics alone
+    python scripts/play.py --task=a1_torque --agent random  # a task without a policy
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from legged_torque import resource_path
 from legged_torque.deploy.description import DESCRIPTION_FILE
+from legged_torque.envs import LeggedRobotCfg
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import UserError
@@ -74,7 +75,6 @@ def main() -> None:
         from legged_torque.deploy.policy import Policy
         from legged_torque.deploy.robot import MujocoRobot
         from legged_torque.deploy.simulation import Simulation
-        from legged_torque.envs import LeggedRobotCfg
         from legged_torque.utils.display import Counter
         from legged_torque.utils.metrics import UNITS, estimates, ratios
         from legged_torque.viewer.native import simulation_window

@@ -1,14 +1,15 @@
 """Train a policy.
 
+Examples:
+    python scripts/train.py                                           # the default training: 110 million steps
+    python scripts/train.py --task=a1_torque --max_iterations 20      # a short one of another task
+    python scripts/train.py --task=a1_position --perturbation low --set rewards.scales.torques=-1e-4
+    python scripts/train.py --resume --max_iterations 40              # go on with the last run
+    python scripts/train.py --task=my_task --task_file my_task.py     # a task of your own
+    python scripts/train.py --list go2                                # tasks of the Go2
+
 On several GPUs of a machine: ``torchrun --standalone --nproc_per_node=2 scripts/train.py --task=a1_torque_multihead``;
 on several machines: docs/howto/cluster.md.
-
-Examples:
-    python scripts/train.py --task=a1_torque_multihead                # the default training: 110 million steps
-    python scripts/train.py --task=a1_torque --max_iterations 20      # a short one
-    python scripts/train.py --task=a1_position --perturbation low --set rewards.scales.torques=-1e-4
-    python scripts/train.py --task=a1_torque --resume                 # go on with the last run
-    python scripts/train.py --task=my_task --task_file my_task.py     # a task of your own
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.envs import task_registry
+from legged_torque.envs.tasks import list_tasks
 from legged_torque.utils import cli, distributed
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.devices import busy_cores_note, device_name, resolve_device
@@ -38,9 +40,10 @@ if TYPE_CHECKING:
 def main() -> None:
     """Parse the command line and train."""
     parser = cli.Parser(__doc__)
-    cli.add_task_args(parser)
     cli.add_options(parser, *cli.TRAINING)
-    parser.add_argument("--list", action="store_true", help="print all tasks and exit")
+    cli.add_task_args(parser)
+    hint = "print all tasks, or those with this in their names, and exit"
+    parser.add_argument("--list", nargs="?", const="", metavar="PART", help=hint)
     hint = "web: a page on which the newest policy of the training walks; default: %(default)s"
     parser.add_argument("--viewer", choices=("none", "web"), default="none", help=hint)
     hint = "iterations from one short video of the policy to the next, made during the training; default: no videos"
@@ -48,8 +51,8 @@ def main() -> None:
     args = parser.parse_args()
     cli.check_args(args, video_interval=Number)
     options, is_first = cli.options_of(args), distributed.rank() == 0
-    if args.list:
-        print("\n".join(task_registry.names()))
+    if args.list is not None:
+        print("\n".join(list_tasks(args.list)))
         return
     if options.resume:
         if options.preset:
