@@ -30,7 +30,7 @@ class Metric:
 
 
 PAPER_METRICS = (
-    Metric("track_percentage", "Track % [share]", False),  # the paper prints 0.76, not 76
+    Metric("track_percentage", "Tracking", False),  # the paper's "Track %", which it prints as 0.76
     Metric("track_xy", "Track xy", True),
     Metric("track_angular", "Track angular", True),
     Metric("collision_force", "Collision forces", True, digits=1),

@@ -23,6 +23,7 @@ from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_json
 from legged_torque.utils.limits import Count, NotNegative, Number, Share
 from legged_torque.utils.task_registry import LOGS
+from legged_torque.utils.words import counted
 
 
 def parse_args() -> argparse.Namespace:
@@ -101,7 +102,7 @@ def main() -> None:
                 sums.append(simulation.run(args.steps, [args.seed, number], lambda after=after: [do() for do in after]))
     control_step = 1.0 / policy.description["timing"]["control_frequency"]
     metrics = estimates(ratios(np.array(sums).T, robot.weight, control_step))
-    print(f"  {args.robots} robots x {args.steps} steps of {control_step:g} s")
+    print(f"  {counted(args.robots, 'robot')} x {counted(args.steps, 'step')} of {control_step:g} s")
     for name, value in metrics.items():
         print(f"  {name:<18} {value.mean:10.4f} +- {value.standard_error:.4f} {UNITS[name]}")
     if args.json:

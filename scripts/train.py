@@ -31,10 +31,16 @@ from legged_torque.utils.limits import Number
 from legged_torque.utils.options import DEFAULT_PRESET, DEFAULT_TASK, Options
 from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, package_versions
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
+from legged_torque.utils.words import counted
 from legged_torque.viewer.training_viewer import TrainingViewer
 
 if TYPE_CHECKING:
     from legged_torque.learning.runner import OnPolicyRunner
+
+LONG_ON_CPU = 5_000_000  # steps, which take an hour or more
+LONG_NOTE = (
+    "a whole training takes hours to days on a CPU; --max_iterations 100 is a short one, and Ctrl-C keeps the run"
+)
 
 
 def main() -> None:
@@ -67,7 +73,7 @@ def main() -> None:
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
         options.max_iterations = options.max_iterations or run.config.get("max_iterations")
         if is_first:
-            print(f"Resuming from {run.checkpoint}, after {run.iterations} iterations.")
+            print(f"Resuming from {run.checkpoint}, after {counted(run.iterations, 'iteration')}.")
     elif options.load_run or options.checkpoint is not None:
         raise UserError("--load_run and --checkpoint need --resume")
     else:
@@ -112,10 +118,13 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     remaining = total - runner.current_learning_iteration
     if remaining < 1:
         done = runner.current_learning_iteration
-        more = shlex.join([*sys.argv[1:], f"--max_iterations={2 * done}"])
-        raise UserError(f"the run has all of its {done} iterations; to go on: {cli.script_command('train')} {more}")
+        command = [*sys.argv[1:], f"--max_iterations={2 * done}"]
+        further = f"{cli.script_command('train')} {shlex.join(command)}"
+        raise UserError(f"the run has all of its {counted(done, 'iteration')}; to go on: {further}")
     if is_first:
-        print_notes([busy_cores_note(torch.get_num_threads()) if env.device == "cpu" else ""])
+        if env.device == "cpu":
+            is_long = train_cfg.runner.total_steps > LONG_ON_CPU and not options.max_iterations
+            print_notes([LONG_NOTE if is_long else "", busy_cores_note(torch.get_num_threads())])
         announce(runner, options, env_cfg, train_cfg, total, viewer.page)
         runner.on_checkpoint = functools.partial(viewer.show, cli.option_words(options, "task_file", "task"))
     is_complete = False
@@ -143,7 +152,8 @@ def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: 
     settings |= {"device_name": device_name(device), "processes": num_processes, "max_iterations": total}
     runner.claim_log_dir(settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     place = device_name(device) if num_processes == 1 else f"{num_processes} x {device_name(device)}"
-    print(f"Training {options.task} on {place}: {num_processes * runner.env.num_envs} worlds, {total} iterations.")
+    worlds = counted(num_processes * runner.env.num_envs, "world")
+    print(f"Training {options.task} on {place}: {worlds}, {counted(total, 'iteration')}.")
     print(f"Curves: tensorboard --logdir {runner.log_dir}")
     how = page or f"{cli.script_command('play')} {run_words(options, runner.log_dir)} --viewer web"
     print(f"See it learn: {how}", flush=True)

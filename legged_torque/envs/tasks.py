@@ -178,7 +178,7 @@ PURPOSES = {
     "torque_curriculum": "torques, nominal pose rewarded first",
     "torque_multihead": "positions + torques, PD fades to 0",
     "multihead": "positions + torques, PD fades to 0.1",
-    "torque_curriculum_multihead": "curriculum + torque multi-head",
+    "torque_curriculum_multihead": "curriculum, torque multi-head",
     "torque_gravity_curriculum": "pre-training + curriculum",
     "torque_gravity_multihead": "pre-training + torque multi-head",
     "torque_curriculum_high": "curriculum with a higher pose",

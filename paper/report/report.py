@@ -28,6 +28,7 @@ from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
 from legged_torque.paper.values import ENVIRONMENTS, TABLE_I
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import portable_path, without_machine
+from legged_torque.utils.words import counted
 
 MEDIA_TYPES = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
 VIDEOS = [".gif", ".mp4", ".webm"]
@@ -126,14 +127,14 @@ def run_problems(run: Training, from_step: float) -> list[str]:
     if len(run.rows) and run.steps < from_step:
         end = f"ends before {from_step / MILLION:g} million steps"
         problems.append(f"{end}; its number is the mean of its last {LAST_SHARE:.0%}")
-    counted = run.counted(run.cell.environment, from_step)
-    for name, count in counted[[metric.name for metric in PAPER_METRICS]].isna().sum().items():
-        problems += [f"{count} of the {len(counted)} evaluations that count have no {name}"] if count else []
+    rows = run.counted(run.cell.environment, from_step)
+    for name, count in rows[[metric.name for metric in PAPER_METRICS]].isna().sum().items():
+        problems += [f"{count} of the {len(rows)} evaluations that count have no {name}"] if count else []
     for name in (name for name in run.cell.evaluated_in if name != run.cell.environment):
-        counted = run.counted(name, from_step)
-        if counted.empty:
+        rows = run.counted(name, from_step)
+        if rows.empty:
             problems.append(f"not evaluated in {name}")
-        elif not run.is_finished(steps := counted["steps"].iloc[-1]):
+        elif not run.is_finished(steps := rows["steps"].iloc[-1]):
             problems.append(f"evaluated in {name} after {steps / MILLION:.4g} of {total}")
     if run.cell.crosses and run.crossings is None:
         problems.append(f"not evaluated on {ROUGH_GROUND}")
@@ -155,7 +156,7 @@ def setup_lines(experiment: Experiment) -> list[str]:
     if len(ends):
         total, speed = ends["seconds"].sum(), ends["steps"].sum() / ends["seconds"].sum() / MILLION
         lines.append(
-            f"{len(ends)} trainings took {timedelta(seconds=round(total))} in all, with their evaluations: "
+            f"{counted(len(ends), 'training')} took {timedelta(seconds=round(total))} in all, with their evaluations: "
             f"{total / len(ends):.4g} s and {speed:.3g} million steps/s each on average; those that shared a device "
             "were slower for it"
         )

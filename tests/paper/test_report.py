@@ -113,9 +113,9 @@ def test_text(text, folder):
     words = " ".join(text.split())
     low, often = "≈ 0.7500 ± 0.0500 | 0.7642", "✗ 0.5500 ± 0.0500 | 0.7163"
     assert "**4 of 80 numbers are at least as good" in words and "3 are better, 1 within it, 11 worse, 65 mi" in words
-    assert f"| Track % [share] | PD | {low} | {often} |" in words
+    assert f"| Tracking [share] | PD | {low} | {often} |" in words
     assert "| | Default torque | 0.5000 (1) † | – | – | – |" in words  # after those of the paper
-    assert "| Track % [share] | PD | 0.6500 ± 0.0500 |" in words.partition("## In other environments")[2]
+    assert "| Tracking [share] | PD | 0.6500 ± 0.0500 |" in words.partition("## In other environments")[2]
     assert "python scripts/experiment.py paper/experiment.yaml --out paper_again" in words
     assert str(folder.parent) not in words
     assert "| `env.control.what` | a1_position | a1_torque |" in text and "`env.control.same`" not in text

@@ -145,8 +145,8 @@ def test_best_torque_methods():
     assert len(header) == 6 and len(rows) == 15
     found = {(row[0], row[1]): row[2:] for row in rows}
     expected = ["0.7866 (Torque curriculum)", "`a1_new`", "0.8400 ± 0.0100 (2)", "✓ +6.8%"]
-    assert found["Track % [share]", "low"] == expected
+    assert found["Tracking [share]", "low"] == expected
     assert found["Track xy [m²/s²]", "low"][1:] == ["`a1_new`", "0.0310 (1) †", "≈ +1.9%"]
     force = found["Collision forces [N]", "low"]
     assert force[0] == "135.1 (PD)" and force[1] == "Torque curriculum" and force[3] == "✗ -0.7%"  # 136.0
-    assert found["Track % [share]", "high"][1:] == ["no data", "", ""]
+    assert found["Tracking [share]", "high"][1:] == ["no data", "", ""]
