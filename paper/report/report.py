@@ -18,14 +18,14 @@ from markupsafe import Markup
 
 from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE
 from legged_torque.experiments.times import describe, read_times
-from legged_torque.paper.metrics import PAPER_METRICS
+from legged_torque.paper.metrics import COMPARED, PAPER_METRICS
 from legged_torque.paper.report import tables
 from legged_torque.paper.report.evaluations import MILLION
 from legged_torque.paper.report.experiment import LAST_SHARE, Experiment, Training, is_of_paper
 from legged_torque.paper.report.figures import draw_all, file_name, planned_figures, rough_figures
 from legged_torque.paper.report.style import name_of
 from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
-from legged_torque.paper.values import ENVIRONMENTS, TABLE_I
+from legged_torque.paper.values import ENVIRONMENTS, PAPER_TASKS
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import portable_path, without_machine
 from legged_torque.utils.words import counted
@@ -62,7 +62,7 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
         "from_step": from_step,
         "columns": list(filter(is_of_paper, experiment.columns())),
         "other_columns": [name for name in experiment.columns() if not is_of_paper(name)],
-        "signs": signs | {"missing": len(TABLE_I) * len(ENVIRONMENTS) - sum(signs.values())},
+        "signs": signs | {"missing": len(COMPARED) * len(PAPER_TASKS) * len(ENVIRONMENTS) - sum(signs.values())},
         "best_torque": best_torque,
         "num_reached": sum(row[-1].startswith(BETTER) for row in best_torque),
         "missing": missing_lines(experiment, from_step),
