@@ -23,7 +23,8 @@ from legged_torque.paper.report import tables
 from legged_torque.paper.report.evaluations import MILLION
 from legged_torque.paper.report.experiment import LAST_SHARE, Experiment, Training, is_of_paper
 from legged_torque.paper.report.figures import draw_all, file_name, planned_figures, rough_figures
-from legged_torque.paper.report.style import name_of
+from legged_torque.paper.report.figures_curves import FEW
+from legged_torque.paper.report.style import in_words, name_of
 from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
 from legged_torque.paper.values import ENVIRONMENTS, PAPER_TASKS
 from legged_torque.utils.errors import UserError
@@ -74,8 +75,9 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
         "folders": [portable_path(experiment.folder), portable_path(out)],
         "configs": configs,
     }
-    filters = {"table": markdown_table, "fenced": fenced, "cell": cell, "one_line": one_line}
-    markdown = render("report.md.jinja", values, filters | {"file_name": file_name, "name_of": name_of})
+    filters = {"table": markdown_table, "fenced": fenced, "cell": cell, "one_line": one_line, "file_name": file_name}
+    filters |= {"name_of": name_of, "in_words": in_words, "steps": steps_text}
+    markdown = render("report.md.jinja", values, filters)
     body, headings = to_html(markdown, {file_name(title): out / file_name(title) for title in drawn})
     sources = {name_of(task): data_uri(file) for task, file in videos.items()}
     texts = {task: yaml.safe_dump(config, sort_keys=False) for task, config in configs.items()}
@@ -104,14 +106,14 @@ def missing_lines(experiment: Experiment, from_step: float) -> list[str]:
     """Return a line for everything planned that is missing, unfinished or unreadable."""
     lines, plan = list(experiment.problems), experiment.plan
     for environment, task in product(plan.environments, plan.tasks):
-        place, runs = f"`{task}` in {environment}", experiment.runs_of(task, environment)
+        where, runs = f"`{task}` in {in_words(environment)}", experiment.runs_of(task, environment)
         absent = sorted(set(plan.seeds if experiment.is_planned else ()) - {run.cell.seed for run in runs})
         if absent and runs:
-            lines.append(f"{place}: no training has begun with seed {', '.join(map(str, absent))}.")
+            lines.append(f"{where}: no training has begun with seed {', '.join(map(str, absent))}.")
         elif absent:
-            lines.append(f"{place}: no data, no training has begun.")
+            lines.append(f"{where}: no data, no training has begun.")
         problems = {run.cell.seed: "; ".join(run_problems(run, from_step)) for run in runs}
-        lines += [f"{place}, seed {seed}: {text}." for seed, text in problems.items() if text]
+        lines += [f"{where}, seed {seed}: {text}." for seed, text in problems.items() if text]
     if experiment.unplanned:
         lines.append(f"Left out, as experiment.yaml does not name them: {', '.join(experiment.unplanned)}.")
     return lines
@@ -133,9 +135,9 @@ def run_problems(run: Training, from_step: float) -> list[str]:
     for name in (name for name in run.cell.evaluated_in if name != run.cell.environment):
         rows = run.counted(name, from_step)
         if rows.empty:
-            problems.append(f"not evaluated in {name}")
+            problems.append(f"not evaluated in {in_words(name)}")
         elif not run.is_finished(steps := rows["steps"].iloc[-1]):
-            problems.append(f"evaluated in {name} after {steps / MILLION:.4g} of {total}")
+            problems.append(f"evaluated in {in_words(name)} after {steps / MILLION:.4g} of {total}")
     if run.cell.crosses and run.crossings is None:
         problems.append(f"not evaluated on {ROUGH_GROUND}")
     return problems
@@ -154,10 +156,10 @@ def setup_lines(experiment: Experiment) -> list[str]:
     ends = pd.DataFrame([run.rows.iloc[-1] for run in experiment.runs if len(run.rows)])
     ends = ends[ends["seconds"] > 0.0] if len(ends) else ends
     if len(ends):
-        total, speed = ends["seconds"].sum(), ends["steps"].sum() / ends["seconds"].sum() / MILLION
+        total, speed = ends["seconds"].sum(), ends["steps"].sum() / ends["seconds"].sum()
         lines.append(
             f"{counted(len(ends), 'training')} took {timedelta(seconds=round(total))} in all, with their evaluations: "
-            f"{total / len(ends):.4g} s and {speed:.3g} million steps/s each on average; those that shared a device "
+            f"{total / len(ends):.4g} s and {steps_text(speed)} steps/s each on average; those that shared a device "
             "were slower for it"
         )
     return lines
@@ -191,6 +193,11 @@ def write_tables(experiment: Experiment, table: pd.DataFrame, out: Path) -> None
     (out / "evaluations.csv.gz").write_bytes(gzip.compress(text.encode(), mtime=0))  # the same bytes every time
     if experiment.has_rough_ground():
         experiment.crossings().to_csv(out / "grounds.csv", index=False, lineterminator="\n")
+
+
+def steps_text(steps: float) -> str:
+    """Return a number of steps in words: in millions, unless it is small."""
+    return f"{steps / MILLION:.4g} million" if steps >= FEW * MILLION else f"{steps:,.0f}"
 
 
 def one_line(text: str) -> str:

@@ -12,7 +12,7 @@ from scipy import stats
 from legged_torque.paper.metrics import COMPARED, PAPER_METRICS, Metric
 from legged_torque.paper.report.evaluations import CURVE_METRICS, METRIC_NAMES
 from legged_torque.paper.report.experiment import MEASURES, PAPER_STEPS, Experiment
-from legged_torque.paper.report.style import method
+from legged_torque.paper.report.style import in_words, method
 from legged_torque.paper.values import MODELS, PAPER_TASKS, paper_column, paper_value
 from legged_torque.utils.config import flat
 
@@ -48,8 +48,9 @@ def summarize(experiment: Experiment, from_step: float) -> pd.DataFrame:
             paper = paper_value(task, column, metric.name) if is_compared or values.empty else None
             is_final = is_finished and len(values) == experiment.num_expected(task, trained)
             numbers = values.mean(), values.sem(), len(values)
-            has_verdict = metric in COMPARED and paper is not None and len(values)
-            sign = verdict(metric, values.mean(), values.sem(), paper) if has_verdict else ""
+            sign = ""
+            if metric in COMPARED and paper is not None and len(values):
+                sign = verdict(metric, values.mean(), values.sem(), paper)
             rows.append([column, task, metric.name, values.tolist(), *numbers, is_final, is_compared, paper, sign])
     names = ["column", "task", "metric", "values", "mean", "standard_error", "seeds", "is_final", "is_compared"]
     return pd.DataFrame(rows, columns=[*names, "paper", "sign"]).astype({"paper": float}).set_index(names[:3])
@@ -127,7 +128,7 @@ def metric_table(experiment: Experiment, table: pd.DataFrame, columns: list[str]
     planned = len(experiment.plan.seeds) if experiment.is_planned else 0  # 0: every entry has its number of seeds
     papers = table["paper"].dropna().index.unique("column")
     names = [name for column in columns for name in ([column, "paper"] if column in papers else [column])]
-    rows = [["metric", "method", *names]]
+    rows = [["metric", "method", *map(in_words, names)]]
     for metric in PAPER_METRICS:
         best = {column: significantly_best(cells_of(table, column, metric), metric) for column in columns}
         for task in tasks:

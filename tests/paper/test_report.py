@@ -23,7 +23,8 @@ from support.reports import (
 
 from legged_torque.experiments.times import write_times
 from legged_torque.paper.report.evaluations import METRIC_NAMES, read_curves
-from legged_torque.paper.report.figures_curves import smoothed
+from legged_torque.paper.report.experiment import read_experiment
+from legged_torque.paper.report.figures_curves import draw_curves, smoothed
 from legged_torque.paper.report.report import fenced, markdown_table, to_html
 from legged_torque.paper.report.tables import welch
 
@@ -112,7 +113,10 @@ def test_text(text, folder):
     """Numbers stand beside the paper's, marked if not final; test, devices and commands are named, no folder is."""
     words = " ".join(text.split())
     low, often = "≈ 0.7500 ± 0.0500 | 0.7642", "✗ 0.5500 ± 0.0500 | 0.7163"
-    assert "**2 of 8 numbers are at least as good" in words and "(better: 1, within it: 1, worse: 6; missing or not compared: 56)" in words
+    assert (
+        "**2 of 8 numbers are at least as good" in words
+        and "(better: 1, within it: 1, worse: 6; missing or not compared: 56)" in words
+    )
     assert f"| Tracking [share] | PD | {low} | {often} |" in words
     assert "| | Default torque | 0.5000 (1) † | – | – | – |" in words  # after those of the paper
     assert "| Tracking [share] | PD | 0.6500 ± 0.0500 |" in words.partition("## In other environments")[2]
@@ -209,6 +213,22 @@ def test_mistakes(tmp_path, capsys, plan, words, message):
 
 
 # -------------------------------------------------------------------------------------------------------- figures
+
+
+def test_figure_of_a_short_training(tmp_path):
+    """Few steps are counted one by one, "none" is said in words, and no curve touches the frame."""
+    write_experiment(tmp_path / "e", {"none": ["none"]}, seeds=(1,), tasks=["a1_torque"])
+    rows = [line(i, i / 10).replace("000000,", "00,", 1) for i in (1, 2, 3)]  # 100 to 300 steps
+    write_part(tmp_path / "e" / "a1_torque-none-s1" / "2026-01-01_00-00-00", rows)
+    assert run_script(tmp_path / "e", "--out", tmp_path / "out") == 0
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "| metric | method | no perturbations |" in text and "### no perturbations" in text
+    figure = draw_curves(read_experiment(tmp_path / "e"), "track_percentage", "Tracking")
+    figure.canvas.draw()
+    (axis,) = figure.axes
+    labels = [tick.get_text() for tick in axis.get_xticklabels()]
+    assert axis.get_xlabel() == "environment steps" and labels[0] == "0" and "200" in labels
+    assert axis.get_title() == "no perturbations" and axis.get_ylim()[1] > 0.3 * 1.05
 
 
 def test_running_medians():
