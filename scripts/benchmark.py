@@ -11,7 +11,6 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from legged_torque.benchmark.baseline import Baseline
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils import cli
@@ -38,7 +37,6 @@ COLUMNS = {
     "startup_s": ("start-up s", 1),
 }
 """Heading of each column, as wide as the column, and its number of decimals."""
-NOT_COMPARED = ("num_envs", "iteration_over_physics", "startup_s")
 LEGEND = """\
   physics: one control step of physics alone, with its torques; step: env.step; iteration: all of it, with logging
   x floor: iteration / (physics x control steps of a rollout); steps/s: over whole iterations
@@ -63,8 +61,6 @@ def main() -> None:
     result = {"task": args.task, "device": device_name(device), "versions": package_versions(), "rounds": args.rounds}
     result |= {"preset": args.preset or "parallel", "perturbation": args.perturbation or "none"}
     result |= {"ranges": args.ranges or "default", "set": without_machine(args.set)}
-    numbers = [(env_cfg.env.num_envs, train_cfg.runner.num_steps_per_env) for env_cfg, train_cfg in sizes]
-    baseline = Baseline(args.baseline, result, numbers) if args.baseline else None
     memory = MemoryMeter(device)
     of_gpu = "GPU memory of torch and Warp together, without the CUDA context"
     print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")
@@ -77,8 +73,6 @@ def main() -> None:
         print_row(row, args.profile)
         if args.json:
             write_json(args.json, result | {"rows": rows})
-    if baseline:
-        print_comparison(args.baseline, baseline, rows)
 
 
 def parse_args() -> argparse.Namespace:
@@ -89,8 +83,6 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
     parser.add_argument("--json", type=Path, help="file to write")
-    help_text = "file that --json of an earlier benchmark wrote: print what is different"
-    parser.add_argument("--baseline", type=Path, help=help_text)
     help_text = "write a trace of a few iterations for ui.perfetto.dev, as .json or .json.gz"
     parser.add_argument("--profile", type=Path, help=help_text)
     args = parser.parse_args()
@@ -120,17 +112,6 @@ def print_row(row: dict[str, Any], trace: Path) -> None:
     print(" | ".join([*cells, *([row["error"]] if "error" in row else [])]), flush=True)
     if "profile" in row:
         print(*row["profile"], f"The trace is in {trace}; Warp's kernels show on a GPU only.", sep="\n")
-
-
-def print_comparison(file: Path, baseline: Baseline, rows: list[dict[str, Any]]) -> None:
-    """Print the numbers of all sizes against those of the baseline."""
-    print(f"\nAgainst {file}", *baseline.notes, sep="\n  ")
-    print(f" worlds | {'what':<12} | {'old':>11} | {'new':>11} | new / old")
-    for row in rows:
-        for name, old, new, ratio in baseline.compare(row, [name for name in COLUMNS if name not in NOT_COMPARED]):
-            title, digits = COLUMNS[name]
-            cells = [f"{row['num_envs']:>7,}", f"{title.strip():<12}"]
-            print(" | ".join([*cells, *(f"{value:>11,.{digits}f}" for value in (old, new)), f"{ratio:>9.3f}"]))
 
 
 if __name__ == "__main__":

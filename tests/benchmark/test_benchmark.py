@@ -70,22 +70,6 @@ def test_table(measured):
         assert cells[0] == str(row["num_envs"]) and f"{row['iteration_steps_per_s']:.0f}" in cells
 
 
-def test_against_an_earlier_run(measured, tmp_path):
-    """Old and new numbers are printed with their ratios."""
-    old = measured[1]
-    (tmp_path / "old.json").write_text(json.dumps(old | {"device": "another GPU"}))
-    files = ["--baseline=old.json", f"--json={tmp_path / 'new.json'}"]
-    status, output, error = run_here("benchmark.py", *SMALL, "--num_envs=2", *files, root=tmp_path)
-    assert (status, error) == (0, "")
-    (new,) = json.loads((tmp_path / "new.json").read_text())["rows"]
-    notes, table = output.split("Against old.json\n")[1].split(" worlds | ")
-    assert "its device was 'another GPU', is 'CPU" in notes
-    lines = [[cell.strip() for cell in line.split("|")] for line in table.splitlines()[1:]]
-    assert [cells[1] for cells in lines][:3] == ["physics ms", "step ms", "rollout ms"] and len(lines) == 8
-    ratios = {cells[1]: float(cells[4]) for cells in lines}
-    assert ratios["update ms"] == pytest.approx(new["update_ms"] / old["rows"][0]["update_ms"], abs=1e-3)
-
-
 def test_trace(runner, tmp_path):
     """The trace is JSON that has the traced iterations with their rollouts and updates; a table has the operators."""
     lines = benchmark.trace_iterations(runner, tmp_path / "trace.json.gz")
