@@ -96,7 +96,8 @@ class Parser(argparse.ArgumentParser):
                 raise UserError(f"the value of {name} is empty" if name else "an argument is empty")
         namespace, unknown = self.parse_known_args(words, namespace)
         if unknown:
-            option, key = ["", "", *words[: words.index(unknown[0])]][-2:]
+            before = words[: words.index(unknown[0])] if unknown[0] in words else []
+            option, key = ["", "", *before][-2:]
             if option == "--set" and "=" not in key:
                 raise UserError(f"--set takes KEY=VALUE: give --set {key}={unknown[0]}")
             options = [option for action in self._actions for option in action.option_strings]
