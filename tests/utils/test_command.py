@@ -11,6 +11,7 @@ from support.settings import error_of, get_cfgs, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.cli import run_script, script_command
+from legged_torque.utils.options import Options
 
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("[!_]*.py"))
 
@@ -62,7 +63,7 @@ def test_list_of_tasks(tmp_path):
     _, output, _ = run_here("train.py", "--list", root=tmp_path)
     assert re.findall(r"^[* ] (\w+_\w+) +\S", output, re.MULTILINE) == sorted(task_registry.names(), key=output.index)
     assert max(map(len, output.splitlines())) <= 80
-    assert re.findall(r"^\* (\w+) ", output, re.MULTILINE)[0] == parse().task == "a1_torque_multihead"
+    assert re.findall(r"^\* (\w+) ", output, re.MULTILINE)[0] == Options().task == "a1_torque_multihead"
     _, output, _ = run_here("train.py", "--list", "go2", root=tmp_path)
     groups = dict(re.findall(r"^(go2 .+):\n((?:  .+\n)+)", output, re.MULTILINE))
     assert {title: lines.count("go2_") for title, lines in groups.items()} == {
