@@ -8,6 +8,25 @@ from torch import Tensor
 from legged_torque.utils.heading import heading
 
 
+def quat_to_matrix(quat: Tensor) -> Tensor:
+    """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    w, x, y, z = quat.unbind(dim=-1)
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def cross_matrix(vec: Tensor) -> Tensor:
+    """Return the matrices (..., 3, 3) whose product with a vector is the cross product of ``vec`` (..., 3) and it."""
+    x, y, z = vec.unbind(dim=-1)
+    none = torch.zeros_like(x)
+    rows = ((none, -z, y), (z, none, -x), (-y, x, none))
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
 def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     """Turn world vectors (..., 3) into the frames of bodies with unit quaternions (..., 4).
 

@@ -29,7 +29,7 @@ from legged_torque.envs.base.random_parameters import (
 from legged_torque.envs.base.reward_terms import RewardTerms
 from legged_torque.envs.base.rewards import Rewards
 from legged_torque.envs.base.robot_checks import range_notes
-from legged_torque.envs.base.state import RobotState
+from legged_torque.envs.base.state import RobotState, StateAccess
 from legged_torque.envs.base.symmetry import Mirror
 from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.validation import check_env_cfg
@@ -47,7 +47,7 @@ OUTSIDE_KERNEL = "torques are computed in torch, outside of the physics kernel: 
 """Note of tasks that override ``_compute_torques`` or have motors without a Warp function."""
 
 
-class LeggedRobot(RewardTerms, BaseTask):
+class LeggedRobot(RewardTerms, StateAccess, BaseTask):
     """A batch of robots with position control, and what all approaches share.
 
     An approach overrides :meth:`action_terms`, or :meth:`_compute_torques` in torch, adds ``_reward_<term>`` methods or
@@ -157,11 +157,6 @@ class LeggedRobot(RewardTerms, BaseTask):
         time_out = state.episode_length >= self.max_episode_length
         state.reset_buf.copy_(ended | time_out)
         state.time_out_buf.copy_(time_out & ~ended)
-
-    @property
-    def base_height(self) -> Tensor:
-        """Height of the trunk's origin above the ground under it [m]. Shape: (num_envs,)."""
-        return self.state.base_height
 
     # ---- one control step --------------------------------------------------------------------------------------------
 
