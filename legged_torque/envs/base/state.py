@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -163,35 +164,14 @@ class RobotState(Buffers):
         return torch.cat([self.base_lin_vel[:, :2], self.base_ang_vel[:, 2:]], dim=1)
 
 
+def _of_state(name: str) -> Any:
+    """Return a property of tasks that is a member of their state."""
+    return property(lambda task: getattr(task.state, name), doc=getattr(RobotState, name).__doc__)
+
+
 class StateAccess:
-    """What a task computes of its :class:`RobotState` only where it is asked for, under the same names."""
+    """What tasks compute of their :class:`RobotState` only where it is asked for, under the same names."""
 
-    state: RobotState
-
-    @property
-    def base_height(self) -> Tensor:
-        """See :attr:`RobotState.base_height`."""
-        return self.state.base_height
-
-    @property
-    def foot_pos(self) -> Tensor:
-        """See :attr:`RobotState.foot_pos`."""
-        return self.state.foot_pos
-
-    @property
-    def foot_vel(self) -> Tensor:
-        """See :attr:`RobotState.foot_vel`."""
-        return self.state.foot_vel
-
-    @property
-    def foot_contact_force(self) -> Tensor:
-        """See :attr:`RobotState.foot_contact_force`."""
-        return self.state.foot_contact_force
-
-    def body_pos(self, name: str) -> Tensor:
-        """See :meth:`RobotState.body_pos`."""
-        return self.state.body_pos(name)
-
-    def body_vel(self, name: str) -> Tensor:
-        """See :meth:`RobotState.body_vel`."""
-        return self.state.body_vel(name)
+    base_height, foot_pos, foot_vel, foot_contact_force, body_pos, body_vel = map(
+        _of_state, ("base_height", "foot_pos", "foot_vel", "foot_contact_force", "body_pos", "body_vel")
+    )
