@@ -54,7 +54,7 @@ WHEN = {24: [32, 48, 80], 16: [16, 32, 48, 64, 80], 5: [16, 32, 48, 64, 80], 50:
 
 @pytest.mark.parametrize(("interval", "steps"), WHEN.items())
 def test_when_rows_appear(make_runner, interval, steps):
-    """A rollout has 16 steps; a row comes at the first end of one at or after each multiple of the interval, and the last."""
+    """A rollout has 16 steps; a row comes at the first end of one at or after each interval, and the last."""
     runner = make_runner(**{"evaluation.interval": interval})
     runner.learn(5)
     numbers = [(row["steps"], row["iteration"]) for row in rows_of(runner) or []] or None
