@@ -27,14 +27,7 @@ from legged_torque.deploy.description import (
     require,
     to_yaml,
 )
-from legged_torque.deploy.policy import (
-    OBSERVATIONS,
-    Policy,
-    State,
-    load_network,
-    parts_without_function,
-    supplied_terms,
-)
+from legged_torque.deploy.policy import OBSERVATIONS, Policy, State, load_network, parts_without_function
 from legged_torque.envs.base.commands import HEADING_GAIN
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.motors.ideal import IdealMotor
@@ -135,8 +128,8 @@ def export_note(task: LeggedRobot, model: MLPModel) -> str:
     problems = network_problems(task, model)
     if not problems:
         description = describe(task, model, "", {})
-        problems = unknown_parts(task, description)
-        problems += [f"the robot's side must supply '{name}'" for name in supplied_terms(description)]
+        terms = [term["name"] for term in description["observations"]["terms"] if "supplied" in term]
+        problems = unknown_parts(task, description) + [f"the robot's side must supply '{name}'" for name in terms]
     return f"exports of this policy will not be complete: {'; '.join(problems)}" if problems else ""
 
 

@@ -52,7 +52,7 @@ class Policy:
         stiffness: Gains [N m/rad]. Shape: (joints,).
         damping: Gains [N m s/rad]. Shape: (joints,).
         torque_limits: Lowest and highest torques. Shape: (2, joints) [N m].
-        supplied: Observation terms that only the task can compute: :attr:`State.terms` must have their values.
+        supplied: Observation terms without a function here: :attr:`State.terms` must have their values.
         scan: Entry ``scan`` of the observations; None if the policy does not see the ground.
         scan_points: Where the height scan measures: x along the trunk's heading and y to its left, from the trunk's
             origin. Shape: (points, 2) [m].
@@ -78,7 +78,7 @@ class Policy:
         self._action_clip = self.description["actions"]["clip"]
         terms = self.description["observations"]["terms"]
         self._observations, sizes = [term["name"] for term in terms], [term["size"] for term in terms]
-        self.supplied = supplied_terms(self.description)
+        self.supplied = [name for name in self._observations if name not in OBSERVATIONS]
         self._scale = np.concatenate([np.full(term["size"], term["scale"], np.float32) for term in terms])
         self._clip: np.ndarray = np.repeat(np.array([term["clip"] for term in terms], np.float32), sizes, axis=0).T
         self._num_kept = sum(term["size"] for term in terms if "group" not in term)  # of which there is a history
@@ -203,21 +203,13 @@ ACTIONS: dict[str, Callable[[Policy, np.ndarray, np.ndarray, np.ndarray], np.nda
 
 
 def parts_without_function(description: dict[str, Any]) -> list[str]:
-    """Return a line for each term or motor of a description that has no function here; no motor has one."""
-    functions: dict[str, Any] = {"observation": OBSERVATIONS, "action": ACTIONS}
+    """Return a line for each action term or motor of a description that has no function here; no motor has one."""
     terms = [
-        f"no numpy function for the {kind} term '{term['name']}'; there are {', '.join(known)}"
-        for kind, known in functions.items()
-        for term in description[f"{kind}s"]["terms"]
-        if term["name"] not in known and not term.get("supplied")
+        f"no numpy function for the action term '{term['name']}'; there are {', '.join(ACTIONS)}"
+        for term in description["actions"]["terms"]
+        if term["name"] not in ACTIONS
     ]
     return terms + [f"no numpy function for the motor '{name}'" for name in description.get("motors", {})]
-
-
-def supplied_terms(description: dict[str, Any]) -> list[str]:
-    """Return the observation terms of a description whose values the robot's side must supply."""
-    terms = description["observations"]["terms"]
-    return [term["name"] for term in terms if term.get("supplied") and term["name"] not in OBSERVATIONS]
 
 
 def load_network(file: Path, description: dict[str, Any]) -> Any:

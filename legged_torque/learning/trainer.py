@@ -161,8 +161,8 @@ class Trainer:
         chosen = [each for each in self._evaluators if each.is_on(steps)] if ended else due
         if self.logger.writer is None or not chosen:
             return {}
-        at_most = "" if due == chosen else f" the policy at the end, for at most {most_steps} steps of each world"
-        self._log.display.begin(f"evaluating{at_most}")
+        at_most = "" if due == chosen else f" at the end of training, at most {most_steps} steps of each world"
+        self._log.display.activity = f"evaluating{at_most}"
         start = time.perf_counter()
         seconds = self._seconds_before + self.logger.tot_time + start - begin
         when = {"steps": steps, "iteration": self.current_learning_iteration + 1, "seconds": seconds}

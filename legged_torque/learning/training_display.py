@@ -100,12 +100,6 @@ class TrainingDisplay(Display):
         if not self._is_quiet:
             self.show(LINE_AFTER_EVALUATION if measured else LINE_EVERY)
 
-    def begin(self, activity: str) -> None:
-        """Show that something unusual has begun, until :attr:`activity` is cleared."""
-        self.activity = activity
-        if not self._is_quiet:
-            self.show()
-
     def line(self) -> str:
         """Return the state in a line."""
         bad = {name: f"{count:,}" for name, count in self._bad.items() if count}

@@ -8,23 +8,18 @@ from torch import Tensor
 from legged_torque.utils.heading import heading
 
 
-def quat_to_matrix(quat: Tensor) -> Tensor:
-    """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
-    w, x, y, z = quat.unbind(dim=-1)
-    rows = (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+def quat_multiply(first: Tensor, second: Tensor) -> Tensor:
+    """Return the quaternions (..., 4) that turn as ``second``, then as ``first`` does; axes are broadcast."""
+    w, xyz, other_w, other = first[..., :1], first[..., 1:], second[..., :1], second[..., 1:]
+    real = w * other_w - (xyz * other).sum(dim=-1, keepdim=True)
+    return torch.cat([real, w * other + other_w * xyz + torch.linalg.cross(xyz, other)], dim=-1)
 
 
-def cross_matrix(vec: Tensor) -> Tensor:
-    """Return the matrices (..., 3, 3) whose product with a vector is the cross product of ``vec`` (..., 3) and it."""
-    x, y, z = vec.unbind(dim=-1)
-    none = torch.zeros_like(x)
-    rows = ((none, -z, y), (z, none, -x), (-y, x, none))
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
+    """Turn vectors (..., 3) of bodies with unit quaternions (..., 4) into the world's frame, see the inverse."""
+    w, xyz = quat[..., :1], quat[..., 1:]
+    t = 2.0 * torch.linalg.cross(xyz, vec)
+    return vec + w * t + torch.linalg.cross(xyz, t)
 
 
 def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:

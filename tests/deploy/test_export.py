@@ -278,8 +278,7 @@ def test_groups_in_the_scripts(tmp_path, monkeypatch):
     simulation = ["sim2sim.py", "[policy,lean]", "--robots=1", "--steps=3"]
     assert run_here(*simulation, words[0], root=tmp_path)[0] == 0
     del OBSERVATIONS["lean"]
-    message = "no numpy function for the observation term 'lean'"
-    assert_told_in_one_line(run_here(*simulation, root=tmp_path), message)
+    assert_told_in_one_line(run_here(*simulation, root=tmp_path), "plain MuJoCo has no values of lean, for which")
 
 
 @pytest.mark.parametrize(
