@@ -68,14 +68,11 @@ class TrainingEvaluator:
         self._warm_up_runs = math.ceil(WARM_UP_TIME / self._task.dt / self._num_steps)
         self._graph.reset()
 
-    def due(self, before: int, steps: int) -> bool:
-        """Return whether to evaluate after a rollout from ``before`` to ``steps`` of the training."""
+    def due(self, before: int, steps: int, is_last: bool = False) -> bool:
+        """Return whether to evaluate after a rollout from ``before`` to ``steps`` of the training, maybe its last."""
         interval = self._settings["interval"]
-        return self.is_on(steps) and steps // interval > before // interval
-
-    def is_on(self, steps: int) -> bool:
-        """Return whether to evaluate at all after so many steps of the training."""
-        return self._settings["interval"] > 0 and (not self.name or steps >= self._settings["also_from"])
+        is_time = interval > 0 and (is_last or steps // interval > before // interval)
+        return is_time and (not self.name or steps >= self._settings["also_from"])
 
     def evaluate(self, most_steps: float = math.inf) -> tuple[dict[str, float], dict[str, float]]:
         """Return the metrics of the policy, and the levels of the training's ground, at this moment of training.
