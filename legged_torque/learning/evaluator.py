@@ -71,7 +71,7 @@ class TrainingEvaluator:
     def due(self, before: int, steps: int, is_last: bool = False) -> bool:
         """Return whether to evaluate after a rollout from ``before`` to ``steps`` of the training, maybe its last."""
         interval = self._settings["interval"]
-        is_time = interval > 0 and (is_last or steps // interval > before // interval)
+        is_time = interval > 0 and ((is_last and self._settings["at_end"]) or steps // interval > before // interval)
         return is_time and (not self.name or steps >= self._settings["also_from"])
 
     def evaluate(self, most_steps: float = math.inf) -> tuple[dict[str, float], dict[str, float]]:
