@@ -25,6 +25,7 @@ def main() -> None:
     with cli.slow_imports():
         run = task_registry.load_run(options)
         from legged_torque.deploy.export import export_policy, nominal_cfg
+        from legged_torque.deploy.policy import Policy
     env, runner = task_registry.make_loaded(run, options, nominal_cfg(run.env_cfg))
     iterations = runner.current_learning_iteration
     out = args.out or run.folder / f"exported_{iterations}"
@@ -34,7 +35,10 @@ def main() -> None:
     print(f"{run.checkpoint}, after {training['total_steps']:,} steps of training:")
     print(f"  exported to {out}: policy.onnx, policy.pt, policy.yaml")
     print(f"  largest difference to the checkpoint's network: {difference:.2g}")
-    if unsupported:
+    supplied = Policy(out).supplied if not unsupported else []
+    if supplied:
+        print(f"  whoever runs it must supply {', '.join(supplied)}: there is no numpy function for it")
+    elif unsupported:
         print("  policy.yaml does not describe the whole task, so sim2sim.py refuses it; the networks are complete:")
         print("".join(f"  - {problem}\n" for problem in unsupported), end="")
     else:

@@ -95,6 +95,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     """Build the task and train it, from a pre-trained policy if the task has one."""
     import torch
 
+    from legged_torque.deploy.export import export_note
     from legged_torque.envs.base.held_pose import standing_note
     from legged_torque.envs.base.legged_robot import LeggedRobot
 
@@ -111,6 +112,8 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     runner, _ = task_registry.make_alg_runner(env, options.task, options, train_cfg)
     if starts_pretrained:
         start_from(runner, pretrained)  # the other processes get the networks of the first one
+    if is_first and isinstance(env, LeggedRobot):
+        print_notes([export_note(env, runner.alg.policy())])
     runner.verbose = options.verbose
     total = options.max_iterations or num_iterations(env, train_cfg)
     settings = {"env": to_dict(env_cfg), "train": to_dict(train_cfg), "version": package_versions()}

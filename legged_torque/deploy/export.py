@@ -27,14 +27,14 @@ from legged_torque.deploy.description import (
     require,
     to_yaml,
 )
-from legged_torque.deploy.policy import Policy, State, load_network, parts_without_function
+from legged_torque.deploy.policy import OBSERVATIONS, Policy, State, load_network, parts_without_function
 from legged_torque.envs.base.commands import HEADING_GAIN, UniformCommands
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.motors.ideal import IdealMotor
 from legged_torque.motors.motor import Motor
 from legged_torque.sensors.height_scan import CLIP, OFFSET
 from legged_torque.terrain.layout import Layout
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.runs import package_versions
 
 TORCHSCRIPT_FILE = "policy.pt"
@@ -83,14 +83,7 @@ def export_policy(
         UserError: If the network has memory or reads other observations or images, or a package is missing.
     """
     require("onnx", "onnxruntime", "jsonschema")
-    if model.is_recurrent:
-        raise UserError("only policies without memory can be exported")
-    if getattr(model, "obs_groups_2d", []):  # of rsl_rl's CNNModel
-        raise UserError(f"policies that see images cannot be exported: {', '.join(model.obs_groups_2d)}")
-    further = task.observations.groups
-    if model.obs_groups[:1] != ["policy"] or not further.keys() >= set(model.obs_groups[1:]):
-        allowed = f"'policy', then groups of single terms ({', '.join(further) or 'here none'})"
-        raise UserError(f"obs_groups.actor of an exported policy must be {allowed}, not {', '.join(model.obs_groups)}")
+    refuse(network_problems(task, model))
     description = describe(task, model, name, training)
     folder.parent.mkdir(parents=True, exist_ok=True)
     if folder.exists() and not folder.is_dir():
@@ -99,16 +92,45 @@ def export_policy(
         part = Path(temporary)
         difference = write_networks(model, part, description)
         (part / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
-        unknown = parts_without_function(description)
-        for link, motor in task.motors.links.items():  # which may do anything over time
-            if type(motor) is not IdealMotor and type(motor).describe is Motor.describe:
-                unknown.append(f"the motor '{link}' has no describe()")
-        description["unsupported"] = unknown or differences(task, model, Policy(part))
+        description["unsupported"] = unknown_parts(task, description) or differences(task, model, Policy(part))
         (part / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
         folder.mkdir(exist_ok=True)
         for file in (NETWORK_FILE, TORCHSCRIPT_FILE, DESCRIPTION_FILE):
             os.replace(part / file, folder / file)
     return difference, description["unsupported"]
+
+
+def network_problems(task: LeggedRobot, model: MLPModel) -> list[str]:
+    """Return why a network cannot be exported at all."""
+    if getattr(model, "is_recurrent", True):  # which rsl_rl's models say
+        return ["only policies without memory can be exported"]
+    if getattr(model, "obs_groups_2d", []):  # of rsl_rl's CNNModel
+        return [f"policies that see images cannot be exported: {', '.join(model.obs_groups_2d)}"]
+    further = task.observations.groups
+    if model.obs_groups[:1] != ["policy"] or not further.keys() >= set(model.obs_groups[1:]):
+        allowed = f"'policy', then groups of single terms ({', '.join(further) or 'here none'})"
+        return [f"obs_groups.actor of an exported policy must be {allowed}, not {', '.join(model.obs_groups)}"]
+    return []
+
+
+def unknown_parts(task: LeggedRobot, description: dict[str, Any]) -> list[str]:
+    """Return a line for each part of a task that only the task can compute, apart from observations."""
+    motors = [name for name, motor in task.motors.links.items() if type(motor) is not IdealMotor]
+    silent = [name for name in motors if type(task.motors.links[name]).describe is Motor.describe]  # may do anything
+    return parts_without_function(description) + [f"the motor '{name}' has no describe()" for name in silent]
+
+
+def export_note(task: LeggedRobot, model: MLPModel) -> str:
+    """Return in a line what exports of a policy will lack, to be said before it is trained; empty if nothing is known.
+
+    What is computed otherwise than described is only found by an export.
+    """
+    problems = network_problems(task, model)
+    if not problems:
+        description = describe(task, model, "", {})
+        terms = [term["name"] for term in description["observations"]["terms"] if "supplied" in term]
+        problems = unknown_parts(task, description) + [f"the robot's side must supply '{name}'" for name in terms]
+    return f"exports of this policy will not be complete: {'; '.join(problems)}" if problems else ""
 
 
 def write_networks(model: MLPModel, folder: Path, description: dict[str, Any]) -> float:
@@ -225,6 +247,8 @@ def _observation_terms(task: LeggedRobot, model: MLPModel) -> list[dict[str, Any
         entry |= {key: getattr(term, key) for key in ("frame", "unit", "meaning")} | {"clip": [-clip, clip]}
         if term.group:
             entry["group"] = term.group
+        if term.name not in OBSERVATIONS:
+            entry["supplied"] = True
         if term.name == "height_scan":
             points = {"points_x": list(settings.measured_points_x), "points_y": list(settings.measured_points_y)}
             entry["scan"] = {**points, "offset": OFFSET, "limit": CLIP, "delay": settings.measure_delay}
@@ -262,14 +286,20 @@ def differences(task: LeggedRobot, model: MLPModel, policy: Policy) -> list[str]
     task.actions.copy_(draw(task.actions, 3.0))
     task.reset_buf.fill_(True)  # the history starts with copies
     task.set_state(qpos, draw(task.sim.qvel, 3.0))
+    supplied = [term for term in (*task.observations.terms, *task.observations.groups.values()) if not term.privileged]
+    values = {term.name: term.value().cpu().clone().numpy() for term in supplied}  # as observed, before torques change
     wanted = task._compute_torques(task.actions)
     task.torques.copy_(task.motors.apply(wanted, task.dof_pos, task.dof_vel, 0))
     parts = (task.base_ang_vel, task.dof_pos, task.dof_vel, task.projected_gravity, task.base_pos, task.base_quat)
     obs, torques = [], []
     for world in range(task.num_envs):
-        *measured, position, quat = (part[world].cpu().numpy() for part in parts)
+        rates, angles, speeds, gravity, position, quat = (part[world].cpu().numpy() for part in parts)
         points = np.pad(policy.scan_places(position, quat), [(0, 0), (0, 1)], constant_values=position[2])
-        state, in_world = State(*measured), torch.as_tensor(points, dtype=torch.float32, device=task.device)
+        state, in_world = (
+            State(rates, angles, speeds, gravity),
+            torch.as_tensor(points, dtype=torch.float32, device=task.device),
+        )
+        state.terms = {name: of_worlds[world] for name, of_worlds in values.items()}
         state.heights = task.terrain.height_above(in_world).cpu().numpy()
         policy.reset()
         policy.last_action = actions = task.actions[world].cpu().numpy()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ class State:
     projected_gravity: np.ndarray | None = None  # unit vector in the trunk's frame; upright it is (0, 0, -1)
     quaternion: np.ndarray | None = None  # the trunk's orientation (w, x, y, z), in place of the gravity vector; (4,)
     heights: np.ndarray | None = None  # of the trunk's origin above the ground at scan_places of the policy [m]
+    terms: dict[str, Any] = field(default_factory=dict)  # unscaled values of the policy's supplied terms, by name
 
     def gravity(self) -> np.ndarray:
         """Return the unit gravity vector in the trunk's frame. Shape: (3,)."""
@@ -51,6 +52,7 @@ class Policy:
         stiffness: Gains [N m/rad]. Shape: (joints,).
         damping: Gains [N m s/rad]. Shape: (joints,).
         torque_limits: Lowest and highest torques. Shape: (2, joints) [N m].
+        supplied: Observation terms without a function here: :attr:`State.terms` must have their values.
         scan: Entry ``scan`` of the observations; None if the policy does not see the ground.
         scan_points: Where the height scan measures: x along the trunk's heading and y to its left, from the trunk's
             origin. Shape: (points, 2) [m].
@@ -75,7 +77,8 @@ class Policy:
         self._action_terms = self.description["actions"]["terms"]
         self._action_clip = self.description["actions"]["clip"]
         terms = self.description["observations"]["terms"]
-        self._observations, sizes = [OBSERVATIONS[term["name"]] for term in terms], [term["size"] for term in terms]
+        self._observations, sizes = [term["name"] for term in terms], [term["size"] for term in terms]
+        self.supplied = [name for name in self._observations if name not in OBSERVATIONS]
         self._scale = np.concatenate([np.full(term["size"], term["scale"], np.float32) for term in terms])
         self._clip: np.ndarray = np.repeat(np.array([term["clip"] for term in terms], np.float32), sizes, axis=0).T
         self._num_kept = sum(term["size"] for term in terms if "group" not in term)  # of which there is a history
@@ -97,7 +100,12 @@ class Policy:
         Call it once per control step, since it keeps the history. The command is v_x, v_y [m/s] and the yaw rate
         [rad/s] in the trunk's frame. Shapes: (3,) to (observations,).
         """
-        now = np.concatenate([np.asarray(value(self, state, command), np.float32) for value in self._observations])
+        missing = [name for name in self.supplied if name not in state.terms]
+        if missing:
+            raise ValueError(f"the terms of a state need values of {', '.join(missing)}")
+        functions = {name: lambda *_, name=name: state.terms[name] for name in self.supplied} | OBSERVATIONS
+        values = [functions[name](self, state, command) for name in self._observations]
+        now = np.concatenate([np.asarray(value, np.float32) for value in values])
         if now.shape != self._scale.shape:
             raise ValueError(f"a state and a command make {now.size} observations, not {self._scale.size}")
         now, others = np.split(np.clip(now * self._scale, *self._clip), [self._num_kept])
@@ -180,8 +188,9 @@ OBSERVATIONS: dict[str, Callable[[Policy, State, np.ndarray], Any]] = {
 }
 """Returns the unscaled values of an observation term, by its name.
 
-Exports compare these with the task's. A task with terms of its own may add their functions here and to :data:`ACTIONS`;
-without one, the network is exported, and running it here is refused.
+Exports compare these with the task's. A task with terms of its own may add their functions here and to :data:`ACTIONS`.
+Without one, an observation is marked as ``supplied`` in ``policy.yaml``: whoever runs the policy gives its values in
+:attr:`State.terms`. With an action term that has none, the network is exported, and running it here is refused.
 """
 
 ACTIONS: dict[str, Callable[[Policy, np.ndarray, np.ndarray, np.ndarray], np.ndarray]] = {
@@ -194,13 +203,11 @@ ACTIONS: dict[str, Callable[[Policy, np.ndarray, np.ndarray, np.ndarray], np.nda
 
 
 def parts_without_function(description: dict[str, Any]) -> list[str]:
-    """Return a line for each term or motor of a description that has no function here; no motor has one."""
-    functions: dict[str, Any] = {"observation": OBSERVATIONS, "action": ACTIONS}
+    """Return a line for each action term or motor of a description that has no function here; no motor has one."""
     terms = [
-        f"no numpy function for the {kind} term '{term['name']}'; there are {', '.join(known)}"
-        for kind, known in functions.items()
-        for term in description[f"{kind}s"]["terms"]
-        if term["name"] not in known
+        f"no numpy function for the action term '{term['name']}'; there are {', '.join(ACTIONS)}"
+        for term in description["actions"]["terms"]
+        if term["name"] not in ACTIONS
     ]
     return terms + [f"no numpy function for the motor '{name}'" for name in description.get("motors", {})]
 

@@ -39,7 +39,7 @@ class Simulation:
         push_velocity: float = 0.0,
         push_probability: float = 0.0,
     ) -> None:
-        """Prepare; :meth:`run` starts an episode.
+        """Prepare; :meth:`run` starts an episode. A UserError if the policy needs terms that nobody supplies here.
 
         Args:
             policy: The policy.
@@ -48,6 +48,9 @@ class Simulation:
             push_velocity: Largest draw of each axis of a push's velocity, either way [m/s].
             push_probability: Of a push per control step.
         """
+        if policy.supplied:
+            why = "for which there is no numpy function here; a file of the task's (--task_file) may add it"
+            raise UserError(f"plain MuJoCo has no values of {', '.join(policy.supplied)}, {why}")
         self.policy, self.robot = policy, robot
         self._push_velocity, self._push_probability = push_velocity, push_probability
         description = policy.description

@@ -227,6 +227,7 @@ def step_words(matrix: Matrix, cell: Cell, state: CellState, device: str) -> lis
     words += [f"--seed={cell.seed}", f"--perturbation={cell.environment}"]
     also = [name for name in cell.evaluated_in if name != cell.environment]
     words += [f"--set={word}" for word in [*matrix.set_words(), f"evaluation.also={json.dumps(also)}"]]
+    words.append("--set=evaluation.at_end=False")  # those are short: without others, the last checkpoint is measured
     return ["train.py", *words, *([f"--ranges={matrix.ranges}"] if matrix.ranges else [])]
 
 

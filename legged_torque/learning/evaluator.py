@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -31,7 +33,8 @@ class TrainingEvaluator:
 
     Its worlds have random numbers of their own, and go on where the last evaluation left them. An evaluation has as
     many steps of robots as the paper's 16 worlds x 2000 steps, but in many worlds at once. Training is the same with
-    and without it. Robots stuck under an early policy stay stuck until time-out, so early metrics lag.
+    and without it. Robots stuck under an early policy stay stuck until time-out, so early metrics lag. The evaluation
+    at the end of a training, where none is due, leaves no trace in those of a training that goes on.
 
     Attributes:
         name: The environment, if it is one of ``evaluation.also``; empty for that of ``evaluation.perturbation``.
@@ -54,7 +57,8 @@ class TrainingEvaluator:
         self._task, self._policy, self._settings, self._seed = task, policy, settings, seed
         self._num_envs = min(settings["num_envs"], task.num_envs)
         self._num_steps = math.ceil(settings["num_samples"] / self._num_envs)
-        self._graph = CudaGraph(self._run, task.device, capture and self._num_steps <= MAX_CAPTURED_STEPS)
+        run = functools.partial(self._run, self._num_steps)
+        self._graph = CudaGraph(run, task.device, capture and self._num_steps <= MAX_CAPTURED_STEPS)
         self.reset()
 
     def reset(self) -> None:
@@ -64,24 +68,36 @@ class TrainingEvaluator:
         self._warm_up_runs = math.ceil(WARM_UP_TIME / self._task.dt / self._num_steps)
         self._graph.reset()
 
-    def due(self, before: int, steps: int) -> bool:
-        """Return whether to evaluate after a rollout from ``before`` to ``steps`` of the training."""
+    def due(self, before: int, steps: int, is_last: bool = False) -> bool:
+        """Return whether to evaluate after a rollout from ``before`` to ``steps`` of the training, maybe its last."""
         interval = self._settings["interval"]
-        is_time = interval > 0 and steps // interval > before // interval
+        is_time = interval > 0 and ((is_last and self._settings["at_end"]) or steps // interval > before // interval)
         return is_time and (not self.name or steps >= self._settings["also_from"])
 
-    def evaluate(self) -> tuple[dict[str, float], dict[str, float]]:
-        """Return the metrics of the policy, and the levels of the training's ground, at this moment of training."""
+    def evaluate(self, most_steps: float = math.inf) -> tuple[dict[str, float], dict[str, float]]:
+        """Return the metrics of the policy, and the levels of the training's ground, at this moment of training.
+
+        Warm-up and evaluation take at most so many control steps, but at least one.
+        """
+        num_steps = int(min(self._num_steps, max(1, most_steps / 2)))
+        run = self._graph if num_steps == self._num_steps else functools.partial(self._run, num_steps)
         evaluation = self._build()
         evaluation.task.total_steps.copy_(self._task.total_steps)
         evaluation.task.update_curriculum()
         with own_random_numbers(self._task.device, self._random_state):
-            for _ in range(self._warm_up_runs):
-                self._graph()
+            for _ in range(int(min(self._warm_up_runs, max(0, most_steps / num_steps - 1)))):
+                run()
             self._warm_up_runs = 0
             evaluation.clear()
-            self._graph()
+            run()
         return evaluation.means(), evaluation.levels()
+
+    def evaluate_at_end(self, most_steps: float) -> tuple[dict[str, float], dict[str, float]]:
+        """Return the same as :meth:`evaluate`; the next evaluations are as without this one."""
+        before = copy.deepcopy(self.state_dict())
+        result = self.evaluate(most_steps)
+        self.load_state_dict(before) if before else self.reset()
+        return result
 
     def state_dict(self) -> dict[str, Any]:
         """Return the worlds and their random numbers, by the evaluator's name; nothing if they are not built."""
@@ -109,12 +125,12 @@ class TrainingEvaluator:
                 worlds.episode_length_buf = torch.randint_like(worlds.episode_length_buf, high)
         return self._evaluation
 
-    def _run(self) -> None:
+    def _run(self, num_steps: int) -> None:
         """Let the policy act; runs as a CUDA graph."""
         evaluation = self._build()
         with torch.no_grad():
             obs = evaluation.task.get_observations()
-            for _ in range(self._num_steps):
+            for _ in range(num_steps):
                 obs = evaluation.step(self._policy(obs))
 
 

@@ -24,6 +24,9 @@ from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.runs import checkpoint_file, claim_run_dir, evaluations_file, tagged
 
+LAST_SHARE = 0.25
+"""Most control steps of an evaluation at the end of a training at which none is due, as a share of the training's."""
+
 
 class Trainer:
     """Trains a learner in a task.
@@ -111,7 +114,8 @@ class Trainer:
                 self._wait()
                 collected = time.perf_counter()
                 numbers = self._update(last)
-                measured = self._evaluate(numbers, begin) | guard.add_iteration(numbers)
+                to_end = num_learning_iterations if self.current_learning_iteration + 1 == last else 0
+                measured = self._evaluate(numbers, begin, to_end) | guard.add_iteration(numbers)
                 times = {"collect_time": collected - begin, "learn_time": time.perf_counter() - collected}
                 self._log.prepare(self.current_learning_iteration, times, numbers, measured)
                 self.current_learning_iteration += 1
@@ -147,20 +151,26 @@ class Trainer:
         numbers = self.alg.update() if self.alg.due() else {}
         return {name: float(number) for name, number in numbers.items()}
 
-    def _evaluate(self, numbers: dict[str, float], begin: float) -> dict[str, float]:
-        """Evaluate the policy where it is time, add rows to the run's tables, and return what is to be logged."""
-        steps = int(self.env.total_steps)
-        due = [each for each in self._evaluators if each.due(steps - self._log.steps_per_iteration, steps)]
-        if self.logger.writer is None or not due:
+    def _evaluate(self, numbers: dict[str, float], begin: float, ended: int) -> dict[str, float]:
+        """Evaluate the policy where it is time, add rows to the run's tables, and return what is to be logged.
+
+        After the last of ``ended`` iterations, which is 0 before, it is time in any case.
+        """
+        steps, most_steps = int(self.env.total_steps), int(LAST_SHARE * ended * self.cfg["num_steps_per_env"])
+        before = steps - self._log.steps_per_iteration
+        chosen = [each for each in self._evaluators if each.due(before, steps, ended > 0)]
+        if self.logger.writer is None or not chosen:
             return {}
-        self._log.display.activity = "evaluating"
         start = time.perf_counter()
         seconds = self._seconds_before + self.logger.tot_time + start - begin
         when = {"steps": steps, "iteration": self.current_learning_iteration + 1, "seconds": seconds}
         critic = {name: numbers[name] for name in ("critic_gradient_norm",) if name in numbers}
         logged: dict[str, float] = {}
-        for evaluator in due:
-            metrics, levels = evaluator.evaluate()
+        for evaluator in chosen:
+            is_due = evaluator.due(before, steps)
+            at_end = f" at the end of training, at most {most_steps} steps of each world"
+            self._log.display.activity = f"evaluating{'' if is_due else at_end}"
+            metrics, levels = evaluator.evaluate() if is_due else evaluator.evaluate_at_end(most_steps)
             logged |= {f"{tagged('Evaluation', evaluator.name)}/{metric}": value for metric, value in metrics.items()}
             file = evaluations_file(Path(str(self.log_dir)), evaluator.name)
             try:

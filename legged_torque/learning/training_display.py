@@ -26,6 +26,7 @@ TREND = 10  # evaluations with whose mean the last one is compared
 CELLS = 12  # characters of the curve of the tracking
 ENTRY = 36  # width of a name and its value in the panel [characters]
 NAME = 16  # width of the name in that
+OTHER_ROWS = 19  # of the panel besides reward terms, at most [rows]
 _SHOWN = {
     "Train/mean_reward": ("reward", "{:.2f}"),
     "Train/mean_episode_length": ("episode length", "{:.1f} s"),
@@ -67,6 +68,7 @@ class TrainingDisplay(Display):
         super().__init__(UNIT, total, done, stays=True, clock=clock)
         self._title, self._folder, self._steps, self._is_quiet = title, folder, steps_per_iteration, is_quiet
         self._env_steps, self._numbers = 0, dict[str, float]()  # so far; of the last iteration
+        self._terms = dict[str, float]()  # rewards of the episodes that ended last, per second
         self._measured, self._tracking = dict[str, float](), list[float]()  # of the last evaluations; of all of them
         self._bad = {"diverged worlds": 0, "skipped updates": 0}  # in this process
 
@@ -89,6 +91,8 @@ class TrainingDisplay(Display):
         measured = {name: number for name, number in numbers.items() if name.startswith(_EVALUATION)}
         self.done, self._env_steps, self._numbers = done, steps, dict(numbers)
         self._measured = {**self._measured, **measured}
+        terms = {name.partition("/")[2]: n for name, n in numbers.items() if name.startswith("Episode_Reward/")}
+        self._terms = terms or self._terms
         if not math.isnan(tracking := numbers.get(f"{_EVALUATION}/track_percentage", math.nan)):
             self._tracking = [*self._tracking, tracking]
         new = (numbers.get("Health/diverged_worlds", 0.0), numbers.get("skipped_updates", 0.0))
@@ -113,6 +117,11 @@ class TrainingDisplay(Display):
         below = (
             [Text.assemble(("curricula: ", "dim"), ", ".join(map(" ".join, curricula.items())))] if curricula else []
         )
+        largest = sorted(self._terms, key=lambda name: -abs(self._terms[name]))
+        shown = largest[: 2 * max(0, self._console.height - OTHER_ROWS)]  # two in a row, at worst
+        if shown:
+            texts = [f"{name} {self._terms[name]:.2g}" for name in shown]
+            below.append(Text.assemble(("reward terms: ", "dim"), ", ".join(texts)))
         if self.warnings:
             below.append(Text(f"warnings: {len(self.warnings)}, last: {self.warnings[-1]}", "yellow"))
         below.append(Text.assemble(("run: ", "dim"), self._folder))

@@ -8,6 +8,20 @@ from torch import Tensor
 from legged_torque.utils.heading import heading
 
 
+def quat_multiply(first: Tensor, second: Tensor) -> Tensor:
+    """Return the quaternions (..., 4) that turn as ``second``, then as ``first`` does; axes are broadcast."""
+    w, xyz, other_w, other = first[..., :1], first[..., 1:], second[..., :1], second[..., 1:]
+    real = w * other_w - (xyz * other).sum(dim=-1, keepdim=True)
+    return torch.cat([real, w * other + other_w * xyz + torch.linalg.cross(xyz, other)], dim=-1)
+
+
+def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
+    """Turn vectors (..., 3) of bodies with unit quaternions (..., 4) into the world's frame, see the inverse."""
+    w, xyz = quat[..., :1], quat[..., 1:]
+    t = 2.0 * torch.linalg.cross(xyz, vec)
+    return vec + w * t + torch.linalg.cross(xyz, t)
+
+
 def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     """Turn world vectors (..., 3) into the frames of bodies with unit quaternions (..., 4).
 

@@ -15,7 +15,7 @@ from support.scripts import SMALL, assert_told_in_one_line, run_here
 from support.settings import TASKS, error_of, torques_in_torch
 
 from legged_torque.deploy.description import check
-from legged_torque.deploy.export import export_policy, nominal_cfg
+from legged_torque.deploy.export import export_note, export_policy, nominal_cfg
 from legged_torque.deploy.policy import ACTIONS, OBSERVATIONS, Policy, State
 from legged_torque.envs import ObservationTerm, task_registry
 from legged_torque.envs.approaches.torque import TorqueRobot
@@ -181,17 +181,15 @@ def test_groups_of_the_actor(make_task, tmp_path, monkeypatch):
         return [*own_terms(task), ObservationTerm(value=lambda: task.dof_pos[:, :3] + 0.2, mirror=None, **RAYS)]
 
     monkeypatch.setattr(robot, "observation_terms", terms_with_rays)
-    export_random(make_task, "a1_position", tmp_path / "out", True, False, groups, **changes)
-    description = read_yaml(tmp_path / "out")
-    assert description["unsupported"][0].startswith("no numpy function for the observation term 'rays'; there are")
-    assert description["network"]["num_observations"] == 2 * 45 + 3
-    assert description["observations"]["terms"][-1] == RAYS | {"size": 3, "clip": [-100.0, 100.0]}
     for offset, is_right in ((0.1, False), (0.2, True)):
         rays = lambda policy, state, command, offset=offset: state.joint_positions[:3] + offset  # noqa: E731
         monkeypatch.setitem(OBSERVATIONS, "rays", rays)
         task, model = export_random(make_task, "a1_position", tmp_path / "out", True, is_right, groups, **changes)
         if not is_right:
             assert "observations of LeggedRobot differ by 0.05" in read_yaml(tmp_path / "out")["unsupported"][0]
+    description = read_yaml(tmp_path / "out")
+    assert description["network"]["num_observations"] == 2 * 45 + 3
+    assert description["observations"]["terms"][-1] == RAYS | {"size": 3, "clip": [-100.0, 100.0]}
     policy, scripted, obs = Policy(tmp_path / "out"), torch.jit.load(str(tmp_path / "out" / "policy.pt")), task.reset()
     for _ in range(3):
         seen = policy.observation(measured(task, 1), task.commands[1].numpy())
@@ -202,6 +200,47 @@ def test_groups_of_the_actor(make_task, tmp_path, monkeypatch):
         np.testing.assert_allclose(policy.act(seen), actions[1], rtol=1e-5, atol=1e-5)
         obs = task.step(actions)[0]
         assert not task.reset_buf[1]
+
+
+class FeelingRobot(TorqueRobot):
+    """The policy feels the torques of its motors, and where its feet are."""
+
+    def observation_terms(self):
+        """Two more, of which one is a group of its own."""
+        felt = ObservationTerm("felt", lambda: self.torques, None, 0.1, unit="N m", meaning="of the motors")
+        return [*super().observation_terms(), felt, ObservationTerm("feet", self.feet, None, group="feet")]
+
+    def feet(self):
+        """Heights of the feet [m]."""
+        return self.foot_pos[:, :, 2]
+
+
+def test_observations_of_a_user(make_task, tmp_path, monkeypatch):
+    """A policy that reads them is exported; whoever runs it supplies their values, and nothing else runs it."""
+    monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
+    task_registry.register("a1_feeling", FeelingRobot, A1TorqueCfg(), task_registry.get_cfgs("a1_torque")[1])
+    out, groups = tmp_path / "out", ["policy", "feet"]
+    changes = {"env.history_length": 2, "noise.add_noise": False}
+    task, model = export_random(make_task, "a1_feeling", out, groups=groups, **changes)
+    terms = {term["name"]: term for term in read_yaml(out)["observations"]["terms"]}
+    assert [name for name, term in terms.items() if "supplied" in term] == ["felt", "feet"]
+    assert terms["felt"] | {"scale": 0.1, "unit": "N m", "meaning": "of the motors", "size": 12} == terms["felt"]
+    policy, obs = Policy(out), task.reset()
+    for _ in range(3):
+        state = measured(task, 1)
+        with pytest.raises(ValueError, match="felt, feet"):
+            policy.observation(state, np.zeros(3))
+        state.terms = {"felt": task.torques[1].numpy(), "feet": task.foot_pos[1, :, 2].numpy()}
+        seen = policy.observation(state, task.commands[1].numpy())
+        np.testing.assert_allclose(seen, torch.cat([obs[group] for group in groups], dim=1)[1], rtol=1e-5, atol=1e-5)
+        policy.act(seen)
+        with torch.inference_mode():
+            obs = task.step(model(obs))[0]
+    assert_told_in_one_line(run_here("sim2sim.py", str(out), root=tmp_path), "plain MuJoCo has no values of felt, feet")
+    note = export_note(task, model)
+    assert "felt" in note and "feet" in note and "\n" not in note
+    assert "memory" in export_note(task, SimpleNamespace(is_recurrent=True))
+    assert not export_note(*export_random(make_task, "a1_torque", tmp_path / "plain"))
 
 
 TASK = """
@@ -231,15 +270,15 @@ def test_groups_in_the_scripts(tmp_path, monkeypatch):
     results = []
     for groups in ("[policy,lean]", "[lean]"):
         actor = f"--set=obs_groups.actor={groups}"
-        assert run_here("train.py", *words, actor, "--max_iterations=1", "--logger=none", root=tmp_path)[0] == 0
+        status, said, _ = run_here("train.py", *words, actor, "--max_iterations=1", "--logger=none", root=tmp_path)
+        assert status == 0 and ("Note: exports of this policy" in said) == (groups == "[lean]")
         results.append(run_here("export.py", *words, actor, f"--out={groups}", root=tmp_path))
     assert results[0][1].endswith("'[policy,lean]' --task_file=lean_robot.py\n")
     assert_told_in_one_line(results[1], "must be 'policy', then groups of single terms (lean), not lean")
     simulation = ["sim2sim.py", "[policy,lean]", "--robots=1", "--steps=3"]
     assert run_here(*simulation, words[0], root=tmp_path)[0] == 0
     del OBSERVATIONS["lean"]
-    message = "no numpy function for the observation term 'lean'"
-    assert_told_in_one_line(run_here(*simulation, root=tmp_path), message)
+    assert_told_in_one_line(run_here(*simulation, root=tmp_path), "plain MuJoCo has no values of lean, for which")
 
 
 @pytest.mark.parametrize(

@@ -49,16 +49,34 @@ def by_evaluation(steps, training):
     return [list(notes) for task, notes in groupby(steps, lambda note: note.task) if task is not training]
 
 
-WHEN = {24: [32, 48, 80], 16: [16, 32, 48, 64, 80], 5: [16, 32, 48, 64, 80], 50: [64], 81: None, 0: None}
+WHEN = {24: [32, 48, 80], 16: [16, 32, 48, 64, 80], 5: [16, 32, 48, 64, 80], 50: [64, 80], 81: [80], 0: None}
 
 
 @pytest.mark.parametrize(("interval", "steps"), WHEN.items())
 def test_when_rows_appear(make_runner, interval, steps):
-    """A rollout has 16 steps; a row comes at the first end of one at or after each multiple of the interval."""
+    """A rollout has 16 steps; a row comes at the first end of one at or after each interval, and the last."""
     runner = make_runner(**{"evaluation.interval": interval})
     runner.learn(5)
     numbers = [(row["steps"], row["iteration"]) for row in rows_of(runner) or []] or None
     assert numbers == (steps and [(number, number // 16) for number in steps])
+
+
+def test_the_end_of_a_training(make_runner, noted):
+    """A short training has a short evaluation there, which changes nothing in a training that goes on."""
+    rows, results, lengths = [], [], []
+    for calls in ([5], [2, 3]):
+        settings = {"evaluation.interval": 64, "algorithm.annealing_start": 1.0, "runner.run_name": str(len(calls))}
+        runner = make_runner(perturbation="low", **settings, **{"evaluation.num_samples": 16})
+        for iterations in calls:
+            runner.learn(iterations)
+        rows.append({int(row["steps"]): {**row, "seconds": 0.0} for row in rows_of(runner)})
+        results.append([*runner.alg.actor.parameters(), *runner.env.get_observations().values(), torch.rand(3)])
+        lengths.append([len(notes) for notes in by_evaluation(noted, runner.env)])
+        noted.clear()
+    assert lengths == [[4, 2], [1, 4, 1]]  # at the end a quarter of the training's steps, half of them to warm up
+    assert list(rows[0]) == [64, 80] and list(rows[1]) == [32, 64, 80]
+    assert rows[0][64] == rows[1][64]
+    assert all(torch.equal(one, other) for one, other in zip(*results, strict=True))
 
 
 @pytest.mark.parametrize(("samples", "most", "worlds", "count"), [(13, 3, 3, 5), (12, 3, 3, 4), (9, 100, 4, 3)])

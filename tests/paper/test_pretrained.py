@@ -65,6 +65,7 @@ def test_a_policy_is_found_or_made(made, trained):
     assert "making it" not in found and "Round" not in found
     assert f"There is no pre-trained policy '{other}' yet; making it." in made_here
     assert f"Starting from the pre-trained policy '{other}'." in made_here
+    assert made_here.count("--set pretraining.num_configurations=") == 1  # how to make it short
     networks = [read_pretrained(path)["actor_state_dict"] for path in (file, other)]
     for network in networks:
         network.pop(STD)

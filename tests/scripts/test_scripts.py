@@ -43,7 +43,7 @@ def test_run_folder(root):
     assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_good", run.name)
     files = {path.name.split(".tfevents")[0] for path in run.iterdir() if path.is_file()}
     models = {"model_0.pt", "model_1.pt", "model_2.pt"}  # the first so that the training can be watched at once
-    assert files == models | {"worlds_2.pt", "events.out", "config.yaml"}
+    assert files == models | {"worlds_2.pt", "events.out", "config.yaml", "evaluations.csv"}
     config = yaml.safe_load((run / "config.yaml").read_text())
     expected = {"task": "a1_position", "preset": "parallel", "device": "cpu", "max_iterations": 2}
     assert expected.items() <= config.items() and config["env"]["env"]["num_envs"] == 2
@@ -61,7 +61,7 @@ def test_resume_in_a_folder_by_its_path(root, tmp_path):
     assert f"Resuming from {run / 'model_1.pt'}, after 1 iteration.\n" in output
     (new,) = (tmp_path / "logs" / "a1_position").iterdir()
     files = {path.name for path in new.iterdir() if path.is_file()}
-    assert files == {"config.yaml", "model_1.pt", "model_2.pt", "worlds_2.pt"}
+    assert files == {"config.yaml", "model_1.pt", "model_2.pt", "worlds_2.pt", "evaluations.csv"}
     state = torch.load(new / "model_2.pt", weights_only=True)
     assert (state["iter"], state["infos"]["total_timesteps"]) == (2, 2 * 2 * 4)
     train = yaml.safe_load((new / "config.yaml").read_text())["train"]

@@ -34,7 +34,7 @@ def export_random(make_task, name, folder, normalization=False, supported=True, 
     model.eval()
     difference, unsupported = export_policy(task, model, folder, name, TRAINING)
     assert difference < 1e-5
-    assert supported == (not unsupported)
+    assert supported == (not unsupported), unsupported
     return task, model
 
 

@@ -5,7 +5,7 @@ import torch
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import set_by_path
 
-SMALL = {"runner.num_steps_per_env": 4, "algorithm.num_mini_batches": 2}
+SMALL = {"runner.num_steps_per_env": 4, "algorithm.num_mini_batches": 2, "evaluation.interval": 0}
 
 
 def build_runner(make_task, name, num_envs=4, seed=0, log_root=None, env=None, **overrides):

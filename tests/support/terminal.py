@@ -13,14 +13,14 @@ import termios
 from support.scripts import ROOT
 
 
-def in_a_terminal(code, columns=80, after="", close=False, **variables):
-    """Run code in a terminal of that width; once ``after`` has come, press Ctrl-C or close the terminal.
+def in_a_terminal(code, columns=80, rows=40, after="", close=False, **variables):
+    """Run code in a terminal of that size; once ``after`` has come, press Ctrl-C or close the terminal.
 
     Returns:
         Exit status, and all that the terminal has got.
     """
     master, slave = pty.openpty()
-    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
     environment = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "NO_COLOR", "LINES")}
     environment |= {"PYTHONPATH": str(ROOT), "TERM": "xterm-256color", "PYTHONUTF8": "1", **variables}
     streams = {"stdin": slave, "stdout": slave, "stderr": slave}

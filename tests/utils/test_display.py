@@ -39,6 +39,9 @@ with TrainingDisplay("a1_torque: 9 worlds on CPU", "/logs/" + "[b]" * 40, 20, 0,
 print("The run is here")
 sys.exit(stop.number)
 """
+LARGE, SMALL = "a_term_with_a_very_long_name", "small_term"
+TERMS = {f"Episode_Reward/{SMALL}": 1e-4} | {f"Episode_Reward/{LARGE}_{i}": -0.0311 - i for i in range(20)}
+"""Numbers of rewards; the last is the largest."""
 COUNTING = """
 import time
 from legged_torque.utils.display import Counter, Display
@@ -97,6 +100,20 @@ def test_panel(columns, variables):
     assert "[b]" * 40 in text.replace(" ", "") and "…" not in text
     assert output.count("\033[?25l") == output.count("\033[?25h") == 1  # the cursor is back
     assert ("33" in re.findall(r"[\d]+", "".join(re.findall(r"\033\[[\d;]*m", output)))) != ("NO_COLOR" in variables)
+
+
+@pytest.mark.parametrize(("rows", "shown", "has_small"), [(24, 8, False), (60, 20, True), (16, 0, False)])
+def test_reward_terms_in_the_panel(rows, shown, has_small):
+    """The largest come first, as many as there is room for; 80 x 24 characters fit the whole panel."""
+    code = TRAINING.replace("numbers |= {", f"numbers |= {TERMS} | {{", 1)
+    status, output = in_a_terminal(code, 80, rows)
+    lines = lines_of(output)
+    panel = lines[max(i for i, line in enumerate(lines) if line.startswith("╭─ a1_torque")) : -1]
+    text = " ".join(re.sub(r" +", " ", line.strip("│ ")) for line in panel)
+    assert status == 0 and text.count(LARGE) >= shown and (SMALL in text) == has_small
+    assert len(panel) < max(rows, 20)
+    if shown:
+        assert text.index(f"{LARGE}_19 -19") < text.index(f"{LARGE}_18 -18")
 
 
 @pytest.mark.parametrize("variables", [{"TERM": "dumb"}, {"PYTHONUTF8": "0", "PYTHONIOENCODING": "latin-1"}])

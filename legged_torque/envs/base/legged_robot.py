@@ -30,7 +30,7 @@ from legged_torque.envs.base.random_parameters import (
 from legged_torque.envs.base.reward_terms import RewardTerms
 from legged_torque.envs.base.rewards import Rewards
 from legged_torque.envs.base.robot_checks import range_notes
-from legged_torque.envs.base.state import RobotState
+from legged_torque.envs.base.state import RobotState, StateAccess
 from legged_torque.envs.base.symmetry import Mirror
 from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.terminations import Terminations
@@ -49,7 +49,7 @@ OUTSIDE_KERNEL = "torques are computed in torch, outside of the physics kernel: 
 """Note of tasks that override ``_compute_torques`` or have motors without a Warp function."""
 
 
-class LeggedRobot(RewardTerms, Terminations, BaseTask):
+class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
     """A batch of robots with position control, and what all approaches share.
 
     An approach overrides :meth:`action_terms`, or :meth:`_compute_torques` in torch, adds ``_reward_<term>`` methods or
@@ -153,11 +153,6 @@ class LeggedRobot(RewardTerms, Terminations, BaseTask):
         curricula = section_keys(self.cfg.rewards.curriculum)
         values = {f"weight_{name}": weights[i] for i, name in enumerate(self.reward_names) if name in curricula}
         return values | self.terrain.curriculum_values() | self.command_generator.curriculum_values()
-
-    @property
-    def base_height(self) -> Tensor:
-        """Height of the trunk's origin above the ground under it [m]. Shape: (num_envs,)."""
-        return self.state.base_height
 
     # ---- one control step --------------------------------------------------------------------------------------------
 

@@ -323,6 +323,7 @@ class LeggedRobotCfgPPO(TrainingCfg):
 
     class evaluation:  # measuring the policy while it learns: mean actions, in worlds of their own, between rollouts
         interval: Number = 128_000  # environment steps from one evaluation to the next; 0: none
+        at_end: bool = True  # whether to evaluate at the end of a training, too, if only for a while
         num_samples: Count = 32_000  # world steps of one evaluation: the paper's 16 worlds x 2000 steps
         num_envs: Worlds = 4000  # worlds, at most as many as train
         perturbation: str = ""  # environment, one of ``perturbations``; empty: that of the training
