@@ -61,7 +61,7 @@ def test_script(tmp_path, monkeypatch, capsys):
     runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
     output = capsys.readouterr().out
     assert "sim.engine 'fused' simulates it" in output
-    assert output.endswith(f"Train it: python {ROOT}/scripts/train.py --task=dog_position\n")
+    assert output.endswith(f"Train it: python {ROOT}/scripts/train.py --task_file new/dog.py --task=dog_position\n")
     helper = "from legged_torque.envs.robots.a1 import A1Cfg\ndef half(number):\n    return number / 2\n"
     (tmp_path / "new" / "legs_of_many.py").write_text(helper)
     monkeypatch.setattr(robots, "__path__", [*robots.__path__, str(tmp_path / "new")])
