@@ -122,7 +122,8 @@ def _wheel(model: mujoco.MjModel, shapes: dict[int, list[Shape]], body: int) -> 
     across = np.linalg.svd(model.jnt_axis[joint][None])[2][1:]  # two directions
     turned = [np.cos(angle) * across[0] + np.sin(angle) * across[1] for angle in np.arange(0, np.pi, np.pi / 8)]
     lengths = [last.length(direction) for direction in turned]
-    if np.linalg.norm(aside) > HUB * radius or max(lengths) > WHEEL * min(lengths):
+    is_round = WHEEL * min(lengths) > max(max(lengths), last.length(model.jnt_axis[joint]))
+    if np.linalg.norm(aside) > HUB * radius or not is_round:
         return None
     shapes[body] = []
     return _ball(radius, last.pos)
@@ -153,11 +154,11 @@ def _take_foot(source: Source, shapes: dict[int, list[Shape]], body: int) -> Sha
     else:
         foot = _ball(FOOT_WIDENING * float(np.prod(sorted(last.half_sizes())[:2]) ** 0.5), tip)
     if foot is not near:
-        source.notes.append(f"a sphere of {foot.radius:.3f} m is the foot at the end of '{name}'")
-    beyond = [shape for shape in found if shape.kind != "sphere" and shape.reach(joint) > far + 0.5 * foot.radius > far]
-    for shape in beyond:
+        source.notes.on([name], f"a sphere of {foot.radius:.3f} m is the foot at the end of")
+    spared = {"capsule": 0.5 * foot.radius, "box": -foot.radius, "sphere": np.inf}  # reaching into the foot
+    for shape in [shape for shape in found if foot.kind == "sphere" and shape.reach(joint) > far + spared[shape.kind]]:
         shape.shorten(joint, far - foot.radius)
-        source.notes.append(f"a {shape.kind} of '{name}' reached beyond its foot and is shorter")
+        source.notes.on([name], "shapes that would touch the ground beside the foot are shorter")
     return foot
 
 

@@ -12,11 +12,8 @@ from legged_torque.importer.legs import PARALLEL, Leg, lowest_point, pitch_axis,
 from legged_torque.importer.shapes import Shape
 from legged_torque.importer.source import Source
 
-TIPPING = {False: 2.3, True: 2.0}
-"""Stiffness of legs, as a multiple of that below which a level trunk tips over its feet; without and with soles.
-
-That is weight times height, shared by the legs. The robots that come along have 1.3 to 2.2, the ankles of the G1 0.3.
-"""
+TIPPING = 2.3  # stiffness of legs, as a multiple of that below which a level trunk tips over its feet: weight times
+# height, shared by the legs. The robots that come along have 1.3 to 2.2, the ankles of the G1 0.3
 SAG = 0.2  # largest deflection of a joint under the robot's weight [rad]
 RETARDATION = 0.025  # damping per stiffness of legs, as those of all robots that come along [s]
 STABLE = 0.5  # damping per inertia and physics step, up to which torques of the step before still damp
@@ -101,7 +98,7 @@ def _standing(source: Source, legs: list[Leg], data: mujoco.MjData) -> tuple[flo
         mujoco.mj_jac(model, data, jac, None, low, leg.bodies[-1])
         holding -= jac.T @ np.array([0, 0, source.weight / len(legs)])
     height = -float(np.mean([low[2] for low in lows]))
-    usual = TIPPING[legs[0].has_sole] * source.weight * height / len(legs)
+    usual = TIPPING * source.weight * height / len(legs)
     return height, holding[6:], np.maximum(usual, np.abs(holding[6:]) / SAG)
 
 
@@ -183,7 +180,8 @@ def _bend(model: mujoco.MjModel, leg: Leg, angles: np.ndarray, ranges: np.ndarra
         rows = []
         for q in columns.reshape(len(joints), -1).T:
             angles[joints - 1] = q
-            data = zero_pose(model, angles)
+            data.qpos[7:] = angles
+            mujoco.mj_kinematics(model, data)
             turned = data.xmat[body].reshape(3, 3) @ level.T
             lean = 0.5 * (turned - turned.T)[[2, 0, 1], [1, 2, 0]]
             rows.append([*(lowest_point(data, body, leg.foot) - goal), *(LEVELING * leg.has_sole * lean)])

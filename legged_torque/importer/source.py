@@ -33,7 +33,10 @@ class Notes(list[str]):
     def on(self, parts: Iterable[str], reason: str) -> None:
         """Add a reason followed by the names of parts, if there are any."""
         names = ", ".join(parts)
-        if names:
+        known = [place for place, note in enumerate(self) if names and note.startswith(f"{reason}: ")]
+        if known:
+            self[known[0]] += f", {names}"
+        elif names:
             self.append(f"{reason}: {names}")
 
 
