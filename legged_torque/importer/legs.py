@@ -9,13 +9,13 @@ from itertools import takewhile
 import mujoco
 import numpy as np
 
-from legged_torque.importer.shapes import Shape, box_around, fit_geom, fit_inertia
+from legged_torque.importer.shapes import ROUND, Shape, box_around, fit_geom, fit_inertia
 from legged_torque.importer.source import Source
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import body_chains
 
 TOLERANCE = 0.01  # distance by which mirror images may miss each other [m]
-PARALLEL = 0.7  # least |cosine| of the angle between axes that count as parallel
+PARALLEL = 0.9  # least |cosine| of the angle between axes that count as parallel
 LEVEL = 0.5  # largest |z| of an axis that counts as level
 SIDEWAYS = 0.3  # least |y| of some level axis of a robot that can walk along x
 LOW = 0.75  # share of the lowest end's depth below the trunk that the end of a leg reaches
@@ -23,7 +23,6 @@ MOST_WITHOUT_ANKLE = 3  # joints of a two-legged robot's leg that ends in a poin
 MOST_WITHOUT_SOLE = 4  # the same of robots with more legs
 FOOT_REACH = 0.03  # largest distance between the end of a leg and the geom there that is its foot [m]
 FLAT = 0.25  # length along the last link, as a share of it, up to which the geom at its end is a foot
-WHEEL = 1.5  # largest ratio of lengths across the axis of a wheel
 HUB = 0.25  # distance of a wheel's center from its axis as a share of its radius
 FOOT_WIDENING = 1.1  # radius of a foot at the end of a capsule or box, as a multiple of theirs
 FOOT, TRUNK = "foot", "trunk"  # in the names of the geoms of feet and trunk, and of no other
@@ -117,13 +116,9 @@ def find_legs(source: Source, shapes: dict[int, list[Shape]]) -> list[Leg]:
 def _wheel(model: mujoco.MjModel, shapes: dict[int, list[Shape]], body: int) -> Shape | None:
     """Return the ball in the place of a wheel at the end of a leg, its only shape; None without a wheel."""
     last = max(shapes[body], key=lambda shape: max(shape.half_sizes()))
-    joint, radius = int(model.body_jntadr[body]), max(last.half_sizes())
+    joint, (_, middle, radius) = int(model.body_jntadr[body]), sorted(last.half_sizes())
     aside = np.cross(last.pos - model.jnt_pos[joint], model.jnt_axis[joint])
-    across = np.linalg.svd(model.jnt_axis[joint][None])[2][1:]  # two directions
-    turned = [np.cos(angle) * across[0] + np.sin(angle) * across[1] for angle in np.arange(0, np.pi, np.pi / 8)]
-    lengths = [last.length(direction) for direction in turned]
-    is_round = WHEEL * min(lengths) > max(max(lengths), last.length(model.jnt_axis[joint]))
-    if np.linalg.norm(aside) > HUB * radius or not is_round:
+    if np.linalg.norm(aside) > HUB * radius or radius > ROUND * middle:
         return None
     shapes[body] = []
     return _ball(radius, last.pos)

@@ -13,6 +13,7 @@ from legged_torque.importer.robot import Robot
 
 WEIGHT_TIMES_HEIGHT = 37.0  # of an A1 with its trunk at 0.303 m [N m]
 TORQUE_SCALE = 1.1  # torque of an action of 1, as a multiple of the largest that holds the nominal pose; as for the A1
+ACTION_SCALE = (0.25, 0.15)  # without and with two legs, whose gains are higher than the G1's [rad]
 LINE = 90  # most characters of a table in one line
 
 TEMPLATE = '''"""{title}: imported settings; each number is a proposal to look at."""
@@ -23,7 +24,7 @@ from __future__ import annotations
 
 {imports}
 
-class {cls}Cfg(LeggedRobotCfg):
+class {cls}Cfg({base}):
     """Settings of the robot; alone, of position control on a plane."""
 
     class asset:
@@ -43,14 +44,16 @@ class {cls}Cfg(LeggedRobotCfg):
     class control:  # as stiff for its weight and height as the robots of the library
         stiffness = {stiffness}
         damping = {damping}
-{action_scale}        torque_scale = {torque_scale}
+        action_scale = {action_scale}
+        torque_scale = {torque_scale}
 
 {two_legs}    class rewards:
         base_height_target = {height}
-{held}
+        held_joints = {held}
+
         class scales:
             torques = {torques:.2g}  # the A1's, as its squared torques are to this robot's: by weight times height
-{scales}
+
 
 class {cls}CfgPPO(LeggedRobotCfgPPO):
     """Training of it."""
@@ -73,32 +76,15 @@ SYMMETRY = """
         class symmetry_cfg:
             use_data_augmentation = True
 """
-ACTION_SCALE = "        action_scale = 0.15\n"
-TWO_LEGS = """    class domain_rand:
-        init_roll = [-0.1, 0.1]
-        init_pitch = [-0.1, 0.1]
-
-    class commands:
-        class ranges:
-            lin_vel_x = [-0.6, 1.0]
-            lin_vel_y = [-0.4, 0.4]
+TWO_LEGS = """    class domain_rand:  # in shares of the robot, not as the G1's
+        trunk_mass = LeggedRobotCfg.domain_rand.trunk_mass
+        dof_damping = LeggedRobotCfg.domain_rand.dof_damping
+        dof_armature = LeggedRobotCfg.domain_rand.dof_armature
+        dof_stiffness = LeggedRobotCfg.domain_rand.dof_stiffness
+        dof_frictionloss = LeggedRobotCfg.domain_rand.dof_frictionloss
 
 """
-HELD = """        feet_air_time_target = 0.4
-        held_joints = {joints}
-"""
-SCALES = """            orientation = -2.0
-            dof_pos_limits = -5.0
-            dof_acc = -1e-7
-            action_rate = -0.01
-            collision = 0.0
-            base_height = -10.0
-            feet_air_time = 0.0
-            single_stance = 1.0
-            dof_deviation = -0.2
-            alive = 0.2
-"""
-"""What two legs need, as the G1 has it."""
+G1 = "from legged_torque.envs.robots.g1 import G1Cfg  # rewards, commands and starts that two legs need\n"
 
 
 def settings(robot: Robot, path: str = "", is_fused: bool = True) -> str:
@@ -113,7 +99,8 @@ def settings(robot: Robot, path: str = "", is_fused: bool = True) -> str:
     return TEMPLATE.format(
         title=robot.name,
         file=ascii(robot.source.file.name),
-        imports=IMPORTS if path else OWN_IMPORTS,
+        imports=(IMPORTS if path else OWN_IMPORTS) + (G1 if two_legs else ""),
+        base="G1Cfg" if two_legs else "LeggedRobotCfg",
         cls=cls,
         path=_literal(path) if path else f'str(Path(__file__).with_name("{robot.name}.xml"))',
         engine="" if is_fused else ENGINE,
@@ -129,10 +116,9 @@ def settings(robot: Robot, path: str = "", is_fused: bool = True) -> str:
         torque_scale=float(f"{TORQUE_SCALE * stance.load:.2g}"),
         height=round(stance.height, 3),
         torques=LeggedRobotCfg.rewards.scales.torques * (WEIGHT_TIMES_HEIGHT / leverage) ** 2,
-        action_scale=ACTION_SCALE if two_legs else "",
+        action_scale=ACTION_SCALE[two_legs],
         two_legs=TWO_LEGS if two_legs else "",
-        held=HELD.format(joints=_literal(_held(robot))) if two_legs else "",
-        scales=SCALES if two_legs else "",
+        held=_literal(_held(robot) if two_legs else []),
         symmetry=SYMMETRY if robot.symmetric else "",
         registration="" if path else REGISTRATION.format(name=robot.name, cls=cls),
     )

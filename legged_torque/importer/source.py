@@ -132,8 +132,6 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
     switched_on = dict[str, None]()
     for geom in spec.geoms:
         geom.material = ""
-        if is_urdf:
-            geom.mass = 0.0  # only <inertial> has masses
         if not (geom.contype or geom.conaffinity) and (geom.group == COLLISION_GROUP or geom.name in in_pairs):
             geom.conaffinity = 1
             if geom.name not in in_pairs:
@@ -172,9 +170,10 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
     if not np.allclose(spec.option.gravity, [0.0, 0.0, -GRAVITY], atol=0.01):
         notes.append(f"gravity is {GRAVITY} m/s^2 along -z, not the file's {np.round(spec.option.gravity, 3).tolist()}")
     spec.option.gravity, spec.option.disableflags = [0.0, 0.0, -GRAVITY], 0
-    if is_urdf and spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+    if is_urdf:  # only <inertial> has masses
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-        notes.append("masses are those of <inertial>, although the file says inertiafromgeom")
+        for geom in spec.geoms:
+            geom.mass = 0.0
     spec.compiler.fusestatic = True
     spec.compiler.discardvisual = True
     return notes
