@@ -15,13 +15,12 @@ from legged_torque.importer.source import Source
 TIPPING = 2.3  # stiffness of legs, as a multiple of that below which a level trunk tips over its feet: weight times
 # height, shared by the legs. The robots that come along have 1.3 to 2.2, the ankles of the G1 0.3
 SAG = 0.2  # largest deflection of a joint under the robot's weight [rad]
-RETARDATION = 0.025  # damping per stiffness of legs, as those of all robots that come along [s]
+RETARDATION = 0.025  # damping per stiffness, as of all robots that come along [s]
 STABLE = 0.5  # damping per inertia and physics step, up to which torques of the step before still damp
 STEP = 0.005  # physics step [s]
 BANDWIDTH = 4.0  # natural frequency of joints off the legs, with the inertia that they move [Hz]
-DAMPING_RATIO = 0.5  # of the same
 LEAST_LOAD = 0.08  # of a straight leg as a share of weight times height per leg, for the scale of torques
-MOST_TILT = 0.15  # inclination of feet in a keyframe in which the robot stands [rad]
+MOST_UNEVEN = 0.2  # difference of the heights of feet in a keyframe in which it stands, as a share of the trunk's
 SPREAD = (0.5, 1.0, 1.5)  # shares of the nominal angles at which episodes may start, see domain_rand
 GAP = 0.02  # between the ground and a robot at the start of an episode [m]
 BALANCING = 5  # iterations in which feet are moved below the center of mass
@@ -74,12 +73,11 @@ def find_stance(
     started = [zero_pose(model, np.clip(share * angles, ranges[:, 0], ranges[:, 1])) for share in SPREAD]
     drop = GAP - min(lowest_point(each, leg.bodies[-1], leg.foot)[2] for each in started for leg in legs)
     stiffness = (2 * np.pi * BANDWIDTH) ** 2 * inertia
-    damping = 2 * DAMPING_RATIO * np.sqrt(stiffness * inertia)
     moving = np.concatenate([model.body_jntadr[leg.bodies] - 1 for leg in legs])
     stiffness[moving] = stiff[moving]
     matrix[range(6, model.nv), range(6, model.nv)] += armature - model.dof_armature[6:]
     freely = 1.0 / np.diag(np.linalg.inv(matrix))[6:]  # inertia about each joint while all others give way
-    damping[moving] = np.minimum(RETARDATION * stiffness, STABLE * freely / STEP)[moving]
+    damping = np.minimum(RETARDATION * stiffness, STABLE * freely / STEP)
     load = max(np.abs(holding[moving]).max(), LEAST_LOAD * source.weight * height / len(legs))
     return Stance(angles, height, drop, float(load), armature, stiffness, damping)
 
@@ -108,11 +106,8 @@ def _why_lying(source: Source, legs: list[Leg], shapes: dict[int, list[Shape]], 
     data = zero_pose(source.model, angles - holding / stiffness)  # under its weight
     feet = np.array([lowest_point(data, leg.bodies[-1], leg.foot) for leg in legs])
     level = feet[:, 2].mean()
-    if len(legs) > 2:
-        slope = np.linalg.lstsq(np.c_[feet[:, :2], np.ones(len(feet))], feet[:, 2], rcond=None)[0][:2]
-        tilt = float(np.arctan(np.linalg.norm(slope)))
-        if tilt > MOST_TILT:
-            return f"its feet are on a slope of {np.degrees(tilt):.0f} degrees"
+    if np.ptp(feet[:, 2]) > MOST_UNEVEN * -level:
+        return "its feet are not level"
     for body, found in shapes.items():
         if any(lowest_point(data, body, shape)[2] < level for shape in found):
             return f"'{source.model.body(body).name}' is lower than its feet"

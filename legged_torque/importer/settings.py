@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from itertools import groupby
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from legged_torque.importer.robot import Robot
 WEIGHT_TIMES_HEIGHT = 37.0  # of an A1 with its trunk at 0.303 m [N m]
 TORQUE_SCALE = 1.1  # torque of an action of 1, as a multiple of the largest that holds the nominal pose; as for the A1
 ACTION_SCALE = (0.25, 0.15)  # without and with two legs, whose gains are higher than the G1's [rad]
-LINE = 90  # most characters of a table in one line
+LINE = 90  # most characters of a literal in one line
 
 TEMPLATE = '''"""{title}: imported settings; each number is a proposal to look at."""
 
@@ -37,9 +36,7 @@ class {cls}Cfg({base}):
 
 {engine}    class init_state:
         pos = [0.0, 0.0, {drop}]
-        default_joint_angles = (
-{angles}
-        )
+        default_joint_angles = {angles}
 
     class control:  # as stiff for its weight and height as the robots of the library
         stiffness = {stiffness}
@@ -110,7 +107,7 @@ def settings(robot: Robot, path: str = "", is_fused: bool = True) -> str:
         mirrored=_literal(robot.mirrored),
         speed=f"{robot.speed:.4g}" if "." in f"{robot.speed:.4g}" else f"{robot.speed:.1f}",
         drop=round(stance.drop, 2),
-        angles=_angles(robot),
+        angles=_literal(dict(zip(robot.joints, (stance.angles.round(3) + 0.0).tolist(), strict=True))),
         stiffness=_table(robot.by_kind(stance.stiffness)),
         damping=_table(robot.by_kind(stance.damping)),
         torque_scale=float(f"{TORQUE_SCALE * stance.load:.2g}"),
@@ -150,26 +147,14 @@ def _held(robot: Robot) -> list[str]:
     return list(dict.fromkeys(kind for joint, kind in enumerate(robot.kinds, 1) if joint not in free))
 
 
-def _literal(value: str | list) -> str:
-    """Return a text, or lists of texts, as a Python literal in double quotes."""
-    return json.dumps(value, ensure_ascii=False)
+def _literal(value: str | list | dict) -> str:
+    """Return texts, numbers, or lists or dictionaries of them as a Python literal in double quotes."""
+    line = json.dumps(value, ensure_ascii=False)
+    return line if len(line) < LINE else json.dumps(value, ensure_ascii=False, indent=4).replace("\n", "\n" + 8 * " ")
 
 
 def _table(numbers: dict[str, float]) -> str:
     """Return numbers by the kinds of joints as a dictionary; one number if they are all the same."""
-    if len(set(numbers.values())) == 1:
-        return str(next(iter(numbers.values())))
     ordered = sorted(numbers, key=len, reverse=True)  # the first part that matches counts
-    entries = [f"{_literal(kind)}: {numbers[kind]}" for kind in ordered]
-    line = "{" + ", ".join(entries) + "}"
-    return line if len(line) < LINE else "{\n" + "".join(f"            {entry},\n" for entry in entries) + "        }"
-
-
-def _angles(robot: Robot) -> str:
-    """Return the lines of the nominal pose: dictionaries of up to three joints of a leg, joined."""
-    rows: list[str] = []
-    named = zip(robot.joints, robot.kinds, robot.stance.angles.tolist(), strict=True)
-    for _, group in groupby(named, key=lambda each: each[0].removesuffix(each[1])):
-        entries = [f"{_literal(joint)}: {round(angle, 3) + 0.0}" for joint, _, angle in group]
-        rows += ["{" + ", ".join(entries[start : start + 3]) + "}" for start in range(0, len(entries), 3)]
-    return "\n".join(f"            {'| ' if number else ''}{row}" for number, row in enumerate(rows))
+    same = len(set(numbers.values())) == 1
+    return str(numbers[ordered[0]]) if same else _literal({kind: numbers[kind] for kind in ordered})

@@ -52,11 +52,13 @@ class Shape:
 
     def shorten(self, start: np.ndarray, reach: float) -> None:
         """Move the end of a capsule or box that is farther from ``start`` to this distance from there [m]."""
-        end = self.end(start)
-        excess = min(self.reach(start) - reach, float(np.linalg.norm(end - self.pos)))
-        side = 2 if self.kind == "capsule" else int(np.argmax(np.abs(rotation(self.quat).T @ (end - self.pos))))
-        self.pos = self.pos - 0.5 * excess * (end - self.pos) / np.linalg.norm(end - self.pos)
-        self.size[1 if self.kind == "capsule" else side] -= 0.5 * excess
+        half = self.end(start) - self.pos
+        length = float(np.linalg.norm(half))
+        excess = min(self.reach(start) - reach, length)
+        side = 2 if self.kind == "capsule" else int(np.argmax(np.abs(rotation(self.quat).T @ half)))
+        if length > 0.0:
+            self.pos = self.pos - 0.5 * excess / length * half
+            self.size[1 if self.kind == "capsule" else side] -= 0.5 * excess
 
     def length(self, along: np.ndarray) -> float:
         """Return its length along a direction of its body's frame [m]."""

@@ -139,6 +139,28 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
     notes.on(switched_on, f"geoms of group {COLLISION_GROUP}, which the file switches off, collide")
     for part in [*spec.materials, *spec.textures]:
         spec.delete(part)
+    _keep_robot(spec, file, is_urdf, notes)
+    for body in spec.bodies:
+        if body.name and not body.joints and body.name != "world":
+            body.add_site(name=SITE + body.name)
+    unnamed = [joint for joint in spec.joints if not joint.name and joint.type != mujoco.mjtJoint.mjJNT_FREE]
+    for number, joint in enumerate(unnamed, 1):
+        joint.name = f"{joint.parent.name or number}_joint"
+        notes.append(f"the joint of '{joint.parent.name}' had no name: '{joint.name}'")
+    if not np.allclose(spec.option.gravity, [0.0, 0.0, -GRAVITY], atol=0.01):
+        notes.append(f"gravity is {GRAVITY} m/s^2 along -z, not the file's {np.round(spec.option.gravity, 3).tolist()}")
+    spec.option.gravity, spec.option.disableflags = [0.0, 0.0, -GRAVITY], 0
+    if is_urdf:  # only <inertial> has masses
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+        for geom in spec.geoms:
+            geom.mass = 0.0
+    spec.compiler.fusestatic = True
+    spec.compiler.discardvisual = True
+    return notes
+
+
+def _keep_robot(spec: mujoco.MjSpec, file: Path, is_urdf: bool, notes: Notes) -> None:
+    """Leave the one child of the world that has hinges, and let it float. Adds notes."""
     free = mujoco.mjtJoint.mjJNT_FREE
     children = {body: {joint.type for joint in body.find_all("joint")} for body in spec.worldbody.bodies}
     roots = [body for body, kinds in children.items() if kinds - {free}]
@@ -160,23 +182,6 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
         if not (others or roots[0].explicitinertial or list(roots[0].geoms) or link.joints):
             link.pos = [0.0, 0.0, 0.0]
             notes.append(f"'{roots[0].name}' is no more than a frame: the trunk's origin is that of '{link.name}'")
-    for body in spec.bodies:
-        if body.name and not body.joints and body.name != "world":
-            body.add_site(name=SITE + body.name)
-    unnamed = [joint for joint in spec.joints if not joint.name and joint.type != free]
-    for number, joint in enumerate(unnamed, 1):
-        joint.name = f"{joint.parent.name or number}_joint"
-        notes.append(f"the joint of '{joint.parent.name}' had no name: '{joint.name}'")
-    if not np.allclose(spec.option.gravity, [0.0, 0.0, -GRAVITY], atol=0.01):
-        notes.append(f"gravity is {GRAVITY} m/s^2 along -z, not the file's {np.round(spec.option.gravity, 3).tolist()}")
-    spec.option.gravity, spec.option.disableflags = [0.0, 0.0, -GRAVITY], 0
-    if is_urdf:  # only <inertial> has masses
-        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-        for geom in spec.geoms:
-            geom.mass = 0.0
-    spec.compiler.fusestatic = True
-    spec.compiler.discardvisual = True
-    return notes
 
 
 def _compile(spec: mujoco.MjSpec, notes: Notes) -> mujoco.MjModel:
@@ -304,10 +309,8 @@ def _note_left_out(model: mujoco.MjModel, notes: Notes) -> None:
         "damping, armature, dry friction and stiffness of the trunk's free joint": trunk,
         "polynomial terms of damping and stiffness": [getattr(model, name, 0.0) for name in polynomials],
         "density, viscosity and wind": (model.opt.density, model.opt.viscosity, model.opt.wind),
-        "the dynamics of actuators (filters, activations, delays)": (
-            model.actuator_dyntype,
-            getattr(model, "actuator_delay", 0.0),
-        ),
+        "the dynamics of actuators (filters, activations)": [model.actuator_dyntype],
+        "the delays of actuators": [getattr(model, "actuator_delay", 0.0)],
         "the compensation of gravity": [model.body_gravcomp],
     }
     notes += [f"left out: {what}" for what, values in found.items() if any(np.any(value) for value in values)]

@@ -1,7 +1,7 @@
 """Published robots rebuilt from their figures: a URDF or MJCF with the bodies, joints, shapes and motors of each.
 
-``tests/importer/published_facts.json`` has names and numbers of five digits, with the source and licence of each. Meshes
-are the boxes around them; what neither moves nor touches is left out.
+``tests/importer/published_facts.json`` has names and numbers of five digits, with the source and licence of each.
+Meshes are the boxes around them; what neither moves nor touches is left out.
 """
 
 import json
@@ -18,7 +18,11 @@ def text_of(numbers):
 def published(name):
     """Return the text of the file of a robot."""
     facts = FACTS[name]
-    return urdf_of(facts["links"], facts["joints"]) if "links" in facts else mjcf_of(**facts)
+    return (
+        urdf_of(facts["links"], facts["joints"])
+        if "links" in facts
+        else mjcf_of(facts["bodies"], facts["motors"], facts["keys"])
+    )
 
 
 def urdf_of(links, joints):
@@ -50,7 +54,7 @@ def urdf_of(links, joints):
     return f'<robot name="robot">{"".join(parts)}</robot>'
 
 
-def mjcf_of(bodies, motors, keys, source, license):
+def mjcf_of(bodies, motors, keys):
     """Return an MJCF. Bodies come after their parents, which are named by their numbers; 0 is the world."""
 
     def body(number):
