@@ -7,7 +7,7 @@ script finds them. Prints what was changed and why, and whether the robot stands
 
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from legged_torque import RESOURCES_DIR
 from legged_torque import __file__ as package
@@ -17,6 +17,9 @@ from legged_torque.utils.devices import choose_offscreen_renderer, disable_rende
 from legged_torque.utils.errors import UserError, collect_errors
 from legged_torque.utils.files import write_whole
 from legged_torque.utils.limits import Limits
+
+if TYPE_CHECKING:
+    import mujoco
 
 Torque = Annotated[float, Limits(above=0, highest=1e5)]
 
@@ -63,25 +66,30 @@ def main() -> None:
         read_tree(model)
     code = settings(robot, path, is_fused=not problems)
     compile(code, code_file, "exec")  # a file with a mistake would be in every later command's way
+    data = mujoco.MjData(model)
+    verdict = check(robot, data)
     write_whole(model_file, text)
     write_whole(code_file, code)
     for note in robot.source.notes:
         print(f"- {''.join(c if c.isprintable() else '?' for c in note)}")
     print(f"wrote {model_file}\nwrote {code_file}")
     print(*problems or ["sim.engine 'fused' simulates it"])
-    data = mujoco.MjData(model)
-    print(f"5 s under PD: {check(robot, data)}")
-    if args.check and no_picture:
-        print(f"no picture: {no_picture}")
-    elif args.check:
-        from PIL import Image
-
-        with mujoco.Renderer(model, 480, 640) as renderer:
-            renderer.update_scene(data, camera="track")
-            Image.fromarray(renderer.render()).save(folder / f"{robot.name}.png")
-        print(f"wrote {folder / robot.name}.png")
+    print(f"5 s under PD: {verdict}")
+    if args.check:
+        print(f"no picture: {no_picture}" if no_picture else draw(data, folder / f"{robot.name}.png"))
     task_file = "" if is_inside else f"--task_file {shlex.quote(str(code_file))} "
     print(f"Train it: {cli.script_command('train')} {task_file}--task={robot.name}_position")
+
+
+def draw(data: "mujoco.MjData", file: Path) -> str:
+    """Draw a robot into a file; return a line that says so."""
+    import mujoco
+    from PIL import Image
+
+    with mujoco.Renderer(data.model, 480, 640) as renderer:
+        renderer.update_scene(data, camera="track")
+        Image.fromarray(renderer.render()).save(file)
+    return f"wrote {file}"
 
 
 if __name__ == "__main__":

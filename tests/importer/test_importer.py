@@ -233,6 +233,7 @@ def test_pose_that_stands(written):
             ),
             "the inertia of 'FL_calf' follows from the mesh 'gone.stl'",
         ),
+        (urdf().replace('<mass value="6"/>', '<mass value="1e30"/>'), "it weighs 1e.30 kg, at most 10000 make sense"),
         ("<mujoco><worldbody/></mujoco>", "must have joints, not 0"),
         ("<mujoco", "unclosed token"),
         (urdf().replace('velocity="15"', 'velocity="fast"'), "could not convert string to float: 'fast'"),
