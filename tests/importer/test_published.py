@@ -1,5 +1,7 @@
 """Published robots, and robots of unusual build: what is imported moves like its source, and stands on its feet."""
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
@@ -175,9 +177,16 @@ def with_parts(links, joints):
     return links, joints
 
 
+def with_payload(links, joints):
+    """Fix a link with a mass to the trunk."""
+    links["payload"] = [[0.3, [0, 0, 0], [0, 0, 0], [1e-4, 0, 0, 1e-4, 0, 1e-4]], []]
+    return links, [*joints, ["p", "fixed", "base", "payload", [0, 0, 0.1], [0, 0, 0], [1, 0, 0], []]]
+
+
 LEVEL, ACROSS = [0, 0, 0], [np.pi / 2, 0, 0]
 SPHERE = ("sphere", [0.035], [0, 0, 0], LEVEL)
 DOG = urdf_of(*legged(FOUR, three, SPHERE))
+LOADED = urdf_of(*with_payload(*legged(FOUR, three, SPHERE)))
 BASE, COLOR = '<link name="base">', '<material name="a"/>'
 UNUSUAL = {
     "feet only": urdf_of(*legged(FOUR, three, SPHERE, calf=False)),
@@ -189,7 +198,7 @@ UNUSUAL = {
     "turned root": urdf_of(*with_root(*legged(FOUR, three, SPHERE), [0, 0, 3.14159])),
     "impossible calf": urdf_of(*with_inertia(*legged(FOUR, three, SPHERE))),
     "feet's names": urdf_of(*with_parts(*legged(FOUR, three, SPHERE))),
-    "masses of geoms": DOG.replace(BASE, f'<mujoco><compiler inertiafromgeom="true"/></mujoco>{BASE}'),
+    "masses of geoms": LOADED.replace(BASE, f'<mujoco><compiler inertiafromgeom="true"/></mujoco>{BASE}'),
     "two colors": DOG.replace(BASE, f'{BASE}<visual><geometry><sphere radius="1"/></geometry>{2 * COLOR}</visual>'),
 }
 """URDFs of unusual build."""
@@ -210,8 +219,8 @@ def test_unusual(imported, name):
     assert feet_share(model, data) == (1.0, len(robot.legs))
     assert sum("foot" in model.geom(geom).name for geom in range(model.ngeom)) == len(robot.legs)
     assert sum("trunk" in model.geom(geom).name for geom in range(model.ngeom)) == 1
-    links = len(robot.joints) - 2 * (name == "feet's names")
-    assert model.body_mass.sum() == pytest.approx(6 + 0.4 * links + 0.1 * (name == "feet's names"))
+    masses = re.findall('mass value="([^"]*)"', text)
+    assert model.body_mass.sum() == pytest.approx(sum(map(float, masses)))
 
 
 def test_turned_root(imported):
