@@ -21,6 +21,7 @@ from legged_torque.envs.tasks import A1TorqueCurriculumCfgPPO as A1TorqueCurricu
 from legged_torque.envs.tasks import A1TorqueCurriculumHighCfg as A1TorqueCurriculumHighCfg
 from legged_torque.envs.tasks import A1TorqueGravityCfgPPO as A1TorqueGravityCfgPPO
 from legged_torque.envs.tasks import A1TorqueMultiHeadCfg as A1TorqueMultiHeadCfg
+from legged_torque.envs.tasks import register_robot as register_robot
 from legged_torque.utils.config import Section as Section
 from legged_torque.utils.task_registry import task_registry as task_registry
 

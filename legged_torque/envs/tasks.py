@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -216,7 +216,16 @@ def on_ground(ground: type, task: type) -> Any:
     return type(ground.__name__, (ground, task), {"__doc__": f"{task.__doc__} On: {ground.__doc__}"})()
 
 
-for robot_name, tasks in [("a1", TASKS), *((parts[0], tasks_of(*parts)) for parts in further_robots())]:
+def register_robot(name: str, cfg: type[LeggedRobotCfg], train_cfg: type[LeggedRobotCfgPPO]) -> None:
+    """Register the tasks of a robot: ``<name>_<approach>`` and ``<name>_rough_<approach>``, for every approach.
+
+    A UserError if one of them is a task already.
+    """
+    _register(name, tasks_of(name, cfg, train_cfg))
+
+
+def _register(robot_name: str, tasks: Sequence[tuple[str, str, Any, Any]]) -> None:
+    """Register tasks of a robot on a plane, then the same on rough ground."""
     for name, robot, env_cfg, train_cfg in tasks:
         task_registry.register(name, robot, env_cfg(), train_cfg())
     for name, robot, env_cfg, train_cfg in tasks:
@@ -224,3 +233,8 @@ for robot_name, tasks in [("a1", TASKS), *((parts[0], tasks_of(*parts)) for part
         training = on_ground(RoughCfgPPO, train_cfg)
         task_registry.register(rough_name, robot, on_ground(RoughCfg, env_cfg), training)
         task_registry.register(f"{rough_name}_scan", robot, on_ground(RoughScanCfg, env_cfg), training)
+
+
+_register("a1", TASKS)
+for robot_parts in further_robots():
+    register_robot(*robot_parts)

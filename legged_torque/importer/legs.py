@@ -9,18 +9,23 @@ from itertools import takewhile
 import mujoco
 import numpy as np
 
-from legged_torque.importer.shapes import Shape, box_around, fit_geom, fit_inertia
+from legged_torque.importer.shapes import ROUND, Shape, box_around, fit_geom, fit_inertia
 from legged_torque.importer.source import Source
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import body_chains
 
 TOLERANCE = 0.01  # distance by which mirror images may miss each other [m]
-PITCHING = 0.7  # least |y| of the axis of a joint that turns about y
+PARALLEL = 0.9  # least |cosine| of the angle between axes that count as parallel
+LEVEL = 0.5  # largest |z| of an axis that counts as level
+SIDEWAYS = 0.3  # least |y| of some level axis of a robot that can walk along x
 LOW = 0.75  # share of the lowest end's depth below the trunk that the end of a leg reaches
-MOST_WITHOUT_ANKLE = 4  # joints of a leg that ends in a point; those with more have an ankle and a sole
-FOOT_RADIUS = 0.02  # of a foot that the file has a place for and no geom [m]
-FOOT_REACH = 0.03  # largest distance of a geom at the end of a leg that becomes its foot [m]
-FOOT_WIDENING = 1.1  # radius of a foot at the end of a capsule, as a multiple of the capsule's
+MOST_WITHOUT_ANKLE = 3  # joints of a two-legged robot's leg that ends in a point; those with more have soles
+MOST_WITHOUT_SOLE = 4  # the same of robots with more legs
+FOOT_REACH = 0.03  # largest distance between the end of a leg and the geom there that is its foot [m]
+FLAT = 0.25  # length along the last link, as a share of it, up to which the geom at its end is a foot
+HUB = 0.25  # distance of a wheel's center from its axis as a share of its radius
+FOOT_WIDENING = 1.1  # radius of a foot at the end of a capsule or box, as a multiple of theirs
+FOOT, TRUNK = "foot", "trunk"  # in the names of the geoms of feet and trunk, and of no other
 END_NAMES = ("foot", "toe", "sole", "contact")  # in names of fixed links at the ends of legs
 
 
@@ -31,11 +36,7 @@ class Leg:
     name: str  # prefix of the names of its joints
     bodies: list[int]
     foot: Shape  # in the frame of the last body
-
-    @property
-    def has_sole(self) -> bool:
-        """Whether it has an ankle, so that a flat foot stays flat."""
-        return len(self.bodies) > MOST_WITHOUT_ANKLE
+    has_sole: bool  # whether it has an ankle, so that a flat foot stays flat
 
 
 def zero_pose(model: mujoco.MjModel, joints: np.ndarray | None = None) -> mujoco.MjData:
@@ -46,6 +47,16 @@ def zero_pose(model: mujoco.MjModel, joints: np.ndarray | None = None) -> mujoco
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     return data
+
+
+def pitch_axis(axes: np.ndarray) -> np.ndarray:
+    """Return the axis about which most level joints of a leg turn, to the left: the last one of several. Shape: (3,).
+
+    ``axes`` are those of its joints in the world. Shape: (joints, 3).
+    """
+    alike = (np.abs(axes @ axes.T) > PARALLEL).sum(axis=1) * (np.abs(axes[:, 2]) < LEVEL)
+    axis = axes[len(axes) - 1 - int(np.argmax(alike[::-1]))]
+    return axis if axis[1] >= 0 else -axis
 
 
 def lowest_point(data: mujoco.MjData, body: int, shape: Shape) -> np.ndarray:
@@ -78,11 +89,11 @@ def find_legs(source: Source, shapes: dict[int, list[Shape]]) -> list[Leg]:
     Legs are the chains with the lowest ends, in the file's keyframe or with all joints at 0.
     """
     model = source.model
-    data = zero_pose(model, source.pose)
+    data = zero_pose(model, next(iter(source.poses.values()), None))
     chains = [chain for chain in body_chains(model) if len(chain) > 1]
     if not chains:
         raise UserError(f"cannot import '{source.file}': it has no legs of two joints or more")
-    if not (np.abs(data.xaxis[1:, 1]) > PITCHING).any():
+    if not (np.abs(data.xaxis[1:, 1]) > SIDEWAYS).any():
         raise UserError(f"cannot import '{source.file}': x must point forwards and y left, but no joint turns about y")
     along_x, along_y, _ = np.abs(data.xaxis[1:]).sum(axis=0)
     if along_x > along_y + TOLERANCE:
@@ -91,36 +102,59 @@ def find_legs(source: Source, shapes: dict[int, list[Shape]]) -> list[Leg]:
     legs = [chain for chain, low in zip(chains, lows, strict=True) if low < LOW * min(lows)]
     if not legs:
         raise UserError(f"cannot import '{source.file}': no leg reaches below its trunk's origin; z must point upwards")
-    names = _leg_names(source, legs, data)
-    return [Leg(name, chain, _take_foot(source, shapes, chain, data)) for name, chain in zip(names, legs, strict=True)]
+    names, found = _leg_names(source, legs, data), []
+    for name, chain in zip(names, legs, strict=True):
+        foot = _wheel(model, shapes, chain[-1])
+        has_sole = not foot and len(chain) > (MOST_WITHOUT_ANKLE if len(legs) == 2 else MOST_WITHOUT_SOLE)
+        if has_sole:
+            foot = box_around(shapes[chain[-1]], data.xmat[chain[-1]].reshape(3, 3).T)
+            shapes[chain[-1]] = []
+        found.append(Leg(name, chain, foot or _take_foot(source, shapes, chain[-1]), has_sole))
+    return found
 
 
-def _take_foot(source: Source, shapes: dict[int, list[Shape]], chain: list[int], data: mujoco.MjData) -> Shape:
-    """Return the foot at the end of a leg, no longer among the shapes; add it where the file has none."""
-    model, body = source.model, chain[-1]
-    found = shapes[body]
-    if len(chain) > MOST_WITHOUT_ANKLE:  # a sole, flat on the ground with level trunk
-        shapes[body] = []
-        return found[0] if len(found) == 1 else box_around(found, data.xmat[body].reshape(3, 3).T)
+def _wheel(model: mujoco.MjModel, shapes: dict[int, list[Shape]], body: int) -> Shape | None:
+    """Return the ball in the place of a wheel at the end of a leg, its only shape; None without a wheel."""
+    last = max(shapes[body], key=lambda shape: max(shape.half_sizes()))
+    joint, (_, middle, radius) = int(model.body_jntadr[body]), sorted(last.half_sizes())
+    aside = np.cross(last.pos - model.jnt_pos[joint], model.jnt_axis[joint])
+    if np.linalg.norm(aside) > HUB * radius or radius > ROUND * middle:
+        return None
+    shapes[body] = []
+    return _ball(radius, last.pos)
+
+
+def _ball(radius: float, place: np.ndarray) -> Shape:
+    """Return a sphere [m] in the frame of its body."""
+    return Shape("sphere", [radius], np.array(place), np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+def _take_foot(source: Source, shapes: dict[int, list[Shape]], body: int) -> Shape:
+    """Return the foot at the end of a leg without a sole, no longer among the shapes; add it where the file has none.
+
+    The end is a fixed link with a name of :data:`END_NAMES`, or where the shape that reaches farthest ends. Adds notes.
+    """
+    model, found, name = source.model, shapes[body], source.model.body(body).name
     joint = model.jnt_pos[model.body_jntadr[body]]
-    reach = [float(np.linalg.norm(shape.ends() - joint, axis=1).max() + shape.radius) for shape in found]
-    last = found[int(np.argmax(reach))]
-    if last.kind == "sphere" and len(found) > 1:
-        found.remove(last)
-        return last
-    sites = source.sites.get(body, [])
-    named = [place for name, place in sites if any(part in name.lower() for part in END_NAMES)]
-    ends = last.ends()
-    tip = named[0] if named else ends[np.argmax(np.linalg.norm(ends - joint, axis=1))]
-    near = [shape for shape in found if np.linalg.norm(shape.pos - tip) < FOOT_REACH and len(found) > 1]
-    radius = FOOT_RADIUS
-    if near:
-        found.remove(near[0])
-        radius = float(np.mean(near[0].half_sizes()))
-    elif last.kind == "capsule":
-        radius = FOOT_WIDENING * last.radius
-    source.notes.append(f"a sphere of {radius:.3f} m is the foot at the end of '{model.body(body).name}'")
-    return Shape("sphere", [radius], np.array(tip), np.array([1.0, 0.0, 0.0, 0.0]))
+    last = max(found, key=lambda shape: shape.reach(joint))
+    named = [place for site, place in source.sites.get(body, []) if any(part in site.lower() for part in END_NAMES)]
+    tip = named[0] if named else last.end(joint)
+    far = float(np.linalg.norm(tip - joint))
+    near = min(found, key=lambda shape: np.linalg.norm(shape.pos - tip) - min(shape.half_sizes()))
+    is_there = np.linalg.norm(near.pos - tip) - min(near.half_sizes()) < FOOT_REACH
+    is_small = max(near.half_sizes()) < FOOT_REACH
+    if is_there and (near.kind == "sphere" or is_small or near.length((tip - joint) / far) < FLAT * far):
+        found.remove(near)
+        foot = _ball(max(near.half_sizes()), near.pos) if is_small and near.kind != "sphere" else near
+    else:
+        foot = _ball(FOOT_WIDENING * float(np.prod(sorted(last.half_sizes())[:2]) ** 0.5), tip)
+    if foot is not near:
+        source.notes.on([name], f"a sphere of {foot.radius:.3f} m is the foot at the end of")
+    spared = {"capsule": 0.5 * foot.radius, "box": -foot.radius, "sphere": np.inf}  # reaching into the foot
+    for shape in [shape for shape in found if foot.kind == "sphere" and shape.reach(joint) > far + spared[shape.kind]]:
+        shape.shorten(joint, far - foot.radius)
+        source.notes.on([name], "shapes that would touch the ground beside the foot are shorter")
+    return foot
 
 
 def _leg_names(source: Source, chains: list[list[int]], data: mujoco.MjData) -> list[str]:
@@ -131,6 +165,7 @@ def _leg_names(source: Source, chains: list[list[int]], data: mujoco.MjData) -> 
         words = zip(*(joint.split("_") for joint in joints), strict=False)
         names.append("_".join(word for word, *_ in takewhile(lambda same: len(set(same)) == 1, words)))
     clash = any(a and b and a != b and b.startswith(a) for a in names for b in names)
+    clash |= any(part in name for name in names for part in (FOOT, TRUNK))
     if all(names) and len(set(names)) == len(names) and not clash:
         return names
     places = [data.xpos[chain[-1]] for chain in chains]

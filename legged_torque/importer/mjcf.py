@@ -7,7 +7,8 @@ import re
 import mujoco
 import numpy as np
 
-from legged_torque.importer.robot import FOOT, Robot
+from legged_torque.importer.legs import FOOT
+from legged_torque.importer.robot import Robot
 from legged_torque.utils.mjcf import loading
 
 SCENE = """

@@ -9,7 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from legged_torque.importer.legs import Leg, find_legs, find_shapes, joint_names, lowest_point, mirrored_legs, zero_pose
+from legged_torque.importer.legs import (
+    FOOT,
+    TRUNK,
+    Leg,
+    find_legs,
+    find_shapes,
+    joint_names,
+    lowest_point,
+    mirrored_legs,
+    zero_pose,
+)
 from legged_torque.importer.pose import Stance, find_stance
 from legged_torque.importer.shapes import Shape
 from legged_torque.importer.source import Source, read_source
@@ -21,7 +31,6 @@ IMPLAUSIBLE = 20.0  # multiple of weight times height from which torque limits c
 SPEED = 20.0  # highest speed of joints without a limit [rad/s]
 FASTEST = 100.0  # speed from which limits count as missing [rad/s]
 MUCH_DAMPING = 0.25  # share of the gains' damping from which that of the file may be a servo's
-FOOT, TRUNK = "foot", "trunk"  # in the names of the geoms of feet and trunk
 
 
 @dataclass
@@ -76,7 +85,7 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     speed = max((limit for limit in source.speed_limits if limit < FASTEST), default=SPEED)
     if speed not in source.speed_limits:
         source.notes.append(f"no speed limits that mean anything: {SPEED:g} rad/s assumed, asset.max_dof_vel")
-    stance = find_stance(source, legs, ranges, torques)
+    stance = find_stance(source, legs, shapes, ranges, torques)
     joints = joint_names(source, legs, mirrored)
     prefixes = [leg.name + "_" for leg in legs]
     asymmetries: list[str] = []
@@ -100,7 +109,7 @@ def _torques(source: Source, shapes: dict[int, list[Shape]], given: float | None
     model = source.model
     if given is not None:
         return np.full(model.njnt - 1, given)
-    data = zero_pose(model, source.pose)
+    data = zero_pose(model, next(iter(source.poses.values()), None))
     lowest = min(lowest_point(data, body, shape)[2] for body, found in shapes.items() for shape in found)
     enough = float(-source.weight * lowest)
     known = (source.torque_limits > 0) & (source.torque_limits < IMPLAUSIBLE * enough)
@@ -120,8 +129,10 @@ def _name_shapes(source: Source, legs: list[Leg], shapes: dict[int, list[Shape]]
         name = TRUNK if body == 1 else model.body(body).name or f"body{body}"
         if body in owner:
             leg = owner[body]
-            kind = name.removeprefix(leg.name).strip("_").replace(FOOT, "sole") or f"link{leg.bodies.index(body) + 1}"
+            kind = name.removeprefix(leg.name).strip("_") or f"link{leg.bodies.index(body) + 1}"
             name = f"{leg.name}_{kind}"
+        if body != 1:
+            name = name.replace(FOOT, "sole").replace(TRUNK, "torso")
         for shape in found:
             shape.name = next(n for n in chain([name], (f"{name}_{i}" for i in count(2))) if n not in taken)
             taken.add(shape.name)

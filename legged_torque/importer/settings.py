@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
-from itertools import groupby
+
+import numpy as np
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.importer.pose import BANDWIDTH, DAMPING_RATIO, SAG
-from legged_torque.importer.robot import FOOT, TRUNK, Robot
+from legged_torque.importer.legs import FOOT, PARALLEL, TRUNK, pitch_axis, zero_pose
+from legged_torque.importer.robot import Robot
 
 WEIGHT_TIMES_HEIGHT = 37.0  # of an A1 with its trunk at 0.303 m [N m]
-DROP = 1.3  # height of the trunk at the start of an episode, as a multiple of the nominal one; as for the A1
-TORQUE_SCALE = 0.12  # torque of an action of 1 as a share of the strongest motor's; as for the A1
-LINE = 90  # most characters of a table in one line
+TORQUE_SCALE = 1.1  # torque of an action of 1, as a multiple of the largest that holds the nominal pose; as for the A1
+ACTION_SCALE = (0.25, 0.15)  # without and with two legs, whose gains are higher than the G1's [rad]
+LINE = 90  # most characters of a literal in one line
 
 TEMPLATE = '''"""{title}: imported settings; each number is a proposal to look at."""
 
@@ -20,33 +21,32 @@ TEMPLATE = '''"""{title}: imported settings; each number is a proposal to look a
 
 from __future__ import annotations
 
-from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+{imports}
 
-
-class {cls}Cfg(LeggedRobotCfg):
+class {cls}Cfg({base}):
     """Settings of the robot; alone, of position control on a plane."""
 
     class asset:
         file = {path}
         foot_name = "{foot}"
         penalize_contacts_on = {penalized}
-        terminate_after_contacts_on = ["{trunk}"]
+        terminate_after_contacts_on = {terminating}
         mirrored_legs = {mirrored}
         max_dof_vel = {speed}
 
 {engine}    class init_state:
         pos = [0.0, 0.0, {drop}]
-        default_joint_angles = (
-{angles}
-        )
+        default_joint_angles = {angles}
 
-    class control:  # {bandwidth:g} Hz with a leg's own inertia, {sag:g} rad under its weight; damping ratio {ratio:g}
+    class control:  # as stiff for its weight and height as the robots of the library
         stiffness = {stiffness}
         damping = {damping}
+        action_scale = {action_scale}
         torque_scale = {torque_scale}
 
-    class rewards:
+{two_legs}    class rewards:
         base_height_target = {height}
+        held_joints = {held}
 
         class scales:
             torques = {torques:.2g}  # the A1's, as its squared torques are to this robot's: by weight times height
@@ -54,7 +54,16 @@ class {cls}Cfg(LeggedRobotCfg):
 
 class {cls}CfgPPO(LeggedRobotCfgPPO):
     """Training of it."""
-{symmetry}'''
+{symmetry}{registration}'''
+IMPORTS = "from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO\n"
+OWN_IMPORTS = """from pathlib import Path
+
+from legged_torque.envs import LeggedRobotCfg, LeggedRobotCfgPPO, register_robot
+"""
+REGISTRATION = """
+
+register_robot("{name}", {cls}Cfg, {cls}CfgPPO)  # its tasks: {name}_position, {name}_rough_position, ...
+"""
 ENGINE = """    class sim:
         engine = "mujoco_warp"  # slower; the fused step cannot simulate this robot
 
@@ -64,45 +73,58 @@ SYMMETRY = """
         class symmetry_cfg:
             use_data_augmentation = True
 """
+TWO_LEGS = """    class domain_rand:  # in shares of the robot, not as the G1's
+        trunk_mass = LeggedRobotCfg.domain_rand.trunk_mass
+        dof_damping = LeggedRobotCfg.domain_rand.dof_damping
+        dof_armature = LeggedRobotCfg.domain_rand.dof_armature
+        dof_stiffness = LeggedRobotCfg.domain_rand.dof_stiffness
+        dof_frictionloss = LeggedRobotCfg.domain_rand.dof_frictionloss
+
+"""
+G1 = "from legged_torque.envs.robots.g1 import G1Cfg  # rewards, commands and starts that two legs need\n"
 
 
-def settings(robot: Robot, path: str, is_fused: bool = True) -> str:
+def settings(robot: Robot, path: str = "", is_fused: bool = True) -> str:
     """Return the text of the module with a robot's settings. Everything from its file is written as literals.
 
-    ``path`` is that of its MJCF, as in ``asset.file``; ``is_fused`` says whether the fused step can simulate it.
+    ``path`` is that of its MJCF, as in ``asset.file``. Without one the module is for ``--task_file``: it registers the
+    robot's tasks, and its MJCF is next to it. ``is_fused`` says whether the fused step can simulate the robot.
     """
+    cls = "".join(part.capitalize() for part in robot.name.split("_"))  # AnymalC for anymal_c
+    penalized, two_legs = _penalized(robot), len(robot.legs) == 2
     stance, leverage = robot.stance, robot.source.weight * robot.stance.height
     return TEMPLATE.format(
         title=robot.name,
         file=ascii(robot.source.file.name),
-        cls="".join(part.capitalize() for part in robot.name.split("_")),  # AnymalC for anymal_c
-        path=_literal(path),
+        imports=(IMPORTS if path else OWN_IMPORTS) + (G1 if two_legs else ""),
+        base="G1Cfg" if two_legs else "LeggedRobotCfg",
+        cls=cls,
+        path=_literal(path) if path else f'str(Path(__file__).with_name("{robot.name}.xml"))',
         engine="" if is_fused else ENGINE,
         foot=FOOT,
-        trunk=TRUNK,
-        penalized=_literal(_penalized(robot)),
+        penalized=_literal(penalized),
+        terminating=_literal(penalized if two_legs else [TRUNK]),
         mirrored=_literal(robot.mirrored),
         speed=f"{robot.speed:.4g}" if "." in f"{robot.speed:.4g}" else f"{robot.speed:.1f}",
-        drop=round(DROP * stance.height, 2),
-        angles=_angles(robot),
-        bandwidth=BANDWIDTH,
-        sag=SAG,
-        ratio=DAMPING_RATIO,
+        drop=round(stance.drop, 2),
+        angles=_literal(dict(zip(robot.joints, (stance.angles.round(3) + 0.0).tolist(), strict=True))),
         stiffness=_table(robot.by_kind(stance.stiffness)),
         damping=_table(robot.by_kind(stance.damping)),
-        torque_scale=float(f"{TORQUE_SCALE * max(robot.torques):.2g}"),
+        torque_scale=float(f"{TORQUE_SCALE * stance.load:.2g}"),
         height=round(stance.height, 3),
         torques=LeggedRobotCfg.rewards.scales.torques * (WEIGHT_TIMES_HEIGHT / leverage) ** 2,
+        action_scale=ACTION_SCALE[two_legs],
+        two_legs=TWO_LEGS if two_legs else "",
+        held=_literal(_held(robot) if two_legs else []),
         symmetry=SYMMETRY if robot.symmetric else "",
+        registration="" if path else REGISTRATION.format(name=robot.name, cls=cls),
     )
 
 
 def _penalized(robot: Robot) -> list[str]:
-    """Return parts of names that match all geoms but feet and the links next to the trunk."""
-    model = robot.source.model
+    """Return parts of names that match all geoms but feet and the legs' links next to the trunk."""
     geoms = {shape.name for found in robot.shapes.values() for shape in found}
-    first = {body for body in range(2, model.nbody) if model.body_parentid[body] == 1}
-    spared = {s.name for body in first for s in robot.shapes[body] if len(robot.legs[0].bodies) > 2}
+    spared = {shape.name for leg in robot.legs if len(leg.bodies) > 2 for shape in robot.shapes[leg.bodies[0]]}
     spared |= {leg.foot.name for leg in robot.legs}
     parts = [TRUNK]
     for name in sorted(geoms - spared):
@@ -114,26 +136,25 @@ def _penalized(robot: Robot) -> list[str]:
     return parts
 
 
-def _literal(value: str | list) -> str:
-    """Return a text, or lists of texts, as a Python literal in double quotes."""
-    return json.dumps(value, ensure_ascii=False)
+def _held(robot: Robot) -> list[str]:
+    """Return the kinds of joints that a two-legged robot holds: those that turn its legs inwards, and off its legs."""
+    model, data = robot.source.model, zero_pose(robot.source.model)
+    free = set[int]()
+    for leg in robot.legs:
+        joints = model.body_jntadr[leg.bodies]
+        pitch = joints[np.abs(data.xaxis[joints] @ pitch_axis(data.xaxis[joints])) > PARALLEL]
+        free |= {*pitch, *joints[list(joints).index(pitch[-1]) :]}
+    return list(dict.fromkeys(kind for joint, kind in enumerate(robot.kinds, 1) if joint not in free))
+
+
+def _literal(value: str | list | dict) -> str:
+    """Return texts, numbers, or lists or dictionaries of them as a Python literal in double quotes."""
+    line = json.dumps(value, ensure_ascii=False)
+    return line if len(line) < LINE else json.dumps(value, ensure_ascii=False, indent=4).replace("\n", "\n" + 8 * " ")
 
 
 def _table(numbers: dict[str, float]) -> str:
     """Return numbers by the kinds of joints as a dictionary; one number if they are all the same."""
-    if len(set(numbers.values())) == 1:
-        return str(next(iter(numbers.values())))
     ordered = sorted(numbers, key=len, reverse=True)  # the first part that matches counts
-    entries = [f"{_literal(kind)}: {numbers[kind]}" for kind in ordered]
-    line = "{" + ", ".join(entries) + "}"
-    return line if len(line) < LINE else "{\n" + "".join(f"            {entry},\n" for entry in entries) + "        }"
-
-
-def _angles(robot: Robot) -> str:
-    """Return the lines of the nominal pose: dictionaries of up to three joints of a leg, joined."""
-    rows: list[str] = []
-    named = zip(robot.joints, robot.kinds, robot.stance.angles.tolist(), strict=True)
-    for _, group in groupby(named, key=lambda each: each[0].removesuffix(each[1])):
-        entries = [f"{_literal(joint)}: {round(angle, 3) + 0.0}" for joint, _, angle in group]
-        rows += ["{" + ", ".join(entries[start : start + 3]) + "}" for start in range(0, len(entries), 3)]
-    return "\n".join(f"            {'| ' if number else ''}{row}" for number, row in enumerate(rows))
+    same = len(set(numbers.values())) == 1
+    return str(numbers[ordered[0]]) if same else _literal({kind: numbers[kind] for kind in ordered})

@@ -34,6 +34,36 @@ class Shape:
             local = signs * self.size
         return local @ rotation(self.quat).T + self.pos
 
+    def end(self, start: np.ndarray) -> np.ndarray:
+        """Return the center of that end of it that is farther from ``start``, in its body's frame [m]. Shape: (3,).
+
+        That is the center of a box's face, or of the sphere at a capsule's end if it lies along the way.
+        """
+        axes = rotation(self.quat)
+        along = axes.T @ (self.pos - start)
+        if self.kind == "sphere" or (self.kind == "capsule" and abs(along[2]) < 0.7 * np.linalg.norm(along)):
+            return self.pos
+        side = 2 if self.kind == "capsule" else int(np.argmax(np.abs(along)))
+        return self.pos + axes[:, side] * self.size[1 if self.kind == "capsule" else side] * np.sign(along[side])
+
+    def reach(self, start: np.ndarray) -> float:
+        """Return how far it reaches from a point of its body's frame [m]."""
+        return float(np.linalg.norm(self.end(start) - start)) + self.radius
+
+    def shorten(self, start: np.ndarray, reach: float) -> None:
+        """Move the end of a capsule or box that is farther from ``start`` to this distance from there [m]."""
+        half = self.end(start) - self.pos
+        length = float(np.linalg.norm(half))
+        excess = min(self.reach(start) - reach, length)
+        side = 2 if self.kind == "capsule" else int(np.argmax(np.abs(rotation(self.quat).T @ half)))
+        if length > 0.0:
+            self.pos = self.pos - 0.5 * excess / length * half
+            self.size[1 if self.kind == "capsule" else side] -= 0.5 * excess
+
+    def length(self, along: np.ndarray) -> float:
+        """Return its length along a direction of its body's frame [m]."""
+        return float(np.ptp(self.ends() @ along)) + 2.0 * self.radius
+
     def half_sizes(self) -> list[float]:
         """Return its half sizes along its axes [m]."""
         if self.kind == "box":

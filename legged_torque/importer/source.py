@@ -12,6 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from legged_torque.importer.shapes import rotation
 from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.mjcf import kept_warnings, motors_of, torque_range
 
@@ -19,6 +20,8 @@ MESH_TYPES = (".stl", ".obj", ".msh")  # files that MuJoCo reads
 COLLISION_GROUP = 3  # of Menagerie's collision geoms, also of those that one of its files switches off
 TINY = 1e-6  # inertia and mass up to which a fixed link has none; MuJoCo refuses less [kg m^2], [kg]
 GRAVITY = 9.81  # of all robots; that of the file does not count [m/s^2]
+HEAVIEST = 1e4  # mass of a robot that is none [kg]
+ROUNDING = 1e-6  # by which raised inertias exceed what they have to be, as a share
 NAME = re.compile(r"[A-Za-z0-9_.:/-]*")  # names of bodies and joints, which become parts of settings and of a MJCF
 SITE = "link:"  # prefix of the names of sites in the places of fixed links
 PARENTS = 4  # folders above that of the file in which meshes are looked for
@@ -30,7 +33,10 @@ class Notes(list[str]):
     def on(self, parts: Iterable[str], reason: str) -> None:
         """Add a reason followed by the names of parts, if there are any."""
         names = ", ".join(parts)
-        if names:
+        known = [place for place, note in enumerate(self) if names and note.startswith(f"{reason}: ")]
+        if known:
+            self[known[0]] += f", {names}"
+        elif names:
             self.append(f"{reason}: {names}")
 
 
@@ -45,8 +51,8 @@ class Source:
     file: Path
     model: mujoco.MjModel
     sites: dict[int, list[tuple[str, np.ndarray]]]
-    pose: np.ndarray | None  # angles of the file's keyframe, by hinge joint [rad]
-    torque_limits: np.ndarray  # tightest of the file, by joint; infinite without any [N m]
+    poses: dict[str, np.ndarray]  # of the file's keyframes, "home" first: angles by hinge joint [rad]
+    torque_limits: np.ndarray  # of the file, by joint; infinite without any [N m]
     speed_limits: list[float]  # of a URDF [rad/s]
     notes: Notes
 
@@ -76,12 +82,19 @@ def read_source(file: Path) -> Source:
             root = ET.parse(file).getroot()
             if any("xacro" in part.tag for part in root.iter()):  # MuJoCo would read the rest and nothing else
                 raise UserError(f"{what}: it is a xacro; make a URDF of it: xacro {file} > robot.urdf")
-            spec = mujoco.MjSpec.from_file(str(file))
+            for link in root.findall("link"):  # of a URDF; shapes follow from its collision geoms
+                for part in link.findall("visual"):
+                    link.remove(part)
+            for part in root.findall("material"):
+                root.remove(part)
+            is_urdf = root.tag == "robot"
+            text = ET.tostring(root, encoding="unicode")
+            spec = mujoco.MjSpec.from_string(text) if is_urdf else mujoco.MjSpec.from_file(str(file))
             names = dict.fromkeys(part.name for part in [*spec.bodies, *spec.joints])
             odd = ", ".join(repr(name) for name in names if not NAME.fullmatch(name))
             if odd:
                 raise UserError(f"{what}: names may have letters, digits and _ . : / -, not {odd}")
-            notes = _prepare(spec, file, root.tag == "robot")
+            notes = _prepare(spec, file, is_urdf)
             model = _compile(spec, notes)
             speeds = [float(limit.get("velocity", 0)) for limit in root.findall("joint/limit")]  # of a URDF
         except (ValueError, ET.ParseError, mujoco.FatalError) as error:
@@ -95,16 +108,19 @@ def read_source(file: Path) -> Source:
         f"a body may have one joint, {', '.join(several)} have more": several,
         f"its {model.neq} equalities (closed loops, mimicked joints) cannot be imported": model.neq,
         f"its {model.ntendon} tendons cannot be imported": model.ntendon,
+        f"it weighs {model.body_mass.sum():g} kg, at most {HEAVIEST:g} make sense": model.body_mass.sum() > HEAVIEST,
     }
     refuse([reason for reason, is_broken in rules.items() if is_broken], what)
     sites: dict[int, list] = {}
     for site in range(model.nsite):
         name = model.site(site).name.removeprefix(SITE)
         sites.setdefault(int(model.site_bodyid[site]), []).append((name, model.site_pos[site].copy()))
-    keys = [model.key(i).name for i in range(model.nkey)]
-    pose = model.key_qpos[keys.index("home") if "home" in keys else 0][7:].copy() if keys else None
+    keys = sorted(range(model.nkey), key=lambda key: model.key(key).name != "home")
+    poses = {model.key(key).name or f"number {key + 1}": model.key_qpos[key][7:].copy() for key in keys}
     limits = _torque_limits(model, notes)
-    return Source(file, model, sites, pose, limits, [speed for speed in speeds if speed > 0], notes)
+    _take_from_actuators(model)
+    _note_left_out(model, notes)
+    return Source(file, model, sites, poses, limits, [speed for speed in speeds if speed > 0], notes)
 
 
 def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
@@ -116,8 +132,6 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
     switched_on = dict[str, None]()
     for geom in spec.geoms:
         geom.material = ""
-        if is_urdf:
-            geom.mass = 0.0  # only <inertial> has masses
         if not (geom.contype or geom.conaffinity) and (geom.group == COLLISION_GROUP or geom.name in in_pairs):
             geom.conaffinity = 1
             if geom.name not in in_pairs:
@@ -125,18 +139,7 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
     notes.on(switched_on, f"geoms of group {COLLISION_GROUP}, which the file switches off, collide")
     for part in [*spec.materials, *spec.textures]:
         spec.delete(part)
-    roots = [body for body in spec.worldbody.bodies if body.find_all("joint")]
-    if len(roots) != 1:
-        raise UserError(f"cannot import '{file}': one child of the world must have joints, not {len(roots)}")
-    if not roots[0].joints:
-        roots[0].add_freejoint()
-        notes.append(f"'{roots[0].name}' was fixed to the world; it floats now")
-        for key in list(spec.keys):
-            spec.delete(key)
-        (link, *others) = roots[0].bodies
-        if not (others or roots[0].explicitinertial or list(roots[0].geoms) or link.joints):
-            link.pos, link.quat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
-            notes.append(f"'{roots[0].name}' is no more than a frame: the trunk's origin is that of '{link.name}'")
+    _keep_robot(spec, file, is_urdf, notes)
     for body in spec.bodies:
         if body.name and not body.joints and body.name != "world":
             body.add_site(name=SITE + body.name)
@@ -144,14 +147,48 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
     for number, joint in enumerate(unnamed, 1):
         joint.name = f"{joint.parent.name or number}_joint"
         notes.append(f"the joint of '{joint.parent.name}' had no name: '{joint.name}'")
+    if not np.allclose(spec.option.gravity, [0.0, 0.0, -GRAVITY], atol=0.01):
+        notes.append(f"gravity is {GRAVITY} m/s^2 along -z, not the file's {np.round(spec.option.gravity, 3).tolist()}")
     spec.option.gravity, spec.option.disableflags = [0.0, 0.0, -GRAVITY], 0
+    if is_urdf:  # only <inertial> has masses
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+        for geom in spec.geoms:
+            geom.mass = 0.0
     spec.compiler.fusestatic = True
     spec.compiler.discardvisual = True
     return notes
 
 
+def _keep_robot(spec: mujoco.MjSpec, file: Path, is_urdf: bool, notes: Notes) -> None:
+    """Leave the one child of the world that has hinges, and let it float. Adds notes."""
+    free = mujoco.mjtJoint.mjJNT_FREE
+    children = {body: {joint.type for joint in body.find_all("joint")} for body in spec.worldbody.bodies}
+    roots = [body for body, kinds in children.items() if kinds - {free}]
+    if len(roots) != 1:
+        raise UserError(f"cannot import '{file}': one child of the world must have joints, not {len(roots)}")
+    others = [body for body in children if body is not roots[0]]
+    notes.on((f"'{body.name}'" for body in others), "no parts of the robot, left out")
+    if any(children[body] for body in others):
+        for key in list(spec.keys):
+            spec.delete(key)
+    for body in others:
+        spec.delete(body)
+    if not roots[0].joints:
+        roots[0].add_freejoint()
+        notes += [] if is_urdf else [f"'{roots[0].name}' was fixed to the world; it floats now"]
+        for key in list(spec.keys):
+            spec.delete(key)
+        (link, *others) = roots[0].bodies
+        if not (others or roots[0].explicitinertial or list(roots[0].geoms) or link.joints):
+            link.pos = [0.0, 0.0, 0.0]
+            notes.append(f"'{roots[0].name}' is no more than a frame: the trunk's origin is that of '{link.name}'")
+
+
 def _compile(spec: mujoco.MjSpec, notes: Notes) -> mujoco.MjModel:
-    """Compile; impossible inertias, which MuJoCo refuses, are replaced where links are fixed. Adds notes."""
+    """Compile; impossible inertias, which MuJoCo refuses, are made possible or replaced. Adds notes.
+
+    Only where links are fixed are those without three positive moments replaced.
+    """
     for body in spec.bodies:
         moves = any(joint.type != mujoco.mjtJoint.mjJNT_FREE for joint in body.joints)
         if moves or not body.explicitinertial or np.isnan(body.fullinertia[0]):
@@ -166,9 +203,31 @@ def _compile(spec: mujoco.MjSpec, notes: Notes) -> mujoco.MjModel:
     except ValueError as error:
         if "balanceinertia" not in str(error):
             raise
-        spec.compiler.balanceinertia = True
-        notes.append(f"some inertias break A + B >= C and were balanced; MuJoCo said: {' '.join(str(error).split())}")
-        return spec.compile()
+    for body in spec.bodies:
+        if body.explicitinertial:
+            _balance(body, notes)
+    return spec.compile()
+
+
+def _balance(body: mujoco.MjsBody, notes: Notes) -> None:
+    """Raise the two smaller moments of inertia of a body as little as A + B >= C needs. Adds a note."""
+    xx, yy, zz, xy, xz, yz = body.fullinertia
+    if np.isnan(xx):
+        axes, moments = rotation(body.iquat), np.array(body.inertia)
+    else:
+        moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    order = np.argsort(moments)
+    missing = 2.0 * moments[order[2]] - moments.sum()
+    if moments[order[0]] <= 0.0 or missing <= 0.0:
+        return
+    moments[order[:2]] += missing / 2.0 + ROUNDING * moments[order[2]]
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = axes @ np.diag(moments) @ axes.T
+    body.fullinertia, body.inertia = [xx, yy, zz, xy, xz, yz], np.zeros(3)
+    body.iquat = [1.0, 0.0, 0.0, 0.0]
+    notes.append(
+        f"the inertia of '{body.name}' broke A + B >= C by {missing:.2g} kg m^2, {missing / moments[order[2]]:.1%} of "
+        "the largest moment: the two smaller ones are raised by half of that each"
+    )
 
 
 def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
@@ -207,7 +266,10 @@ def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
 
 
 def _torque_limits(model: mujoco.MjModel, notes: Notes) -> np.ndarray:
-    """Return the tightest torque limit of each hinge in either direction [N m]. Shape: (joints,). Adds notes."""
+    """Return the torque limit of each hinge, in its weaker direction [N m]. Shape: (joints,). Adds notes.
+
+    It is the sum of its motors', or the joint's own.
+    """
     for actuator in range(model.nu):
         if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
             raise UserError(f"the actuator '{model.actuator(actuator).name}' does not act on a joint")
@@ -215,20 +277,40 @@ def _torque_limits(model: mujoco.MjModel, notes: Notes) -> np.ndarray:
     model.actuator_ctrllimited[is_servo] = False  # their controls are not torques
     if is_servo.any():
         notes.append(f"{is_servo.sum()} position or velocity servos became motors; their gains are left out")
-    if model.actuator_dyntype.any():
-        notes.append("the dynamics of actuators (filters, activations) are left out")
-    if model.body_gravcomp.any():
-        notes.append("the compensation of gravity is left out")
     limits, bare, uneven = [], list[str](), list[str]()
     for joint in range(1, model.njnt):
         motors, name = motors_of(model, joint), model.joint(joint).name
-        ranges = [torque_range(model, motor) for motor in motors]
-        if model.jnt_actfrclimited[joint]:
-            ranges.append(tuple(model.jnt_actfrcrange[joint]))
-        down, up = min((-low for low, _ in ranges), default=np.inf), min((high for _, high in ranges), default=np.inf)
+        low, high = np.sum([torque_range(model, motor) for motor in motors], axis=0) if motors else (-np.inf, np.inf)
+        own = model.jnt_actfrcrange[joint] if model.jnt_actfrclimited[joint] else (-np.inf, np.inf)
+        down, up = min(-low, -own[0]), min(high, own[1])
         limits.append(min(down, up))
         bare += [name] if model.nu and not motors else []
         uneven += [name] if down != up else []
     notes.on(bare, "joints that no actuator of the file drives get motors, as every joint must have one")
     notes.on(uneven, "torque limits that differ by direction are the smaller of both")
     return np.array(limits)
+
+
+def _take_from_actuators(model: mujoco.MjModel) -> None:
+    """Move armature and damping of actuators, on the motors' side of their gears, to the joints that they act on."""
+    dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
+    for name in ("armature", "damping"):
+        values = getattr(model, f"actuator_{name}", None)  # not in all versions of MuJoCo
+        if values is not None:
+            np.add.at(getattr(model, f"dof_{name}"), dofs, model.actuator_gear[:, 0] ** 2 * values)
+            values[:] = 0.0
+
+
+def _note_left_out(model: mujoco.MjModel, notes: Notes) -> None:
+    """Add notes on what a file has that robots of this library have not."""
+    trunk = (model.dof_damping[:6], model.dof_armature[:6], model.dof_frictionloss[:6], model.jnt_stiffness[:1])
+    polynomials = ("dof_dampingpoly", "jnt_stiffnesspoly", "actuator_dampingpoly")  # not in all versions of MuJoCo
+    found = {
+        "damping, armature, dry friction and stiffness of the trunk's free joint": trunk,
+        "polynomial terms of damping and stiffness": [getattr(model, name, 0.0) for name in polynomials],
+        "density, viscosity and wind": (model.opt.density, model.opt.viscosity, model.opt.wind),
+        "the dynamics of actuators (filters, activations)": [model.actuator_dyntype],
+        "the delays of actuators": [getattr(model, "actuator_delay", 0.0)],
+        "the compensation of gravity": [model.body_gravcomp],
+    }
+    notes += [f"left out: {what}" for what, values in found.items() if any(np.any(value) for value in values)]

@@ -7,7 +7,7 @@ import pytest
 from support.published import as_mjcf, urdf
 from support.scripts import ROOT
 
-from legged_torque.envs import robots, tasks
+from legged_torque.envs import robots, task_registry, tasks
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import import_robot
@@ -60,19 +60,14 @@ def test_script(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--out", "new"])
     runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
     output = capsys.readouterr().out
+    before = task_registry._tasks
     assert "sim.engine 'fused' simulates it" in output
-    assert output.endswith(f"Train it: python {ROOT}/scripts/train.py --task=dog_position\n")
-    helper = "from legged_torque.envs.robots.a1 import A1Cfg\ndef half(number):\n    return number / 2\n"
-    (tmp_path / "new" / "legs_of_many.py").write_text(helper)
-    monkeypatch.setattr(robots, "__path__", [*robots.__path__, str(tmp_path / "new")])
-    (found,) = [parts for parts in tasks.further_robots() if parts[0] in ("dog", "legs_of_many")]
-    assert [name for name, *_ in tasks.tasks_of(*found)][:2] == ["dog_position", "dog_torque"]
-    (tmp_path / "new" / "two.py").write_text((tmp_path / "new" / "dog.py").read_text() + "class B(DogCfg): pass\n")
-    with pytest.raises(UserError, match=r"'two\.py' in envs/robots must have one class of this kind, not DogCfg, B"):
-        list(tasks.further_robots())
-    monkeypatch.chdir("/")
-    assert len(load_asset(found[1]()).feet) == 4
-    monkeypatch.chdir(tmp_path)
+    assert output.endswith(f"Train it: python {ROOT}/scripts/train.py --task_file new/dog.py --task=dog_position\n")
+    monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
+    task_registry.import_files(["new/dog.py"])
+    assert {"dog_position", "dog_torque_multihead", "dog_rough_torque_scan"} <= set(task_registry.names())
+    assert len(load_asset(task_registry.get_cfgs("dog_torque")[0]).feet) == 4
+    monkeypatch.setattr(task_registry, "_tasks", before)
     assert sorted(path.name for path in (tmp_path / "new").glob("dog.*")) == ["dog.py", "dog.xml"]
     with pytest.raises(SystemExit, match="2"):
         runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
@@ -81,3 +76,26 @@ def test_script(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
         runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
     assert "names that are taken, as 'go2_torque_gravity'" in capsys.readouterr().err
+    monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--name", "cat"])
+    runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
+    assert sorted(path.name for path in tmp_path.glob("cat.*")) == ["cat.py", "cat.xml"]  # outside of a clone
+    for number in ("1e20", "0"):
+        monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--name", "hen", "--torque_limit", number])
+        with pytest.raises(SystemExit, match="2"):
+            runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
+    assert not list(tmp_path.glob("hen.*"))
+
+
+def test_robots_of_the_clone(tmp_path, monkeypatch):
+    """Modules in envs/robots are robots, others and helpers beside them are none; two robots in one are refused."""
+    (tmp_path / "dog.urdf").write_text(urdf())
+    text = settings(import_robot(tmp_path / "dog.urdf"), "resources/robots/dog/dog.xml")
+    (tmp_path / "dog.py").write_text(text)
+    helper = "from legged_torque.envs.robots.a1 import A1Cfg\ndef half(number):\n    return number / 2\n"
+    (tmp_path / "legs_of_many.py").write_text(helper)
+    monkeypatch.setattr(robots, "__path__", [*robots.__path__, str(tmp_path)])
+    (found,) = [parts for parts in tasks.further_robots() if parts[0] in ("dog", "legs_of_many")]
+    assert [name for name, *_ in tasks.tasks_of(*found)][:2] == ["dog_position", "dog_torque"]
+    (tmp_path / "two.py").write_text(text + "class B(DogCfg): pass\n")
+    with pytest.raises(UserError, match=r"'two\.py' in envs/robots must have one class of this kind, not DogCfg, B"):
+        list(tasks.further_robots())
