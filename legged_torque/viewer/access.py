@@ -11,6 +11,7 @@ import ipaddress
 import logging
 import secrets
 import socket
+import warnings
 from collections.abc import Callable
 from http.cookies import SimpleCookie
 from typing import Any
@@ -27,7 +28,7 @@ from websockets.http11 import Request, Response
 from legged_torque.viewer.ports import free_port
 
 MAX_MESSAGE = 2**16  # bytes of a message from a browser; longer ones end the connection
-LOGGERS = ("asyncio", "websockets.server")  # would report all that clients do wrong, and fill the disk
+LOGGERS = ("asyncio", "websockets.server")  # quote what clients send wrong, which could fill the disk
 VERSION = f"viser-v{viser.__version__}"  # of pages that may connect; viser prints all others
 
 
@@ -52,6 +53,7 @@ class GuardedServer(viser.ViserServer):
             super().__init__(host, free_port(host, port), label=label, verbose=False)
         for name in LOGGERS:
             logging.getLogger(name).setLevel(logging.CRITICAL)
+        warnings.filterwarnings("ignore", r"\[viser\]")  # as do the loggers
         self._handle = self._websock_server._handle_incoming_message
         self._websock_server._handle_incoming_message = self._receive
 
