@@ -169,7 +169,7 @@ def test_metrics(tmp_path):
 
 @pytest.mark.parametrize("aspect", [1.6, 0.46])
 def test_two_robots_stay_in_the_picture(tmp_path, monkeypatch, aspect):
-    """A camera sees both, with a third of a metre around them, also when they are far apart; pictures are wide or high."""
+    """In wide and high pictures, a camera sees both, with a third of a metre around them, also if far apart."""
     session = new_session(tmp_path / "first", "a1_position", 1)
     session.companion = new_session(tmp_path / "other", "a1_position", 1)
     monkeypatch.setattr(scene, "SIDE", 1.9)
