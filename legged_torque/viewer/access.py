@@ -1,7 +1,4 @@
-"""Access to the page: only from this machine and from the page itself, or with the token in the printed address.
-
-Whoever has access can use the page's controls, and nothing else.
-"""
+"""Access to the page: only from this machine and from the page itself, or with the token in the printed address."""
 
 from __future__ import annotations
 

@@ -59,8 +59,7 @@ class Plots:
             lines = [*self._parts, ("applied", APPLIED)]
             gui.add_html(block_html(legend_html([*lines, ("limits", LIMIT)]), []))
             self._torques = add_plots(gui, seconds, titles, lines, has_limits=True)
-            lines = [("target", COMMAND), ("position", ACTUAL)]
-            lines = lines if self._has_targets else lines[1:]
+            lines = [("target", COMMAND), ("position", ACTUAL)][0 if self._has_targets else 1 :]
             gui.add_html(block_html(legend_html([*lines, ("limits", LIMIT)]), []))
             self._angles = add_plots(gui, seconds, titles, lines, has_limits=True)
         with panel.add_tab("Rewards", viser.Icon.TROPHY):
@@ -179,8 +178,8 @@ def add_plots(
     lines = [{"label": name, "stroke": color, "width": 1.5, "points": {"show": False}} for name, color in series]
     limit = {"label": "limit", "stroke": LIMIT, "width": 1, "dash": (4, 4), "auto": False, "points": {"show": False}}
     lines += 2 * [limit] if has_limits else []
-    mode = 1 if reach else 0  # whether the soft ends count
-    ends = {end: {"soft": value, "mode": mode, "pad": 0.1} for end, value in (("min", -reach), ("max", reach))}
+    soft = {"mode": int(reach > 0.0), "pad": 0.1}
+    ends = {"min": {"soft": -reach, **soft}, "max": {"soft": reach, **soft}}
     font = {"font": "10px sans-serif", "labelFont": "10px sans-serif"}
     settings = {
         "scales": {"x": {"time": False, "auto": False, "range": (-seconds, 0)}, "y": {"auto": True, "range": ends}},
