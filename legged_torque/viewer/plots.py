@@ -54,7 +54,7 @@ class Plots:
             self._velocities = add_plots(gui, seconds, VELOCITIES, self._lines, VELOCITY_RANGE)
             self._metrics, self._gait, self._bars = gui.add_html(""), gui.add_html(""), gui.add_html("")
         with panel.add_tab("Joints", viser.Icon.ROBOT):
-            self._leg = gui.add_dropdown("leg", tuple(self._legs))
+            self._leg = gui.add_dropdown("leg", tuple(self._legs), hint="whose joints are plotted")
             titles = [""] * max(map(len, self._legs.values()))
             lines = [*self._parts, ("applied", APPLIED)]
             gui.add_html(block_html(legend_html([*lines, ("limits", LIMIT)]), []))
@@ -63,7 +63,7 @@ class Plots:
             gui.add_html(block_html(legend_html([*lines, ("limits", LIMIT)]), []))
             self._angles = add_plots(gui, seconds, titles, lines, has_limits=True)
         with panel.add_tab("Rewards", viser.Icon.TROPHY):
-            self._term = gui.add_dropdown("over time", (SUM, *self._terms))
+            self._term = gui.add_dropdown("over time", (SUM, *self._terms), hint="what is plotted")
             self._reward = add_plots(gui, seconds, ["weighted, per second"], [("term", ACTUAL)])
             self._rewards = gui.add_html("")
         panel.dock_left()

@@ -190,7 +190,8 @@ class Page:
         if session.mixing:
             with gui.add_folder("Mixing weights"):
                 automatic = gui.add_checkbox("as in training", True, hint="the weights at this point of the training")
-                sliders = [gui.add_slider(name.replace("_", " "), 0.0, 1.0, STEP, 0.0) for name in session.mixing]
+                names, hint = [name.replace("_", " ") for name in session.mixing], "factor on this part of the torques"
+                sliders = [gui.add_slider(name, 0.0, 1.0, STEP, 0.0, hint=hint) for name in names]
                 values = (lambda: list(session.mixing.values()), automatic, lambda: session.chosen_mixing is None)
                 self._bind_sliders(sliders, *values, session.set_mixing)
         if self._ground:
