@@ -242,7 +242,9 @@ def test_keys_and_hints(opened, session):
         wait_for(lambda message=message: session.message.text == message)
     press("0")
     wait_for(lambda: session.command == (0.0, 0.0, 0.0))
-    for label in opened.find_elements(By.XPATH, "//label[@for]"):
+    labels = [label for label in opened.find_elements(By.XPATH, "//label[@for]") if label.text]
+    assert len(labels) > 15
+    for label in labels:
         opened.execute_script("arguments[0].dispatchEvent(new Event('pointerover', {bubbles: true}))", label)
         assert label.get_attribute("title"), label.text
     click(opened, control(opened, "random"))
