@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import argparse
 import functools
+import shlex
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -179,7 +181,9 @@ def import_viewer(args: argparse.Namespace, title: str) -> Callable[[Session], N
         from legged_torque.viewer.web import watch
     except ImportError as error:
         raise UserError(f"--viewer web needs the extra: pip install 'legged_torque[viewer]' ({error})") from None
-    return functools.partial(watch, title=title, host=args.host, port=args.port, no_renderer=args.no_renderer)
+    again = f"{cli.script_command('play')} {shlex.join(sys.argv[1:])}"
+    words = {"title": title, "host": args.host, "port": args.port, "again": again, "no_renderer": args.no_renderer}
+    return functools.partial(watch, **words)
 
 
 def roll_out(

@@ -5,20 +5,28 @@ from __future__ import annotations
 import functools
 import http
 import ipaddress
+import logging
 import secrets
 import socket
+import warnings
 from collections.abc import Callable
 from http.cookies import SimpleCookie
 from typing import Any
 from unittest import mock
 from urllib.parse import parse_qs, urlsplit
 
+import numpy as np
 import viser
 import websockets.asyncio.server
+from viser._messages import GuiUpdateMessage, Message
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from legged_torque.viewer.ports import free_port
+
+MAX_MESSAGE = 2**16  # bytes of a message from a browser; longer ones end the connection
+LOGGERS = ("asyncio", "websockets.server")  # quote what clients send wrong, which could fill the disk
+VERSION = f"viser-v{viser.__version__}"  # of pages that may connect; viser prints all others
 
 
 class GuardedServer(viser.ViserServer):
@@ -35,10 +43,16 @@ class GuardedServer(viser.ViserServer):
         start = websockets.asyncio.server.serve
 
         def serve(*args: Any, process_request: Callable[..., Response | None], **settings: Any) -> Any:
-            return start(*args, process_request=functools.partial(self._answer, process_request), **settings)
+            settings |= {"process_request": functools.partial(self._answer, process_request), "max_size": MAX_MESSAGE}
+            return start(*args, **settings)
 
         with mock.patch.object(websockets.asyncio.server, "serve", serve):  # viser has no hook for requests
             super().__init__(host, free_port(host, port), label=label, verbose=False)
+        for name in LOGGERS:
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+        warnings.filterwarnings("ignore", r"\[viser\]")  # as do the loggers
+        self._handle = self._websock_server._handle_incoming_message
+        self._websock_server._handle_incoming_message = self._receive
 
     @property
     def url(self) -> str:
@@ -46,9 +60,12 @@ class GuardedServer(viser.ViserServer):
         host = "127.0.0.1" if self.get_host() == "0.0.0.0" else self.get_host()
         return f"http://{host}:{self.get_port()}" + (f"/?token={self.token}" if self.token else "")
 
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refuse to open a tunnel from the internet, which viser does for any page that asks."""
-        return None
+    async def _receive(self, client: Any, message: Message) -> None:
+        """Handle a user's choice in a control, and nothing else: viser would set any attribute of a control."""
+        if isinstance(message, GuiUpdateMessage) and list(message.updates) == ["value"]:
+            control = self.gui._gui_input_handle_from_uuid.get(message.uuid)
+            if control and is_choice(control, message.updates["value"]):
+                await self._handle(client, message)
 
     def _answer(
         self, serve: Callable[..., Response | None], connection: ServerConnection, request: Request
@@ -67,6 +84,8 @@ class GuardedServer(viser.ViserServer):
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin", "")
         if origin and urlsplit(origin).netloc != host:
             return "only the page itself may connect, no page of another site"
+        if "Upgrade" in request.headers and request.headers.get("Sec-WebSocket-Protocol") != VERSION:
+            return "load the page again, it is of another version"
         if not self.token:  # another site may have its name resolved to this machine to pass as the page
             name = urlsplit(f"//{host}").hostname or "none"
             is_address = ":" in name or name.replace(".", "").isdecimal()
@@ -84,3 +103,14 @@ def is_local(host: str) -> bool:
     except OSError:
         return False
     return all(ipaddress.ip_address(address[0]).is_loopback for *_, address in found)
+
+
+def is_choice(control: viser.GuiInputHandle[Any], value: Any) -> bool:
+    """Return whether users can choose a value in a control of the page."""
+    if isinstance(control, viser.GuiDropdownHandle):
+        return value in control.options
+    if isinstance(control, (viser.GuiSliderHandle, viser.GuiVector3Handle)):
+        low, high, numbers = (np.atleast_1d(each) for each in (control.min, control.max, value))
+        is_known = numbers.dtype.kind in "if" and numbers.shape == low.shape
+        return is_known and bool(((low <= numbers) & (numbers <= high)).all())
+    return isinstance(value, bool)  # of a box or a button

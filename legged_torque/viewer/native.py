@@ -122,7 +122,7 @@ def draw(session: Session, window: mujoco.viewer.Handle, drawing: Drawing) -> No
         window.user_scn.ngeom = 0
         drawing.add_velocities(window.user_scn, command, velocity)
     texts = {"": "commanded, actual"}
-    for name, wanted, actual in zip(("v_x [m/s]", "v_y [m/s]", "yaw [rad/s]"), command, velocity, strict=True):
+    for name, wanted, actual in zip(("v_x [m/s]", "v_y [m/s]", "yaw rate [rad/s]"), command, velocity, strict=True):
         texts[name] = f"{wanted:+.2f}   {actual:+.2f}"
     texts[f"model_{session.checkpoint}"] = "paused" if session.is_paused else f"{session.pacer.rate:.2f} x real time"
     if drawing.ground and snapshot.tile:

@@ -1,8 +1,8 @@
-// Runs on the page, again after a lost connection: the looks of its panels, and steering with held keys and a gamepad,
-// for which viser has no events. Steering sets FIELD, an input of viser, to shares of the largest v_x, v_y and yaw rate,
-// -1 to 1, whenever held keys (W S, A D, arrows) or the sticks of a gamepad change them.
+// Runs on the page, again after a lost connection: the looks of its panels, hints on labels, keys that press controls,
+// and steering with held keys and a gamepad, for which viser has no events. Steering sets page.field, an input of viser,
+// to shares of the largest v_x, v_y and yaw rate, -1 to 1, whenever held keys or the sticks of a gamepad change them.
 const isRunning = Boolean(window.steering);
-window.steering = {field: "FIELD", sent: isRunning ? "" : "0,0,0"};  // after a lost connection, send again
+window.steering = {...page, sent: isRunning ? "" : "0,0,0"};  // after a lost connection, send again
 if (isRunning) return;
 
 document.head.insertAdjacentHTML("beforeend", `<style>
@@ -10,21 +10,39 @@ document.head.insertAdjacentHTML("beforeend", `<style>
   .lt-error { color: #e03131 }
   .lt-keys { font-size: 12px; padding: 0 12px }
   .lt-plot { font-size: 12px; padding: 4px 10px }
+  .lt-plot td + td { width: 62px; text-align: right; font-variant-numeric: tabular-nums }
+  table.lt-plot { width: 100%; padding: 6px 10px; line-height: 1.25 }
   .lt-legend > span { margin-right: 12px; white-space: nowrap; font-weight: normal }
   .lt-row { display: flex; align-items: center; gap: 6px; height: 17px }
   .lt-row > :first-child { width: 52px; white-space: nowrap }
   .lt-wide > :first-child { width: 116px }
   .lt-row > svg { flex: 1; min-width: 0; height: 13px; background: #8882; border-radius: 2px }
   .lt-row > :last-child { width: 58px; text-align: right; font-variant-numeric: tabular-nums }
+  @media (max-width: 36em) {  /* viser's layout for phones: a sheet, here as wide as the page, plots first */
+    [style*="max-height: 60%"], [style*="max-height: 60%"] [style="width: 20em;"] { width: 100% !important }
+    div:has(> * > .mantine-Tabs-root) { display: flex; flex-direction: column }
+    div:has(> .mantine-Tabs-root) { order: -1 }
+  }
+  .mantine-Notification-description { overflow-wrap: anywhere }
 </style>`);
 
+addEventListener("pointerover", event => {
+  const label = event.target.closest?.("label");
+  if (label) label.title = window.steering.hints[label.htmlFor] ?? "";
+});
+
 const keys = {KeyW: [0, 1], ArrowUp: [0, 1], KeyS: [0, -1], ArrowDown: [0, -1], KeyA: [1, 1], KeyD: [1, -1],
-              ArrowLeft: [2, 1], ArrowRight: [2, -1]};
+              ArrowLeft: [2, 1], ArrowRight: [2, -1], Comma: [1, 1], Period: [1, -1]};
 const held = new Set();
+const typing = "textarea, input:not([type=checkbox])";
 const press = event => {
-  const uses = event.code.startsWith("Arrow") ? "input, textarea, [role]:not([role=dialog])" : "input, textarea";
-  if (!(event.code in keys) || event.ctrlKey || event.metaKey || event.altKey || event.target.closest?.(uses)) return;
-  held.add(event.code);
+  const control = window.steering.controls[event.code];
+  const uses = event.code === "Space" ? "textarea, input, button" :
+      event.code.startsWith("Arrow") ? `${typing}, [role]:not([role=dialog])` : typing;
+  if (!(event.code in keys || control) || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (event.target.closest?.(uses)) return;
+  if (event.code in keys) held.add(event.code);
+  else if (!event.repeat) document.getElementById(control)?.click();
   event.preventDefault();
   event.stopImmediatePropagation();  // these keys would move viser's camera
 };

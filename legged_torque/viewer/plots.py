@@ -11,18 +11,23 @@ import viser
 from numpy.typing import ArrayLike
 
 from legged_torque.envs.base.asset import Asset
+from legged_torque.utils.metrics import UNITS
+from legged_torque.utils.mjcf import joint_limits
 from legged_torque.viewer.session import HISTORY_STEPS, Session
 
 Series = Iterable[tuple[str, str]]  # names and colors
+Row = tuple[str, str, Sequence[str]]  # name, color of its dot or nothing, and texts
 
 COMMAND, ACTUAL, APPLIED, COMPANION = "#1faa55", "#2f7df6", "#343a40", "#f08c00"
 PARTS = ("#f08c00", "#2f7df6", "#ae3ec9", "#1faa55")  # colors of the parts of torques
-REWARD, PENALTY, STANCE, MIDDLE = "#1faa55", "#e03131", "#343a40", "#868e96"
+REWARD, PENALTY, LIMIT, STANCE, MIDDLE = "#1faa55", "#e03131", "#e03131", "#343a40", "#868e96"
 VELOCITIES = ("v_x, forward [m/s]", "v_y, to the left [m/s]", "yaw rate, to the left [rad/s]")
-VELOCITY_LIMITS = (-1.6, 1.6)
-TORQUE, ANGLE = "torque of {} [N m]", "angle of {} [rad]"
+VELOCITY_RANGE = 1.6  # of the plots' scale, which grows with larger velocities [m/s, rad/s]
+TORQUE, ANGLE = "{} torque, {:.3g} to {:.3g} N m", "{} angle, {:.2f} to {:.2f} rad"  # with limits
 STRIDE = 2  # control steps per point of a plot
 GAIT_STEPS = HISTORY_STEPS // 2  # control steps in the gait diagram
+METRICS = {**UNITS, "mechanical_power": "W"}  # in the table, with units
+COST, SPEED = (list(UNITS).index(name) for name in ("cost_of_transport", "speed"))
 MEAN_STEPS = 15  # control steps over which present reward terms are means: 0.3 s
 SUM = "sum of all"  # of the reward terms
 WIDTH = 300  # of the panel [pixels]
@@ -36,24 +41,29 @@ class Plots:
         task, self._session = session.task, session
         self._joints = [name.removesuffix("_joint").replace("_", " ") for name in task.dof_names]
         self._legs = joints_by_leg(task.dof_names, task.cfg.asset.mirrored_legs)
-        self._limits = task.torque_limits.abs().amax(dim=0).tolist()
+        self._torque_limits = task.torque_limits.cpu().numpy()
+        self._angle_limits = joint_limits(task.sim.mj_model)[1:].T
         self._feet, self._terms = foot_labels(task.asset), task.reward_names
         self._parts = list(zip((name.replace("_", " ") for name in session.mixing), cycle(PARTS), strict=False))
         self._has_targets = any(term.name == "position_residual" for term in task.control_law.terms)
         seconds, panel = HISTORY_STEPS * task.dt, gui.add_panel()
         with panel.add_tab("Walking", viser.Icon.ACTIVITY):
-            lines = [("commanded", COMMAND), ("actual", ACTUAL), ("companion", COMPANION)]
-            lines = lines if session.companion else lines[:2]
-            self._velocities = add_plots(gui, seconds, VELOCITIES, lines, VELOCITY_LIMITS)
-            self._gait, self._bars = gui.add_html(""), gui.add_html("")
+            self._lines = [("commanded", COMMAND), ("actual", ACTUAL), ("companion", COMPANION)]
+            self._lines = self._lines if session.companion else self._lines[:2]
+            self._now = gui.add_html("")
+            self._velocities = add_plots(gui, seconds, VELOCITIES, self._lines, VELOCITY_RANGE)
+            self._metrics, self._gait, self._bars = gui.add_html(""), gui.add_html(""), gui.add_html("")
         with panel.add_tab("Joints", viser.Icon.ROBOT):
-            self._leg = gui.add_dropdown("leg", tuple(self._legs))
+            self._leg = gui.add_dropdown("leg", tuple(self._legs), hint="whose joints are plotted")
             titles = [""] * max(map(len, self._legs.values()))
-            self._torques = add_plots(gui, seconds, titles, [*self._parts, ("applied", APPLIED)])
-            lines = [("target", COMMAND), ("position", ACTUAL)]
-            self._angles = add_plots(gui, seconds, titles, lines if self._has_targets else lines[1:])
+            lines = [*self._parts, ("applied", APPLIED)]
+            gui.add_html(block_html(legend_html([*lines, ("limits", LIMIT)]), []))
+            self._torques = add_plots(gui, seconds, titles, lines, has_limits=True)
+            lines = [("target", COMMAND), ("position", ACTUAL)][0 if self._has_targets else 1 :]
+            gui.add_html(block_html(legend_html([*lines, ("limits", LIMIT)]), []))
+            self._angles = add_plots(gui, seconds, titles, lines, has_limits=True)
         with panel.add_tab("Rewards", viser.Icon.TROPHY):
-            self._term = gui.add_dropdown("over time", (SUM, *self._terms))
+            self._term = gui.add_dropdown("over time", (SUM, *self._terms), hint="what is plotted")
             self._reward = add_plots(gui, seconds, ["weighted, per second"], [("term", ACTUAL)])
             self._rewards = gui.add_html("")
         panel.dock_left()
@@ -67,6 +77,7 @@ class Plots:
         feet = np.array([one.feet for one in past[-GAIT_STEPS:]])
         self._gait.content = gait_html(self._feet, feet, GAIT_STEPS, round(GAIT_STEPS * dt, 1))
         self._bars.content = self._torque_bars(past[-1].torques, past[-1].torque_parts)
+        self._metrics.content = self._metrics_table()
         self._rewards.content = self._reward_bars(np.mean([one.rewards for one in past[-MEAN_STEPS:]], axis=0))
         now, past = past[-1].time, past[len(past) % STRIDE :: STRIDE]  # always the same steps, against jitter
         time = np.array([one.time for one in past]) - now
@@ -75,29 +86,52 @@ class Plots:
             known = {round(one.time, 4): one.velocities[0] for one in list(other.history)}
             velocities.append([known.get(round(one.time, 4), np.full(3, np.nan)) for one in past])
         draw(self._velocities, time, velocities)
+        means = np.mean(np.array(velocities)[:, -MEAN_STEPS // STRIDE :], axis=1)
+        rows = [(*line, [f"{value:+.2f}" for value in mean]) for line, mean in zip(self._lines, means, strict=True)]
+        self._now.content = table_html(("", "", ["v_x", "v_y", "yaw rate"]), *rows)
         torques = np.array([[*one.torque_parts, one.torques] for one in past])
-        self._draw_leg(self._torques, TORQUE, time, torques.swapaxes(0, 1))
+        self._draw_leg(self._torques, TORQUE, time, torques.swapaxes(0, 1), self._torque_limits)
         targets = [[one.targets for one in past]] if self._has_targets else []
-        self._draw_leg(self._angles, ANGLE, time, [*targets, [one.qpos[one.world, 7:] for one in past]])
+        angles = [*targets, [one.qpos[one.world, 7:] for one in past]]
+        self._draw_leg(self._angles, ANGLE, time, angles, self._angle_limits)
         rewards = np.array([one.rewards for one in past])
         shown = rewards.sum(axis=1) if self._term.value == SUM else rewards[:, self._terms.index(self._term.value)]
         draw(self._reward, time, [shown[:, None]])
 
-    def _draw_leg(self, plots: Sequence[viser.GuiUplotHandle], title: str, time: np.ndarray, values: ArrayLike) -> None:
-        """Draw curves of the chosen leg's joints over time, given those of all. Shape: (series, steps, num_dof)."""
+    def _metrics_table(self) -> str:
+        """Return metrics over the history, as evaluate.py measures them, and the power of the cost of transport."""
+        sessions, columns = [each for each in (self._session, self._session.companion) if each], []
+        for each in sessions:
+            sums = sum((one.metrics for one in list(each.history)), np.zeros((len(UNITS), 2)))
+            sums = np.vstack([sums, [sums[COST, 0], sums[SPEED, 1]]])  # of the power and of steps
+            with np.errstate(divide="ignore", invalid="ignore"):
+                columns.append([f"{value:.3g}" for value in sums[:, 0] / sums[:, 1]])
+        names = [f"{name.replace('_', ' ')} {unit and f'[{unit}]'}" for name, unit in METRICS.items()]
+        rows = [(name, "", texts) for name, *texts in zip(names, *columns, strict=True)]
+        head = f"<b>Metrics, last {HISTORY_STEPS * self._session.task.dt:g} s</b>"
+        return table_html((head, "", ["actual", "companion"][: len(sessions)]), *rows)
+
+    def _draw_leg(
+        self, plots: Sequence[viser.GuiUplotHandle], title: str, time: np.ndarray, values: ArrayLike, limits: np.ndarray
+    ) -> None:
+        """Draw curves of the chosen leg's joints over time and their limits, given those of all joints.
+
+        Shapes: (steps,), (series, steps, num_dof), (2, num_dof).
+        """
         chosen = self._legs[self._leg.value]
         for i, plot in enumerate(plots):
             plot.visible = i < len(chosen)
             if plot.visible:
-                plot.title = title.format(self._joints[chosen[i]])
-        draw(plots, time, np.array(values)[:, :, chosen])
+                plot.title = title.format(self._joints[chosen[i]], *limits[:, chosen[i]])
+        lines = np.where(np.isfinite(limits), limits, np.nan)[:, None].repeat(len(time), axis=1)
+        draw(plots, time, np.concatenate([values, lines])[:, :, chosen])
 
     def _torque_bars(self, torques: np.ndarray, parts: np.ndarray) -> str:
         """Return the present torques as bars, in parts if the task mixes action terms."""
         colors = [color for _, color in self._parts] or [ACTUAL]
         parts = parts if self._parts else torques[None]
-        rows = []
-        for name, values, torque, limit in zip(self._joints, parts.T, torques, self._limits, strict=True):
+        rows, limits = [], np.abs(self._torque_limits).max(axis=0)
+        for name, values, torque, limit in zip(self._joints, parts.T, torques, limits, strict=True):
             rows.append(bars_html(name, values / limit, colors, f"{torque:+.1f}/{limit:.0f}"))
         weights = zip(self._parts, self._session.mixing.values(), strict=True)
         legend = legend_html((f"{name} x {weight:.2f}", color) for (name, color), weight in weights)
@@ -134,20 +168,26 @@ def add_plots(
     seconds: float,
     titles: Sequence[str],
     series: Sequence[tuple[str, str]],
-    limits: tuple[float, float] | None = None,
+    reach: float = 0.0,
+    has_limits: bool = False,
 ) -> list[viser.GuiUplotHandle]:
-    """Add plots of equal series over the last seconds, below a legend; limits of None are those of the data."""
-    if len(series) > 1:
-        gui.add_html(block_html(legend_html(series), []))
+    """Add plots of equal series over the last seconds, and of two limits where the data come near them.
+
+    The scale holds at least the values from -reach to reach.
+    """
     lines = [{"label": name, "stroke": color, "width": 1.5, "points": {"show": False}} for name, color in series]
-    values = {"auto": True} if limits is None else {"auto": False, "range": limits}
+    limit = {"label": "limit", "stroke": LIMIT, "width": 1, "dash": (4, 4), "auto": False, "points": {"show": False}}
+    lines += 2 * [limit] if has_limits else []
+    soft = {"mode": int(reach > 0.0), "pad": 0.1}
+    ends = {"min": {"soft": -reach, **soft}, "max": {"soft": reach, **soft}}
+    font = {"font": "10px sans-serif", "labelFont": "10px sans-serif"}
     settings = {
-        "scales": {"x": {"time": False, "auto": False, "range": (-seconds, 0)}, "y": values},
-        "axes": ({"size": 24, "font": "10px sans-serif"}, {"size": 38, "font": "10px sans-serif"}),
+        "scales": {"x": {"time": False, "auto": False, "range": (-seconds, 0)}, "y": {"auto": True, "range": ends}},
+        "axes": ({"size": 28, "label": "time [s]", "labelSize": 12, **font}, {"size": 38, **font}),
         "legend": {"show": False},
-        "height": 128,  # [pixels]
+        "height": 140,  # [pixels]
     }
-    nothing = (np.zeros(2),) * (len(series) + 1)
+    nothing = (np.zeros(2),) * (len(lines) + 1)
     return [gui.add_uplot(nothing, ({"label": "s"}, *lines), title=title, **settings) for title in titles]
 
 
@@ -174,6 +214,15 @@ def legend_html(series: Series) -> str:
     """Return names with colored dots."""
     dots = (f'<span><span style="color:{color}">&#9679;</span> {name}</span>' for name, color in series)
     return f'<div class="lt-legend">{"".join(dots)}</div>'
+
+
+def table_html(*rows: Row) -> str:
+    """Return a table, whose first row is its head."""
+    lines = []
+    for name, color, texts in rows:
+        dot = f'<span style="color:{color}">&#9679;</span> ' if color else ""
+        lines.append(f"<tr><td>{dot}{name}</td>{''.join(f'<td>{text}</td>' for text in texts)}</tr>")
+    return f'<table class="lt-plot">{"".join(lines)}</table>'
 
 
 def block_html(title: str, rows: list[str]) -> str:

@@ -34,8 +34,8 @@ ROOT = "/world"  # node of all that moves such that the followed robot stays whe
 SPACING = 2.0  # distance between neighbouring worlds on a plane [m]
 COMMAND_COLOR, VELOCITY_COLOR, SCAN_COLOR = (10, 150, 50), (20, 90, 230), (214, 51, 108)
 COLLISION_TINT, GHOST_TINT, COMPANION_TINT = (0.68, 0.24, 0.82, 0.4), (0.12, 0.67, 0.33, 0.4), (0.95, 0.55, 0.1, 1.0)
-ARROW_SHAPE: dict[str, Any] = {"shaft_radius": 0.009, "head_radius": 0.024, "head_length": 0.05}  # [m]
-SCAN_SHAPE: dict[str, Any] = {"point_size": 0.009, "point_shape": "circle", "precision": "float32"}
+ARROW_SHAPE: dict[str, Any] = {"shaft_radius": 0.009, "head_radius": 0.024, "head_length": 0.05, "visible": False}
+SCAN_SHAPE: dict[str, Any] = {"point_size": 0.009, "point_shape": "circle", "precision": "float32", "visible": False}
 SCAN_HEIGHT = 0.01  # of the points above the ground, which would hide them [m]
 LABEL_HEIGHT = 0.35  # of a name above the trunk's origin, for the A1 [m]
 UP = np.array([0.0, 0.0, 1.0])
@@ -43,9 +43,11 @@ GHOST_SECONDS = 1.0  # for which the ghost has followed the commands
 SIDE = 0.8  # distance of the companion at the start, to the right of the followed robot [m]
 FARTHEST = 2.0  # distance at which the companion returns to the side of the followed robot [m]
 
-FIELD_OF_VIEW = 0.75  # vertical [rad]
+FIELD_OF_VIEW, WIDEST = 0.75, 1.4  # vertical, and its limit where two robots are far from each other [rad]
+HALF_HEIGHT = math.tan(0.5 * FIELD_OF_VIEW)  # of what is seen at a distance of 1
+REACH = 0.45  # of a robot with its name around its trunk's origin, for the A1 [m]
 VIEW_FROM, VIEW_TO = np.array([1.2, -1.2, 0.62]), np.array([0.0, 0.0, 0.24])  # place and target, for the A1 [m]
-PHONE_FROM, PHONE_TO = np.array([1.85, -1.85, 1.0]), np.array([0.0, 0.0, -0.4])  # the same above a phone's controls
+PHONE_FROM, PHONE_TO = np.array([1.85, -1.85, 1.0]), np.array([0.0, 0.0, -0.45])  # the same above a phone's controls
 PHONE = 0.6  # ratio of width to height below which a view is a phone's
 TWO_ROBOTS = 1.5  # factor on the camera's distance for two robots side by side
 LIFTING, TOLERANCE = 0.2, 0.01  # share of its way up that a camera moves per frame; way that is ignored [m]
@@ -118,7 +120,7 @@ class Scene:
         self._contacts = Contacts(scene, f"{ROOT}/contacts", drawing.data, task.asset.geom_names)
         self._scan = scene.add_point_cloud(f"{ROOT}/scan", np.zeros((1, 3)), SCAN_COLOR, **SCAN_SHAPE)
         names = (session.name, other.name) if other else ()
-        self._labels = [scene.add_label(f"{ROOT}/name{i}", name) for i, name in enumerate(names)]
+        self._labels = [scene.add_label(f"{ROOT}/{i}", name, anchor="bottom-center") for i, name in enumerate(names)]
         self._command = scene.add_arrows(f"{ROOT}/command", np.zeros((1, 2, 3)), COMMAND_COLOR, **ARROW_SHAPE)
         self._velocity = scene.add_arrows(f"{ROOT}/velocity", np.zeros((1, 2, 3)), VELOCITY_COLOR, **ARROW_SHAPE)
 
@@ -150,6 +152,8 @@ class Scene:
             self._draw_arrow(self._command, own[0], snapshot.commands[world], COMMAND_HEIGHT)
             self._draw_arrow(self._velocity, own[0], snapshot.velocities[world], VELOCITY_HEIGHT)
         self._move_cameras()
+        if "follow" in shown and len(second):
+            self._frame(trunks - trunks.mean(axis=0) * [1.0, 1.0, 0.0])
 
     def _draw_arrow(self, arrow: viser.ArrowsHandle, qpos: np.ndarray, velocity: np.ndarray, height: float) -> None:
         """Draw a velocity in the trunk's frame, which begins with v_x and v_y [m/s], above a robot."""
@@ -182,6 +186,23 @@ class Scene:
                     position[2] += LIFTING * (lowest - position[2])
                     place_camera(client, position, target)
             self._framed.add(number)
+
+    def _frame(self, trunks: np.ndarray) -> None:
+        """Let all cameras see two trunks around the origin, by their fields of view: users choose place and direction.
+
+        Shape: (2, 3) [m].
+        """
+        cameras = [client.camera for number, client in self._server.get_clients().items() if number in self._framed]
+        for camera in cameras:
+            is_phone = camera.aspect < PHONE
+            first = self._distance * np.linalg.norm(PHONE_FROM if is_phone else VIEW_FROM)
+            place = np.array(camera.position) * first / np.linalg.norm(camera.position)
+            wanted = field_of_view(place, np.array(camera.look_at), camera.aspect, trunks, REACH * self._size)
+            change = np.clip(wanted, FIELD_OF_VIEW, WIDEST) - camera.fov
+            if abs(change) > TOLERANCE:
+                camera.fov += LIFTING * change
+                if is_phone:  # above the controls
+                    camera.look_at = self._distance * PHONE_TO * math.tan(0.5 * camera.fov) / HALF_HEIGHT
 
 
 class Robots:
@@ -261,6 +282,18 @@ def place_camera(client: viser.ClientHandle, position: np.ndarray, target: np.nd
     with client.atomic():
         client.camera.position = position  # moves the target, too
         client.camera.look_at = target
+
+
+def field_of_view(place: np.ndarray, target: np.ndarray, aspect: float, middles: np.ndarray, radius: float) -> float:
+    """Return the vertical angle in which a camera sees spheres [rad]; ``aspect`` is the picture's width by height.
+
+    Shapes: (3,), (3,), (spheres, 3) [m].
+    """
+    ahead = (target - place) / np.linalg.norm(target - place)
+    right = np.cross(ahead, UP) / max(np.linalg.norm(np.cross(ahead, UP)), 1e-6)
+    depth, x, y = np.stack([ahead, right, np.cross(right, ahead)]) @ (middles - place).T
+    edges = np.maximum((abs(x) + radius) / aspect, abs(y) + radius) / np.maximum(depth, radius)
+    return 2.0 * math.atan(edges.max())
 
 
 def commanded_pose(past: Sequence[Snapshot], dt: float) -> np.ndarray:

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.base.metrics import WalkingMetrics
 from legged_torque.sensors.height_scan import HeightScan
 from legged_torque.terrain.rough import RoughGround
 
@@ -32,6 +33,7 @@ class Snapshot:
     torque_parts: np.ndarray  # the same by weighted action term, see WatchedRobot; (terms, num_dof)
     targets: np.ndarray  # joint positions wanted by PD control [rad]; (num_dof,), empty without PD control
     rewards: np.ndarray  # weighted reward terms of this step, per second; (terms,)
+    metrics: np.ndarray  # numerator and denominator of each metric in this step, see WalkingMetrics; (metrics, 2)
     feet: np.ndarray  # 1 for each foot on the ground, else 0; (feet,)
     forces: np.ndarray  # of the ground on the collision geoms, in the world [N]; (geoms, 3)
     tile: tuple[int, int] | None  # level and column of the tile; None on a plane
@@ -49,7 +51,7 @@ class WatchedRobot(LeggedRobot):
     def _init_state(self) -> None:
         """Allocate the parts, and prepare the height scan."""
         super()._init_state()
-        self._watched_scan = HeightScan(self.cfg.terrain, self.state)
+        self._watched_scan, self._metrics = HeightScan(self.cfg.terrain, self.state), WalkingMetrics(self)
         self.torque_parts = torch.zeros(len(weighted_terms(self)), *self.dof_pos.shape, device=self.device)
 
     def _compute_torques(self, actions: Tensor) -> Tensor:
@@ -62,9 +64,12 @@ class WatchedRobot(LeggedRobot):
         return super()._compute_torques(actions)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
-        """Keep the commands, which a control step may draw anew at its end, and make one."""
+        """Keep the commands, which a control step may draw anew at its end, make one, and measure it."""
         self._commands_before = self.commands.clone()
-        return super().step(actions)
+        result = super().step(actions)
+        self._metrics.clear()
+        self._metrics.add_step(self._commands_before)
+        return result
 
     def snapshot(self, time: float, world: int) -> Snapshot:
         """Return the result of the last step; for the arguments see :class:`Snapshot`."""
@@ -86,6 +91,7 @@ class WatchedRobot(LeggedRobot):
             "torque_parts": self.torque_parts[:, world],
             "targets": targets[world],
             "rewards": self.rewards.terms[:, world] / self.dt,
+            "metrics": torch.stack([torch.stack(pair)[:, world] for pair in self._metrics.ratios().values()]),
             "feet": self.feet_contact[world],
             "forces": self.sim.contact_force[world],
             "scan": scan,

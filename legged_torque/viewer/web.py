@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import html
+import json
 import math
 import tempfile
 import threading
@@ -28,14 +29,15 @@ from legged_torque.viewer.video import VideoRecorder
 FRAME_INTERVAL = 1.0 / 30.0  # seconds between drawings of the robots
 PLOT_INTERVAL = 0.2  # seconds between drawings of the plots and the status
 COLOR = (47, 125, 246)  # of controls
-NOTICE_SECONDS = 10.0  # for which notifications are shown
 MAX_SECONDS = 60.0  # of a video
 RECORD, STOP = "Record", "Stop and download"  # labels of the button
 PUSHES = {"from behind": 0.0, "from the right": 90.0, "from the front": 180.0, "from the left": -90.0}
 """Directions of pushes from the robot's heading to its left [degrees]."""
 STEP = 0.05  # of the sliders of commands [m/s, rad/s] and weights
-KEYS = '<div class="lt-keys">or hold W A S D, arrows, or a gamepad\'s sticks</div>'
-COMMANDS = {"x [m/s]": "forward", "y [m/s]": "to the left", "yaw [rad/s]": "turning to the left"}
+FAREWELL_SECONDS = 0.5  # in which browsers get the last message
+KEYS = """<div class="lt-keys">or hold W A S D, arrows, or a gamepad's sticks<br>
+    0 stand still, space pause, R reset, P push</div>"""
+COMMANDS = {"v_x [m/s]": "forward", "v_y [m/s]": "to the left", "yaw rate [rad/s]": "turning to the left"}
 VIEW = {
     "follow": ("camera follows", True, "keeps the followed robot in view"),
     "others": ("all worlds", True, "draw the other worlds too"),
@@ -56,6 +58,7 @@ class Page:
     Attributes:
         server: Of viser, at its address ``url``.
         status: Text above the controls.
+        errors: Of the page itself, in red; hidden if there are none.
     """
 
     def __init__(self, session: Session, title: str, host: str, port: int, no_renderer: str | None = None) -> None:
@@ -67,25 +70,28 @@ class Page:
         self._gui, self._ground = gui, drawing.ground
         self._scene = Scene(self.server, session, drawing)
         self._shown: list[tuple[Any, str, Callable[[], Any]]] = []  # controls, attributes of theirs, and their values
-        self.status = gui.add_html("")
+        self.status, self.errors = gui.add_html(""), gui.add_html("", visible=False)
+        self._errors: dict[str, str] = {}  # by part of the page or control
+        self._keys: dict[str, viser.GuiInputHandle] = {}  # controls that keys press, by the names of keys in browsers
         self._add_controls()
         self._plots = Plots(gui, session)
         self._recorder: VideoRecorder | None = None
-        hint = f"up to {MAX_SECONDS:.0f} s of the followed robot"
-        self._record = gui.add_button(RECORD, icon=viser.Icon.VIDEO, hint=hint)
-        self._record.on_click(lambda event: self._start_or_end_recording())
+        hint = f"a video of the followed robot, up to {MAX_SECONDS:.0f} s"
+        self._record = self._add_button(RECORD, viser.Icon.VIDEO, hint, self._start_or_end_recording)
+        self._add_script()
         gui.main_panel.dock_right()
         gui.main_panel.set_width(WIDTH)
-        self._errors: dict[str, str] = {}  # of the last drawing, by part of the page
-        self._message_shown = session.message
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
         self._thread.start()
 
-    def close(self) -> None:
-        """Stop drawing and serving."""
+    def close(self, farewell: str = "") -> None:
+        """Stop drawing and serving; a farewell stays in the browsers."""
         self._closed.set()
         self._thread.join(timeout=2.0)
+        for client in self.server.get_clients().values() if farewell else ():
+            client.add_notification("The viewer has ended", farewell, color="red")
+        time.sleep(FAREWELL_SECONDS if farewell else 0.0)
         self.server.stop()
 
     def _run(self) -> None:
@@ -100,12 +106,17 @@ class Page:
                     self._attempt("plots", self._plots.update)
                     self._attempt("controls", self._update_controls)
                     self._attempt("status", self._draw_status)
+                    lines = [html.escape(error) for error in list(self._errors.values())]
+                    self.errors.content = f'<div class="lt-status lt-error">{"<br>".join(lines)}</div>'
+                    self.errors.visible = bool(lines)
 
-    def _attempt(self, part: str, draw: Callable[[], None]) -> None:
-        """Draw a part of the page; an error is shown until it has been drawn again."""
+    def _attempt(self, part: str, action: Callable[[], None]) -> None:
+        """Draw a part of the page, or do what a control asks for; an error is shown until that has worked again."""
         try:
-            draw()
+            action()
             self._errors.pop(part, None)
+        except UserError as error:
+            self._errors[part] = str(error)
         except Exception as error:
             text = f"{part}: {type(error).__name__}: {error}"
             if self._errors.get(part) != text:
@@ -128,7 +139,7 @@ class Page:
                 setattr(control, attribute, now)
 
     def _draw_status(self) -> None:
-        """Write checkpoint, time, companion, tile on rough ground, errors and message; notify of a new error."""
+        """Write checkpoint, time, companion, tile on rough ground and message."""
         session, message = self._session, self._session.message
         running = "paused" if session.is_paused else f"{session.pacer.rate:.2f} x real time"
         lines = [
@@ -139,18 +150,9 @@ class Page:
             lines.append(f"companion: <b>{html.escape(other.name)}</b>, model_{other.checkpoint}, {other.falls} falls")
         if self._ground and session.snapshot and session.snapshot.tile:
             lines.append(self._ground.tile_text(*session.snapshot.tile))
-        lines += [f'<span class="lt-error">{html.escape(error)}</span>' for error in self._errors.values()]
         kind = "lt-error" if message.is_error else ""
         lines.append(f'<span class="{kind}">{html.escape(message.text) or "&nbsp;"}</span>')
         self.status.content = f'<div class="lt-status">{"<br>".join(lines)}</div>'
-        if message.is_error and message is not self._message_shown:
-            self._notify("That did not work", message.text)
-        self._message_shown = message
-
-    def _notify(self, title: str, text: str) -> None:
-        """Show an error in all browsers."""
-        for client in self.server.get_clients().values():
-            client.add_notification(title, text, color="red", auto_close_seconds=NOTICE_SECONDS)
 
     # ---- controls ----------------------------------------------------------------------------------------------------
 
@@ -160,17 +162,21 @@ class Page:
         with gui.add_folder("Command"):
             self._add_command()
         with gui.add_folder("Time"):
-            self._bind(gui.add_checkbox("pause", False), lambda: session.is_paused, session.set_paused)
+            pause = gui.add_checkbox("pause", False, hint="stop all robots; controls take effect at once")
+            self._bind(pause, lambda: session.is_paused, session.set_paused)
+            self._keys["Space"] = pause
             speed = gui.add_slider("speed [x]", SLOWEST, FASTEST, 0.1, FASTEST, hint="1 is real time")
             self._bind(speed, lambda: session.pacer.speed, session.set_speed)
-            reset = gui.add_button("Reset", icon=viser.Icon.ROTATE, hint="a new episode in every world")
-            reset.on_click(lambda event: session.reset())
+            hint = "a new episode in every world"
+            self._keys["KeyR"] = self._add_button("Reset", viser.Icon.ROTATE, hint, session.reset)
         with gui.add_folder("Push"):
-            direction = gui.add_dropdown("push", tuple(PUSHES), hint="in the robot's frame")
+            direction = gui.add_dropdown("direction", tuple(PUSHES), hint="where it comes from, seen by the robot")
             hint = "added to the trunk's velocity at once"
             strength = gui.add_slider("strength [m/s]", 0.1, 2.0, 0.1, 0.8, hint=hint)
-            push = gui.add_button("Push", icon=viser.Icon.ARROW_BIG_RIGHT)
-            push.on_click(lambda event: session.push(math.radians(PUSHES[direction.value]), strength.value))
+            icon, hint = viser.Icon.ARROW_BIG_RIGHT, "pushes the robots of all worlds"
+            self._keys["KeyP"] = self._add_button(
+                "Push", icon, hint, lambda: session.push(math.radians(PUSHES[direction.value]), strength.value)
+            )
         with gui.add_folder("Run"):
             self._add_checkpoint("checkpoint", session)
             newest = gui.add_checkbox("follow training", False, hint="load each new checkpoint as soon as it is saved")
@@ -184,7 +190,8 @@ class Page:
         if session.mixing:
             with gui.add_folder("Mixing weights"):
                 automatic = gui.add_checkbox("as in training", True, hint="the weights at this point of the training")
-                sliders = [gui.add_slider(name.replace("_", " "), 0.0, 1.0, STEP, 0.0) for name in session.mixing]
+                names, hint = [name.replace("_", " ") for name in session.mixing], "factor on this part of the torques"
+                sliders = [gui.add_slider(name, 0.0, 1.0, STEP, 0.0, hint=hint) for name in names]
                 values = (lambda: list(session.mixing.values()), automatic, lambda: session.chosen_mixing is None)
                 self._bind_sliders(sliders, *values, session.set_mixing)
         if self._ground:
@@ -196,7 +203,14 @@ class Page:
     def _bind(self, control: viser.GuiInputHandle, value: Callable[[], Any], request: Callable[[Any], None]) -> None:
         """Show a value of the session in a control, and request what users choose."""
         self._shown.append((control, "value", value))
-        control.on_update(lambda event: request(control.value) if event.client else None)  # a user has changed it
+        choose = functools.partial(self._attempt, control.label, lambda: request(control.value))
+        control.on_update(lambda event: choose() if event.client else None)  # a user has changed it
+
+    def _add_button(self, label: str, icon: Any, hint: str, action: Callable[[], None]) -> viser.GuiButtonHandle:
+        """Add a button."""
+        button = self._gui.add_button(label, icon=icon, hint=hint)
+        button.on_click(lambda event: self._attempt(label, action))
+        return button
 
     def _bind_sliders(
         self,
@@ -236,20 +250,30 @@ class Page:
 
         self._bind_sliders(sliders, command, random, lambda: session.command is None, session.set_command)
         gui.add_html(KEYS)
-        gui.add_button("Stand still", icon=viser.Icon.HAND_STOP).on_click(lambda event: steer((0.0, 0.0, 0.0)))
-        field = gui.add_vector3("steering", (0.0, 0.0, 0.0), visible=False)  # set by held keys and a gamepad
+        hint = "the command 0 for all robots"
+        low, none, high = (-1.0, -1.0, -1.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+        self._keys["Digit0"] = self._add_button("Stand still", viser.Icon.HAND_STOP, hint, lambda: steer(none))
+        self._field = field = gui.add_vector3("steering", none, min=low, max=high, visible=False)
 
         @field.on_update
         async def changed(event: viser.GuiEvent) -> None:  # viser calls coroutines in the order of the changes
-            if all(abs(share) <= 1.0 for share in field.value):
-                steer(field.value)
+            self._attempt("steering", lambda: steer(field.value))
 
-        script = Path(__file__).with_name("page.js").read_text().replace("FIELD", field._impl.uuid)
-        gui._websock_interface.queue_message(RunJavascriptMessage(script))  # as viser itself does for Plotly
+    def _add_script(self) -> None:
+        """Let browsers run page.js, with the field that held keys and sticks set, the controls of keys, and hints."""
+        controls = self._gui._gui_input_handle_from_uuid
+        page = {
+            "field": self._field._impl.uuid,
+            "controls": {key: control._impl.uuid for key, control in self._keys.items()},
+            "hints": {uuid: control.hint for uuid, control in controls.items()},
+        }
+        script = f"const page = {json.dumps(page)};\n{Path(__file__).with_name('page.js').read_text()}"
+        self._gui._websock_interface.queue_message(RunJavascriptMessage(script))  # as viser itself does for Plotly
 
     def _add_checkpoint(self, label: str, session: Session) -> None:
         """Add the choice of a session's checkpoint."""
-        control = self._gui.add_dropdown(label, (str(session.checkpoint),), hint="iterations of the training")
+        hint = "iterations of the training after which the policy was saved"
+        control = self._gui.add_dropdown(label, (str(session.checkpoint),), hint=hint)
 
         def options() -> tuple[str, ...]:
             return tuple(map(str, sorted({*session.checkpoints, session.checkpoint})))
@@ -281,7 +305,7 @@ class Page:
         """Add the followed world and what is drawn."""
         gui, session, num_envs = self._gui, self._session, self._session.task.num_envs
         if num_envs > 1:
-            world = gui.add_dropdown("world", tuple(map(str, range(num_envs))), hint="for camera and plots")
+            world = gui.add_dropdown("world", tuple(map(str, range(num_envs))), hint="the robot of camera and plots")
             self._bind(world, lambda: str(session.world), lambda value: session.follow_world(int(value)))
         is_needed = {"others": num_envs > 1, "scan": self._ground is not None}
         self._boxes = {
@@ -294,8 +318,8 @@ class Page:
     def _start_or_end_recording(self) -> None:
         """Start, or end and draw in a thread of its own."""
         if self._recorder:
-            recorder, self._recorder = self._recorder, None
-            threading.Thread(target=self._send_video, args=(recorder,), name="recording", daemon=True).start()
+            send, self._recorder = functools.partial(self._send_video, self._recorder), None
+            threading.Thread(target=self._attempt, args=("video", send), name="recording", daemon=True).start()
         else:
             self._recorded = self._session.sim_time  # time of the last step that has been recorded [s]
             self._recorder = VideoRecorder(Drawing.of_task(self._session.task), self._session.task.dt)
@@ -312,7 +336,7 @@ class Page:
                 self._start_or_end_recording()
 
     def _send_video(self, recorder: VideoRecorder) -> None:
-        """Draw a video and send it to the browsers, or show why there is none."""
+        """Draw a video and send it to the browsers; a UserError says why there is none."""
 
         def show_progress(frame: int, total: int) -> None:
             self._record.label = f"Drawing frame {frame} of {total}"
@@ -323,15 +347,12 @@ class Page:
                 file = Path(folder) / "walking.mp4"
                 recorder.write(file, self._no_renderer, show_progress)
                 self.server.send_file_download(file.name, file.read_bytes(), save_immediately=True)
-        except Exception as error:  # the page goes on
-            reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-            self._notify("There is no video", reason)
         finally:
             self._record.label, self._record.disabled = RECORD, False
 
 
-def watch(session: Session, title: str, host: str, port: int, no_renderer: str | None = None) -> None:
-    """Serve a :class:`Page` and step until Ctrl-C."""
+def watch(session: Session, title: str, host: str, port: int, again: str, no_renderer: str | None = None) -> None:
+    """Serve a :class:`Page` and step until Ctrl-C; ``again`` is the command that opens it again."""
     page = Page(session, title, host, port, no_renderer)
     if page.server.get_port() != port:
         print(f"Port {port} is taken.")
@@ -342,4 +363,4 @@ def watch(session: Session, title: str, host: str, port: int, no_renderer: str |
         with StopRequest(lambda text: session.stop()):
             session.run()
     finally:
-        page.close()
+        page.close(f"If a training has started it, that has ended, too. Open the viewer again with: {again}")

@@ -9,12 +9,23 @@ import pytest
 pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
 
 import websockets.asyncio.server
-from websockets.exceptions import InvalidStatus
+from support.clock import wait_for
+from support.visitor import PROTOCOL, visitor
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from legged_torque.utils.errors import UserError
 from legged_torque.viewer.access import GuardedServer, is_local
 from legged_torque.viewer.ports import free_port
+
+FORGED = {
+    "box": [{"removed": True}, {"value": "yes"}, {"value": True, "removed": True}, {"no_such": 1}, {"update_cb": []}],
+    "slider": [{"value": value} for value in (7.0, float("nan"), "1.0", None, [0.5])] + [{"uuid": "x"}],
+    "list": [{"value": "77"}, {"value": [0]}, {"value": 1}, {"options": ["7"]}],
+    "vector": [{"value": value} for value in ([9, 0, 0], [0, float("nan"), 0], [0, 0], "000", [[0, 0, 0]] * 3)],
+}
+"""Updates that no control of these kinds sends."""
+CHOICES = {"box": True, "slider": 1.5, "list": "b", "vector": [1.0, -1.0, 0.5]}
 
 
 @contextlib.contextmanager
@@ -22,8 +33,42 @@ def serving(host):
     """A server; gives its port and its token."""
     server = GuardedServer(host, 8440, "title")
     yield server.get_port(), server.token
-    assert server.request_share_url() is None
     server.stop()
+
+
+def test_only_choices_count(monkeypatch, capfd, caplog, recwarn):
+    """What no control sends changes nothing, of whatever kind and size, and fills no log; then choices still count."""
+    server, tunnels = GuardedServer("127.0.0.1", 8440, "title"), []
+    monkeypatch.setattr(server, "request_share_url", lambda: tunnels.append("open"))
+    controls = {
+        "box": server.gui.add_checkbox("box", False),
+        "slider": server.gui.add_slider("slider", 0.5, 2.0, 0.5, 1.0),
+        "list": server.gui.add_dropdown("list", ("a", "b")),
+        "vector": server.gui.add_vector3("vector", (0.0, 0.0, 0.0), min=(-1.0, -1.0, -1.0), max=(1.0, 1.0, 1.0)),
+    }
+    before = {name: vars(each._impl).copy() for name, each in controls.items()}
+    capfd.readouterr()
+    with visitor(server) as send:
+        for name, forged in FORGED.items():
+            for updates in forged:
+                send(type="GuiUpdateMessage", uuid=before[name]["uuid"], updates=updates)
+        send(type="ShareUrlRequest")
+        for number in range(20):
+            send(type="ViewerCameraMessage", wxyz=f"{number}" * 10_000)
+    for message in ({"type": "x" * 10_000}, {"type": "GuiUpdateMessage", "uuid": "x" * 1_000_000}):
+        with contextlib.suppress(ConnectionClosed), visitor(server) as send:
+            send(**message)
+    with pytest.raises(InvalidStatus), connect(f"ws://127.0.0.1:{server.get_port()}", subprotocols=["viser-v0" * 500]):
+        pass
+    assert {name: vars(each._impl) for name, each in controls.items()} == before and not tunnels
+    with visitor(server) as send:
+        for name, value in CHOICES.items():
+            send(type="GuiUpdateMessage", uuid=before[name]["uuid"], updates={"value": value})
+        wait_for(lambda: [each.value for each in controls.values()] == [True, 1.5, "b", (1.0, -1.0, 0.5)])
+    server.stop()
+    written = capfd.readouterr()
+    noted = "".join(str(each.message) for each in recwarn)
+    assert len(written.out + written.err + caplog.text + noted) < 1000
 
 
 def get(port, path="/", **headers):
@@ -41,7 +86,9 @@ def connects(port, host="127.0.0.1", origin=None, cookie=None):
     headers = {"Cookie": cookie} if cookie else {}
     sock = socket.create_connection(("127.0.0.1", port), timeout=10)
     try:
-        with connect(f"ws://{host}:{port}", sock=sock, origin=origin, additional_headers=headers):
+        with connect(
+            f"ws://{host}:{port}", sock=sock, origin=origin, additional_headers=headers, subprotocols=[PROTOCOL]
+        ):
             return True
     except InvalidStatus as error:
         assert error.response.status_code == 403

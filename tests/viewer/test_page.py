@@ -1,6 +1,8 @@
 """The page without a browser: robots of all kinds, and errors that must not end it."""
 
 import re
+import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,18 +10,41 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
 
-from support.clock import wait_for
+from support.clock import Clock, wait_for
+from support.published import urdf
 from support.sessions import new_session, running
+from support.visitor import visitor
 
+from legged_torque.envs import task_registry
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_torque.importer.mjcf import mjcf
+from legged_torque.importer.robot import import_robot
+from legged_torque.importer.settings import settings
+from legged_torque.viewer import scene
 from legged_torque.viewer.plots import foot_labels, gait_html, joints_by_leg
-from legged_torque.viewer.web import Page, watch
+from legged_torque.viewer.video import VideoRecorder
+from legged_torque.viewer.web import RECORD, Page, watch
 
 
-@pytest.fixture(scope="module", params=["g1_torque_multihead", "go2_rough_torque"])
+def imported_task(folder):
+    """The name of a new task of a robot that has been imported into a folder."""
+    (folder / "paged.urdf").write_text(urdf())
+    robot = import_robot(folder / "paged.urdf")
+    (folder / "paged.xml").write_text(mjcf(robot)[0])
+    parts = {"__name__": "paged"}
+    exec(compile(settings(robot, str(folder / "paged.xml")), "paged.py", "exec"), parts)
+    kinds = {kind: parts[f"Paged{kind}"]() for kind in ("Cfg", "CfgPPO")}
+    assert isinstance(kinds["Cfg"], LeggedRobotCfg) and isinstance(kinds["CfgPPO"], LeggedRobotCfgPPO)
+    task_registry.register("imported", "legged_torque.envs.base.legged_robot:LeggedRobot", *kinds.values())
+    return "imported"
+
+
+@pytest.fixture(scope="module", params=["g1_torque_multihead", "go2_rough_torque", "imported"])
 def page(request, tmp_path_factory):
-    """The page of a running session: of a robot with several geoms per foot, and one of rough ground."""
-    ground = {"curriculum": False} if "rough" in request.param else None
-    session = new_session(tmp_path_factory.mktemp("run"), request.param, ground=ground)
+    """The page of a running session: of a robot with several geoms per foot, one of rough ground, and a stranger's."""
+    folder, name = tmp_path_factory.mktemp("run"), request.param
+    ground = {"curriculum": False} if "rough" in name else None
+    session = new_session(folder, imported_task(folder) if name == "imported" else name, ground=ground)
     with running(session):
         page = Page(session, "title", "127.0.0.1", 8460)
         page.session = session
@@ -48,27 +73,57 @@ def test_page_goes_on(page):
     """Time passes, robots move, the gait has a row per foot, and there is no error."""
     wait_for(lambda: page.session.sim_time > 0.5)
     wait_for(lambda: "lt-error" not in status(page) and not status(page).count("> 0.0 s simulated"))
-    assert moves(page) and not page._errors
+    assert moves(page) and not page.errors.visible
     feet = page.session.snapshot.feet
     assert page._plots._gait.content.count("<svg") == len(feet) == len(page._plots._feet)
 
 
-def test_error_of_a_part(page, monkeypatch, capsys):
-    """It is shown in red until it is over; robots and commands are not concerned."""
+@pytest.mark.parametrize(
+    ("owner", "name"), [("_plots", "update"), ("", "_draw_status"), ("_scene", "update"), ("session", "push")]
+)
+def test_error_of_a_part(page, monkeypatch, capsys, owner, name):
+    """It is shown in red until it is over, whatever it is; robots and commands are not concerned."""
 
-    def fail():
-        raise ValueError("a <b> of the plots")
+    def fail(*args):
+        raise ValueError("a <b> of a part")
 
-    with monkeypatch.context() as patch:
-        patch.setattr(page._plots, "update", fail)
-        wait_for(lambda: "lt-error" in status(page))
-        assert "plots: ValueError: a &lt;b&gt; of the plots" in status(page)
+    page.session.set_command(None)
+    wait_for(lambda: control(page, "random").value is True)
+    with visitor(page.server) as send, monkeypatch.context() as patch:
+        push = {"type": "GuiUpdateMessage", "uuid": control(page, "Push")._impl.uuid, "updates": {"value": True}}
+        patch.setattr(getattr(page, owner) if owner else page, name, fail)
+        send(**push)
+        wait_for(lambda: page.errors.visible and "ValueError: a &lt;b&gt; of a part" in page.errors.content)
+        assert "lt-error" in page.errors.content
+        assert owner == "_scene" or moves(page)
         page.session.set_command((0.25, 0.0, 0.0))
-        assert moves(page)
         wait_for(lambda: page.session.command == (0.25, 0.0, 0.0))
         wait_for(lambda: control(page, "random").value is False)
-    wait_for(lambda: "lt-error" not in status(page))
+        patch.undo()
+        send(**push)
+        wait_for(lambda: not page.errors.visible)
+    assert moves(page)
     assert capsys.readouterr().err.count("Traceback") == 1  # not with every picture
+
+
+def test_recording(page, monkeypatch):
+    """The button tells how far the drawing is, until the video is there; then it can be used again."""
+    go_on = threading.Event()
+
+    def write(self, file, no_renderer, on_frame):
+        on_frame(3, 70)
+        assert len(self.steps) > 3 and go_on.wait(60.0)
+        file.write_bytes(b"video")
+
+    monkeypatch.setattr(VideoRecorder, "write", write)
+    button = page._record
+    for seconds in (0.5, 0.0):
+        button.value = True
+        time.sleep(seconds)
+    wait_for(lambda: "3 of 70" in button.label and button.disabled)
+    go_on.set()
+    wait_for(lambda: button.label == RECORD and not button.disabled)
+    assert not page.errors.visible
 
 
 def test_controls_follow_the_session(page):
@@ -89,10 +144,55 @@ def test_controls_follow_the_session(page):
 def test_what_is_printed(page, monkeypatch, capsys, host, is_open):
     """The address, with a token and a warning if other machines reach it."""
     monkeypatch.setattr(page.session, "run", lambda: None)
-    watch(page.session, "title", host, 8470)
+    watch(page.session, "title", host, 8470, "play.py")
     printed = capsys.readouterr().out
     assert re.search(r"^See it walk: http://127\.0\.0\.1:\d+(/\?token=\w{32})? ", printed, re.MULTILINE)
     assert ("Warning: other machines reach this page" in printed) == ("?token=" in printed) == is_open
+
+
+def test_metrics(tmp_path):
+    """Power and cost of transport on the page follow from torques, joint velocities, speed and weight of all steps."""
+    session = new_session(tmp_path, "a1_position", 1, clock=Clock())
+    page, task, power, speed = Page(session, "title", "127.0.0.1", 8460), session.task, [], []
+    for _ in range(20):
+        session.tick()
+        power.append(float((task.torques[0] * task.dof_vel[0]).abs().sum()))
+        speed.append(float(task.base_lin_vel[0, :2].norm()))
+    page._plots.update()
+    rows = dict(re.findall(r"<td>([^<]*)</td><td>([^<]*)</td>", page._plots._metrics.content))
+    assert float(rows["mechanical power [W]"]) == pytest.approx(np.mean(power), rel=0.01)
+    weight = 9.81 * task.sim.mj_model.body_mass.sum()
+    cost = float(rows["cost of transport "])
+    assert cost == pytest.approx(np.mean(power) / (weight * np.mean(speed)), rel=0.01)
+    page.close()
+
+
+@pytest.mark.parametrize("aspect", [1.6, 0.46])
+def test_two_robots_stay_in_the_picture(tmp_path, monkeypatch, aspect):
+    """In wide and high pictures, a camera sees both, with a third of a metre around them, also if far apart."""
+    session = new_session(tmp_path / "first", "a1_position", 1)
+    session.companion = new_session(tmp_path / "other", "a1_position", 1)
+    monkeypatch.setattr(scene, "SIDE", 1.9)
+    page = Page(session, "title", "127.0.0.1", 8460)
+
+    def are_in_sight():
+        """Whether both are between the picture's edges, as seen by a pinhole camera."""
+        ahead = client.camera.look_at - client.camera.position
+        sideways = np.cross(ahead, [0.0, 0.0, 1.0])
+        axes = np.array([axis / np.linalg.norm(axis) for axis in (ahead, sideways, np.cross(sideways, ahead))])
+        robots = page._scene._robots
+        places = np.array([robots[name]._handles[0].batched_positions[0] for name in ("robot", "companion")])
+        assert np.linalg.norm(places[0] - places[1]) > 1.7
+        depth, right, up = axes @ (places + page._scene._root.position - client.camera.position).T
+        half = np.tan(0.5 * client.camera.fov) * depth
+        return (abs(right) + 0.33 < half * aspect).all() and (abs(up) + 0.33 < half).all()
+
+    with visitor(page.server, (2.0, -1.5, 1.0), aspect):
+        (client,) = page.server.get_clients().values()
+        session.tick()
+        wait_for(lambda: page._scene._robots["companion"]._handles)
+        wait_for(are_in_sight, 20.0)
+    page.close()
 
 
 def test_gait():

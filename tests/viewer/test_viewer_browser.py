@@ -164,18 +164,28 @@ def is_dark(red, green, blue):
     return np.maximum(np.maximum(red, green), blue) < 90
 
 
+def is_orange(red, green, blue):
+    """The companion is."""
+    return (red > 180) & (blue < 120) & (red > green + 20)
+
+
 def test_what_is_shown(opened):
     """Both robots are drawn, one of them tinted, and the panels show numbers of both."""
     wait_for(lambda: share(opened, is_dark) > 0.01)
-    wait_for(lambda: share(opened, lambda red, green, blue: (red > 180) & (blue < 120) & (red > green + 20)) > 0.01)
+    wait_for(lambda: share(opened, is_orange) > 0.01)
     text = text_of(opened)
     for words in (
-        *("model_0", "companion: a1_position", "Command", "x [m/s]", "yaw [rad/s]", "gamepad", "Mixing weights"),
+        *("model_0", "companion: a1_position", "Command", "v_x [m/s]", "yaw rate [rad/s]", "gamepad", "Mixing weights"),
         *("v_x, forward [m/s]", "commanded", "actual", "Feet on the ground, last 5 s", "FR", "FR thigh", "/34"),
         *("contacts", "collision geoms", "ghost", "Record"),
     ):
         assert words in text, words
-    tabs = {"Joints": "angle of FR calf [rad]", "Rewards": "weighted, per second", "Walking": "v_x, forward [m/s]"}
+    assert "cost of transport" in text and "mechanical power [W]" in text
+    tabs = {
+        "Joints": "FR calf angle, -2.70 to -0.92 rad",
+        "Rewards": "weighted, per second",
+        "Walking": "v_x, forward [m/s]",
+    }
     for tab, words in tabs.items():
         opened.find_element(By.XPATH, f"//*[@role='tab'][contains(., '{tab}')]").click()
         wait_for(lambda words=words: words in text_of(opened))
@@ -183,7 +193,7 @@ def test_what_is_shown(opened):
 
 def test_steering(opened, session):
     """Fields, button, held keys and a gamepad's sticks choose the command, which the fields show; or it is drawn."""
-    type_into(opened, "x [m/s]", "0.8")
+    type_into(opened, "v_x [m/s]", "0.8")
     wait_for(lambda: session.command and session.command[0] == 0.8)  # the others stay as they were drawn
     opened.find_element(By.XPATH, "//button[contains(., 'Stand still')]").click()  # keys are no longer for the field
     wait_for(lambda: session.command == (0.0, 0.0, 0.0))
@@ -193,7 +203,7 @@ def test_steering(opened, session):
             hold.key_down(key)
         hold.perform()
         wait_for(lambda command=command: session.command == command)
-        wait_for(lambda command=command: float(control(opened, "x [m/s]").get_attribute("value")) == command[0])
+        wait_for(lambda command=command: float(control(opened, "v_x [m/s]").get_attribute("value")) == command[0])
         for key in keys:
             hold.key_up(key)
         hold.perform()
@@ -213,7 +223,63 @@ def test_steering(opened, session):
     walk(session, 0.1)
     drawn = session.snapshot.commands[0]
     np.testing.assert_array_equal(session.companion.snapshot.commands[0], drawn)
-    wait_for(lambda: float(control(opened, "x [m/s]").get_attribute("value")) == pytest.approx(drawn[0], abs=0.006))
+    wait_for(lambda: float(control(opened, "v_x [m/s]").get_attribute("value")) == pytest.approx(drawn[0], abs=0.006))
+
+
+def test_keys_and_hints(opened, session):
+    """Keys do what they do in MuJoCo's window; what a label is for is told where the pointer rests on it."""
+
+    def press(key, focus="document.activeElement.blur()"):
+        opened.execute_script(focus, control(opened, "contacts"))
+        ActionChains(opened).send_keys(key).perform()
+
+    for is_paused in (False, True):
+        press(" ")
+        wait_for(lambda is_paused=is_paused: session.is_paused == is_paused)
+    session.set_command((0.5, 0.0, 0.0))
+    for key, message in {"p": "pushed with 0.8 m/s", "r": "reset"}.items():
+        press(key, "arguments[0].focus()")  # a box in which nobody types
+        wait_for(lambda message=message: session.message.text == message)
+    press("0")
+    wait_for(lambda: session.command == (0.0, 0.0, 0.0))
+    labels = [label for label in opened.find_elements(By.XPATH, "//label[@for]") if label.text]
+    assert len(labels) > 15
+    for label in labels:
+        opened.execute_script("arguments[0].dispatchEvent(new Event('pointerover', {bubbles: true}))", label)
+        assert label.get_attribute("title"), label.text
+    click(opened, control(opened, "random"))
+
+
+CURVES = """return Object.values(window.__viserTestpoints.uplots).filter(({chart}) => chart.scales.y.max >= 1.6)
+    .map(({chart}) => [chart.axes[0].label, chart.scales.y.max, Math.max(...chart.data[2])])"""
+
+
+def test_no_curve_is_cut(opened, session):
+    """Scales of velocities grow with large values, and are no smaller than at first; axes of time have a label."""
+    session.push(0.0, 4.0)
+    walk(session, 0.2)
+    wait_for(lambda: max(largest for *_, largest in opened.execute_script(CURVES)) > 2.5)
+    for label, high, largest in opened.execute_script(CURVES):
+        assert label == "time [s]" and high >= largest
+
+
+def test_phone(opened):
+    """The sheet is as wide as the page; the plots, at its top, can be unfolded; both robots are above it."""
+    screen = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    try:
+        open_page(opened, opened.current_url)
+        sheet = wait_for(lambda: opened.find_element(By.CSS_SELECTOR, "[style*='max-height: 60%']"))
+        wait_for(lambda: sheet.size["width"] == 390)
+        plots = opened.find_element(By.CSS_SELECTOR, "[aria-label='Expand panel Walking']")
+        assert plots.location["y"] < opened.find_element(By.XPATH, "//label[.='random']").location["y"]
+        robots = {"left": 0.0, "right": 1.0, "top": 0.15, "bottom": 0.38}
+        wait_for(lambda: share(opened, is_dark, **robots) > 0.01 and share(opened, is_orange, **robots) > 0.01)
+        click(opened, plots)
+        wait_for(lambda: "v_x, forward [m/s]" in text_of(opened))
+    finally:
+        opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        open_page(opened, opened.current_url)
 
 
 def test_recording_without_a_renderer(opened, page):
@@ -272,6 +338,8 @@ def test_a_video_is_downloaded(browser, tmp_path):
                 time.sleep(seconds)
             file = browser.downloads / "walking.mp4"
             wait_for(file.is_file)
+            process.send_signal(signal.SIGINT)
+            wait_for(lambda: " ".join(play[2:]) in text_of(browser))  # how to open it again
         finally:
             process.send_signal(signal.SIGINT)
             process.communicate()

@@ -1,0 +1,26 @@
+"""A visitor of the page without a browser."""
+
+import contextlib
+
+import msgspec
+import viser
+from support.clock import wait_for
+from websockets.sync.client import connect
+
+PROTOCOL = f"viser-v{viser.__version__}"  # as the page says it
+CAMERA = {"type": "ViewerCameraMessage", "wxyz": (1, 0, 0, 0), "up_direction": (0, 0, 1), "near": 0.1, "far": 100}
+
+
+@contextlib.contextmanager
+def visitor(server, position=(3.0, 0.0, 1.0), aspect=1.0):
+    """A function that sends messages as a browser does, whose camera looks at the origin, almost; see CAMERA."""
+    others = set(server.get_clients())
+    with connect(f"ws://127.0.0.1:{server.get_port()}", subprotocols=[PROTOCOL], max_size=None) as socket:
+
+        def send(**message):
+            socket.send(msgspec.msgpack.encode(message))
+
+        picture = {"fov": 0.75, "image_height": 500, "image_width": int(500 * aspect)}
+        send(**CAMERA, **picture, position=position, look_at=(0.0, 0.0, 0.1))
+        wait_for(lambda: set(server.get_clients()) - others)
+        yield send
