@@ -4,6 +4,7 @@ Writes resources/robots/NAME/NAME.xml and legged_torque/envs/robots/NAME.py, whi
 other tasks need, or both into the folder --out; prints what was changed and why.
 """
 
+import io
 from pathlib import Path
 
 from legged_torque import RESOURCES_DIR
@@ -11,7 +12,7 @@ from legged_torque import __file__ as package
 from legged_torque.envs import task_registry
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer, disable_renderer
-from legged_torque.utils.errors import UserError, collect_errors
+from legged_torque.utils.errors import UserError, collect_errors, printable
 from legged_torque.utils.files import write_whole
 from legged_torque.utils.limits import Positive
 
@@ -57,7 +58,7 @@ def main() -> None:
     write_whole(model_file, text)
     write_whole(code_file, code)
     for note in robot.source.notes:
-        print(f"- {note}")
+        print(printable(f"- {note}"))
     print(f"wrote {model_file}\nwrote {code_file}")
     print(*problems or ["sim.engine 'fused' simulates it"])
     if args.check:
@@ -71,7 +72,8 @@ def main() -> None:
 
             with mujoco.Renderer(model, 480, 640) as renderer:
                 renderer.update_scene(data, camera="track")
-                Image.fromarray(renderer.render()).save(folder / f"{robot.name}.png")
+                Image.fromarray(renderer.render()).save(picture := io.BytesIO(), format="png")
+            write_whole(folder / f"{robot.name}.png", picture.getvalue())
             print(f"wrote {folder / robot.name}.png")
     if args.out:
         print(f"To have its tasks, put {code_file.name} into {Path(package).parent / 'envs' / 'robots'}")

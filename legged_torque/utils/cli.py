@@ -202,6 +202,7 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
     if not draws:
         disable_renderer()
     try:
+        check_names()
         main()
         return
     except BrokenPipeError:
@@ -224,8 +225,22 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
         else:
             raise
         status, line = 2, f"error: {message}"
+    finally:
+        if "triton" in sys.modules:
+            gc.unfreeze()  # what Python does not collect when it ends, triton reports as leaks
     print(line, file=sys.stderr)
     sys.exit(status)
+
+
+def check_names() -> None:
+    """Raise a UserError if the current folder is gone, or its name or an argument cannot be written to a file."""
+    try:
+        for name in (os.getcwd(), *sys.argv):
+            name.encode()
+    except FileNotFoundError:
+        raise UserError("the current folder has been removed") from None
+    except UnicodeEncodeError:
+        raise UserError(f"'{name}' is not UTF-8, or the locale is another one: LC_ALL=C.UTF-8 may help") from None
 
 
 def check_args(args: object, **hints: Any) -> None:

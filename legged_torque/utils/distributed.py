@@ -9,6 +9,7 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.processes import end_with_parent
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -43,11 +44,15 @@ def _variable(name: str, lowest: int) -> int:
 
 
 def join(device: str) -> None:
-    """Join the other processes, if that is not done yet, to exchange tensors on a device ("cpu", "cuda:N")."""
+    """Join the other processes, if that is not done yet, to exchange tensors on a device ("cpu", "cuda:N").
+
+    From then on this process ends with torchrun, even when that is killed: a training finishes its iteration and saves.
+    """
     import torch
 
     if torch.distributed.is_initialized():
         return
+    end_with_parent()
     try:
         torch.distributed.init_process_group("nccl" if torch.device(device).type == "cuda" else "gloo")
     except ValueError as error:  # an environment variable that torchrun sets is missing

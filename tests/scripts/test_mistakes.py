@@ -1,6 +1,9 @@
 """Mistakes on the command lines of scripts: one line, exit status 2, and nothing is written."""
 
+import os
 import re
+import subprocess
+import sys
 
 import pytest
 from support.scripts import ROOT, SMALL, assert_light, assert_told_in_one_line, contents, run_here
@@ -23,6 +26,8 @@ MISTAKES = [
     ("--resume --experiment_name=half_checkpoint", "model_2.pt' is not a readable checkpoint"),
     ("--resume --experiment_name=a1_position --task=a1_torque", "is of task 'a1_position', not 'a1_torque'"),
     ("--set=asset.mirrored_legs=[[FR]]", "asset.mirrored_legs must be pairs [right, left], not ['FR']"),
+    ("--set=asset.mirrored_legs=[[FR,FR]] --set=algorithm.symmetry_cfg.use_data_augmentation=true", "no counterpart"),
+    ("--experiment_name=\udcff", "is not UTF-8"),
     ("--log_root=/dev/null", "cannot write '/dev/null/a1_position/"),
     (f"--run_name={'x' * 300}", "File name too long"),
     ("--task=a1_torque_gravity --set=pretraining.file=/proc/x/y.pt", "cannot write '/proc/x/y.pt'"),
@@ -70,6 +75,16 @@ def test_mistakes_after_training(root, script, words, message):
     result = run_here(script, "--task=a1_position", "--device=cpu", *words.split(), root=root)
     assert_told_in_one_line(result, message)
     assert contents(root) == before
+
+
+def test_folder_that_is_gone(tmp_path):
+    """The current folder may have been removed meanwhile."""
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    command = ["sh", "-c", f'rmdir "{folder}"; exec "$@"', "sh", sys.executable, str(ROOT / "scripts" / "train.py")]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    assert_told_in_one_line((done.returncode, done.stdout, done.stderr), "the current folder has been removed")
 
 
 def test_number_of_processes_that_is_none(tmp_path, monkeypatch):

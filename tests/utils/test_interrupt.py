@@ -57,6 +57,21 @@ def test_under_nohup():
     assert not stop.requested
 
 
+def test_nothing_is_called_a_leak():
+    """Triton, which torch imports where it is installed, has nothing to say when a script ends."""
+    pytest.importorskip("triton", reason="triton is not installed")
+    code = """
+from legged_torque.utils.cli import slow_imports, run_script
+def main():
+    with slow_imports():
+        import triton
+run_script(main)
+"""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+
+
 def test_mujoco_leaves_no_file(tmp_path):
     """Its warnings go to standard error."""
     code = """
