@@ -202,7 +202,7 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
     if not draws:
         disable_renderer()
     try:
-        check_names()
+        " ".join([os.getcwd(), *sys.argv]).encode()  # files name them
         main()
         return
     except BrokenPipeError:
@@ -215,6 +215,10 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
     except Exception as error:
         if isinstance(error, UserError):
             message = " ".join(str(error).splitlines())
+        elif isinstance(error, UnicodeEncodeError):
+            message = f"a name is not UTF-8, or the locale is another one (LC_ALL=C.UTF-8 may help): {error.object!r}"
+        elif isinstance(error, FileNotFoundError) and not error.filename:
+            message = "the current folder has been removed"
         elif isinstance(error, OSError):
             message = f"{error.strerror or error}" + (f": {str(error.filename)!r}" if error.filename else "")
         elif isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("legged_torque"):
@@ -230,17 +234,6 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
             gc.unfreeze()  # what Python does not collect when it ends, triton reports as leaks
     print(line, file=sys.stderr)
     sys.exit(status)
-
-
-def check_names() -> None:
-    """Raise a UserError if the current folder is gone, or its name or an argument cannot be written to a file."""
-    try:
-        for name in (os.getcwd(), *sys.argv):
-            name.encode()
-    except FileNotFoundError:
-        raise UserError("the current folder has been removed") from None
-    except UnicodeEncodeError:
-        raise UserError(f"'{name}' is not UTF-8, or the locale is another one: LC_ALL=C.UTF-8 may help") from None
 
 
 def check_args(args: object, **hints: Any) -> None:

@@ -9,10 +9,12 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.processes import end_with_parent
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+_PARENT = os.getppid()  # torchrun, if it has started this process
 
 
 def world_size() -> int:
@@ -35,6 +37,11 @@ def local_rank() -> int:
     return _variable("LOCAL_RANK", 0) if world_size() > 1 else 0
 
 
+def has_lost_parent() -> bool:
+    """Return whether torchrun has been killed: the processes that it has started live on."""
+    return world_size() > 1 and os.getppid() != _PARENT
+
+
 def _variable(name: str, lowest: int) -> int:
     """Return the number that torchrun has put into an environment variable; ``lowest`` if it has not."""
     text = os.environ.get(name, str(lowest))
@@ -44,15 +51,11 @@ def _variable(name: str, lowest: int) -> int:
 
 
 def join(device: str) -> None:
-    """Join the other processes, if that is not done yet, to exchange tensors on a device ("cpu", "cuda:N").
-
-    From then on this process ends with torchrun, even when that is killed: a training finishes its iteration and saves.
-    """
+    """Join the other processes, if that is not done yet, to exchange tensors on a device ("cpu", "cuda:N")."""
     import torch
 
     if torch.distributed.is_initialized():
         return
-    end_with_parent()
     try:
         torch.distributed.init_process_group("nccl" if torch.device(device).type == "cuda" else "gloo")
     except ValueError as error:  # an environment variable that torchrun sets is missing

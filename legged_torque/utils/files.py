@@ -104,10 +104,9 @@ def is_whole_archive(file: Path) -> bool:
     try:
         with zipfile.ZipFile(file) as archive:
             parts = archive.infolist()
-            if any(part.external_attr for part in parts):  # of a folder: torch writes none, and reads no data
-                return False
-            is_plain = sum(part.file_size for part in parts) <= file.stat().st_size  # torch does not compress
-            return is_plain and archive.testzip() is None
+            is_compressed = sum(part.file_size for part in parts) > file.stat().st_size  # which torch's are not
+            has_folders = any(part.external_attr for part in parts)  # torch writes none, and reads no data
+            return not is_compressed and not has_folders and archive.testzip() is None
     except Exception:  # zipfile raises about anything for a damaged file
         return False
 

@@ -79,8 +79,8 @@ class TaskRegistry:
             env_cfg: Settings of the task.
             train_cfg: Settings of its training, of a :class:`~legged_torque.envs.base.training_config.TrainingCfg`.
         """
-        if not isinstance(name, str) or not isinstance(task_class, (type, str)):
-            raise UserError(f"a task must have a text as its name, not {name!r}, and a class, not {task_class!r}")
+        if not isinstance(name, str):
+            raise UserError(f"the name of a task must be a text, not {name!r}")
         if name in self._tasks:
             raise UserError(f"'{name}' is a task already; choose another name")
         for cfg, member in ((env_cfg, "env"), (train_cfg, "runner")):
@@ -118,14 +118,13 @@ class TaskRegistry:
     def get_task_class(self, name: str) -> type[VecEnv]:
         """Return the class of a task; a UserError if the task is not known, or its class cannot be found."""
         task_class = self._get(name)[0]
-        if isinstance(task_class, str):
-            try:
-                task_class = pkgutil.resolve_name(found := task_class)
-            except (ValueError, AttributeError, ModuleNotFoundError) as error:
-                raise UserError(f"the class of task '{name}' cannot be found: {error}") from error
-            if not isinstance(task_class, type):
-                raise UserError(f"the class of task '{name}' must be a class, which '{found}' is not")
-        return task_class
+        try:
+            found = pkgutil.resolve_name(task_class) if isinstance(task_class, str) else task_class
+        except (ValueError, AttributeError, ModuleNotFoundError) as error:
+            raise UserError(f"the class of task '{name}' cannot be found: {error}") from error
+        if not isinstance(found, type):
+            raise UserError(f"the class of task '{name}' must be a class, not {found!r}")
+        return found
 
     def get_cfgs(
         self, name: str, args: Options | None = None, run_config: dict[str, Any] | None = None

@@ -280,9 +280,9 @@ def test_processes_end_with_torchrun(tmp_path):
             if "Learning iteration 3/" in line:
                 process.kill()
                 break
-        process.communicate(timeout=60)  # which waits for all of them
+        output = process.communicate(timeout=60)[0]  # which waits for all of them
     (run,) = (tmp_path / "a1_position").iterdir()
-    assert checkpoint_number(find_checkpoint(run, None)) >= 3
+    assert checkpoint_number(find_checkpoint(run, None)) >= 3, output
 
 
 def test_two_machines_without_shared_files(script, tmp_path):
