@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import io
 import os
 import tempfile
 import warnings
@@ -139,16 +138,16 @@ def write_networks(model: MLPModel, folder: Path, description: dict[str, Any]) -
         exported = onnx.load(folder / NETWORK_FILE)
         onnx.helper.set_model_props(exported, interface(description))
         onnx.save(exported, folder / NETWORK_FILE)
-        torch.jit.save(torch.jit.script(model.as_jit().cpu().eval()), content := io.BytesIO())
-        (folder / TORCHSCRIPT_FILE).write_bytes(content.getvalue())
+        scripted = torch.jit.script(model.as_jit().cpu().eval())
+        (folder / TORCHSCRIPT_FILE).write_bytes(scripted.save_to_buffer())
     description["network"]["sha256"] = hashlib.sha256((folder / NETWORK_FILE).read_bytes()).hexdigest()
     check(description)
     obs = torch.randn(NUM_SAMPLES, model.obs_dim, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         expected = model.as_jit().cpu().eval()(obs).numpy()
-        scripted = torch.jit.load(str(folder / TORCHSCRIPT_FILE))(obs).numpy()
+        loaded = torch.jit.load(str(folder / TORCHSCRIPT_FILE))(obs).numpy()
     (run,) = load_network(folder / NETWORK_FILE, description).run(["actions"], {"obs": obs.numpy()})
-    difference = max(_difference(run, expected), _difference(scripted, expected))
+    difference = max(_difference(run, expected), _difference(loaded, expected))
     if not difference <= TOLERANCE:
         raise UserError(f"the exported network differs from the checkpoint's by {difference:.3g}; nothing was written")
     return difference

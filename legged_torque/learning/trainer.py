@@ -85,9 +85,9 @@ class Trainer:
         """Train, and leave a checkpoint. Ctrl-C ends training after the current iteration, a second one at once.
 
         A call is one training: at its end ``algorithm.annealing_start`` has made steps small. All processes that train
-        together end after the same iteration, whichever is asked to stop, or loses torchrun. With
-        ``init_at_random_ep_len`` episodes start at random lengths, so that they do not all end at once; those of a
-        checkpoint go on as they are.
+        together end after the same iteration, whichever is asked to stop, or when torchrun is killed. With
+        ``init_at_random_ep_len`` episodes start at random lengths and do not all end at once; those of a checkpoint
+        go on as they are.
 
         Raises:
             TrainingError: Nothing can be learned any more; the checkpoint is written before.

@@ -31,8 +31,7 @@ _PACKAGES = ("legged_torque", "torch", "warp-lang", "mujoco", "mujoco-warp", "rs
 def new_run_dir(log_root: Path, run_name: str) -> Path:
     """Return the folder for a run that starts now; it is not created yet.
 
-    Its name is later than those of the runs that are there, even if the clock or the time zone was set back: the last
-    run is the last one by name.
+    Even after the clock was set back, its name is later than those of all other runs: the last by name is the newest.
     """
     now = datetime.now()
     for path in log_root.glob("*"):

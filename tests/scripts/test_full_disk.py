@@ -11,17 +11,12 @@ from legged_torque import RESOURCES_DIR
 from legged_torque.learning.evaluator import append_row
 
 LIMIT = 600  # bytes
+A1 = RESOURCES_DIR / "robots" / "a1" / "a1.xml"
 COMMANDS = {
     "train.py": ([*SMALL, "--log_root={out}"], []),
     "evaluate.py": (["--task=a1_position", "--load_run={run}", "--steps=2", "--json={out}/a.json"], ["a.json"]),
-    "export.py": (
-        ["--task=a1_position", "--device=cpu", "--load_run={run}", "--out={out}"],
-        ["policy.onnx", "policy.pt", "policy.yaml"],
-    ),
-    "import_robot.py": (
-        [f"{RESOURCES_DIR}/robots/a1/a1.xml", "--name=full", "--out={out}", "--force"],
-        ["full.py", "full.xml"],
-    ),
+    "export.py": (["--task=a1_position", "--load_run={run}", "--out={out}"], ["policy.onnx", "policy.yaml"]),
+    "import_robot.py": ([str(A1), "--name=full", "--out={out}", "--force"], ["full.py", "full.xml"]),
     "report.py": (["{run}", "--out={out}"], ["report.html", "report.md", "table.csv"]),
 }
 """Arguments of scripts, and the files that they would replace in the folder ``out``."""

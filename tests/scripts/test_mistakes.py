@@ -1,12 +1,11 @@
 """Mistakes on the command lines of scripts: one line, exit status 2, and nothing is written."""
 
-import os
 import re
-import subprocess
-import sys
 
 import pytest
 from support.scripts import ROOT, SMALL, assert_light, assert_told_in_one_line, contents, run_here
+
+from legged_torque.utils.cli import run_script
 
 MISTAKES = [
     ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
@@ -77,14 +76,14 @@ def test_mistakes_after_training(root, script, words, message):
     assert contents(root) == before
 
 
-def test_folder_that_is_gone(tmp_path):
+def test_folder_that_is_gone(tmp_path, monkeypatch, capsys):
     """The current folder may have been removed meanwhile."""
-    folder = tmp_path / "gone"
-    folder.mkdir()
-    command = ["sh", "-c", f'rmdir "{folder}"; exec "$@"', "sh", sys.executable, str(ROOT / "scripts" / "train.py")]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
-    assert_told_in_one_line((done.returncode, done.stdout, done.stderr), "the current folder has been removed")
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    with pytest.raises(SystemExit) as end:
+        run_script(lambda: None)
+    assert_told_in_one_line((end.value.code, *capsys.readouterr()), "the current folder has been removed")
 
 
 def test_number_of_processes_that_is_none(tmp_path, monkeypatch):

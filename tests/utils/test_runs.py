@@ -1,7 +1,6 @@
 """Run folders: found, read, and refused when they are broken."""
 
 import os
-import resource
 import time
 import zipfile
 from pathlib import Path
@@ -127,19 +126,6 @@ def test_no_run_is_without_its_settings(tmp_path, monkeypatch):
     (tmp_path / "run.999999999.part").mkdir()  # of a process that was killed
     monkeypatch.undo()
     assert list(tmp_path.iterdir()) != [runs.claim_run_dir(tmp_path / "run", {})] == list(tmp_path.iterdir())
-
-
-def test_a_full_disk(tmp_path):
-    """It is reported by its name, and the file stays what it was."""
-    (tmp_path / "file").write_bytes(b"old")
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limit[1]))
-    try:
-        line = error_of(write_whole, tmp_path / "file", b"1" * 100_000)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-    assert line == f"cannot write '{tmp_path / 'file'}': File too large"
-    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
 
 
 def test_a_device_is_not_replaced(tmp_path):

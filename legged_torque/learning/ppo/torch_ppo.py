@@ -96,8 +96,6 @@ class TorchPPO(PPO):
         """Build the algorithm with its networks and storage, from settings in rsl_rl's layout."""
         algorithm = {**cfg["algorithm"], "class_name": cls.make}
         alg = PPO.construct_algorithm(obs, env, {**cfg, "algorithm": algorithm}, device)
-        if alg.symmetry:
-            alg.symmetry.data_augmentation_func(env=env, obs=obs[:1], actions=None)  # refuses what has no mirror image
         alg.update_graph.enabled = cfg["capture"]
         alg.warm_up_iterations = cfg["pretraining"]["critic_warmup_iterations"]
         return alg
