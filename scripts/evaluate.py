@@ -23,7 +23,7 @@ from legged_torque.utils import cli
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.files import portable_path, without_machine, write_json
+from legged_torque.utils.files import path_inside, portable_path, without_machine, write_json
 from legged_torque.utils.limits import Count
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
@@ -53,7 +53,7 @@ def main() -> None:
             grounds = Grounds.of(args.terrain, args.level, args.command)
         run = task_registry.load_run(options)
         if args.all_checkpoints and not args.json:
-            args.json = run.folder / "curve.json"
+            args.json = path_inside(run.folder, "curve.json")
         if args.json:
             cli.check_output(args.json)
         if args.seed is None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from legged_torque.deploy.description import DESCRIPTION_FILE
 from legged_torque.envs import task_registry
 from legged_torque.utils import cli
+from legged_torque.utils.files import path_inside
 
 
 def main() -> None:
@@ -28,7 +29,7 @@ def main() -> None:
         from legged_torque.deploy.policy import Policy
     env, runner = task_registry.make_loaded(run, options, nominal_cfg(run.env_cfg))
     iterations = runner.current_learning_iteration
-    out = args.out or run.folder / f"exported_{iterations}"
+    out = args.out or path_inside(run.folder, f"exported_{iterations}")
     training = {"run": run.folder.name, "checkpoint": run.checkpoint.name}
     training |= {"iterations": iterations, "total_steps": int(env.total_steps)}
     difference, unsupported = export_policy(env, runner.alg.policy(), out, run.task, training)

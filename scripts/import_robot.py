@@ -5,6 +5,7 @@ by --task_file. In a clone, without --out, they go to resources/robots/NAME and 
 script finds them. Prints what was changed and why, and whether the robot stands.
 """
 
+import io
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +15,7 @@ from legged_torque import __file__ as package
 from legged_torque.envs import task_registry
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer, disable_renderer
-from legged_torque.utils.errors import UserError, collect_errors
+from legged_torque.utils.errors import UserError, collect_errors, printable
 from legged_torque.utils.files import write_whole
 from legged_torque.utils.limits import Limits
 
@@ -71,7 +72,7 @@ def main() -> None:
     write_whole(model_file, text)
     write_whole(code_file, code)
     for note in robot.source.notes:
-        print(f"- {''.join(c if c.isprintable() else '?' for c in note)}")
+        print(printable(f"- {note}"))
     print(f"wrote {model_file}\nwrote {code_file}")
     print(*problems or ["sim.engine 'fused' simulates it"])
     print(f"5 s under PD: {verdict}")
@@ -88,7 +89,8 @@ def draw(data: "mujoco.MjData", file: Path) -> str:
 
     with mujoco.Renderer(data.model, 480, 640) as renderer:
         renderer.update_scene(data, camera="track")
-        Image.fromarray(renderer.render()).save(file)
+        Image.fromarray(renderer.render()).save(picture := io.BytesIO(), format="png")
+    write_whole(file, picture.getvalue())
     return f"wrote {file}"
 
 

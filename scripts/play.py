@@ -23,6 +23,7 @@ from legged_torque.terrain.selection import named_kinds, rising_levels, select_t
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer, resolve_device
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import path_inside
 from legged_torque.utils.limits import Count, Limits
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.options import DEFAULT_TASK, Options
@@ -67,7 +68,7 @@ def main() -> None:
 
         env, runner = task_registry.make_loaded(run, options)
         title = f"{run.checkpoint}, after {int(runner.logger.tot_timesteps):,} steps of training"
-        video = run.checkpoint.parent / "videos" / f"{run.checkpoint.stem}.mp4"
+        video = path_inside(run.checkpoint.parent, f"videos/{run.checkpoint.stem}.mp4")
         if roll_out(args, env, runner.get_inference_policy(env.device), title, video):
             show_in_tensorboard(video, run.iterations)
     else:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from legged_torque.paper.report import check_extra
 from legged_torque.utils import cli
+from legged_torque.utils.files import path_inside
 from legged_torque.utils.limits import NotNegative
 from legged_torque.utils.words import counted
 
@@ -25,7 +26,7 @@ def main() -> None:
     parser.add_argument("--videos", type=Path, help=help_text)
     args = parser.parse_args()
     cli.check_args(args, from_step=NotNegative)
-    out = args.out or args.experiment / "report"
+    out = args.out or path_inside(args.experiment, "report")
     cli.check_output(out / "report.md")
     cli.check_output(out / "report.html")
     with cli.slow_imports():

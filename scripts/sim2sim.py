@@ -19,7 +19,7 @@ from legged_torque.deploy.description import DESCRIPTION_FILE
 from legged_torque.envs import LeggedRobotCfg
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, printable
 from legged_torque.utils.files import write_json
 from legged_torque.utils.limits import Count, NotNegative, Number, Share
 from legged_torque.utils.task_registry import LOGS
@@ -92,9 +92,9 @@ def main() -> None:
     sums = []
     with simulation_window(simulation) if args.viewer else contextlib.nullcontext(lambda: None) as show:
         training = policy.description["training"]
-        print(f"{policy.description['task']}, {training['checkpoint']} of {training['run']}, in MuJoCo with '{xml}':")
-        for note in notes:
-            print(f"  note: {note}")
+        what = f"{policy.description['task']}, {training['checkpoint']} of {training['run']}"
+        for line in (f"{what}, in MuJoCo with '{xml}':", *(f"  note: {note}" for note in notes)):
+            print(printable(line))
         with Counter("simulating, step", args.robots * args.steps) as counter:
             for number in range(args.robots):
                 record = recorder.add_step if recorder and number == 0 else lambda: None

@@ -23,6 +23,7 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.sim.graph import CudaGraph, prepare_device
+from legged_torque.utils.files import write_whole
 from legged_torque.utils.progress import CompileProgress
 from legged_torque.utils.task_registry import set_seed
 
@@ -213,7 +214,9 @@ def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[str]:
     schedule = torch.profiler.schedule(wait=0, warmup=1, active=TRACED, repeat=1)
     with torch.profiler.profile(activities=activities, schedule=schedule) as profiler:
         time_iterations(runner, 1 + TRACED, lambda number: profiler.step() if number else None)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    profiler.export_chrome_trace(str(file))
+    with tempfile.TemporaryDirectory() as folder:
+        part = Path(folder, file.name)
+        profiler.export_chrome_trace(str(part))
+        write_whole(file, part.read_bytes())
     order = "self_device_time_total" if cuda else "self_cpu_time_total"
     return profiler.key_averages().table(sort_by=order, row_limit=10).splitlines()

@@ -35,6 +35,7 @@ from legged_torque.motors.motor import Motor
 from legged_torque.sensors.height_scan import CLIP, OFFSET
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.errors import UserError, refuse
+from legged_torque.utils.files import write_errors
 from legged_torque.utils.runs import package_versions
 
 TORCHSCRIPT_FILE = "policy.pt"
@@ -88,7 +89,7 @@ def export_policy(
     folder.parent.mkdir(parents=True, exist_ok=True)
     if folder.exists() and not folder.is_dir():
         raise UserError(f"'{folder}' is not a folder")
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
+    with write_errors(folder), tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
         part = Path(temporary)
         difference = write_networks(model, part, description)
         (part / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
@@ -159,15 +160,16 @@ def write_networks(model: MLPModel, folder: Path, description: dict[str, Any]) -
         exported = onnx.load(folder / NETWORK_FILE)
         onnx.helper.set_model_props(exported, interface(description))
         onnx.save(exported, folder / NETWORK_FILE)
-        torch.jit.script(model.as_jit().cpu().eval()).save(str(folder / TORCHSCRIPT_FILE))
+        scripted = torch.jit.script(model.as_jit().cpu().eval())
+        (folder / TORCHSCRIPT_FILE).write_bytes(scripted.save_to_buffer())
     description["network"]["sha256"] = hashlib.sha256((folder / NETWORK_FILE).read_bytes()).hexdigest()
     check(description)
     obs = torch.randn(NUM_SAMPLES, model.obs_dim, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         expected = model.as_jit().cpu().eval()(obs).numpy()
-        scripted = torch.jit.load(str(folder / TORCHSCRIPT_FILE))(obs).numpy()
+        loaded = torch.jit.load(str(folder / TORCHSCRIPT_FILE))(obs).numpy()
     (run,) = load_network(folder / NETWORK_FILE, description).run(["actions"], {"obs": obs.numpy()})
-    difference = max(_difference(run, expected), _difference(scripted, expected))
+    difference = max(_difference(run, expected), _difference(loaded, expected))
     if not difference <= TOLERANCE:
         raise UserError(f"the exported network differs from the checkpoint's by {difference:.3g}; nothing was written")
     return difference

@@ -8,16 +8,18 @@ import subprocess
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO
 
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, command_of, step_words
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.limits import Limits, check_value
 from legged_torque.utils.processes import ending_with_parent
 
 CPU_JOBS, GPU_JOBS, MPS_JOBS = 1, 2, 4
 """Steps at a time on the CPU, a GPU, and a GPU with ``--mps``, by default: more are hardly faster."""
-MAX_JOBS = 1000
+Jobs = Annotated[int, Limits(1, 1000)] | None
+"""Steps at a time on each device; None is the default."""
 MPS = "nvidia-cuda-mps-control"
 
 
@@ -51,7 +53,7 @@ class LocalLauncher:
         import torch
 
         first = resolve_device(device)  # does not create a CUDA context
-        check_jobs(jobs)
+        check_value("--jobs", jobs, Jobs)
         self.device = "cpu" if first == "cpu" else "cuda:0"
         self._devices: dict[str, dict[str, str]] = {"cpu": {}}  # environment variables by name of the device
         if first != "cpu":
@@ -78,14 +80,6 @@ class LocalLauncher:
         process = LocalProcess(place, command, log, self.variables | self._devices[place], pass_fds=[lock.fileno()])
         self._running.append(process)
         return process
-
-
-def check_jobs(jobs: int | None) -> None:
-    """Refuse, by UserError, a number of steps at a time that makes no sense."""
-    if jobs is not None and jobs < 1:
-        raise UserError(f"--jobs must be at least 1, not {jobs}")
-    if jobs is not None and jobs > MAX_JOBS:
-        raise UserError(f"--jobs must be at most {MAX_JOBS}, not {jobs}")
 
 
 @contextlib.contextmanager

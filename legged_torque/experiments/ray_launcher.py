@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from legged_torque.experiments.job import LOST
-from legged_torque.experiments.local_launcher import GPU_JOBS, check_jobs
+from legged_torque.experiments.local_launcher import GPU_JOBS, Jobs
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, last_checkpoint, step_words
 from legged_torque.experiments.ray_node import Files, NodeStep, Report, is_checkpoint, versions_here, write_files
 from legged_torque.learning.worlds import remove_other_worlds, worlds_file
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.limits import check_value
 from legged_torque.utils.runs import CONFIG_FILE, PRETRAINED
 
 SEND_EVERY = 60.0  # seconds between checkpoints that are brought home while a training goes on
@@ -30,7 +31,7 @@ class RayLauncher:
 
     def __init__(self, address: str, device: str, jobs: int | None) -> None:
         """Join the cluster at an address; a UserError if Ray is not installed, or there is no cluster."""
-        check_jobs(jobs)
+        check_value("--jobs", jobs, Jobs)
         if device not in ("auto", "cuda", "cpu"):
             raise UserError(f"on a cluster, --device must be auto, cuda or cpu, not '{device}': Ray chooses the GPUs")
         self._ray = join_cluster(address)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import io
+import pickle
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +30,16 @@ def write(file: Path, content: dict[str, Any]) -> str:
 
 def load(file: Path, what: str, device: str) -> Any:
     """Return what :func:`write` has written, on a device; a UserError names ``what`` if the file is broken."""
+    if not is_whole_archive(file):
+        raise UserError(f"'{file}' is not a readable {what}: it is damaged, or not written by this library")
     try:
-        content = torch.load(file, weights_only=True, map_location=device)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch warns of an archive of TorchScript
+            return torch.load(file, weights_only=True, map_location=device)
+    except pickle.UnpicklingError:
+        raise UserError(f"'{file}' is not a readable {what}: it holds more than tensors and plain values") from None
     except Exception as error:  # torch raises about anything for other files
         raise UserError(f"'{file}' is not a readable {what}: {last_line(error)}") from None
-    if not is_whole_archive(file):
-        raise UserError(f"'{file}' is not a readable {what}: it is damaged")
-    return content
 
 
 def read(file: Path, what: str, device: str) -> Any:
@@ -42,8 +47,8 @@ def read(file: Path, what: str, device: str) -> Any:
     content = load(file, what, device)
     try:
         bad = not_finite(content)
-    except RecursionError:
-        raise UserError(f"'{file}' is not a readable {what}: it is nested too deeply") from None
+    except (RuntimeError, MemoryError) as error:  # nested too deeply, or a tensor of few numbers, repeated many times
+        raise UserError(f"'{file}' is not a readable {what}: {last_line(error)}") from None
     if bad:
         raise UserError(f"'{file}' is not a usable {what}: {bad} holds numbers that are not finite")
     return content

@@ -24,7 +24,8 @@ class OnPolicyRunner(Trainer, runners.OnPolicyRunner):
         """Create learner and trainer, with settings in rsl_rl's layout and on the task's device, "cpu" or "cuda:N".
 
         The folder of the run, ``log_dir``, is created when training starts; None keeps nothing. A UserError if a
-        network reads observations that the task does not have, or processes that train together do not find each other.
+        network reads observations that the task does not have, mirror images that training needs are not known, or
+        processes that train together do not find each other.
         """
         torch.set_float32_matmul_precision("high")  # TF32 on a GPU
         groups_of_task = list(map(str, env.get_observations().keys()))
@@ -42,6 +43,9 @@ class OnPolicyRunner(Trainer, runners.OnPolicyRunner):
             raise UserError(f"obs_groups: {error}") from error  # such as images for a network of vectors
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         Trainer.__init__(self, env, self.alg, train_cfg, self.logger)
+        symmetry = getattr(self.alg, "symmetry", None)
+        if log_dir and symmetry:  # refuse what has no mirror image before a folder is made
+            symmetry.data_augmentation_func(env=env, obs=env.get_observations()[:1], actions=None)
 
     def get_inference_policy(self, device: str | None = None) -> nn.Module:
         """Return the policy for inference, on a device if one is given."""

@@ -88,8 +88,9 @@ class Trainer:
         """Train, and leave a checkpoint. Ctrl-C ends training after the current iteration, a second one at once.
 
         A call is one training: at its end ``algorithm.annealing_start`` has made steps small. All processes that train
-        together end after the same iteration, whichever of them is asked to stop. With ``init_at_random_ep_len``
-        episodes start at random lengths, so that they do not all end at once; those of a checkpoint go on as they are.
+        together end after the same iteration, whichever is asked to stop, or when torchrun is killed. With
+        ``init_at_random_ep_len`` episodes start at random lengths and do not all end at once; those of a checkpoint
+        go on as they are.
 
         Raises:
             TrainingError: Nothing can be learned any more; the checkpoint is written before.
@@ -106,7 +107,8 @@ class Trainer:
         self.save_checkpoint()  # the viewer shows it while the first iterations run
         with self._log.display, StopRequest(self._log.display.notify) as stop:
             while self.current_learning_iteration < last and not guard.problem:
-                if distributed.any_process(stop.requested or self._log.broken_pipe is not None, self.device):
+                asked = stop.requested or self._log.broken_pipe is not None or distributed.has_lost_parent()
+                if distributed.any_process(asked, self.device):
                     break
                 begin = time.perf_counter()
                 self.collect_rollout()

@@ -234,6 +234,7 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
     if not draws:
         disable_renderer()
     try:
+        " ".join([os.getcwd(), *sys.argv]).encode()  # files name them
         main()
         return
     except BrokenPipeError:
@@ -246,6 +247,10 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
     except Exception as error:
         if isinstance(error, UserError):
             message = " ".join(str(error).splitlines())
+        elif isinstance(error, UnicodeEncodeError):
+            message = f"a name is not UTF-8, or the locale is another one (LC_ALL=C.UTF-8 may help): {error.object!r}"
+        elif isinstance(error, FileNotFoundError) and not error.filename:
+            message = "the current folder has been removed"
         elif isinstance(error, OSError):
             message = f"{error.strerror or error}" + (f": {str(error.filename)!r}" if error.filename else "")
         elif isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("legged_torque"):
@@ -256,6 +261,9 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
         else:
             raise
         status, line = 2, f"error: {message}"
+    finally:
+        if "triton" in sys.modules:
+            gc.unfreeze()  # what Python does not collect when it ends, triton reports as leaks
     print(line, file=sys.stderr)
     sys.exit(status)
 

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+_PARENT = os.getppid()  # torchrun, if it has started this process
+
+
 def world_size() -> int:
     """Return how many processes train together: 1 unless torchrun has started more."""
     return _variable("WORLD_SIZE", 1)
@@ -32,6 +35,11 @@ def local_world_size() -> int:
 def local_rank() -> int:
     """Return the number of this process among those on this machine, which is that of its GPU."""
     return _variable("LOCAL_RANK", 0) if world_size() > 1 else 0
+
+
+def has_lost_parent() -> bool:
+    """Return whether torchrun has been killed: the processes that it has started live on."""
+    return world_size() > 1 and os.getppid() != _PARENT
 
 
 def _variable(name: str, lowest: int) -> int:

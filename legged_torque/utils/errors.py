@@ -12,6 +12,11 @@ MANY = 40  # names, of which an error lists only the nearest
 NEAREST = 5  # how many those are
 
 
+def printable(text: object) -> str:
+    """Return a text with codes in place of characters such as line ends, with which names could change a terminal."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
+
+
 class UserError(Exception):
     """A mistake of the user, in one line: the given value, the allowed ones and the nearest match.
 
@@ -19,8 +24,8 @@ class UserError(Exception):
     """
 
     def __init__(self, message: object) -> None:
-        """Replace characters that cannot be printed by their codes: names in a stranger's file may hold line ends."""
-        super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(message)))
+        """Take the message; what it quotes of a stranger's file is made :func:`printable`."""
+        super().__init__(printable(message))
 
 
 class TrainingError(Exception):

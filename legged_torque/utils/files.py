@@ -103,10 +103,20 @@ def is_whole_archive(file: Path) -> bool:
         return False
     try:
         with zipfile.ZipFile(file) as archive:
-            has_folders = any(part.external_attr for part in archive.infolist())  # torch writes none, and reads no data
-            return archive.testzip() is None and not has_folders
+            parts = archive.infolist()
+            is_compressed = sum(part.file_size for part in parts) > file.stat().st_size  # which torch's are not
+            has_folders = any(part.external_attr for part in parts)  # torch writes none, and reads no data
+            return not is_compressed and not has_folders and archive.testzip() is None
     except Exception:  # zipfile raises about anything for a damaged file
         return False
+
+
+def path_inside(folder: Path, name: str) -> Path:
+    """Return a path in a folder, which may be a stranger's; a UserError if it leads out of it by a link."""
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise UserError(f"'{path}' leads out of '{folder}' by a link, and is not written to")
+    return path
 
 
 def portable_path(path: str | Path) -> str:

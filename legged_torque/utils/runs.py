@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import importlib.metadata
 import math
 import platform
-from datetime import datetime
+import shutil
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +23,21 @@ EVALUATIONS_FILE = "evaluations.csv"  # a row per evaluation during training
 PRETRAINED = "pretrained"  # folder of pre-trained policies, in that of all experiments
 MOVED = {"legged_torque.control.gravity_pretraining:pretrain": "legged_torque.paper.gravity.pretraining:pretrain"}
 """Present names of functions that the settings of older runs name by their former modules."""
+NAME, NAME_LENGTH = "%Y-%m-%d_%H-%M-%S", 19  # of a run, by its start, in local time; in characters
 _CHECKPOINT = "model_"
 _PACKAGES = ("legged_torque", "torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib", "numpy")
 
 
 def new_run_dir(log_root: Path, run_name: str) -> Path:
-    """Return the folder for a run that starts now; it is not created yet."""
-    name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    return log_root / tagged(name, run_name)
+    """Return the folder for a run that starts now; it is not created yet.
+
+    Even after the clock was set back, its name is later than those of all other runs: the last by name is the newest.
+    """
+    now = datetime.now()
+    for path in log_root.glob("*"):
+        with contextlib.suppress(ValueError, OverflowError):  # of another name, or of the year 9999
+            now = max(now, datetime.strptime(path.name[:NAME_LENGTH], NAME) + timedelta(seconds=1))
+    return log_root / tagged(now.strftime(NAME), run_name)
 
 
 def claim_run_dir(run_dir: Path, config: dict[str, Any]) -> Path:
@@ -39,15 +48,18 @@ def claim_run_dir(run_dir: Path, config: dict[str, Any]) -> Path:
     with write_errors(run_dir):
         remove_stale_parts(run_dir.parent)
         part, candidate, number = part_of(run_dir), run_dir, 1
-        save_config(part, config)
-        while True:
-            try:
-                return part.rename(candidate)
-            except OSError as error:
-                if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
-                    raise
-            number += 1
-            candidate = run_dir.with_name(f"{run_dir.name}_{number}")
+        try:
+            save_config(part, config)
+            while True:
+                try:
+                    return part.rename(candidate)
+                except OSError as error:
+                    if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+                        raise
+                number += 1
+                candidate = run_dir.with_name(f"{run_dir.name}_{number}")
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
 
 
 def tagged(word: str, name: str) -> str:

@@ -24,7 +24,7 @@ from legged_torque import resource_path
 from legged_torque.utils import distributed
 from legged_torque.utils.config import BaseConfig
 from legged_torque.utils.devices import resolve_device
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, printable, unknown_name
 from legged_torque.utils.files import remove_stale_parts
 from legged_torque.utils.options import Options, apply_options
 from legged_torque.utils.runs import (
@@ -77,8 +77,7 @@ class TaskRegistry:
     def register(self, name: str, task_class: type[VecEnv] | str, env_cfg: BaseConfig, train_cfg: BaseConfig) -> None:
         """Make a task known that is created as ``task_class(env_cfg, device)``.
 
-        A UserError if another task has the name, or the settings are not instances of configurations, or all mistakes
-        in the names of the settings.
+        A UserError if another task has the name, an argument is of another kind, or names of settings are mistaken.
 
         Args:
             name: Name of the task.
@@ -86,10 +85,12 @@ class TaskRegistry:
             env_cfg: Settings of the task.
             train_cfg: Settings of its training, of a :class:`~legged_torque.envs.base.training_config.TrainingCfg`.
         """
+        if not isinstance(name, str):
+            raise UserError(f"the name of a task must be a text, not {name!r}")
         if name in self._tasks:
             raise UserError(f"'{name}' is a task already; choose another name")
-        for cfg in (env_cfg, train_cfg):
-            if not isinstance(cfg, BaseConfig):
+        for cfg, member in ((env_cfg, "env"), (train_cfg, "runner")):
+            if not isinstance(cfg, BaseConfig) or not hasattr(cfg, member):
                 raise UserError(f"the settings of task '{name}' must be instances of configurations, not {cfg!r}")
         type(env_cfg).refuse_mistakes(type(train_cfg))
         self._tasks[name] = (task_class, env_cfg, train_cfg)
@@ -122,9 +123,15 @@ class TaskRegistry:
         return list(self._tasks)
 
     def get_task_class(self, name: str) -> type[VecEnv]:
-        """Return the class of a task; an unknown name is a UserError."""
+        """Return the class of a task; a UserError if the task is not known, or its class cannot be found."""
         task_class = self._get(name)[0]
-        return pkgutil.resolve_name(task_class) if isinstance(task_class, str) else task_class
+        try:
+            found = pkgutil.resolve_name(task_class) if isinstance(task_class, str) else task_class
+        except (ValueError, AttributeError, ModuleNotFoundError) as error:
+            raise UserError(f"the class of task '{name}' cannot be found: {error}") from error
+        if not isinstance(found, type):
+            raise UserError(f"the class of task '{name}' must be a class, not {found!r}")
+        return found
 
     def get_cfgs(
         self, name: str, args: Options | None = None, run_config: dict[str, Any] | None = None
@@ -266,7 +273,7 @@ class TaskRegistry:
             yield
             if len(self._tasks) == len(before):
                 raise UserError("it registers no task: it must call task_registry.register")
-        except (Exception, SystemExit) as error:  # some read the command line themselves, and end the process
+        except (Exception, SystemExit, GeneratorExit) as error:  # some read the command line, and end the process
             self._tasks = before
             if isinstance(error, UserError):
                 raise UserError(f"{source}: {error}") from error
@@ -281,7 +288,7 @@ class TaskRegistry:
 def print_notes(notes: Iterable[str]) -> None:
     """Print notes for the user, once for all processes, and nothing for those that are empty."""
     for note in filter(None, notes) if distributed.rank() == 0 else ():
-        print(f"Note: {note}", flush=True)
+        print(f"Note: {printable(note)}", flush=True)
 
 
 def experiment_dir(train_cfg: Any, log_root: str | None = None) -> Path:

@@ -50,8 +50,8 @@ def read_curves(file: Path) -> pd.DataFrame:
             table[name] = kind(training[name]) if name in training else texts.get(name, unnamed).map(kind)
     except (LookupError, ValueError, TypeError, AttributeError, OverflowError) as error:
         problems.append(f"cannot read '{file}' as learning curves: {error!r}")
-    if problems:
-        raise UserError(problems[0])
+    if problems or table.empty:
+        raise UserError(problems[0] if problems else f"'{file}' holds no evaluations")
     return table
 
 

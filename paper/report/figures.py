@@ -19,6 +19,7 @@ from legged_torque.paper.report.experiment import Experiment
 from legged_torque.paper.report.figures_curves import SEED_MARK, draw_curves
 from legged_torque.paper.report.style import in_words, name_of, style
 from legged_torque.paper.values import ENVIRONMENTS, task_on_plane
+from legged_torque.utils.files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,7 +93,9 @@ def draw_all(experiment: Experiment, figures: dict[str, Draw], out: Path) -> lis
             figure = draw(f"{title} ({conditions})")
             if figure is not None:
                 figure.savefig(stream := io.BytesIO(), format="png")
-                Image.open(stream).convert("RGB").quantize(COLOURS).save(out / file_name(title), optimize=True)
+                image = Image.open(stream).convert("RGB").quantize(COLOURS)
+                image.save(stream := io.BytesIO(), format="png", optimize=True)
+                write_whole(out / file_name(title), stream.getvalue())
                 pyplot.close(figure)
                 drawn.append(title)
     return drawn

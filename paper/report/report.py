@@ -28,7 +28,7 @@ from legged_torque.paper.report.style import in_words, name_of
 from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
 from legged_torque.paper.values import ENVIRONMENTS, PAPER_TASKS
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.files import portable_path, without_machine
+from legged_torque.utils.files import portable_path, without_machine, write_whole
 from legged_torque.utils.words import counted
 
 MEDIA_TYPES = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
@@ -50,7 +50,6 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
         How many figures there are, and how many lines on what is missing.
     """
     table = summarize(experiment, from_step)
-    out.mkdir(parents=True, exist_ok=True)
     planned, rough = planned_figures(experiment, table), rough_figures(experiment)
     drawn = draw_all(experiment, planned | rough, out)
     configs, best_torque = first_configs(experiment), tables.best_torque(table)
@@ -82,8 +81,8 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
     sources = {name_of(task): data_uri(file) for task, file in videos.items()}
     texts = {task: yaml.safe_dump(config, sort_keys=False) for task, config in configs.items()}
     page = {"title": values["title"], "body": body, "headings": headings, "videos": sources, "configs": texts}
-    (out / "report.md").write_text(markdown, encoding="utf-8")
-    (out / "report.html").write_text(render("page.html.jinja", page, {}), encoding="utf-8")
+    write_whole(out / "report.md", markdown)
+    write_whole(out / "report.html", render("page.html.jinja", page, {}))
     write_tables(experiment, table, out)
     return len(drawn), len(values["missing"])
 
@@ -188,11 +187,11 @@ def write_tables(experiment: Experiment, table: pd.DataFrame, out: Path) -> None
     """
     summary = table.rename(columns={"paper": "paper_mean"}).reset_index(names=["environment", "task", "metric"])
     names = ["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean"]
-    summary[names].to_csv(out / "table.csv", index=False, lineterminator="\n")
+    write_whole(out / "table.csv", summary[names].to_csv(index=False, lineterminator="\n"))
     text = experiment.evaluations().to_csv(index=False, float_format="%.4g", lineterminator="\n")
-    (out / "evaluations.csv.gz").write_bytes(gzip.compress(text.encode(), mtime=0))  # the same bytes every time
+    write_whole(out / "evaluations.csv.gz", gzip.compress(text.encode(), mtime=0))  # the same bytes every time
     if experiment.has_rough_ground():
-        experiment.crossings().to_csv(out / "grounds.csv", index=False, lineterminator="\n")
+        write_whole(out / "grounds.csv", experiment.crossings().to_csv(index=False, lineterminator="\n"))
 
 
 def steps_text(steps: float) -> str:

@@ -72,6 +72,9 @@ def test_table(measured):
 
 def test_trace(runner, tmp_path):
     """The trace is JSON that has the traced iterations with their rollouts and updates; a table has the operators."""
+    (tmp_path / "null").symlink_to("/dev/null")
+    benchmark.trace_iterations(runner, tmp_path / "null")
+    assert (tmp_path / "null").is_char_device()  # a device is not replaced
     lines = benchmark.trace_iterations(runner, tmp_path / "trace.json.gz")
     trace = json.loads(gzip.decompress((tmp_path / "trace.json.gz").read_bytes()))
     names = [event.get("name", "") for event in trace["traceEvents"]]

@@ -141,7 +141,7 @@ def test_mistakes_in_the_file(change, message, tmp_path):
         (["nothing.yaml"], "there is no file 'nothing.yaml'"),
         (["experiments/papr.yaml"], "unknown file 'experiments/papr.yaml'; did you mean 'experiments/paper.yaml'?"),
         (["{file}", "--job=2"], "unknown option '--job'; did you mean '--jobs'?"),
-        (["{file}", "--device=cpu", "--jobs=0"], "--jobs must be at least 1, not 0"),
+        (["{file}", "--device=cpu", "--jobs=0"], "--jobs must be from 1 to 1000, not 0"),
         (["{file}", "--device=cpu", "--mps"], "--mps is for GPUs, and this experiment would run on the CPU"),
         (["{file}", "--device=cuda:99"], "there is no device 'cuda:99'"),
         (["{broken}"], "is not valid YAML"),

@@ -272,6 +272,19 @@ def test_train_script_in_two_processes(script):
     assert f"{2 * WORLDS} worlds" in output and output.count(f"The run is in {run}") == 1
 
 
+def test_processes_end_with_torchrun(tmp_path):
+    """If it is killed, they save the iteration that both have finished, and end."""
+    words = [*SCRIPT, f"--log_root={tmp_path}", "--max_iterations=100000"]
+    with torchrun(ROOT / "scripts" / "train.py", *words) as process:
+        for line in process.stdout:
+            if "Learning iteration 3/" in line:
+                process.kill()
+                break
+        output = process.communicate(timeout=60)[0]  # which waits for all of them
+    (run,) = (tmp_path / "a1_position").iterdir()
+    assert checkpoint_number(find_checkpoint(run, None)) >= 3, output
+
+
 def test_two_machines_without_shared_files(script, tmp_path):
     """A process on each goes on from the run that the first has; they learn what two on one machine do, bit by bit."""
     run, kept, _ = script

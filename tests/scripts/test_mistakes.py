@@ -5,6 +5,8 @@ import re
 import pytest
 from support.scripts import ROOT, SMALL, assert_light, assert_told_in_one_line, contents, run_here
 
+from legged_torque.utils.cli import run_script
+
 MISTAKES = [
     ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
     ("--set=algorithm.num_mini_batches=9", "algorithm.num_mini_batches is 9, more than the samples of a rollout"),
@@ -23,6 +25,8 @@ MISTAKES = [
     ("--resume --experiment_name=half_checkpoint", "model_2.pt' is not a readable checkpoint"),
     ("--resume --experiment_name=a1_position --task=a1_torque", "is of task 'a1_position', not 'a1_torque'"),
     ("--set=asset.mirrored_legs=[[FR]]", "asset.mirrored_legs must be pairs [right, left], not ['FR']"),
+    ("--set=asset.mirrored_legs=[[FR,FR]] --set=algorithm.symmetry_cfg.use_data_augmentation=true", "no counterpart"),
+    ("--experiment_name=\udcff", "is not UTF-8"),
     ("--log_root=/dev/null", "cannot write '/dev/null/a1_position/"),
     (f"--run_name={'x' * 300}", "File name too long"),
     ("--task=a1_torque_gravity --set=pretraining.file=/proc/x/y.pt", "cannot write '/proc/x/y.pt'"),
@@ -70,6 +74,16 @@ def test_mistakes_after_training(root, script, words, message):
     result = run_here(script, "--task=a1_position", "--device=cpu", *words.split(), root=root)
     assert_told_in_one_line(result, message)
     assert contents(root) == before
+
+
+def test_folder_that_is_gone(tmp_path, monkeypatch, capsys):
+    """The current folder may have been removed meanwhile."""
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    with pytest.raises(SystemExit) as end:
+        run_script(lambda: None)
+    assert_told_in_one_line((end.value.code, *capsys.readouterr()), "the current folder has been removed")
 
 
 def test_number_of_processes_that_is_none(tmp_path, monkeypatch):

@@ -81,11 +81,13 @@ def test_figures(tmp_path, text):
     assert not (tmp_path / "figure.png").exists()
 
 
-def test_curves_that_unpack_to_too_much(tmp_path):
-    """A compressed file does not take all of the memory."""
-    (tmp_path / "large.csv.gz").write_bytes(gzip.compress(b"\n" * 60_000_000, 1))
-    result = run_here("plot.py", "curves", "large.csv.gz", "--out=figure.png", root=tmp_path)
-    assert_told_in_one_line(result, "cannot read 'large.csv.gz'")
+@pytest.mark.parametrize("content", [b"\n" * 60_000_000, b"", b"steps,task,seed\n"], ids=["many", "none", "header"])
+def test_curves_that_are_none(tmp_path, content):
+    """A compressed file does not take all of the memory, and one without evaluations is no empty figure."""
+    (tmp_path / "theirs.csv.gz").write_bytes(gzip.compress(content, 1))
+    result = run_here("plot.py", "curves", "theirs.csv.gz", "--out=figure.png", root=tmp_path)
+    assert_told_in_one_line(result, "" if not content else "'theirs.csv.gz'")
+    assert not (tmp_path / "figure.png").exists()
 
 
 # ------------------------------------------------------------------------------------------------- exports
@@ -127,6 +129,16 @@ def test_exports(exported, harm, tmp_path, name):
     result = run_here("sim2sim.py", str(folder), "--steps=2", "--robots=1", root=tmp_path)
     assert_told_in_one_line(result, told)
     assert result[1] == ""
+
+
+def test_codes_of_terminals(exported, tmp_path):
+    """What a description is called does not clear the screen."""
+    folder = shutil.copytree(exported, tmp_path / "out")
+    description = yaml.safe_load((folder / "policy.yaml").read_text())
+    description["task"] = description["training"]["run"] = "\x1b[2J\x9b2J\n"
+    (folder / "policy.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
+    status, output, _ = run_here("sim2sim.py", str(folder), "--steps=2", "--robots=1", root=tmp_path)
+    assert status == 0 and output.replace("\n", "").isprintable() and output.startswith(r"\x1b[2J\x9b2J\n, model_1.pt")
 
 
 def test_network_that_runs_code(exported, harm, tmp_path):

@@ -75,7 +75,40 @@ def test_checkpoint_without_an_end(run):
     (run / "model_1.pt").unlink()
     os.mkfifo(run / "model_1.pt")
     (run / "model_2.pt").symlink_to("/dev/zero")
-    assert_told_in_one_line(load_run("train.py", run), "is not a readable checkpoint")
+    for words in ([], ["--checkpoint=1"]):
+        assert_told_in_one_line(load_run("train.py", run, *words), "is not a readable checkpoint")
+
+
+def test_checkpoint_that_is_larger_inside(run):
+    """Neither a compressed archive, nor a number that is repeated for ever, takes the time or memory of its size.
+
+    Of an archive of TorchScript, torch itself would warn.
+    """
+    file = run / "model_1.pt"
+    with zipfile.ZipFile(file) as whole, zipfile.ZipFile(run / "other.pt", "w", zipfile.ZIP_DEFLATED) as other:
+        for name in whole.namelist():
+            other.writestr(name, whole.read(name))
+        other.writestr("archive/zeros", bytes(10_000_000))
+    state = torch.load(file, weights_only=True)
+    (run / "other.pt").replace(file)
+    assert_told_in_one_line(load_run("evaluate.py", run), "is not a readable checkpoint")
+    state["repeated"] = torch.zeros(1).as_strided((2**44,), (0,))
+    script = torch.jit.script(torch.nn.Linear(1, 1))
+    for save in (lambda: torch.save(state, file), lambda: script.save(str(file))):
+        save()
+        assert_told_in_one_line(load_run("evaluate.py", run), "model_1.pt' is not a readable checkpoint")
+
+
+@pytest.mark.parametrize("command", ["export.py", "play.py", "report.py", "evaluate.py"])
+def test_links_out_of_a_run(run, tmp_path, command):
+    """What a script writes into a run's folder by default stays there."""
+    (tmp_path / "mine").mkdir()
+    for name in ("exported_1", "videos", "report", "curve.json"):
+        (run / name).symlink_to(tmp_path / "mine")
+    words = ["--all_checkpoints"] if command == "evaluate.py" else []
+    result = run_here(command, str(run), root=tmp_path) if command == "report.py" else load_run(command, run, *words)
+    assert_told_in_one_line(result, "by a link")
+    assert not list((tmp_path / "mine").iterdir())
 
 
 @pytest.mark.parametrize("script", ["train.py", "evaluate.py"])

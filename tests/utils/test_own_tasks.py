@@ -94,6 +94,8 @@ def test_answers_come_before_torch(tmp_path):
         ("x = 1\n", "'theirs.py': it registers no task"),
         ("def f(:\n", "'theirs.py' cannot be imported: line 1 of 'theirs.py': SyntaxError"),
         ("import sys\nsys.exit()\n", "'theirs.py' cannot be imported: line 2 of 'theirs.py': SystemExit"),
+        ("raise GeneratorExit\n", "'theirs.py' cannot be imported: line 1 of 'theirs.py': GeneratorExit"),
+        (REGISTER.format("x").replace("'x'", "5"), "'theirs.py': the name of a task must be a text"),
         (None, "--task_file takes a Python file with the name of a module, not 'theirs.py'"),
     ],
 )

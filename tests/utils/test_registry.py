@@ -43,6 +43,14 @@ def test_a_name_is_given_once():
     assert registry.get_task_class("mine") is LeggedRobot
 
 
+@pytest.mark.parametrize("name", ["os:getcwd", "os:Nothing", "no_module:Robot", "no:module:Robot"])
+def test_a_class_that_is_none(name):
+    """The name of a class must lead to one."""
+    registry = TaskRegistry()
+    registry.register("mine", name, A1Cfg(), A1CfgPPO())
+    assert "the class of task 'mine'" in error_of(registry.get_task_class, "mine")
+
+
 def test_settings_are_independent_copies():
     """Changing what the registry hands out changes neither the registry nor the classes."""
     env_cfg, train_cfg = first = task_registry.get_cfgs("a1_torque")
