@@ -19,26 +19,29 @@ def reach_along(turn: wp.mat33, half: wp.vec3, k: int) -> float:
 def lowest_crossing(surface: Surface, start: wp.vec3, along: wp.vec3) -> float:
     """Return how far along a line it is deepest in the ground, or least high above it, as a share of its length.
 
-    Where the ground rises above both ends, that is on an edge. Edges along x and y are looked at, not diagonals; the
-    result is 0 if there are none.
+    Where the ground rises above both ends, that is on an edge between samples. The result is 0 if there are none.
     """
     place = surface.density * place_on_map(surface, start, 0.0)
     way = surface.density * along
     best, least = float(0.0), float(1.0e10)
-    for k in range(2):
-        line = int(wp.floor(wp.min(place[k], place[k] + way[k]))) + 1
-        last = int(wp.floor(wp.max(place[k], place[k] + way[k])))
-        while line <= last:
-            share = (float(line) - place[k]) / way[k]
-            beside = place[1 - k] + share * way[1 - k]
-            other = int(wp.floor(beside))
-            i, j = wp.where(k == 0, line, other), wp.where(k == 0, other, line)
-            low, high = sample(surface, i, j), sample(surface, i + k, j + 1 - k)
-            above = start[2] + share * along[2] - low - (beside - float(other)) * (high - low)
+    k = int(0)  # edges of one x, of one y, diagonals; not unrolled, as in nearest_point
+    while k < 3:
+        at = wp.where(k == 0, place[0], wp.where(k == 1, place[1], place[0] - place[1]))
+        rate = wp.where(k == 0, way[0], wp.where(k == 1, way[1], way[0] - way[1]))
+        line = int(wp.floor(wp.min(at, at + rate))) + 1
+        while line <= int(wp.floor(wp.max(at, at + rate))):
+            share = (float(line) - at) / rate
+            beside = wp.where(k == 0, place[1] + share * way[1], place[0] + share * way[0])
+            cell = int(wp.floor(beside))
+            i = wp.where(k == 0, line, cell)
+            j = wp.where(k == 0, cell, wp.where(k == 1, line, cell - line))
+            low, high = sample(surface, i, j), sample(surface, i + wp.min(k, 1), j + wp.where(k == 1, 0, 1))
+            above = start[2] + share * along[2] - low - (beside - float(cell)) * (high - low)
             if above < least:
                 least = above
                 best = share
             line += 1
+        k += 1
     return best
 
 
