@@ -36,7 +36,6 @@ turn into walls: there, points all around the end circles turn with the cylinder
 
 Place = tuple[float, float, float]
 """A position, or half sizes, in half sizes of a geom."""
-_CAPSULE_PARTS = [((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))]
 MIN_PARTS = 4
 """Parts of a box that is not small, at least: enough to lie on."""
 
@@ -107,7 +106,7 @@ def _parts(kind: mujoco.mjtGeom, size: np.ndarray) -> list[tuple[Place, Place]]:
     A box is halved across its longest side until its parts are small and enough.
     """
     if kind != mujoco.mjtGeom.mjGEOM_BOX:
-        return _CAPSULE_PARTS if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else []
+        return [((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else []
     counts = np.ones(3, int)
     while (radius := np.linalg.norm(size / counts)) > FAR or (radius > NEAR and counts.prod() < MIN_PARTS):
         counts[np.argmax(size / counts)] *= 2
