@@ -86,8 +86,9 @@ def test_trunks_in_the_ground_are_felt(kind, difficulty):
     sim.mj_model.opt.timestep = 0.005
     home = torch.tensor(sim.mj_model.key_qpos[0], dtype=torch.float32)
     sim.qpos.copy_(home)
-    sim.qpos[:, :2] = torch.tensor(rng.uniform(-3.0, 3.0, (24, 2)))
-    sim.qpos[:, 2] += 0.1 + torch.tensor(heights_under(height_map, sim.qpos.numpy()))
+    places, around = rng.uniform(-3.0, 3.0, (24, 2)), np.stack(np.meshgrid(*[np.linspace(-0.3, 0.3, 13)] * 2), axis=-1)
+    sim.qpos[:, :2] = torch.tensor(places)
+    sim.qpos[:, 2] += torch.tensor(heights_under(height_map, places[:, None, None] + around).max(axis=(1, 2)))
     silent, deep = [], []
     for step in range(600):
         if step % 100 == 0:

@@ -127,7 +127,7 @@ def test_nothing_falls_through(kind, size, ground):
         for _ in range(50):
             sim.step()
     above = np.array(points)[..., 2] - heights_under(height_map, np.array(points))
-    assert above.min() > (-0.02 if kind in ("box", "cylinder") else 0.0)  # under a riser's edge: 5 mm from its face
+    assert above.min() > (-0.03 if kind in ("box", "cylinder") else 0.0)  # under a riser's edge: 5 mm from its face
     assert np.mean(above.min(axis=1) < 0.1) > 0.9
 
 

@@ -5,8 +5,8 @@ import warp as wp
 from legged_torque.sim.fused.collision import Point
 from legged_torque.sim.fused.surface import FAR_AWAY, SphereContacts, Surface, place_on_map, sample
 
-UPWARDS = wp.constant(0.7)
-"""Nothing leaves the ground through a face of a box whose normal's z is greater: it looks up by over 45 degrees."""
+UPWARDS = wp.constant(0.5)
+"""Nothing leaves the ground through a face of a box whose normal's z is greater: it looks up by over 30 degrees."""
 
 
 @wp.func
