@@ -16,8 +16,7 @@ BALL = """<mujoco><compiler angle="radian" autolimits="true"/>
  <geom name="ball" type="{kind}" size="{size}" mass="2" contype="1" conaffinity="15" condim="3" friction="1e-5"/>{fill}
  <body><joint axis="1 0 0" range="-9 9" damping="0.01"/><inertial pos="0 0 0" mass="0.01" diaginertia="1e-3 1e-3 1e-3"/>
  </body></body></worldbody></mujoco>"""
-# Tiny spheres in the middle make up for the points of other kinds, so that one kernel simulates all of them:
-POINTS = {"sphere": 1, "capsule": 2, "box": 8, "cylinder": 16}
+# Two tiny spheres in a sphere make up for a capsule's points, so that one kernel simulates both:
 FILL = '<geom size="1e-3" mass="0" contype="1" conaffinity="15" condim="3"/>'
 FLAT = '<geom name="floor" type="plane" size="0 0 1" contype="15" conaffinity="1" friction="{friction}"/>'
 
@@ -52,7 +51,7 @@ def ball(friction=1e-5, kind="sphere", size="0.1", planes=()):
         for quat in planes
     )
     floors = posed or FLAT.format(friction=friction)
-    fill = FILL * max(0, 8 - POINTS[kind])
+    fill = 2 * FILL if kind == "sphere" else ""
     spec = mujoco.MjSpec.from_string(BALL.format(floors=floors, kind=kind, size=size, fill=fill))
     if not planes:
         return compiled(spec)

@@ -3,15 +3,19 @@
 import warp as wp
 
 from legged_torque.sim.fused.collision import CYLINDER, Point, contact_normal, half_size, make_contact
+from legged_torque.sim.fused.collision_parts import lowest_of_capsule, reach_along, touch_part
 from legged_torque.sim.fused.constraint import Contact
 from legged_torque.sim.fused.math import quat_to_matrix
 from legged_torque.sim.fused.model import Model, of_world
 from legged_torque.sim.fused.smooth import Pose, Poses
-from legged_torque.sim.fused.surface import Surface, is_clear, sphere_map
+from legged_torque.sim.fused.surface import SphereContacts, Surface, is_clear, sphere_map
 from legged_torque.sim.fused.types import vec4
 
 MAX_MAP_CONTACTS = 2
 """Most contacts of a sphere with a height map."""
+
+MIN_EXCESS = wp.constant(1.0e-4)
+"""Part of a geom that is not this much deeper [m] than its corners or ends is on the same plane as these."""
 
 
 @wp.struct
@@ -60,10 +64,14 @@ def is_geom_clear(
     half = wp.cw_mul(model.point_offset[b, index], point.half)
     if cylinders and model.geom_type[point.geom] == CYLINDER:
         half = point.half  # points around its ends are not corners of a box
-    middle = origin + point.middle
-    turn = point.turn
-    drop = wp.abs(turn[2, 0] * half[0]) + wp.abs(turn[2, 1] * half[1]) + wp.abs(turn[2, 2] * half[2])
-    return is_clear(surface, middle, middle[2] - drop - point.radius, wp.length(half) + point.radius)
+    return is_part_clear(surface, origin + point.middle, half, point)
+
+
+@wp.func
+def is_part_clear(surface: Surface, middle: wp.vec3, half: wp.vec3, point: Point) -> bool:
+    """Return whether a part of a point's geom, by its middle and half sizes, is known to be above the ground."""
+    lowest = middle[2] - reach_along(point.turn, half, 2) - point.radius
+    return is_clear(surface, middle, lowest, wp.length(half) + point.radius)
 
 
 @wp.func
@@ -81,6 +89,8 @@ def find_map_contacts(
     index = int(0)
     point = Point()
     point.geom = -1
+    part = wp.vec3()
+    deepest = float(0.0)  # of the geom's corners or ends
     is_above = bool(False)
     while index < model.point_count[b]:
         is_near = bool(False)
@@ -88,20 +98,34 @@ def find_map_contacts(
             if model.point_geom[b, index] != point.geom:
                 point = load_geom(model, world, b, index, poses[model.point_depth[b, index]], cylinders)
                 is_above = is_geom_clear(model, b, index, origin, point, surface, cylinders)
+                deepest = 0.0
             if is_above:
                 index = model.point_next[b, index]
             else:
+                part = wp.cw_mul(model.point_half[b, index], point.half)
                 point.centre = point.middle + point.turn * wp.cw_mul(model.point_offset[b, index], point.half)
-                centre = origin + point.centre
-                is_near = not is_clear(surface, centre, centre[2] - point.radius, point.radius)
+                if part[2] > 0.0 and point.radius > 0.0:
+                    point.centre = lowest_of_capsule(surface, origin, point)
+                size = wp.where(point.radius > 0.0, wp.vec3(), part)
+                is_near = not is_part_clear(surface, origin + point.centre, size, point)
                 index += 1
         if is_near:
-            touch = sphere_map(surface, origin + point.centre, point.radius)
+            touch = SphereContacts()
+            if part[2] > 0.0 and point.radius == 0.0:
+                touch, place = touch_part(surface, origin, point, part)
+                point.centre = place
+            else:
+                touch = sphere_map(surface, origin + point.centre, point.radius)
             for i in range(touch.count):
                 normal = wp.where(i == 0, touch.first, touch.second)
                 dist = wp.where(i == 0, touch.dist[0], touch.dist[1])
-                contacts.normal[first + count] = normal
-                pose = poses[point.depth]
-                contacts.found[first + count] = make_contact(model, world, point, pose, dist, normal)
-                count += 1
+                if part[2] > 0.0:
+                    dist = dist + deepest
+                else:
+                    deepest = wp.max(deepest, -dist)
+                if part[2] == 0.0 or dist < -MIN_EXCESS:
+                    contacts.normal[first + count] = normal
+                    pose = poses[point.depth]
+                    contacts.found[first + count] = make_contact(model, world, point, pose, dist, normal)
+                    count += 1
     return count

@@ -125,13 +125,16 @@ def place_on_map(surface: Surface, centre: wp.vec3, radius: float) -> wp.vec3:
 
 
 @wp.func
+def sample(surface: Surface, i: int, j: int) -> float:
+    """Return the height of a sample, or of the nearest one for places outside of the map."""
+    row = wp.clamp(i, 0, surface.shape[0] - 1) * surface.shape[1]
+    return surface.heights[row + wp.clamp(j, 0, surface.shape[1] - 1)]
+
+
+@wp.func
 def load_row(surface: Surface, i: int, j: int) -> wp.vec3:
     """Return the heights of three samples of a row from (i, j) on."""
-    first = wp.clamp(i, 0, surface.shape[0] - 1) * surface.shape[1]
-    out = wp.vec3()
-    for b in range(3):
-        out[b] = surface.heights[first + wp.clamp(j + b, 0, surface.shape[1] - 1)]
-    return out
+    return wp.vec3(sample(surface, i, j), sample(surface, i, j + 1), sample(surface, i, j + 2))
 
 
 @wp.func

@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from legged_torque.sim.fused.surface import FAR, NEAR
 from legged_torque.utils.errors import refuse
 from legged_torque.utils.mjcf import body_chains, self_pairs, why_no_motor
 
@@ -33,6 +34,11 @@ points of both end circles, and two more of the lower circle, which make a trian
 turn into walls: there, points all around the end circles turn with the cylinder.
 """
 
+Place = tuple[float, float, float]
+"""A position, or half sizes, in half sizes of a geom."""
+MIN_PARTS = 4
+"""Parts of a box that is not small, at least: enough to lie on."""
+
 SLOWER = "about 30 times slower"  # on an H200, see docs/performance.md
 REFUSED = "sim.engine 'fused' cannot simulate this robot"
 ADVICE = f"use sim.engine = 'mujoco_warp', {SLOWER}, without randomize_parameters"
@@ -45,11 +51,12 @@ class Tree:
     """A robot's structure: a floating trunk and branches of hinge joints.
 
     ``points`` are, per branch, those that can touch the floor: geom, depth of its body (0 is the trunk), position in
-    half sizes of the geom, radius in first sizes of the geom, number of the first point of the branch's next geom.
+    half sizes of the geom, radius in first sizes of the geom, number of the first point of the branch's next geom, half
+    sizes of the part of the geom around it, in the same units: 0 but for parts that only a height map touches.
     """
 
     joints: np.ndarray  # joint of each place, -1 behind the end of a branch. Shape: (branches, most joints of one)
-    points: list[list[tuple[int, int, tuple[float, float, float], float, int]]]
+    points: list[list[tuple[int, int, Place, float, int, Place]]]
     has_cylinders: bool  # whether any of these geoms is one
     floor: int  # the geom that the robot stands on
     geom_places: list[tuple[int, int]]  # branch and depth of each geom's body; 0 and 0 of the trunk's and the world's
@@ -85,9 +92,25 @@ def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:
         offsets, radius = _GEOM_POINTS[mujoco.mjtGeom(model.geom_type[geom])]
         if on_map and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER:
             offsets = _AROUND_CIRCLES
-        end = len(of_branch) + len(offsets)
-        of_branch += [(geom, depth, offset, radius, end) for offset in offsets]
+        pieces = [(offset, (0.0, 0.0, 0.0)) for offset in offsets]
+        if on_map:
+            pieces += _parts(mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom])
+        end = len(of_branch) + len(pieces)
+        of_branch += [(geom, depth, offset, radius, end, half) for offset, half in pieces]
     return Tree(joints, points, mujoco.mjtGeom.mjGEOM_CYLINDER in model.geom_type[geoms], floor, places)
+
+
+def _parts(kind: mujoco.mjtGeom, size: np.ndarray) -> list[tuple[Place, Place]]:
+    """Return middles and half sizes of the parts of a geom that a height map can stick into between its points.
+
+    A box is halved across its longest side until its parts are small and enough.
+    """
+    if kind != mujoco.mjtGeom.mjGEOM_BOX:
+        return [((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else []
+    counts = np.ones(3, int)
+    while (radius := np.linalg.norm(size / counts)) > FAR or (radius > NEAR and counts.prod() < MIN_PARTS):
+        counts[np.argmax(size / counts)] *= 2
+    return [(tuple((2 * np.array(at) + 1) / counts - 1.0), tuple(1.0 / counts)) for at in np.ndindex(*counts)]
 
 
 def reasons_against(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS) -> list[str]:
