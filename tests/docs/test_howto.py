@@ -1,5 +1,6 @@
 """The code of the how-to pages and the README, run as it stands there."""
 
+import importlib
 import math
 import re
 import runpy
@@ -14,12 +15,11 @@ from support.command import command
 from support.scripts import run_here
 
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.utils.cli import Parser
 from legged_torque.utils.options import Options
 
 ROOT = Path(__file__).resolve().parents[2]
-GENERATED = ("docs/reference/", "docs/results/")
+GENERATED = ("docs/reference/", "docs/results/", "docs/index.md", "docs/changelog.md", "docs/contributing.md")
 FILES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [name for name in (str(file.relative_to(ROOT)) for file in FILES) if not name.startswith(GENERATED)]
 RUN_PYTHON = {"README.md", "docs/terrain.md"} | {page for page in PAGES if page.startswith("docs/howto/")}
@@ -35,16 +35,30 @@ def blocks(page, language):
     return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / page).read_text(), flags=re.MULTILINE | re.DOTALL)
 
 
+def python_files(page):
+    """A page's files of Python that are run, a block each: name, given in the first line or made up, and text."""
+    texts = [block for _, mark, language, block in fences(page) if language == "python" and not mark]
+    texts = ["\n".join(texts)] if page == "docs/howto/python.md" else texts  # a program, as it says
+    names = [re.match(r"# (\w+)\.py\n", text) for text in texts]
+    made_up = (f"block_{i}_of_a_page" for i in range(len(texts)))
+    return [(name[1] if name else other, text) for name, other, text in zip(names, made_up, texts, strict=True)]
+
+
 @pytest.fixture
 def run_page(monkeypatch, tmp_path):
-    """Run a page's Python as one file, which Warp reads; its tasks are forgotten afterwards."""
+    """Import a page's blocks of Python, each a file of its own; tasks and modules are forgotten afterwards."""
     monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
 
     def run(page):
-        file = tmp_path / "page.py"
-        file.write_text("\n".join(blocks(page, "python")))
-        return runpy.run_path(str(file))
+        names = {}
+        for name, text in python_files(page):
+            (tmp_path / f"{name}.py").write_text(text)
+            monkeypatch.delitem(sys.modules, name, raising=False)
+            names |= vars(importlib.import_module(name))
+            monkeypatch.setitem(sys.modules, name, sys.modules.pop(name))  # taken out again afterwards
+        return names
 
     return run
 
@@ -69,24 +83,29 @@ def train(task, name):
 
 
 @pytest.mark.parametrize(
-    ("page", "name"), [("README.md", "a1_quiet_torque"), ("docs/howto/reward.md", "a1_quiet_torque")]
+    ("page", "name"),
+    [
+        ("README.md", "a1_quiet_torque"),
+        ("docs/howto/reward.md", "a1_slow_joints"),
+        ("docs/howto/reward.md", "a1_slow_joints_later"),
+    ],
 )
 def test_reward(run_page, page, name):
-    """The new term counts with its weight."""
-    names = run_page(page)
+    """The new term counts with its weight, which a curriculum changes from none to all."""
+    run_page(page)
     task = make(name)
     assert "dof_vel" in task.reward_names
     task.dof_vel.copy_(torch.arange(48.0).view(4, 12))
     expected = np.square(np.arange(48.0).reshape(4, 12)).sum(axis=1)
     np.testing.assert_allclose(task._reward_dof_vel().numpy(), expected, rtol=1e-6)
     weights = dict(zip(task.reward_names, task.reward_weights().tolist(), strict=True))
-    assert weights["dof_vel"] == pytest.approx(-1e-4 * 0.02)
-    if "FadedCfg" in names:
-        assert "torques" not in task.reward_names
-        factor = LinearCurriculum([names["FadedCfg"]().rewards.curriculum.dof_vel], "cpu")
-        assert [factor(torch.tensor(steps)).item() for steps in (0, 5_000_000, 20_000_000)] == [0.0, 0.5, 1.0]
-    else:
-        assert task.cfg.control.torque_scale == 5.0
+    assert weights["dof_vel"] == pytest.approx(-1e-4 * 0.02 * (name != "a1_slow_joints_later"))
+    assert ("torques" in task.reward_names) == (page == "README.md")
+    if name == "a1_slow_joints_later":
+        for steps, share in ((5_000_000, 0.5), (20_000_000, 1.0)):
+            task.total_steps.fill_(steps)
+            column = task.reward_names.index("dof_vel")
+            assert task.reward_weights()[column].item() == pytest.approx(-1e-4 * 0.02 * share)
 
 
 def test_observation(run_page):
@@ -125,7 +144,7 @@ def test_parameter(run_page):
 def test_learner(tmp_path, monkeypatch):
     """The page's learner trains, resumes and is evaluated by the scripts."""
     file = tmp_path / "random_search.py"
-    file.write_text("\n".join(blocks("docs/howto/learner.md", "python")))
+    file.write_text(python_files("docs/howto/learner.md")[0][1])
     monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
     words = ["--task=a1_search", f"--task_file={file}", "--device=cpu"]
     settings = [*TINY, "--logger=none", "--set=actor.hidden_dims=[8]", "--set=evaluation.interval=8"]
@@ -233,11 +252,26 @@ def calls_of(page):
     return calls
 
 
+def test_python(run_page):
+    """The page makes a task, trains it, loads the run, rolls it out and measures it."""
+    names = run_page("docs/howto/python.md")
+    assert names["heights"][0].shape == (4,) and names["pair"].num_envs == 2
+    assert 0.0 <= names["metrics"].means()["track_percentage"] <= 1.0
+
+
+def test_names_differ():
+    """No two pages name a file or a task alike, so that what a reader has copied stays."""
+    files = [name for page in sorted(RUN_PYTHON) for name, _ in python_files(page) if not name.startswith("block_")]
+    code = "".join(text for page in sorted(RUN_PYTHON) for _, text in python_files(page))
+    tasks = re.findall(r"register\(\s*\"(\w+)\"", code)
+    assert len(tasks) > 10 and len({*tasks}) == len(tasks) and len({*files}) == len(files)
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_marks(page):
-    """Python that no test runs says so in the line above, and no other does; tests that marks name are there."""
+    """Python that no test runs says so in the line above; tests that marks name are there."""
     for line, mark, language, block in fences(page):
-        assert language == "bash" or bool(mark) != (page in RUN_PYTHON), f"{page}:{line}"
+        assert language == "bash" or mark or page in RUN_PYTHON, f"{page}:{line}"
         for test in re.findall(r"tests/\w+\.py", mark + block):
             assert (ROOT / test).is_file(), f"{page}:{line}"
 
