@@ -19,19 +19,21 @@ os.environ["MUJOCO_GL"] = "disable"
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import LeggedRobot, TorqueRobot
 from legged_torque.envs.approaches import multi_head_config, torque_config, torque_curriculum_config, torque_gravity
-from legged_torque.envs.base import legged_robot_config
+from legged_torque.envs.base import commands_config, legged_robot_config
 from legged_torque.envs.base.actions import ControlParameters
 from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.state import RobotState
 from legged_torque.envs.robots import a1, anymal_c, g1, go1, go2
 from legged_torque.sim.engine import Engine
 from legged_torque.utils.limits import describe, types_of
+from legged_torque.utils.successors import successors
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 CONFIGS = (
     (legged_robot_config, "LinearChange"),
     (legged_robot_config, "LeggedRobotCfg"),
+    (commands_config, "CommandsCfg"),
     (legged_robot_config, "LeggedRobotCfgPPO"),
     (a1, "A1Cfg"),
     (a1, "A1CfgPPO"),
@@ -83,21 +85,30 @@ Methods that a subclass may override. Call `super()` to keep what the base does.
 | method | of | what it does |
 |---|---|---|
 | `_reward_<term>()` | | A reward term, not weighted, used if `rewards.scales.<term>` is not 0. Shape: (num_envs,). |
+| `_termination_<term>()` | | An end of episodes, used if `terminations.<term>` is not 0. Shape: (num_envs,), bool. |
+"""
+NAMES_HEAD = """# Old names
+
+Made by `python docs/reference/generate.py` from `legged_torque/utils/successors.yaml`: names of
+[legged_gym](../howto/migrate.md), and of this library before settings were renamed. A task that uses one is refused with
+the same words.
 """
 HOOKS = (
     (LeggedRobot, "action_terms"),
     (LeggedRobot, "_compute_torques"),
     (LeggedRobot, "observation_terms"),
     (LeggedRobot, "random_parameters"),
-    (LeggedRobot, "check_termination"),
     (LeggedRobot, "curriculum_values"),
     (BaseTask, "update_curriculum"),
+    (BaseTask, "_post_physics_step_callback"),
     (BaseTask, "state_dict"),
     (BaseTask, "load_state_dict"),
     (TorqueRobot, "actions_for"),
 )
 """Methods that a subclass may override, of the class that has them."""
-METHODS = ("step", "get_observations", "reset", "set_state", "keep", "mirror", "base_height", "episode_length_buf")
+COMPUTED = ("base_height", "foot_pos", "foot_vel", "foot_contact_force", "body_pos", "body_vel")
+"""Members of the state that are computed where they are used."""
+METHODS = ("step", "get_observations", "reset", "set_state", "keep", "mirror", "episode_length_buf", *COMPUTED)
 """Methods and properties of tasks that others call."""
 OWNERS = (
     ("self", LeggedRobot, "Task"),
@@ -187,7 +198,8 @@ def settings_table(module: ModuleType, name: str, known: dict[str, str]) -> str:
     bases = ", ".join(f"`{ast.unparse(base)}`" for base in node.bases)
     text = " ".join(re.sub(r":\w+:`~?[\w.]*?(\w+)`", r"`\1`", ast.get_docstring(node) or "").replace("``", "`").split())
     table = ["| setting | default | allowed | meaning |", "|---|---|---|---|"]
-    table += rows(node, getattr(module, name), "", source, comments(source), known)
+    section = "commands." if name == "CommandsCfg" else ""
+    table += rows(node, getattr(module, name), section, source, comments(source), known)
     return "\n".join([f"## {name}", "", f"{text} Base: {bases}.", "", *table, ""])
 
 
@@ -253,15 +265,24 @@ def task_page() -> str:
         parts.append(f"| `{name}({arguments})` | `{cls.__name__}` | {plain(inspect.getdoc(method) or '')} |")
     parts += ["", "## Methods and properties", "", "| name | what it does |", "|---|---|"]
     for name in METHODS:
-        member = inspect.getattr_static(LeggedRobot, name)
+        member = inspect.getattr_static(RobotState if name in COMPUTED else LeggedRobot, name)
         is_method = inspect.isfunction(member)
         signature = f"({', '.join(list(inspect.signature(member).parameters)[1:])})" if is_method else ""
-        parts.append(f"| `{name}{signature}` | {plain(inspect.getdoc(getattr(LeggedRobot, name)) or '')} |")
+        parts.append(f"| `{name}{signature}` | {plain(inspect.getdoc(member) or '')} |")
     for owner, cls, title in OWNERS:
         parts += ["", f"## {title}", "", "| attribute | meaning [unit] | shape |", "|---|---|---|"]
         if cls is LeggedRobot:
             parts += [attribute_row([f"self.{name}"], meaning) for name, meaning in UNLISTED.items()]
         parts += [row for row in attribute_rows(owner, cls) if row not in parts]
+    return "\n".join([*parts, ""])
+
+
+def names_page() -> str:
+    """Return old_names.md."""
+    parts = [NAMES_HEAD.rstrip()]
+    for kind in ("settings", "methods", "attributes"):
+        parts += ["", f"## {kind.capitalize()}", "", "| old name | what to use |", "|---|---|"]
+        parts += [f"| `{name}` | {plain(text)} |" for name, text in successors(kind).items()]
     return "\n".join([*parts, ""])
 
 
@@ -281,6 +302,7 @@ OF_CODE = {
     "reference/settings.md": settings_page,
     "reference/scripts.md": scripts_page,
     "reference/task.md": task_page,
+    "reference/old_names.md": names_page,
 }
 """Pages by what makes them."""
 PAGES = (*OF_SITE.values(), *OF_CODE)
