@@ -59,14 +59,13 @@ def main() -> None:
             args.seed = run.train_cfg.seed + CURVE_SEED if args.all_checkpoints else 1
         import torch
 
-        from legged_torque.envs.base.commands import fix_command
         from legged_torque.envs.base.evaluation import evaluation_cfg
     if grounds:
         env_cfg = grounds.cfg(run.env_cfg, run.env_cfg.env.num_envs)
     else:
         env_cfg = evaluation_cfg(run.env_cfg, run.env_cfg.env.num_envs)
         if args.command:
-            fix_command(env_cfg, args.command)
+            env_cfg.commands.fix(args.command)
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options, env_cfg)
     torch.manual_seed(args.seed)  # building and loading have drawn numbers too

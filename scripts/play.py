@@ -50,8 +50,7 @@ def main() -> None:
 
         run = task_registry.load_run(options) if args.agent == "policy" else None
         env_cfg, train_cfg = (run.env_cfg, run.train_cfg) if run else task_registry.get_cfgs(args.task, options)
-        from legged_torque.envs.base.commands import fix_command
-    env_cfg.terrain.curriculum = False  # robots stay on their tiles
+    env_cfg.terrain.curriculum = env_cfg.commands.curriculum = False  # all tiles, all commands
     if kinds:
         select_tiles(env_cfg.terrain, kinds, levels, 1)
     set_seed(args.seed)
@@ -59,7 +58,7 @@ def main() -> None:
         show(args, run)
         return
     if args.command:
-        fix_command(env_cfg, args.command)
+        env_cfg.commands.fix(args.command)
     if run:
         from legged_torque.viewer.video import show_in_tensorboard
 

@@ -28,7 +28,7 @@ from legged_torque.deploy.description import (
     to_yaml,
 )
 from legged_torque.deploy.policy import Policy, State, load_network, parts_without_function
-from legged_torque.envs.base.commands import HEADING_GAIN
+from legged_torque.envs.base.commands import HEADING_GAIN, UniformCommands
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.motors.ideal import IdealMotor
 from legged_torque.motors.motor import Motor
@@ -164,7 +164,7 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
         }
         joints[joint] = {"axis": [round(float(part), 6) + 0.0 for part in axis], **passive}
     observations = {"history_length": cfg.env.history_length, "terms": _observation_terms(task, model)}
-    description = {
+    description: dict[str, Any] = {
         "format_version": FORMAT_VERSION,
         "task": name,
         "unsupported": [],
@@ -195,11 +195,24 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
         "initial_state": {"trunk_position": list(cfg.init_state.pos)}
         | {name: list(getattr(cfg.domain_rand, setting)) for name, setting in INITIAL_STATE.items()},
         "pushes": {"set_factor": cfg.domain_rand.push_set_factor},
-        "episode": {"length": cfg.env.episode_length_s, "ends_on_contact_of": list(asset.terminate_after_contacts_on)},
+        "episode": {
+            "length": cfg.env.episode_length_s,
+            "ends_on_contact_of": list(asset.terminate_after_contacts_on) if cfg.terminations.contact else [],
+        },
     }
+    if others := _not_simulated(task):
+        description["episode"]["not_simulated"] = others
     if cfg.terrain.mesh_type == "heightfield":
         description["terrain"] = dataclasses.asdict(Layout.of(cfg.terrain))
     return description
+
+
+def _not_simulated(task: LeggedRobot) -> list[str]:
+    """Return settings by which commands and episodes of the training differ from those of sim2sim.py."""
+    commands = task.cfg.commands
+    named = [f"commands.{name}" for name in ("standing_share", "zero_below") if getattr(commands, name)]
+    named += ["commands.build"] if type(task.command_generator) is not UniformCommands else []
+    return named + [f"terminations.{name}" for name in task.terminations if name != "contact"]
 
 
 def _observation_terms(task: LeggedRobot, model: MLPModel) -> list[dict[str, Any]]:

@@ -62,6 +62,8 @@ class Simulation:
             self.notes.append(
                 "pushes: policy.yaml does not name pushes.set_factor, so 1.0 is taken; trainings have 1.1 by default"
             )
+        if others := description["episode"].get("not_simulated"):
+            self.notes.append(f"episodes of the training are different, by {', '.join(others)}")
         self.command = np.zeros(3)
         self._steps = 0
 

@@ -155,12 +155,13 @@ def further_robots() -> Iterator[tuple[str, Any, Any]]:
         if module.name != "a1":
             try:
                 parts = vars(importlib.import_module(f"{robots.__name__}.{module.name}"))
+                own = [c for c in parts.values() if isinstance(c, type) and c.__module__ == parts["__name__"]]
+                settings = [part for part in own if issubclass(part, LeggedRobotCfg)]
+                training = [part for part in own if issubclass(part, LeggedRobotCfgPPO)]
+                LeggedRobotCfg.refuse_mistakes(*settings, *training)
             except Exception as error:  # a user's own file may raise anything
                 print(f"Note: the robot '{module.name}' is missing: {type(error).__name__}: {error}", file=sys.stderr)
                 continue
-            own = [c for c in parts.values() if isinstance(c, type) and c.__module__ == parts["__name__"]]
-            settings = [part for part in own if issubclass(part, LeggedRobotCfg)]
-            training = [part for part in own if issubclass(part, LeggedRobotCfgPPO)]
             for classes in (settings, training) if settings and training else ():
                 if len(classes) > 1:
                     names = ", ".join(part.__name__ for part in classes)

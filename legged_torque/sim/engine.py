@@ -97,17 +97,19 @@ class Engine(Protocol):
     def step(self, sense: bool = True) -> None:
         """Advance every world by one physics step under the torques in ``ctrl``, and update the contact sensors.
 
-        Of several steps, only the last one needs to ``sense``.
+        Of several steps, only the last one needs to ``sense``. A world with a NaN in ``ctrl`` steps without torques, as
+        in ``mj_step``.
         """
 
     def reset(self, mask: Tensor) -> None:
         """Put the worlds of ``mask`` (num_envs,), bool, back to the reference pose, at rest.
 
-        Everything that they carry from step to step is cleared, warm starts and applied forces included.
+        Everything that they carry from step to step is cleared, warm starts and applied forces included. A UserError,
+        here and in :meth:`update_constants`, for a mask of another device, type or shape.
         """
 
     def flag_diverged(self) -> None:
-        """Mark the worlds whose state is not finite or absurdly large."""
+        """Mark the worlds whose state is not finite or absurdly large, or whose torques are not finite."""
 
     def check_buffers(self) -> str | None:
         """Return a warning if contacts or constraints were dropped since the start because a buffer was full.
@@ -169,6 +171,18 @@ class Engine(Protocol):
         Shape: (num_envs,), bool.
         """
         raise lacks(self, "per_world")
+
+
+def check_mask(engine: Engine, mask: Tensor) -> None:
+    """Raise a UserError unless a mask of worlds fits an engine: a kernel would read memory that is none of it."""
+    expected = (torch.bool, (engine.num_envs,), torch.device(engine.device))
+    given = (mask.dtype, tuple(mask.shape), mask.device)
+    if given != expected:
+        words = [
+            "{} {} on {}".format(str(dtype).removeprefix("torch."), shape, place)
+            for dtype, shape, place in (given, expected)
+        ]
+        raise UserError(f"a mask of worlds is {words[0]}; it must be {words[1]}")
 
 
 def lacks(engine: Engine | type[Engine], capability: str, what: str = "this") -> UserError:

@@ -31,6 +31,19 @@ def reset_worlds(
             sensordata[world, i] = 0.0
 
 
+@wp.kernel(enable_backward=False)
+def clear_nan_ctrl(ctrl: Rows, diverged: Mask):
+    """Set the controls of a world with a NaN among them to zero, as ``mj_step`` does, and mark the world."""
+    world = wp.tid()
+    is_nan = bool(False)
+    for i in range(ctrl.shape[1]):
+        is_nan = is_nan or wp.isnan(ctrl[world, i])
+    if is_nan:
+        diverged[world] = True
+        for i in range(ctrl.shape[1]):
+            ctrl[world, i] = 0.0
+
+
 @wp.func
 def turn(qpos: Rows, world: int, roll: float, pitch: float, yaw: float):
     """Write the quaternion (w, x, y, z) of one world's trunk, turned about the world's x, then y, then z axis."""
@@ -43,8 +56,10 @@ def turn(qpos: Rows, world: int, roll: float, pitch: float, yaw: float):
 
 
 @wp.kernel(enable_backward=False)
-def flag_diverged(qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverged: Mask, overflow_seen: Integers):
-    """Check one position, velocity and acceleration of a world; the comparisons are false for NaN."""
+def flag_diverged(
+    qpos: Rows, qvel: Rows, qacc: Rows, ctrl: Rows, overflow: Integers, diverged: Mask, overflow_seen: Integers
+):
+    """Check one position, velocity, acceleration and control of a world; the comparisons are false for NaN."""
     world, i = wp.tid()  # so that neighbours in memory are read together
     if not wp.abs(qpos[world, i]) <= wp.static(MAX_POSITION):
         diverged[world] = True
@@ -52,6 +67,10 @@ def flag_diverged(qpos: Rows, qvel: Rows, qacc: Rows, overflow: Integers, diverg
         if not wp.abs(qvel[world, i]) <= wp.static(MAX_VELOCITY):
             diverged[world] = True
         if not wp.abs(qacc[world, i]) <= wp.static(MAX_ACCELERATION):
+            diverged[world] = True
+    if i < ctrl.shape[1]:
+        torque = ctrl[world, i]
+        if not wp.abs(torque) <= wp.static(MAX_FLOAT):
             diverged[world] = True
     if i == 0:
         overflow_seen[world] = overflow_seen[world] | overflow[world]
@@ -87,6 +106,7 @@ def apply_random_events(
     low: Numbers,
     span: Numbers,
     # Out:
+    new_commands: Mask,
     new_parameters: Mask,
     commands: Rows,
     headings: Numbers,
@@ -102,7 +122,8 @@ def apply_random_events(
     drawn = wp.vec4(wp.randf(random), wp.randf(random), wp.randf(random), wp.randf(random))
     if is_new[world]:
         turn(qpos, world, angles[world, 0], angles[world, 1], angles[world, 2])
-    if is_new[world] or drawn[0] < chances[0]:
+    new_commands[world] = is_new[world] or drawn[0] < chances[0]
+    if new_commands[world]:
         draw_command(seeds[world], low, span, commands, headings, world)
     new_parameters[world] = is_new[world] or drawn[1] < chances[1]
     if drawn[2] < chances[2]:

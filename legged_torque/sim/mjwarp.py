@@ -6,6 +6,7 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from legged_torque.sim import kernels
 from legged_torque.sim.fused.tree import SLOWER, reasons_against
 from legged_torque.sim.model import max_constraints, max_contacts
 from legged_torque.sim.warp_engine import WarpEngine
@@ -36,4 +37,5 @@ class MuJoCoWarpEngine(WarpEngine):
         """Launch one physics step."""
         self._model.opt.disableflags = self._flags if sense else self._flags | _NO_SENSORS
         with wp.ScopedDevice(self._wp_device):
+            wp.launch(kernels.clear_nan_ctrl, self.num_envs, [self._data.ctrl, self._diverged])
             mjw.step(self._model, self._data)

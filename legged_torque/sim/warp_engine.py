@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from legged_torque.sim import kernels
-from legged_torque.sim.engine import Engine
+from legged_torque.sim.engine import Engine, check_mask
 from legged_torque.sim.fused.model import Model
 from legged_torque.sim.fused.set_const import DerivedConstants
 from legged_torque.sim.model import CONTACT_DATA, use_known_options
@@ -59,6 +59,7 @@ class WarpEngine(Engine):
 
     def reset(self, mask: Tensor) -> None:
         """Reset worlds in one kernel, and what else they carry."""
+        check_mask(self, mask)
         data = self._data
         state = (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, data.sensordata)
         inputs = [wp.from_torch(mask), self._reference_pose, *state]
@@ -69,7 +70,7 @@ class WarpEngine(Engine):
     def flag_diverged(self) -> None:
         """Mark the worlds whose state is not finite or absurdly large; MuJoCo Warp has no such check."""
         data = self._data
-        state = [data.qpos, data.qvel, data.qacc_warmstart, data.overflow, self._diverged, self._overflow]
+        state = [data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, data.overflow, self._diverged, self._overflow]
         wp.launch(kernels.flag_diverged, data.qpos.shape, state, device=self._wp_device)
 
     def check_buffers(self) -> str | None:
@@ -106,6 +107,7 @@ class WarpEngine(Engine):
 
     def update_constants(self, mask: Tensor) -> None:
         """Recompute inverse weights."""
+        check_mask(self, mask)
         self._constants.update(mask)
 
     @functools.cached_property
@@ -118,9 +120,14 @@ class WarpEngine(Engine):
         return constants
 
     def _field_names(self) -> list[str]:
-        """Return which fields of the model may differ from world to world: those to which MuJoCo Warp gives rows."""
+        """Return which fields of the model may differ from world to world: those to which MuJoCo Warp gives rows.
+
+        The reference pose is not one of them: resets and inverse weights are those of the model's.
+        """
         annotations = {**mjw.Model.__annotations__, "gravity": mjw.Option.__annotations__["gravity"]}
-        return [name for name, kind in annotations.items() if getattr(kind, "shape", ("",))[0] == "*"]
+        return [
+            name for name, kind in annotations.items() if getattr(kind, "shape", ("",))[0] == "*" and name != "qpos0"
+        ]
 
     def _give_rows(self, name: str) -> None:
         """Replace a field that all worlds share by one with a row per world, all equal at first."""

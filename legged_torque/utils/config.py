@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import copy
 import inspect
-from typing import Any
+from typing import Any, ClassVar
 
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, collect_errors, refuse, unknown_name
 from legged_torque.utils.limits import check_value, types_of
 from legged_torque.utils.plain_yaml import parse_yaml
+from legged_torque.utils.successors import successor
 
 
 class Section:
@@ -19,27 +20,34 @@ class Section:
     ``control`` from the sections of that name in the base classes, in Python's method resolution order. Naming a base,
     as in ``class control(A1Cfg.control):``, is allowed; it matters only if it is a section of another configuration.
 
-    A name that no base class has is refused when the class is made, unless the class declares it new: a setting by an
-    annotation (``ramp_time: float = 2.0``), a section by its base (``class ramp(Section):``).
+    A name that no base class has is a mistake, unless the class declares it new: a setting by an annotation
+    (``ramp_time: float = 2.0``), a section by its base (``class ramp(Section):``). :class:`BaseConfig` refuses all
+    mistakes of a configuration at once.
 
     An instance has instances in place of all nested classes, and copies of lists and dictionaries, so that changing it
     never changes its class.
     """
 
+    _mistakes: ClassVar[dict[str, str]] = {}
+    """What is wrong with names of this class and of its sections, by dotted path."""
+
     def __init_subclass__(cls) -> None:
-        """Refuse unknown names of a new class with a UserError, and let its nested classes inherit."""
+        """Keep mistakes in the names of a new class, and let its nested classes inherit."""
         super().__init_subclass__()
-        _check_names(cls)
+        cls._mistakes = {path: text for base in cls.__bases__ for path, text in getattr(base, "_mistakes", {}).items()}
+        cls._mistakes |= _find_mistakes(cls)
         for name in _entries(cls):
             if not inspect.isclass(getattr(cls, name)):
                 continue
-            found = dict.fromkeys(getattr(owner, name) for owner in (cls, *cls.__bases__) if hasattr(owner, name))
-            parts = [part for part in found if not any(o is not part and issubclass(o, part) for o in found)]
+            values = (getattr(owner, name, None) for owner in (cls, *cls.__bases__))
+            found = dict.fromkeys(filter(inspect.isclass, values))
+            parts: list[Any] = [part for part in found if not any(o is not part and issubclass(o, part) for o in found)]
             if len(parts) > 1 or not issubclass(parts[0], Section):
                 bases = parts if any(issubclass(part, Section) for part in parts) else [*parts, Section]
                 names = {"__qualname__": f"{cls.__qualname__}.{name}", "__module__": cls.__module__}
                 parts = [type(name, tuple(bases), names)]
             setattr(cls, name, parts[0])
+            cls._mistakes |= {f"{name}.{path}": text for path, text in parts[0]._mistakes.items()}
 
     def __init__(self) -> None:
         """Instantiate the nested sections, all the way down."""
@@ -52,16 +60,19 @@ class Section:
             setattr(self, key, value)
 
     def check(self, path: str = "") -> None:
-        """Raise a UserError that names the first setting, here or below, with a value that is not allowed.
+        """Raise a UserError that names all settings, here and below, with values that are not allowed.
 
         ``path`` is where the section stands in its configuration.
         """
+        problems: list[str] = []
         for key in section_keys(self):
             value, dotted = getattr(self, key), f"{path}.{key}" if path else key
-            if isinstance(value, Section):
-                value.check(dotted)
-            else:
-                check_value(dotted, value, _type_of(self, key))
+            with collect_errors(problems):
+                if isinstance(value, Section):
+                    value.check(dotted)
+                else:
+                    check_value(dotted, value, _type_of(self, key))
+        refuse(problems)
 
 
 def _is_entry(name: str, value: Any) -> bool:
@@ -75,9 +86,9 @@ def _entries(owner: type) -> list[str]:
     return list(dict.fromkeys(name for name, value in found if _is_entry(name, value)))
 
 
-def _check_names(cls: type[Section]) -> None:
-    """Refuse names of a class, and of its bases that are no sections yet, that they do not have from a section."""
-    where = cls.__qualname__.rpartition("<locals>.")[2]
+def _find_mistakes(cls: type[Section]) -> dict[str, str]:
+    """Return mistakes in names of a class, and of its bases that are no sections yet; kinds of entries stay right."""
+    where, mistakes = cls.__qualname__.rpartition("<locals>.")[2], dict[str, str]()
     for owner in (cls, *(base for base in cls.__bases__ if not issubclass(base, Section))):
         own = {name: value for name, value in vars(owner).items() if _is_entry(name, value)}
         sections = [base for base in cls.__bases__ if issubclass(base, Section)] if own else []
@@ -86,26 +97,37 @@ def _check_names(cls: type[Section]) -> None:
         for name, value in own.items():
             declared_new = name in annotated or (inspect.isclass(value) and issubclass(value, Section))
             if known and name not in known and not declared_new:
-                raise UserError(
-                    f"{unknown_name(f'setting or section of {where}', name, known)}; to declare it new, annotate a "
-                    f"setting ({name}: float = ...), derive a section from Section"
-                )
+                mistakes[name] = str(unknown_name(f"setting or section of {where}", name, known))
             for section in sections:
-                if inspect.isclass(getattr(section, name, value)) != inspect.isclass(value):
+                inherited = getattr(section, name, value)
+                if inspect.isclass(inherited) != inspect.isclass(value):
                     kinds = ("a setting", "a section") if inspect.isclass(value) else ("a section", "a setting")
-                    raise UserError(f"{where}.{name} is {kinds[1]}, but in {section.__qualname__} it is {kinds[0]}")
+                    mistakes[name] = f"{where}.{name} is {kinds[1]}, but in {section.__qualname__} it is {kinds[0]}"
+                    setattr(cls, name, inherited)
+    return mistakes
 
 
 class BaseConfig(Section):
     """A whole configuration."""
 
+    @classmethod
+    def refuse_mistakes(cls, *others: type[BaseConfig]) -> None:
+        """Raise a UserError that names all mistakes in names of settings, also those of other configurations.
+
+        legged_gym's names have their successors, others the nearest names.
+        """
+        mistakes = {path: text for part in (cls, *others) for path, text in part._mistakes.items()}
+        advice = "to declare new ones, annotate a setting (name: float = ...), derive a section from Section"
+        refuse([successor("settings", path) or text for path, text in mistakes.items()], advice=advice)
+
+    def check(self, path: str = "") -> None:
+        """Refuse mistakes in names, then values that are not allowed, by UserError."""
+        self.refuse_mistakes()
+        super().check(path)
+
     def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
         """Return the settings of an earlier run, as nested dictionaries, in today's layout."""
         return values
-
-    def renamed(self) -> dict[str, str]:
-        """Return the new dotted paths of settings and sections by their old ones, which users may still give."""
-        return {}
 
 
 def section_keys(section: Any) -> list[str]:
@@ -173,5 +195,7 @@ def _dotted(path: str, key: str, names: list[str]) -> str:
     """Return the dotted path of the entry ``key`` at ``path``; a UserError if it is not one of the names."""
     prefix = f"{path}." if path else ""
     if key not in names:
+        if replaced := successor("settings", f"{prefix}{key}"):
+            raise UserError(replaced)
         raise unknown_name("config key", f"{prefix}{key}", [f"{prefix}{name}" for name in names])
     return f"{prefix}{key}"

@@ -9,6 +9,7 @@ from typing import Any
 from legged_torque.utils.config import section_keys, set_by_path, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import Count, Number, Worlds, check_value, types_of
+from legged_torque.utils.successors import successor
 
 DEFAULT_PRESET = "parallel"
 
@@ -100,11 +101,10 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
         changes.append((path, text))
     sections = {key: cfg for cfg in (env_cfg, train_cfg) for key in section_keys(cfg)}
     for path, value in changes:
-        for old, new in (env_cfg.renamed() | train_cfg.renamed()).items():
-            if f"{path}.".startswith(f"{old}."):
-                raise UserError(f"'{path}' is now '{new}{path.removeprefix(old)}'")
         section = path.split(".")[0]
         if section not in sections:
+            if replaced := successor("settings", section):
+                raise UserError(replaced)
             raise unknown_name("config section", section, sections)
         set_by_path(sections[section], path, value)
 

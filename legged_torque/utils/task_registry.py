@@ -71,7 +71,8 @@ class TaskRegistry:
     def register(self, name: str, task_class: type[VecEnv] | str, env_cfg: BaseConfig, train_cfg: BaseConfig) -> None:
         """Make a task known that is created as ``task_class(env_cfg, device)``.
 
-        A UserError if another task has the name, or the settings are not instances of configurations.
+        A UserError if another task has the name, or the settings are not instances of configurations, or all mistakes
+        in the names of the settings.
 
         Args:
             name: Name of the task.
@@ -84,6 +85,7 @@ class TaskRegistry:
         for cfg in (env_cfg, train_cfg):
             if not isinstance(cfg, BaseConfig):
                 raise UserError(f"the settings of task '{name}' must be instances of configurations, not {cfg!r}")
+        type(env_cfg).refuse_mistakes(type(train_cfg))
         self._tasks[name] = (task_class, env_cfg, train_cfg)
 
     def import_files(self, files: Iterable[str | Path]) -> None:

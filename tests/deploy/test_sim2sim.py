@@ -9,10 +9,11 @@ import sys
 import numpy as np
 import pytest
 import torch
-from support.exports import XML
+from support.exports import XML, export_random
 from support.scripts import assert_told_in_one_line, run_here
 
 from legged_torque.deploy.description import check
+from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Simulation, quaternion
 from legged_torque.viewer import video
@@ -96,6 +97,16 @@ def test_random_numbers(policy):
     simulation = Simulation(policy, robot, command=(0.5, 0.0, -0.2))
     simulation.run(3, 1)
     assert simulation.command.tolist() == [0.5, 0.0, -0.2]
+
+
+def test_what_is_not_simulated(make_task, tmp_path):
+    """Commands and ends of episodes that this simulation does not have are named."""
+    changes = {"commands.zero_below": 0.2, "terminations.tilt": 1.0, "terminations.contact": False}
+    export_random(make_task, "a1_position", tmp_path, **changes)
+    policy = Policy(tmp_path)
+    simulation = Simulation(policy, MujocoRobot(XML, policy.description))
+    assert any("commands.zero_below, terminations.tilt" in note for note in simulation.notes)
+    assert policy.description["episode"]["ends_on_contact_of"] == []
 
 
 @pytest.mark.parametrize(("refresh", "computed"), [(True, 4), (False, 1)])

@@ -55,10 +55,14 @@ def spring(springs: Springs, world: int, motor: int, step: int, pos: float, vel:
 
 
 def test_simulator_drives():
-    """A law of the position, the speed and the step acts as by hand in MuJoCo; motors are not in the joints' order."""
+    """A law of the position, the speed and the step acts as by hand in MuJoCo; motors are not in the joints' order.
+
+    In the last world the law gives a motor no number, with which MuJoCo stops all motors; only this world is flagged.
+    """
     model = compiled(make_walker())
     sim = make_engine("fused", model, 6, "cpu", 100, 50)
     stiffness, target = np.array([2.0, 0.0, 7.0, 3.0, 5.0], np.float32), random((6, model.nu), -0.5, 0.5)
+    target[5, 2] = np.nan
     sim.qpos[:, 2] = torch.linspace(0.15, 0.4, 6)
     sim.qvel.copy_(torch.tensor(random((6, model.nv), -2.0, 2.0)))
     joints = model.actuator_trnid[:, 0]
@@ -79,6 +83,8 @@ def test_simulator_drives():
         np.testing.assert_allclose(sim.qvel[world], data.qvel, rtol=0, atol=2e-3)
         np.testing.assert_allclose(sim.ctrl[world], data.ctrl, rtol=0, atol=2e-3)
         assert sim.contact_found[world].sum() == data.ncon
+    sim.flag_diverged()
+    assert sim.diverged.tolist() == [False] * 5 + [True]
 
 
 # ------------------------------------------------------------------------------------------------ tasks

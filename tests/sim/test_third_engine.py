@@ -8,7 +8,7 @@ from support.engine_suite import EngineSuite
 from support.fused import compiled, make_a1
 from support.scripts import assert_told_in_one_line, run_here
 
-from legged_torque.sim.engine import Engine
+from legged_torque.sim.engine import Engine, check_mask
 from legged_torque.sim.registry import ENGINES
 from legged_torque.terrain.height_grid import HeightGrid
 
@@ -36,7 +36,7 @@ class PlainMuJoCo(Engine):
         """Step one world after another; one that is not finite stays as it is."""
         for world in range(self.num_envs):
             state = [getattr(self, name)[world] for name in STATE]
-            if not all(values.isfinite().all() and values.abs().max() < 1e10 for values in state):
+            if not all(values.isfinite().all() and values.abs().max() < 1e10 for values in state[:3]):
                 continue
             mujoco.mj_resetData(self.mj_model, self._data)
             for name, values in zip(STATE, state, strict=True):
@@ -48,6 +48,7 @@ class PlainMuJoCo(Engine):
 
     def reset(self, mask):
         """Put worlds back."""
+        check_mask(self, mask)
         self.qpos[mask] = self._reference
         for tensor in (self.qvel, self.qacc_warmstart, self.ctrl, self._sensors):
             tensor[mask] = 0.0
@@ -56,6 +57,7 @@ class PlainMuJoCo(Engine):
         """Look at all numbers."""
         state = torch.cat([self.qpos, self.qvel], dim=1)
         self.diverged |= ~(state.abs() <= 1e4).all(dim=1) | ~(self.qacc_warmstart.abs() <= 1e10).all(dim=1)
+        self.diverged |= ~self.ctrl.isfinite().all(dim=1)
 
     def state_dict(self):
         """Return what worlds carry."""

@@ -215,6 +215,30 @@ class EngineSuite:
             sim.diverged.zero_()
             assert not sim.diverged.any()
 
+    @pytest.mark.parametrize("motor", [0, 11])
+    def test_a_torque_that_is_no_number(self, motor):
+        """A NaN in ``ctrl`` acts as in MuJoCo, which stops all motors of that world, and flags the world."""
+        sim = self.make(3)
+        model, states = sim.mj_model, draw_states(sim.mj_model, 3, self.height)
+        states["ctrl"][1, motor] = np.nan
+        put(sim, states)
+        sim.step()
+        sim.flag_diverged()
+        assert sim.diverged.tolist() == [False, True, False]
+        np.testing.assert_allclose(sim.qvel, step_mujoco(model, states)[0], rtol=0, atol=self.tolerance)
+
+    @pytest.mark.parametrize(
+        "mask", [torch.ones(2, dtype=torch.bool, device="meta"), torch.ones(2), torch.ones(3, dtype=torch.bool)]
+    )
+    def test_masks_that_do_not_fit(self, mask):
+        """A mask of another device, type or shape is refused, and nothing is reset."""
+        sim = self.scattered(2)
+        before = sim.qpos.clone()
+        for use in [sim.reset] + [sim.update_constants] * ("per_world" in sim.capabilities):
+            with pytest.raises(UserError, match=r"it must be bool \(2,\) on cpu"):
+                use(mask)
+        assert torch.equal(sim.qpos, before)
+
     def test_a_reset_removes_bad_numbers(self):
         """A world that was not finite goes on after a reset as one that always was, to the bit."""
         sims = [self.scattered(3) for _ in range(2)]
@@ -328,8 +352,9 @@ class EngineSuite:
             for values, expected in zip(derived, exact, strict=True):
                 np.testing.assert_allclose(values[world], expected, rtol=2e-5)
 
-    def test_unknown_fields(self):
-        """A field that does not exist, or that the engine does not read by world, is refused by its name."""
+    @pytest.mark.parametrize(("name", "nearest"), [("body_mas", "body_mass"), ("qpos0", "")])
+    def test_unknown_fields(self, name, nearest):
+        """A field that does not exist, or that is not read everywhere by world, is refused by its name."""
         self.need("per_world")
-        with pytest.raises(UserError, match=f"unknown field for sim.engine '{self.engine}' 'body_mas'.*'body_mass'"):
-            self.make(1).field("body_mas")
+        with pytest.raises(UserError, match=f"unknown field for sim.engine '{self.engine}' '{name}'.*{nearest}"):
+            self.make(1).field(name)

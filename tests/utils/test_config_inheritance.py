@@ -1,9 +1,10 @@
-"""Nested settings inherit by themselves, and misspelt ones are refused when a class is made."""
+"""Nested settings inherit by themselves, and misspelt ones are refused before anything is built."""
 
 import pytest
+from support.settings import error_of
 
+from legged_torque.envs import task_registry
 from legged_torque.utils.config import BaseConfig, Section, to_dict
-from legged_torque.utils.errors import UserError
 
 
 class Base(BaseConfig):
@@ -105,6 +106,38 @@ MISTAKES = {
 def test_misspelt_names_are_refused(text):
     """A name that no base has is reported with the nearest one, before anything is built."""
     lines = "\n".join(f" {line}" for line in text.splitlines())
-    with pytest.raises(UserError) as error:
-        exec(f"class V(Both):\n{lines}", globals())  # the only way to write a class from a table
-    assert MISTAKES[text] in str(error.value) and "\n" not in str(error.value)
+    exec(f"class V(Both):\n{lines}", globals())  # the only way to write a class from a table
+    message = error_of(V().check)  # noqa: F821
+    assert MISTAKES[text] in message and "\n" not in message
+
+
+class Port(Both):
+    """Settings with many mistakes, in sections of both kinds and in a section of a section."""
+
+    class control(Both.control):
+        control_type = "P"
+        dampin = 1.0
+
+        class mixing(Both.control.mixing):
+            strt = 2.0
+
+    class viewer:
+        ref_env = 0
+
+    rewards = 3
+
+
+class PortAgain(Port):
+    """A variant of it with one more."""
+
+    class rewards:
+        scle = 1.0
+
+
+def test_all_mistakes_are_told_at_once():
+    """Those of bases, of nested classes with and without a base, and legged_gym's names with their successors."""
+    message = error_of(task_registry.register, "port", "no:Task", PortAgain(), PortAgain())
+    for part in ("control_type", "strt", "viewers", "TorqueRobot", "Port.rewards is a setting", "scle"):
+        assert part in message
+    assert "did you mean 'damping'?" in message and "'P'" not in message
+    assert "port" not in task_registry._tasks

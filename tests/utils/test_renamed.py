@@ -1,4 +1,4 @@
-"""Settings with new names: old runs have the same values, and old names on a command line are answered."""
+"""Settings with new names: old runs have the same values."""
 
 from support.settings import error_of
 
@@ -16,10 +16,6 @@ class Cfg(BaseConfig):
         """The number of worlds was on top."""
         worlds = values.pop("worlds", None)
         return values if worlds is None else values | {"env": {"num_envs": worlds}}
-
-    def renamed(self):
-        """The settings that were in other places."""
-        return {"worlds": "env.num_envs", "domain_rand.old": "env"}
 
 
 class TrainCfg(BaseConfig):
@@ -40,13 +36,3 @@ def test_runs():
         assert to_dict(cfg) == {"env": {"num_envs": 7}}
     run = {"env": {"world": 7}, "train": {}}
     assert error_of(apply_options, Cfg(), TrainCfg(), Options(), run).startswith("unknown config key 'world'")
-
-
-def test_command_line():
-    """One line has the new name."""
-    for item, message in {
-        "worlds=3": "'worlds' is now 'env.num_envs'",
-        "domain_rand.old.num_envs=3": "'domain_rand.old.num_envs' is now 'env.num_envs'",
-        "domain_rand.older=1": "unknown config section 'domain_rand'",
-    }.items():
-        assert error_of(apply_options, Cfg(), TrainCfg(), Options(set=[item])).startswith(message)

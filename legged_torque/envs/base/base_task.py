@@ -22,6 +22,8 @@ from legged_torque.sim.graph import CudaGraph
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.buffers import copy_state
 from legged_torque.utils.config import flat, to_dict
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.successors import successor
 
 
 class BaseTask(VecEnv):
@@ -39,6 +41,8 @@ class BaseTask(VecEnv):
         num_diverged: Worlds that were reset since something in them was not finite. Scalar, int64.
         num_processes: Processes that train together, each with as many worlds; the trainer sets it.
         keep_final_observations: Whether "final_observations" of the extras are computed, see :meth:`step`.
+
+    Once a task is built, its tensors must be written in place: binding such an attribute to another is a UserError.
     """
 
     sim: Engine
@@ -49,6 +53,8 @@ class BaseTask(VecEnv):
     _parts: Sequence[Callable[[], None]] = ()
     """What a step does with torch, in the order of the step, between what Warp's kernels do."""
     _is_compiled = False
+    _shared: frozenset[str] = frozenset()
+    """Attributes that are tensors which others hold, too."""
 
     def __init__(self, num_envs: int, device: str) -> None:
         """Allocate rewards and counters of ``num_envs`` worlds on the device, "cpu" or "cuda:N"."""
@@ -59,6 +65,18 @@ class BaseTask(VecEnv):
         self._keeps_final = False
         self._world_state: dict[str, Tensor] = {}
         self.step_graph = CudaGraph(self._step, device)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuse another tensor for an attribute of :attr:`_shared`: nobody else would see it."""
+        if name in self._shared and value is not getattr(self, name):
+            raise UserError(f"write the task's {name} in place, {name}.copy_(...): a step would not see another tensor")
+        super().__setattr__(name, value)
+
+    def __getattr__(self, name: str) -> Any:
+        """Refuse legged_gym's attributes with their successors; Python calls this for what does not exist."""
+        if replaced := successor("attributes", name):
+            raise UserError(replaced)
+        raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
 
     def compile(self) -> None:
         """Let a GPU with Triton run what a step does with torch as few kernels; trainings do this.
@@ -172,6 +190,9 @@ class BaseTask(VecEnv):
         return WalkingEvaluation(self, num_envs, perturbation)
 
     # ---- what a task does --------------------------------------------------------------------------------------------
+
+    def _post_physics_step_callback(self) -> None:
+        """Hook at every control step, with the new state, before terminations and rewards; as in legged_gym."""
 
     def update_curriculum(self) -> None:
         """Curriculum hook for what may only change between rollouts; the trainer calls it before each of them."""

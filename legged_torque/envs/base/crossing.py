@@ -17,6 +17,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.envs.base.commands_config import CommandsCfg
 from legged_torque.envs.base.evaluation import evaluation_cfg
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import WalkingMetrics
@@ -64,14 +65,17 @@ class Grounds:
     def cfg(self, cfg: Any, worlds_per_tile: int) -> Any:
         """Return a copy of a task's settings for trials of ``worlds_per_tile`` worlds on each kind and level.
 
-        The policy sees what it does with the settings given, whatever ground these are for; the critic may not.
+        The policy sees what it does with the settings given, whatever ground these are for; the critic may not. A
+        UserError if the task has commands of its own kind, under which robots may not walk straight on.
         """
+        if type(cfg.commands).build is not CommandsCfg.build:
+            raise UserError("robots cross tiles under uniform commands; commands.build of the task gives others")
         cfg = evaluation_cfg(cfg, worlds_per_tile * len(self.kinds) * len(self.levels))
         terrain, ranges = cfg.terrain, cfg.commands.ranges
         select_tiles(terrain, self.kinds, self.levels, COLUMNS)
         terrain.seed += SEED
         cfg.env.episode_length_s = self.time_limit(terrain.tile_size) + 1.0  # no trial ends with the episode
-        cfg.commands.resampling_probability = 0.0
+        cfg.commands.resampling_probability = cfg.commands.standing_share = cfg.commands.zero_below = 0.0
         ranges.lin_vel_x, ranges.lin_vel_y = ([speed, speed] for speed in self.command)
         cfg.commands.heading_command = True
         cfg.domain_rand.init_yaw = [0.0, 0.0]

@@ -1,4 +1,4 @@
-"""The curriculum of eq. 1, for many values at once and on the device."""
+"""Curricula on the device: of values, by the number of steps (eq. 1), and of commands, by how they are followed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ import torch
 from torch import Tensor
 
 from legged_torque.envs.base.legged_robot_config import LinearChange
+
+TRACKED = 0.8
+"""Share of the highest tracking reward beyond which ranges grow, as in legged_gym."""
+GROWTH = 0.1
+"""Share of the full ranges by which they grow."""
 
 
 class LinearCurriculum:
@@ -27,3 +32,40 @@ class LinearCurriculum:
         """Return the values after ``total_steps`` (scalar, int64). Shape: (number of values,)."""
         progress = ((total_steps - self._t_start) / self._duration).clamp(0.0, 1.0)
         return (self._start + self._change * progress).float()
+
+
+class RangeCurriculum:
+    """Ranges that grow as soon as robots track them well, like legged_gym's ``update_command_curriculum``.
+
+    The mean over all worlds and the steps of a full episode decides. Every process of a training has its own ranges.
+
+    Attributes:
+        share: Share of the full ranges; they shrink towards their number that is nearest to 0. Shape: ().
+    """
+
+    def __init__(self, start: float, low: Tensor, span: Tensor, num_steps: int) -> None:
+        """Start with a share of ranges, whose tensors in use are ``low`` and ``span``; decide after ``num_steps``."""
+        self._low, self._span, self._full_low, self._full_span = low, span, low.clone(), span.clone()
+        self._middle, self._num_steps = torch.zeros_like(low).clamp(low, low + span), num_steps
+        self.share = torch.full_like(low[0], start)
+        self._sums = torch.zeros(2, device=low.device)  # of the mean tracking, and steps
+        self._set_ranges()
+
+    def add_step(self, tracking: Tensor) -> None:
+        """Add the tracking of a step, from 0 to 1. Shape: (num_envs,)."""
+        self._sums[0].add_(tracking.mean())
+        self._sums[1].add_(1.0)
+        is_due = self._sums[1] >= self._num_steps
+        grows = is_due & (self._sums[0] > TRACKED * self._num_steps)
+        self.share.copy_((self.share + GROWTH * grows).clamp(max=1.0))
+        self._sums.masked_fill_(is_due, 0.0)
+        self._set_ranges()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the share, and what decides on its growth."""
+        return {"share": self.share, "sums": self._sums}
+
+    def _set_ranges(self) -> None:
+        """Write the ranges."""
+        self._low.copy_(torch.lerp(self._middle, self._full_low, self.share))
+        self._span.copy_(self.share * self._full_span)

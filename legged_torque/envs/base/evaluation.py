@@ -50,11 +50,11 @@ class WalkingEvaluation:
 def evaluation_cfg(cfg: Any, num_envs: int, perturbation: str = "") -> Any:
     """Return a copy of a task's settings for evaluation in an environment; an empty name leaves that as it is.
 
-    Levels of rough ground stay as they are, spread over all.
+    Levels of rough ground stay as they are, spread over all; commands are those of the full ranges.
     """
     cfg = copy.deepcopy(cfg)
     cfg.env.num_envs = num_envs
-    cfg.terrain.curriculum = False
+    cfg.terrain.curriculum = cfg.commands.curriculum = False
     for term in section_keys(cfg.rewards.scales):
         setattr(cfg.rewards.scales, term, 0.0)
     if perturbation:

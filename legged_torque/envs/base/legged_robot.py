@@ -7,13 +7,14 @@ import math
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.envs.base.actions import ActionTerm, ControlLaw, ControlParameters, position_residual
 from legged_torque.envs.base.asset import load_asset, nominal_pose
 from legged_torque.envs.base.base_task import BaseTask
-from legged_torque.envs.base.commands import UniformCommands
 from legged_torque.envs.base.health import watched
+from legged_torque.envs.base.hooks import check_methods
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
 from legged_torque.envs.base.random_events import RandomEvents
@@ -32,6 +33,7 @@ from legged_torque.envs.base.robot_checks import range_notes
 from legged_torque.envs.base.state import RobotState
 from legged_torque.envs.base.symmetry import Mirror
 from legged_torque.envs.base.task_log import TaskLog
+from legged_torque.envs.base.terminations import Terminations
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.motors.chain import MotorChain
 from legged_torque.motors.joints import Joints
@@ -47,7 +49,7 @@ OUTSIDE_KERNEL = "torques are computed in torch, outside of the physics kernel: 
 """Note of tasks that override ``_compute_torques`` or have motors without a Warp function."""
 
 
-class LeggedRobot(RewardTerms, BaseTask):
+class LeggedRobot(RewardTerms, Terminations, BaseTask):
     """A batch of robots with position control, and what all approaches share.
 
     An approach overrides :meth:`action_terms`, or :meth:`_compute_torques` in torch, adds ``_reward_<term>`` methods or
@@ -95,6 +97,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         A UserError if a setting makes no sense or names something that does not exist.
         """
         check_env_cfg(cfg)
+        check_methods(type(self), LeggedRobot, cfg)
         super().__init__(cfg.env.num_envs, device)
         self.cfg = cfg
         self.dt = cfg.sim.dt * cfg.control.decimation
@@ -110,6 +113,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.health = Health(watched(self.state, kept, self.rewards, self.observations), self.sim.diverged)
         self._parts = [self._compute_rewards_and_dones, self._update_sums, self._end_episodes]
         self._parts += [self._finish_step, self._begin_episodes, self._observe]
+        self._shared = frozenset(name for name, value in vars(self).items() if isinstance(value, (Tensor, TensorDict)))
         self.reset()
 
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
@@ -148,15 +152,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         weights = self.reward_weights() / self.dt
         curricula = section_keys(self.cfg.rewards.curriculum)
         values = {f"weight_{name}": weights[i] for i, name in enumerate(self.reward_names) if name in curricula}
-        return values | self.terrain.curriculum_values()
-
-    def check_termination(self) -> None:
-        """End episodes whose trunk touches the ground, whose state diverged, or whose time is over."""
-        state = self.state
-        ended = state.contacts[:, self.termination_contact_indices].any(dim=1) | state.diverged
-        time_out = state.episode_length >= self.max_episode_length
-        state.reset_buf.copy_(ended | time_out)
-        state.time_out_buf.copy_(time_out & ~ended)
+        return values | self.terrain.curriculum_values() | self.command_generator.curriculum_values()
 
     @property
     def base_height(self) -> Tensor:
@@ -215,6 +211,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.state.episode_length.add_(1)
         self.total_steps.add_(self.num_envs * self.num_processes)
         self.state.update()
+        self._post_physics_step_callback()
         self.check_termination()
         self.compute_reward()
         self.health.begin()
@@ -229,6 +226,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.rew_buf.masked_fill_(diverged, 0.0)
         self.rewards.add_to_episode(diverged)
         state.episode_return.add_(self.rew_buf)
+        self.command_generator.add_step()
         self.log.add_step(state, self.episode_sums)
         state.update_feet_air_time()
 
@@ -269,7 +267,7 @@ class LeggedRobot(RewardTerms, BaseTask):
             buffer.masked_fill_(state.reset_buf, 0)
         self.motors.reset(state.reset_buf)
         state.update()
-        self.command_generator.follow_headings()
+        self.command_generator.update(self.command_generator.is_new)
 
     def _observe(self) -> None:
         """Measure, compute the observations, and keep what the next rewards compare with."""
@@ -289,7 +287,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.sim.qpos.copy_(qpos)
         self.sim.qvel.copy_(qvel)
         self.state.update()
-        self.command_generator.follow_headings()
+        self.command_generator.update()
         self.sensors.update_all(self.state.reset_buf, compilable=False)
         self._observe()
 
@@ -322,7 +320,7 @@ class LeggedRobot(RewardTerms, BaseTask):
         self.control = ControlParameters(self.cfg.control, self.dof_names, pose, self.num_envs, self.device)
         limits = self.asset.mj_model.actuator_forcerange.T
         self.torque_limits = torch.tensor(limits, dtype=torch.float32, device=self.device)
-        self.termination_contact_indices = torch.tensor(self.asset.terminating, dtype=torch.long, device=self.device)
+        self._init_terminations(self.asset.terminating, self.device)
         self._init_reward_buffers(self.asset, self.device)
 
     def _init_state(self) -> None:
@@ -361,7 +359,8 @@ class LeggedRobot(RewardTerms, BaseTask):
     def _init_random_events(self) -> None:
         """Prepare commands, initial states, random parameters and pushes."""
         cfg, model, rand = self.cfg, self.asset.mj_model, self.cfg.domain_rand
-        self.command_generator = UniformCommands(cfg.commands, self.state)
+        commands: Any = cfg.commands
+        self.command_generator = commands.build(self)
         angles = torch.zeros(self.num_envs, 3, device=self.device)
         of_motors = self.motors.random_parameters()
         pose, state = self.default_dof_pos.tolist(), (self.sim.qpos, self.sim.qvel)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from legged_torque.envs.base.older_runs import RENAMED, converted, is_older
+from legged_torque.envs.base.commands_config import CommandsCfg
+from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
 from legged_torque.motors.config import DelayCfg, IdealCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
@@ -174,16 +175,13 @@ class LeggedRobotCfg(BaseConfig):
             gravity: NotNegative = 0.05  # of the unit vector
             height_measurements: NotNegative = 0.1  # [m] of each point of the height scan
 
-    class commands:  # commanded velocities, in the trunk's frame
-        resampling_probability: Share = 0.002  # per control step: about every 10 s at 50 Hz
+    class commands(CommandsCfg):  # commanded velocities: what they are drawn from, and ``build``
+        pass
 
-        heading_command: bool = False  # whether headings are drawn, and yaw rates are what turns to them
-
-        class ranges:  # drawn uniformly
-            lin_vel_x: Interval = [-1.0, 1.0]  # [m/s]
-            lin_vel_y: Interval = [-1.0, 1.0]  # [m/s]
-            ang_vel_yaw: Interval = [-1.0, 1.0]  # [rad/s]; the limits of what turns to headings
-            heading: Annotated[list[float], Limits(-3.14160, 3.14160, ordered=True)] = [-3.14159, 3.14159]  # [rad]
+    class terminations:  # early ends of episodes: methods ``_termination_<term>``; false or 0: not in use
+        contact: bool = True  # geoms of asset.terminate_after_contacts_on touch the ground
+        tilt: Annotated[float, Limits(0, 3.14160)] = 0.0  # [rad] the trunk leans more than this
+        base_height: NotNegative = 0.0  # [m] the trunk is lower than this above the ground
 
     class control:  # from actions to torques
         decimation: Annotated[int, Limits(1, 1000)] = 4  # physics steps per control step: 50 Hz
@@ -294,10 +292,6 @@ class LeggedRobotCfg(BaseConfig):
     def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
         """Return the settings of a run of commit d8439d6 in today's layout."""
         return converted(values) if is_older(values) else values
-
-    def renamed(self) -> dict[str, str]:
-        """Return the new names of settings of commit d8439d6."""
-        return RENAMED
 
     def random_parameters(self) -> dict[str, dict[str, list[float]]]:
         """Return the ranges of all parameters of ``domain_rand``, by name."""

@@ -4,23 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-RENAMED = {
-    "domain_rand.action_delay": "motors.delay.range",
-    "domain_rand.action_delay_unit": "motors.delay.unit",
-    "motors.model": "motors.chain",
-    "domain_rand.trunk_mass_offset": "domain_rand.trunk_mass",
-    "domain_rand.trunk_mass_scale": "domain_rand.trunk_mass",
-    "domain_rand.trunk_com_offset": "domain_rand.trunk_com",
-    "domain_rand.foot_offset": "domain_rand.foot_pos",
-    "domain_rand.action_scale_offset": "domain_rand.action_scale",
-    "domain_rand.motor_strength_per_joint": "domain_rand.motor_strength",
-    **{f"domain_rand.{name}_share": f"domain_rand.{name}" for name in ("foot_radius", "dof_damping", "dof_armature")},
-    **{f"domain_rand.{name}_share": f"domain_rand.{name}" for name in ("dof_stiffness", "dof_frictionloss")},
-    **{f"domain_rand.stiffness_{of}": "domain_rand.stiffness" for of in ("offset", "scale", "scale_per_joint")},
-    **{f"domain_rand.damping_{of}": "domain_rand.damping" for of in ("offset", "scale", "scale_per_joint")},
-}
-"""Settings that have another name now."""
-
 _RANGES = {
     "trunk_mass": {"add": "trunk_mass_offset", "scale": "trunk_mass_scale"},
     "trunk_com": {"add": "trunk_com_offset"},

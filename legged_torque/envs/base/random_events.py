@@ -63,8 +63,9 @@ class RandomEvents:
         pushes = (wp.vec2(*settings.push_velocity), settings.push_set_factor)
         new, seeds = map(wp.from_torch, (is_new, self._seeds[0]))
         read = map(wp.from_torch, (self.init_angles, commands.low, commands.span))
-        written = map(wp.from_torch, (self._new_parameters, commands.values, commands.headings))
-        arguments = [new, seeds, self._chances, *pushes, *read, *written, *map(wp.from_torch, (sim.qpos, sim.qvel))]
+        masks, drawn = (commands.is_new, self._new_parameters), (commands.values, commands.headings)
+        written = map(wp.from_torch, (*masks, *drawn, sim.qpos, sim.qvel))
+        arguments = [new, seeds, self._chances, *pushes, *read, *written]
         wp.launch(kernels.apply_random_events, sim.num_envs, arguments, device=seeds.device)
         if settings.randomize_parameters:
             self.parameters.draw(self._new_parameters)

@@ -32,7 +32,8 @@ class RobotState(Buffers):
         actions: Last actions. Shape: (num_envs, num_actions).
         last_actions: Actions of the step before. Shape: (num_envs, num_actions).
         commands: Commanded v_x, v_y [m/s] and yaw rate [rad/s] in the trunk's frame. Shape: (num_envs, 3).
-        contacts: 1 for each collision geom that touches the ground, else 0. Shape: (num_envs, geoms).
+        contacts: 1 for each collision geom that touches the ground or, with ``asset.self_collisions``, another part of
+            the robot, else 0: a foot on another leg counts as stance. Shape: (num_envs, geoms).
         contact_force: Net contact force on each collision geom in the world frame [N]. Shape: (num_envs, geoms, 3).
         feet_contact: 1 for each foot on the ground, which may have several geoms. Shape: (num_envs, feet).
         feet_air_time: Time since each foot left the ground [s]. Shape: (num_envs, feet).

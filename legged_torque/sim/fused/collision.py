@@ -13,7 +13,11 @@ CYLINDER = wp.constant(5)
 BOX = wp.constant(6)
 """MuJoCo's mjGEOM_CAPSULE, mjGEOM_CYLINDER and mjGEOM_BOX."""
 UPRIGHT = wp.constant(1.0e-6)
-"""A cylinder whose axis leans less than this [rad] from the normal has no lowest direction across it."""
+"""A cylinder whose axis leans less than this [rad] from the normal has no lowest direction across it.
+
+MuJoCo turns the three contacts of a flat end to the direction of the lean, however small. In float32 this direction is
+rounding below some 1e-5 rad: the contacts are then elsewhere on the rim than MuJoCo's, as deep in the ground.
+"""
 MAX_CORNERS = wp.constant(4)
 """Most contacts of a box with a plane: MuJoCo takes the first four corners below its centre that touch."""
 

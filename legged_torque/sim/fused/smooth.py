@@ -89,16 +89,25 @@ def make_trunk(model: Model, state: State, world: int) -> Trunk:
 
 
 @wp.func
+def has_torques(state: State, world: int) -> bool:
+    """Return whether a world's motors act: MuJoCo sets all of them to zero where one has no number."""
+    is_nan = bool(False)
+    for i in range(state.ctrl.shape[1]):
+        is_nan = is_nan or wp.isnan(state.ctrl[world, i])
+    return not is_nan
+
+
+@wp.func
 def joint_force(
-    model: Model, world: int, b: int, j: int, pos: float, vel: float, ctrl: wp.array2d(dtype=float)
+    model: Model, world: int, b: int, j: int, pos: float, vel: float, ctrl: wp.array2d(dtype=float), driven: bool
 ) -> float:
-    """Return the torque of a joint's motor, spring and damper."""
+    """Return the torque of a joint's spring, damper and, if ``driven``, motor."""
     joint = model.branch_joint[b, j]
     spring = of_world(model.qpos_spring, world, qadr(joint))
     force = of_world(model.jnt_stiffness, world, joint) * (spring - pos)
     force -= of_world(model.dof_damping, world, dof(joint)) * vel
     motor = model.branch_actuator[b, j]
-    if motor >= 0:
+    if driven and motor >= 0:
         ctrl_range = of_world(model.actuator_ctrlrange, world, motor)
         force_range = of_world(model.actuator_forcerange, world, motor)
         gear = of_world(model.actuator_gear, world, motor)[0]
@@ -137,6 +146,7 @@ def links_maker(n: int) -> wp.Function:
         pos = wp.vec3(0.0)
         ang_acc = wp.vec3(0.0)
         lin_acc = trunk_acc(model, world, trunk)
+        driven = has_torques(state, world)
         poses[0] = pose
         for j in range(wp.static(n)):
             if j < joints:
@@ -164,7 +174,7 @@ def links_maker(n: int) -> wp.Function:
                 links.torque = with_column(links.torque, j, body.torque)
                 branch.smooth.axis = with_column(branch.smooth.axis, j, axis)
                 branch.smooth.lever = with_column(branch.smooth.lever, j, lever)
-                branch.smooth.force[j] = joint_force(model, world, b, j, angle, vel, state.ctrl)
+                branch.smooth.force[j] = joint_force(model, world, b, j, angle, vel, state.ctrl, driven)
                 branch.smooth.damping[j] = of_world(model.dof_damping, world, dof(joint))
         return branch, links
 

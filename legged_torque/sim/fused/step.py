@@ -55,6 +55,7 @@ def torque_writer(layout: Layout, law: wp.Function | None) -> wp.Function:
                             pos = state.qpos[world, qadr(joint)]
                             vel = state.qvel[world, dof(joint)]
                             state.ctrl[world, motor] = law(reads, world, motor, step, pos, vel)
+            sync_group(wp.static(own.threads))  # a NaN among them stops all of a world's motors
 
     return write_torques
 

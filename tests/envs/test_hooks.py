@@ -1,0 +1,121 @@
+"""Task classes as people bring them from legged_gym: what nothing would call or see is refused, the rest works."""
+
+import operator
+import re
+
+import pytest
+import torch
+from support.control import IN_THE_AIR
+from support.settings import error_of, get_cfgs
+
+from legged_torque.envs import A1Cfg, A1CfgPPO, A1TorqueCfg, LeggedRobot, TorqueRobot
+from legged_torque.utils.config import section_keys
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.successors import successors
+
+IDLE = {
+    "_resample_commands": "generator",
+    "_push_robots": "push_probability",
+    "update_command_curriculum": "commands.curriculum",
+    "_update_terrain_curriculum": "terrain.curriculum",
+    "_reset_dofs": "init_dof_pos_scale",
+    "_get_noise_scale_vec": "noise_scales",
+    "_process_rigid_body_props": "trunk_mass",
+    "compute_observations": "observation_terms",
+    "_compute_torque": "'_compute_torques'",
+    "check_terminations": "'check_termination'",
+    "_reward_tracking_lin_vels": "'_reward_tracking_lin_vel'",
+    "_reward_silence": "rewards.scales.silence",
+    "_termination_silence": "terminations.silence",
+}
+
+
+def small(**settings):
+    """Settings of two robots high above the ground."""
+    cfg = A1TorqueCfg()
+    cfg.env.num_envs, cfg.init_state.pos = 2, IN_THE_AIR["init_state.pos"]
+    for name, value in settings.items():
+        setattr(cfg.env, name, value)
+    return cfg
+
+
+def has(owner, path):
+    """Whether a dotted path leads to something."""
+    try:
+        operator.attrgetter(path)(owner)
+    except (AttributeError, UserError):
+        return False
+    return True
+
+
+def robot(**methods):
+    """A task class with further methods."""
+    return type("Port", (TorqueRobot,), methods)
+
+
+def test_methods_that_nothing_calls():
+    """All of them are named at once, each with what replaces it or with the nearest hook."""
+    message = error_of(robot(**dict.fromkeys(IDLE, lambda self, *arguments: None)), small())
+    problems = message.split("; ")
+    for name, successor in IDLE.items():
+        assert any(name in problem for problem in problems) and successor in message, name
+
+
+def test_methods_of_ones_own():
+    """Helpers, terms with a setting, and hooks that exist are not disturbed; the callback runs at every step."""
+
+    class Counting(TorqueRobot):
+        def _init_buffers(self):
+            super()._init_buffers()
+            self.count = torch.zeros(self.num_envs)
+
+        def _post_physics_step_callback(self):
+            self.count += 1
+
+        def _reward_alive(self):
+            return self.count
+
+        def swing_height(self):
+            return self.count
+
+    task = Counting(small())
+    for step in range(1, 4):
+        task.step(torch.zeros(2, 12))
+        assert task._reward_alive().tolist() == [step, step]
+
+
+@pytest.mark.parametrize("name", ["reset_buf", "commands", "obs_buf", "rew_buf", "count"])
+def test_tensors_stay(name):
+    """A tensor that a step shares cannot be replaced by another one, as legged_gym's code does; writing it works."""
+    bind = robot(
+        _init_buffers=lambda self: setattr(self, "count", torch.zeros(2)) or TorqueRobot._init_buffers(self),
+        check_termination=lambda self: setattr(self, name, getattr(self, name).clone()),
+    )
+    task = bind(small())
+    message = error_of(task.step, torch.zeros(2, 12))
+    assert name in message and "in place" in message
+    task.reset_buf |= True
+    assert task.state.reset_buf.all()
+
+
+def test_successors_exist():
+    """Settings and methods that replace old names are there, and the old names are not."""
+    task, owners = LeggedRobot(small()), (A1Cfg(), A1CfgPPO())
+    text = " ".join(text for kind in ("settings", "methods", "attributes") for text in successors(kind).values())
+    places = "|".join(name for owner in owners for name in section_keys(owner))
+    paths = set(re.findall(rf"\b((?:{places})(?:\.[a-z_]*[a-z])+)\b", text))
+    assert len(paths) > 40
+    for path in paths:
+        assert any(has(owner, path) for owner in (*owners, task)), path
+    for name in re.findall(r"\b(?!draw|build)([a-z_]+)\(\)", text):
+        assert callable(getattr(task, name)), name
+    for name in successors("attributes"):
+        assert name in error_of(getattr, task, name)
+    old = [path for path in successors("settings") if any(has(owner, path) for owner in owners)]
+    assert old == ["terrain.terrain_proportions"]  # a list there, a section here
+
+
+def test_old_names_on_the_command_line():
+    """They are answered with their successors, sections included."""
+    for path, successor in {"commands.resampling_time": "resampling_probability", "viewer.pos": "cameras"}.items():
+        assert successor in error_of(get_cfgs, f"--set={path}=1")
