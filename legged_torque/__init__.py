@@ -38,7 +38,8 @@ def experiment_path(file: str | Path) -> Path:
     """Return where the description of an experiment is: ``experiments/<name>`` comes with the package.
 
     Args:
-        file: A path. One below ``experiments/`` means :data:`EXPERIMENTS_DIR`, unless the current directory has it.
+        file: A path. One below ``experiments/`` that is not in the current directory may be in :data:`EXPERIMENTS_DIR`.
     """
     path = Path(file)
-    return EXPERIMENTS_DIR / path.name if path.parts[:1] == ("experiments",) and not path.exists() else path
+    installed = EXPERIMENTS_DIR / path.name
+    return installed if path.parts[:1] == ("experiments",) and not path.exists() and installed.is_file() else path

@@ -30,13 +30,15 @@ class Metric:
 
 
 PAPER_METRICS = (
-    Metric("track_percentage", "Track % [share]", False),  # the paper prints 0.76, not 76
+    Metric("track_percentage", "Tracking", False),  # the paper's "Track %", which it prints as 0.76
     Metric("track_xy", "Track xy", True),
     Metric("track_angular", "Track angular", True),
-    Metric("collision_force", "Collision forces", True, digits=1),
+    Metric("collision_force", "Collision forces", None, digits=1),  # the weight and a little more, however it walks
     Metric("cost_of_transport", "Cost of transport", True),
 )
 """The metrics of Table I of the paper, in its order."""
+COMPARED = tuple(metric for metric in PAPER_METRICS if metric.lower_is_better is not None)
+"""Those that say who is better."""
 METRICS = (
     *PAPER_METRICS,
     Metric("height", "Walking height", None),

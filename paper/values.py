@@ -6,8 +6,8 @@ table's caption). The table prints no standard errors or deviations, and has no 
 have does not show; the test behind the marks is not named.
 
 The paper names no units; those of :mod:`legged_torque.utils.metrics` are ours. "Track %" is printed as a share
-(0.76, not 76), "Track xy" and "Track angular" are squared deviations (section IV-F), cost of transport has no unit.
-Collision forces fit newtons: a standing A1 presses on the ground with 122 N.
+(0.76, not 76), and is "Tracking" in our tables. "Track xy" and "Track angular" are squared deviations (section IV-F),
+cost of transport has no unit. Collision forces fit newtons: a standing A1 presses on the ground with 122 N.
 """
 
 from __future__ import annotations

@@ -8,19 +8,16 @@ os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or torch's profiler writes to
 
 import argparse
 import dataclasses
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from legged_torque import SCRIPTS_DIR
-from legged_torque.benchmark.baseline import Baseline
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError, is_out_of_memory
 from legged_torque.utils.files import without_machine, write_json
-from legged_torque.utils.limits import Count, Number
+from legged_torque.utils.limits import Count
 from legged_torque.utils.runs import package_versions
 
 if TYPE_CHECKING:
@@ -40,20 +37,11 @@ COLUMNS = {
     "startup_s": ("start-up s", 1),
 }
 """Heading of each column, as wide as the column, and its number of decimals."""
-NOT_COMPARED = ("num_envs", "iteration_over_physics", "startup_s")
 LEGEND = """\
   physics: one control step of physics alone, with its torques; step: env.step; iteration: all of it, with logging
   x floor: iteration / (physics x control steps of a rollout); steps/s: over whole iterations
   peak: {memory}
   start-up: from building the task to the end of the second iteration, when everything is compiled and captured"""
-ENDURANCE = """\
-  {iterations} iterations in a row: {first_ms:.1f} ms in the first tenth, {last_ms:.1f} ms in the last \
-({slowdown:+.1%}); memory {first_memory_mib:.0f} MiB, then {growth_mib:+.1f} MiB"""
-LEARNING = """\
-  train.py, {steps:,} steps: {total_s:.1f} s from the command to its end, training starts after {start_s:.1f} s"""
-REACHED = """\
-    tracking {share:.0%} after {steps:,} steps: {training_s:.1f} s from there, {command_s:.1f} s from the command"""
-NOT_REACHED = "    tracking {share:.0%} was not reached"
 
 
 def main() -> None:
@@ -73,8 +61,6 @@ def main() -> None:
     result = {"task": args.task, "device": device_name(device), "versions": package_versions(), "rounds": args.rounds}
     result |= {"preset": args.preset or "parallel", "perturbation": args.perturbation or "none"}
     result |= {"ranges": args.ranges or "default", "set": without_machine(args.set)}
-    numbers = [(env_cfg.env.num_envs, train_cfg.runner.num_steps_per_env) for env_cfg, train_cfg in sizes]
-    baseline = Baseline(args.baseline, result, numbers) if args.baseline else None
     memory = MemoryMeter(device)
     of_gpu = "GPU memory of torch and Warp together, without the CUDA context"
     print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")
@@ -85,12 +71,8 @@ def main() -> None:
         row = measure_size(args, cfgs, memory)
         rows.append(row)
         print_row(row, args.profile)
-        if args.learn and "error" not in row:
-            row["learn"] = learn(args, row["num_envs"])
         if args.json:
             write_json(args.json, result | {"rows": rows})
-    if baseline:
-        print_comparison(args.baseline, baseline, rows)
 
 
 def parse_args() -> argparse.Namespace:
@@ -101,24 +83,12 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
     parser.add_argument("--json", type=Path, help="file to write")
-    help_text = "file that --json of an earlier benchmark wrote: print what is different"
-    parser.add_argument("--baseline", type=Path, help=help_text)
-    help_text = "also run train.py for each number of worlds, and print when tracking reaches 70%% and 75%%"
-    parser.add_argument("--learn", action="store_true", help=help_text)
     help_text = "write a trace of a few iterations for ui.perfetto.dev, as .json or .json.gz"
     parser.add_argument("--profile", type=Path, help=help_text)
-    help_text = "also run N iterations and compare the first tenth with the last"
-    parser.add_argument("--endurance", type=int, default=0, metavar="N", help=help_text)
     args = parser.parse_args()
-    cli.check_args(args, rounds=Count, endurance=Number)
+    cli.check_args(args, rounds=Count)
     if args.profile and len(args.num_envs or [None]) > 1:
         raise UserError("--profile writes one trace: give one number of worlds")
-    if args.learn:
-        with cli.slow_imports():
-            _, cfg = task_registry.get_cfgs(args.task, dataclasses.replace(cli.options_of(args), num_envs=None))
-        if not 0 < cfg.evaluation.interval <= cfg.runner.total_steps:
-            steps = f"evaluation.interval is {cfg.evaluation.interval}, of {cfg.runner.total_steps} steps"
-            raise UserError(f"--learn needs evaluations during training: {steps}")
     return args
 
 
@@ -127,7 +97,7 @@ def measure_size(args: argparse.Namespace, cfgs: tuple, memory: MemoryMeter) -> 
     from legged_torque.benchmark.measure import measure
 
     try:
-        row = measure(args.task, cfgs, memory, args.rounds, args.endurance, args.profile)
+        row = measure(args.task, cfgs, memory, args.rounds, args.profile)
     except Exception as error:
         if not is_out_of_memory(error):
             raise
@@ -136,37 +106,12 @@ def measure_size(args: argparse.Namespace, cfgs: tuple, memory: MemoryMeter) -> 
     return row | {"left_memory_mib": memory.used()}
 
 
-def learn(args: argparse.Namespace, num_envs: int) -> dict[str, Any]:
-    """Run train.py with the same options, print its wall clock and return it."""
-    from legged_torque.benchmark.measure import time_training
-
-    words = [*cli.option_words(args, *cli.SETTINGS, "preset"), f"--num_envs={num_envs}"]
-    times = time_training([sys.executable, str(SCRIPTS_DIR / "train.py"), *words])
-    print(LEARNING.format(**times))
-    for point in times["reached"]:
-        print((REACHED if point["steps"] else NOT_REACHED).format(**point), flush=True)
-    return times
-
-
 def print_row(row: dict[str, Any], trace: Path) -> None:
     """Print the numbers of one size; ``trace`` is the file of its trace, if there is one."""
     cells = [f"{row[key]:>{len(title)},.{digits}f}" for key, (title, digits) in COLUMNS.items() if key in row]
     print(" | ".join([*cells, *([row["error"]] if "error" in row else [])]), flush=True)
-    if "endurance" in row:
-        print(ENDURANCE.format(**row["endurance"]))
     if "profile" in row:
         print(*row["profile"], f"The trace is in {trace}; Warp's kernels show on a GPU only.", sep="\n")
-
-
-def print_comparison(file: Path, baseline: Baseline, rows: list[dict[str, Any]]) -> None:
-    """Print the numbers of all sizes against those of the baseline."""
-    print(f"\nAgainst {file}", *baseline.notes, sep="\n  ")
-    print(f" worlds | {'what':<12} | {'old':>11} | {'new':>11} | new / old")
-    for row in rows:
-        for name, old, new, ratio in baseline.compare(row, [name for name in COLUMNS if name not in NOT_COMPARED]):
-            title, digits = COLUMNS[name]
-            cells = [f"{row['num_envs']:>7,}", f"{title.strip():<12}"]
-            print(" | ".join([*cells, *(f"{value:>11,.{digits}f}" for value in (old, new)), f"{ratio:>9.3f}"]))
 
 
 if __name__ == "__main__":

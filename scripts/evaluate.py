@@ -1,13 +1,13 @@
 """Measure a checkpoint, or all of a run.
 
-With ``--terrain`` and ``--level``, robots try to cross tiles of rough ground, once in each world: see docs/terrain.md.
-
 Examples:
-    python scripts/evaluate.py --task=a1_position                       # as in training
+    python scripts/evaluate.py                                          # the last run, as in its training
     python scripts/evaluate.py --task=a1_position --perturbation=high   # in another environment
-    python scripts/evaluate.py --task=a1_position --command 0.5 0 0.2   # with one command
-    python scripts/evaluate.py --task=a1_position --terrain all --level 0.5
-    python scripts/evaluate.py --task=a1_position --all_checkpoints     # a learning curve, for plot.py curves
+    python scripts/evaluate.py --load_run RUN --command 0.5 0 0.2       # with one command
+    python scripts/evaluate.py --terrain all --level 0.5                # on rough ground
+    python scripts/evaluate.py --all_checkpoints                        # a learning curve, for plot.py curves
+
+With ``--terrain`` and ``--level``, robots try to cross tiles of rough ground, once in each world: see docs/terrain.md.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from legged_torque.utils.limits import Count
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import LoadedRun, set_seed
+from legged_torque.utils.words import counted
 
 if TYPE_CHECKING:
     from rsl_rl.runners import OnPolicyRunner
@@ -77,7 +78,7 @@ def main() -> None:
         measured = walk(run, env, runner, args.steps, bool(args.command))
     if args.json:
         kept, device = "as in training", device_name(env.device)
-        result = {"task": args.task, "run": portable_path(run.folder), "checkpoint": run.checkpoint.name}
+        result = {"task": run.task, "run": portable_path(run.folder), "checkpoint": run.checkpoint.name}
         result |= {"steps": runner.logger.tot_timesteps, "perturbation": args.perturbation or kept}
         result |= {"ranges": args.ranges or kept, "command": args.command, "num_envs": env.num_envs}
         result |= {"seed": args.seed, "device": device, "versions": package_versions()}
@@ -121,15 +122,19 @@ def walk(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, num_steps: in
     breakdown = CommandBreakdown(env)
     metrics = measure(env, runner.get_inference_policy(env.device), num_steps, breakdown.add_step).estimates()
     trained = runner.logger.tot_timesteps
-    print(f"{run.checkpoint}, after {trained:,} steps of training, {env.num_envs} worlds x {num_steps} steps:")
+    size = f"{counted(env.num_envs, 'world')} x {counted(num_steps, 'step')}"
+    print(f"{run.checkpoint}, after {counted(trained, 'step')} of training, {size}:")
     for name, estimate in metrics.items():
         print(f"  {name:<18} {estimate.mean:10.4f} +- {estimate.standard_error:.4f} {UNITS[name]}")
     if not is_fixed:
-        print(f"  {'command':<12} {'from':>6} {'to':>6} {'share':>6} {'tracking':>9} {'error':>7}")
-    line = "  {:<12} {from:>6.2f} {to:>6.2f} {share:>6.2f} {track_percentage:>9.3f} {error:>7.3f}"
+        print(f"  {'command':<19} {'from':>6} {'to':>6} {'share':>6} {'tracking [share]':>16} {'error':>16}")
+    line = "  {:<19} {from:>6.2f} {to:>6.2f} {share:>6.2f} "
+    line += "{track_percentage:7.3f} +- {track_percentage_standard_error:.3f} "
+    line = "  error of {:<19} " if is_fixed else line
     for name, parts in breakdown.table().items():
+        what = f"{name} [{'rad/s' if name == 'ang_vel_yaw' else 'm/s'}]"
         for part in parts:
-            print(("  error of {:<12} {error:7.3f}" if is_fixed else line).format(name, **part))
+            print((line + "{error:7.3f} +- {error_standard_error:.3f}").format(what, **part))
     shown = {name: asdict(estimate) for name, estimate in metrics.items()}
     return {"num_steps": num_steps, "metrics": shown, "by_command": breakdown.table()}
 
@@ -159,7 +164,7 @@ def cross_tiles(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, ground
     results = cross(env, runner.get_inference_policy(env.device), grounds)
     time_limit, trained = grounds.time_limit(env.cfg.terrain.tile_size), runner.logger.tot_timesteps
     trial = "commanded to walk {:g} {:g} m/s for {:.1f} s at most".format(*grounds.command, time_limit)
-    print(f"{run.checkpoint}, after {trained:,} steps of training, {env.num_envs} worlds, {trial}:")
+    print(f"{run.checkpoint}, after {counted(trained, 'step')} of training, {counted(env.num_envs, 'world')}, {trial}:")
     print(f"  {'kind':<18} {'level':>6} {'worlds':>6} {'crossed':>16} {'fell':>16} {'tracking':>9} {'cost':>6}")
     for result in results:
         shares = [f"{share.mean:.3f} +- {share.standard_error:.3f}" for share in (result.crossed, result.fell)]

@@ -1,11 +1,12 @@
 """Train and evaluate tasks x environments x seeds.
 
-Finished cells are skipped and interrupted ones resumed: to continue an experiment, repeat the command.
-
 Examples:
+    python scripts/experiment.py experiments/smoke.yaml --jobs 2      # a few iterations, to try it
     python scripts/experiment.py experiments/paper.yaml --dry-run     # list pending jobs
     python scripts/experiment.py experiments/paper.yaml               # run them on all GPUs
     python scripts/experiment.py my.yaml --device cpu --jobs 2 --out results
+
+Finished cells are skipped and interrupted ones resumed: to continue an experiment, repeat the command.
 """
 
 import argparse
@@ -13,7 +14,7 @@ import contextlib
 import sys
 from pathlib import Path
 
-from legged_torque import experiment_path
+from legged_torque import EXPERIMENTS_DIR, experiment_path
 from legged_torque.experiments.job import Launcher
 from legged_torque.experiments.local_launcher import CPU_JOBS, GPU_JOBS, MPS_JOBS, LocalLauncher, multi_process_service
 from legged_torque.experiments.matrix import SETTINGS_FILE, cell_state, check_same, read_matrix
@@ -41,6 +42,7 @@ def main() -> None:
     parser.add_argument("--dry-run", action="store_true", help="only list what is left to do")
     cli.add_options(parser, "task_file")
     args = parser.parse_args()
+    check_exists(args.file)
     with cli.slow_imports():
         matrix = read_matrix(experiment_path(args.file), args.task_file)
     out = (args.out or Path("logs", "experiments", args.file.stem)).resolve()
@@ -57,6 +59,14 @@ def main() -> None:
         claim_folder(matrix, experiment_path(args.file), out)
         status = ExperimentRun(matrix, out, launcher).run()
     sys.exit(status)
+
+
+def check_exists(file: Path) -> None:
+    """Raise a UserError with the nearest names if there is no such description, but others in its folder."""
+    folders = [file.parent, *([EXPERIMENTS_DIR] if file.parts[:1] == ("experiments",) else [])]
+    others = {str(file.parent / other.name) for folder in folders for other in folder.glob("*.yaml")}
+    if others and not experiment_path(file).exists():
+        raise unknown_name("file", str(file), others)
 
 
 def make_launcher(args: argparse.Namespace) -> Launcher:

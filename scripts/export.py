@@ -1,8 +1,8 @@
 """Export a checkpoint for a robot.
 
 Examples:
-    python scripts/export.py --task=a1_torque_multihead                     # the last run's last checkpoint
-    python scripts/export.py --task=a1_torque_multihead --load_run=RUN --checkpoint=500 --out=exported
+    python scripts/export.py                                   # the last run's last checkpoint
+    python scripts/export.py --load_run=RUN --checkpoint=500 --out=exported
 """
 
 import shlex
@@ -16,7 +16,7 @@ from legged_torque.utils import cli
 def main() -> None:
     """Load a checkpoint and write policy.onnx, policy.pt and policy.yaml; print what the latter does not describe."""
     parser = cli.Parser(__doc__)
-    cli.add_task_args(parser)
+    cli.add_options(parser, "task", "device", "set", "task_file", *cli.RUNS)
     parser.add_argument("--out", type=Path, help="folder to write; default: exported_<checkpoint> in the run's folder")
     args = parser.parse_args()
     if args.out:
@@ -30,7 +30,7 @@ def main() -> None:
     out = args.out or run.folder / f"exported_{iterations}"
     training = {"run": run.folder.name, "checkpoint": run.checkpoint.name}
     training |= {"iterations": iterations, "total_steps": int(env.total_steps)}
-    difference, unsupported = export_policy(env, runner.alg.policy(), out, args.task, training)
+    difference, unsupported = export_policy(env, runner.alg.policy(), out, run.task, training)
     print(f"{run.checkpoint}, after {training['total_steps']:,} steps of training:")
     print(f"  exported to {out}: policy.onnx, policy.pt, policy.yaml")
     print(f"  largest difference to the checkpoint's network: {difference:.2g}")

@@ -18,6 +18,7 @@ from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import collect_errors
 from legged_torque.utils.runs import package_versions
+from legged_torque.utils.words import counted
 
 PURPOSES = {
     "video": "videos of play.py and sim2sim.py",
@@ -82,7 +83,7 @@ def caches() -> list[str]:
     wp.init()
     folder = Path(wp.config.kernel_cache_dir or "")
     modules, size = sum(1 for path in folder.glob("wp_*")), size_of(folder) / 2**20
-    return [f"compiled kernels: {folder}, {modules} modules, {size:.0f} MiB; WARP_CACHE_PATH chooses it"]
+    return [f"compiled kernels: {folder}, {counted(modules, 'module')}, {size:.0f} MiB; WARP_CACHE_PATH chooses it"]
 
 
 def size_of(folder: Path) -> int:

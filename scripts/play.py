@@ -1,11 +1,11 @@
 """Watch a policy walk.
 
 Examples:
-    python scripts/play.py --task=a1_torque_multihead                       # print metrics, save a video
-    python scripts/play.py --task=a1_torque_multihead --viewer web          # a page to watch and steer
-    python scripts/play.py --task=a1_torque_multihead --command 0.5 0 0.2   # a fixed command
-    python scripts/play.py --task=a1_torque_multihead --no_video            # metrics alone
-    python scripts/play.py --task=a1_torque --agent random                  # a task without a policy
+    python scripts/play.py                                  # the last run: print metrics, save a video
+    python scripts/play.py --viewer web                     # a page to watch and steer
+    python scripts/play.py --load_run RUN --command 0.5 0 0.2
+    python scripts/play.py --no_video                       # metrics alone
+    python scripts/play.py --task=a1_torque --agent random  # a task without a policy
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from legged_torque.utils.devices import choose_offscreen_renderer, resolve_devic
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import Count, Limits
 from legged_torque.utils.metrics import UNITS
-from legged_torque.utils.options import Options
-from legged_torque.utils.runs import load_config
+from legged_torque.utils.options import DEFAULT_TASK, Options
 from legged_torque.utils.task_registry import LoadedRun, experiment_dir, set_seed
 
 if TYPE_CHECKING:
@@ -45,11 +44,13 @@ def main() -> None:
     args.no_renderer = choose_offscreen_renderer()
     kinds, levels = named_kinds(args.terrain), rising_levels(args.level)
     options = cli.options_of(args)
+    if args.agent != "policy":
+        options.task = options.task or DEFAULT_TASK
     with cli.slow_imports():
         import rsl_rl.runners  # noqa: F401  # before MuJoCo: Triton's LLVM cannot be loaded after that of Mesa's renderer
 
         run = task_registry.load_run(options) if args.agent == "policy" else None
-        env_cfg, train_cfg = (run.env_cfg, run.train_cfg) if run else task_registry.get_cfgs(args.task, options)
+        env_cfg, train_cfg = (run.env_cfg, run.train_cfg) if run else task_registry.get_cfgs(options.task, options)
     env_cfg.terrain.curriculum = env_cfg.commands.curriculum = False  # all tiles, all commands
     if kinds:
         select_tiles(env_cfg.terrain, kinds, levels, 1)
@@ -68,7 +69,7 @@ def main() -> None:
         if roll_out(args, env, runner.get_inference_policy(env.device), title, video):
             show_in_tensorboard(video, run.iterations)
     else:
-        env, _ = task_registry.make_env(args.task, options, env_cfg)
+        env, _ = task_registry.make_env(options.task, options, env_cfg)
         video = experiment_dir(train_cfg, options.log_root) / "videos" / f"{args.agent}.mp4"
         roll_out(args, env, agent(args.agent, env), f"{args.agent} actions", video)
 
@@ -93,7 +94,7 @@ def parse_args() -> argparse.Namespace:
     hint = """none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's
         window; default: %(default)s"""
     parser.add_argument("--viewer", choices=NUM_ENVS, default="none", help=hint)
-    hint = "folder of a run whose policy walks next to the followed robot, under the same command (--viewer web)"
+    hint = "run whose policy walks next to the followed robot, under the same command (--viewer web): a name or a path"
     parser.add_argument("--compare", metavar="RUN", help=hint)
     hint = "address of the page; default: %(default)s, this machine alone; others need the printed token"
     parser.add_argument("--host", default="127.0.0.1", help=hint)
@@ -133,13 +134,13 @@ def check_combinations(args: argparse.Namespace) -> None:
 def show(args: argparse.Namespace, run: LoadedRun) -> None:
     """Show a policy live, and one that it is compared with."""
     compared = load_compared(args, run) if args.compare else None
-    watch, device = import_viewer(args), resolve_device(args.device)  # refuses what is missing, before slow imports
+    watch, device = import_viewer(args, run.task), resolve_device(args.device)  # refuse before slow imports
     with cli.slow_imports():
         from legged_torque.viewer.session import Session
-    session = Session(task_registry.get_task_class(args.task), run, device)
+    session = Session(task_registry.get_task_class(run.task), run, device)
     session.follow_newest(args.checkpoint in (None, -1))
     if compared:
-        session.companion = Session(task_registry.get_task_class(compared.config["task"]), compared, device)
+        session.companion = Session(task_registry.get_task_class(compared.task), compared, device)
     if args.command:
         session.set_command(tuple(args.command))
     watch(session)
@@ -147,9 +148,8 @@ def show(args: argparse.Namespace, run: LoadedRun) -> None:
 
 def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
     """Return the run of ``--compare``; a UserError if its robot cannot walk next to that of another run."""
-    task = load_config(Path(args.compare))["task"]
-    options = Options(task, args.device, num_envs=1, load_run=args.compare, perturbation=args.perturbation)
-    options.ranges, options.set = args.ranges, args.set
+    options = Options("", args.device, num_envs=1, load_run=args.compare, log_root=args.log_root)
+    options.perturbation, options.ranges, options.set = args.perturbation, args.ranges, args.set
     compared = task_registry.load_run(options)
     if compared.env_cfg.asset.file != run.env_cfg.asset.file:
         raise UserError(
@@ -168,7 +168,7 @@ def agent(name: str, env: LeggedRobot) -> Callable[[TensorDict], Tensor]:
     return lambda obs: actions.uniform_(-1.0, 1.0) if name == "random" else actions
 
 
-def import_viewer(args: argparse.Namespace) -> Callable[[Session], None]:
+def import_viewer(args: argparse.Namespace, title: str) -> Callable[[Session], None]:
     """Return the function that shows a session; a UserError if a package or a screen is missing."""
     if args.viewer == "native":
         from legged_torque.viewer import native
@@ -179,7 +179,7 @@ def import_viewer(args: argparse.Namespace) -> Callable[[Session], None]:
         from legged_torque.viewer.web import watch
     except ImportError as error:
         raise UserError(f"--viewer web needs the extra: pip install 'legged_torque[viewer]' ({error})") from None
-    return functools.partial(watch, title=args.task, host=args.host, port=args.port, no_renderer=args.no_renderer)
+    return functools.partial(watch, title=title, host=args.host, port=args.port, no_renderer=args.no_renderer)
 
 
 def roll_out(

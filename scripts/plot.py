@@ -1,12 +1,12 @@
 """Draw figures.
 
-Each figure has options of its own: plot.py curves --help.
-
 Examples:
     python scripts/plot.py curves logs/a1_torque/*/evaluations.csv --out curves.png
     python scripts/plot.py pretraining report.json --out pretraining.png
     python scripts/plot.py randomization --out distributions.png
     python scripts/plot.py terrain --out tiles.png
+
+Each figure has options of its own: plot.py curves --help.
 """
 
 import pkgutil

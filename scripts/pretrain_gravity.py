@@ -1,10 +1,10 @@
 """Teach a torque policy to stand by supervision.
 
-The policy is kept where ``train.py`` looks for it, which also makes it itself if it is missing.
-
 Examples:
     python scripts/pretrain_gravity.py --task=a1_torque_gravity
     python scripts/pretrain_gravity.py --check_standing --num_envs=1000
+
+The policy is kept where ``train.py`` looks for it, which also makes it itself if it is missing.
 """
 
 import argparse

@@ -8,6 +8,7 @@ from pathlib import Path
 from legged_torque.paper.report import check_extra
 from legged_torque.utils import cli
 from legged_torque.utils.limits import NotNegative
+from legged_torque.utils.words import counted
 
 
 def main() -> None:
@@ -35,7 +36,8 @@ def main() -> None:
     videos = find_videos(args.videos, experiment.plan.tasks) if args.videos else {}
     from_step = experiment.last_part() if args.from_step is None else args.from_step
     figures, missing = write_report(experiment, from_step, out, videos)
-    print(f"{out / 'report.md'}, report.html, {figures} figures; missing or not finished: {missing} lines")
+    lines = counted(missing, "line")
+    print(f"{out / 'report.md'}, report.html, {counted(figures, 'figure')}; missing or not finished: {lines}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Run an exported policy in plain MuJoCo, without torch and Warp.
 
 Examples:
+    python scripts/sim2sim.py                                            # the last export of the last run
     python scripts/sim2sim.py logs/a1_torque_multihead/RUN/exported_1119
     python scripts/sim2sim.py exported --command 0.5 0 0 --video walk.mp4
     python scripts/sim2sim.py exported --viewer --robots 1
@@ -14,17 +15,22 @@ import importlib.metadata
 from pathlib import Path
 
 from legged_torque import resource_path
+from legged_torque.deploy.description import DESCRIPTION_FILE
+from legged_torque.envs import LeggedRobotCfg
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_json
 from legged_torque.utils.limits import Count, NotNegative, Number, Share
+from legged_torque.utils.task_registry import LOGS
+from legged_torque.utils.words import counted
 
 
 def parse_args() -> argparse.Namespace:
     """Parse and check the command line."""
     parser = cli.Parser(__doc__)
-    parser.add_argument("policy", type=Path, help="policy.yaml, policy.onnx, or the folder of both")
+    hint = "policy.yaml, policy.onnx, or the folder of both; default: the last export of the last run that has one"
+    parser.add_argument("policy", type=Path, nargs="?", help=hint)
     parser.add_argument("--xml", type=Path, help="MJCF of the robot; default: that of the training")
     parser.add_argument("--steps", type=int, default=2000, help="control steps of each robot; default: %(default)s")
     parser.add_argument("--robots", type=int, default=16, help="robots, one after another; default: %(default)s")
@@ -43,7 +49,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--video", type=Path, help="mp4 of the first robot")
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
-    cli.add_options(parser, "task_file")
+    cli.add_options(parser, "task_file", "log_root")
     args = parser.parse_args()
     cli.check_args(args, steps=Count, robots=Count, seed=Number, command=list[float])
     cli.check_args(args, push_velocity=NotNegative, push_probability=Share)
@@ -70,11 +76,11 @@ def main() -> None:
         from legged_torque.deploy.policy import Policy
         from legged_torque.deploy.robot import MujocoRobot
         from legged_torque.deploy.simulation import Simulation
-        from legged_torque.envs import LeggedRobotCfg
         from legged_torque.utils.display import Counter
         from legged_torque.utils.metrics import UNITS, estimates, ratios
         from legged_torque.viewer.native import simulation_window
         from legged_torque.viewer.video import SimulationRecorder
+    args.policy = args.policy or last_export(Path(args.log_root or LOGS))
     policy = Policy(args.policy)
     if args.terrain:
         select_ground(policy.description, LeggedRobotCfg().terrain, args.terrain, args.level)
@@ -96,7 +102,7 @@ def main() -> None:
                 sums.append(simulation.run(args.steps, [args.seed, number], lambda after=after: [do() for do in after]))
     control_step = 1.0 / policy.description["timing"]["control_frequency"]
     metrics = estimates(ratios(np.array(sums).T, robot.weight, control_step))
-    print(f"  {args.robots} robots x {args.steps} steps of {control_step:g} s")
+    print(f"  {counted(args.robots, 'robot')} x {counted(args.steps, 'step')} of {control_step:g} s")
     for name, value in metrics.items():
         print(f"  {name:<18} {value.mean:10.4f} +- {value.standard_error:.4f} {UNITS[name]}")
     if args.json:
@@ -107,6 +113,14 @@ def main() -> None:
         write_json(args.json, result)  # in which null stands for values that were not measured
     if recorder:
         recorder.save(args.video, no_renderer)
+
+
+def last_export(log_root: Path) -> Path:
+    """Return the folder of the last policy that export.py has kept with a run; a UserError if there is none."""
+    exports = list(log_root.glob(f"*/*/exported_*/{DESCRIPTION_FILE}"))
+    if not exports:
+        raise UserError(f"there is no exported policy in '{log_root}'; run export.py first, or name a policy")
+    return max(exports, key=lambda file: (file.parents[1].name, file.stat().st_mtime)).parent
 
 
 if __name__ == "__main__":

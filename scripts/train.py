@@ -1,14 +1,15 @@
 """Train a policy.
 
+Examples:
+    python scripts/train.py                                           # the default training: 110 million steps
+    python scripts/train.py --task=a1_torque --max_iterations 20      # a short one of another task
+    python scripts/train.py --task=a1_position --perturbation low --set rewards.scales.torques=-1e-4
+    python scripts/train.py --resume --max_iterations 40              # go on with the last run
+    python scripts/train.py --task=my_task --task_file my_task.py     # a task of your own
+    python scripts/train.py --list go2                                # tasks of the Go2
+
 On several GPUs of a machine: ``torchrun --standalone --nproc_per_node=2 scripts/train.py --task=a1_torque_multihead``;
 on several machines: docs/howto/cluster.md.
-
-Examples:
-    python scripts/train.py --task=a1_torque_multihead                # the default training: 110 million steps
-    python scripts/train.py --task=a1_torque --max_iterations 20      # a short one
-    python scripts/train.py --task=a1_position --perturbation low --set rewards.scales.torques=-1e-4
-    python scripts/train.py --task=a1_torque --resume                 # go on with the last run
-    python scripts/train.py --task=my_task --task_file my_task.py     # a task of your own
 """
 
 from __future__ import annotations
@@ -17,29 +18,38 @@ import contextlib
 import functools
 import shlex
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.envs import task_registry
+from legged_torque.envs.tasks import list_tasks
 from legged_torque.utils import cli, distributed
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.devices import busy_cores_note, device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.limits import Number
-from legged_torque.utils.options import DEFAULT_PRESET, Options
+from legged_torque.utils.options import DEFAULT_PRESET, DEFAULT_TASK, Options
 from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, package_versions
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
+from legged_torque.utils.words import counted
 from legged_torque.viewer.training_viewer import TrainingViewer
 
 if TYPE_CHECKING:
     from legged_torque.learning.runner import OnPolicyRunner
 
+LONG_ON_CPU = 5_000_000  # steps, which take an hour or more
+LONG_NOTE = (
+    "a whole training takes hours to days on a CPU; --max_iterations 100 is a short one, and Ctrl-C keeps the run"
+)
+
 
 def main() -> None:
     """Parse the command line and train."""
     parser = cli.Parser(__doc__)
-    cli.add_task_args(parser)
     cli.add_options(parser, *cli.TRAINING)
-    parser.add_argument("--list", action="store_true", help="print all tasks and exit")
+    cli.add_task_args(parser)
+    hint = "print all tasks, or those with this in their names, and exit"
+    parser.add_argument("--list", nargs="?", const="", metavar="PART", help=hint)
     hint = "web: a page on which the newest policy of the training walks; default: %(default)s"
     parser.add_argument("--viewer", choices=("none", "web"), default="none", help=hint)
     hint = "iterations from one short video of the policy to the next, made during the training; default: no videos"
@@ -47,8 +57,8 @@ def main() -> None:
     args = parser.parse_args()
     cli.check_args(args, video_interval=Number)
     options, is_first = cli.options_of(args), distributed.rank() == 0
-    if args.list:
-        print("\n".join(task_registry.names()))
+    if args.list is not None:
+        print("\n".join(list_tasks(args.list)))
         return
     if options.resume:
         if options.preset:
@@ -59,14 +69,15 @@ def main() -> None:
 
                 use_first_run(options)
             run = task_registry.load_run(options)
-        env_cfg, train_cfg = run.env_cfg, run.train_cfg
+        env_cfg, train_cfg, options.task = run.env_cfg, run.train_cfg, run.task
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
         options.max_iterations = options.max_iterations or run.config.get("max_iterations")
         if is_first:
-            print(f"Resuming from {run.checkpoint}, after {run.iterations} iterations.")
+            print(f"Resuming from {run.checkpoint}, after {counted(run.iterations, 'iteration')}.")
     elif options.load_run or options.checkpoint is not None:
         raise UserError("--load_run and --checkpoint need --resume")
     else:
+        options.task = options.task or DEFAULT_TASK
         with cli.slow_imports():
             env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
     folder = experiment_dir(train_cfg, options.log_root)
@@ -106,9 +117,14 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     distributed.check_same(flat({**settings, "task": options.task, "max_iterations": total}))
     remaining = total - runner.current_learning_iteration
     if remaining < 1:
-        raise UserError(f"the run has {runner.current_learning_iteration} iterations already; raise --max_iterations")
+        done = runner.current_learning_iteration
+        command = [*sys.argv[1:], f"--max_iterations={2 * done}"]
+        further = f"{cli.script_command('train')} {shlex.join(command)}"
+        raise UserError(f"the run has all of its {counted(done, 'iteration')}; to go on: {further}")
     if is_first:
-        print_notes([busy_cores_note(torch.get_num_threads()) if env.device == "cpu" else ""])
+        if env.device == "cpu":
+            is_long = train_cfg.runner.total_steps > LONG_ON_CPU and not options.max_iterations
+            print_notes([LONG_NOTE if is_long else "", busy_cores_note(torch.get_num_threads())])
         announce(runner, options, env_cfg, train_cfg, total, viewer.page)
         runner.on_checkpoint = functools.partial(viewer.show, cli.option_words(options, "task_file", "task"))
     is_complete = False
@@ -136,15 +152,16 @@ def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: 
     settings |= {"device_name": device_name(device), "processes": num_processes, "max_iterations": total}
     runner.claim_log_dir(settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     place = device_name(device) if num_processes == 1 else f"{num_processes} x {device_name(device)}"
-    print(f"Training {options.task} on {place}: {num_processes * runner.env.num_envs} worlds, {total} iterations.")
+    worlds = counted(num_processes * runner.env.num_envs, "world")
+    print(f"Training {options.task} on {place}: {worlds}, {counted(total, 'iteration')}.")
     print(f"Curves: tensorboard --logdir {runner.log_dir}")
     how = page or f"{cli.script_command('play')} {run_words(options, runner.log_dir)} --viewer web"
     print(f"See it learn: {how}", flush=True)
 
 
 def run_words(options: Options, run_dir: str) -> str:
-    """Return the options with which other scripts find a run."""
-    return shlex.join([*cli.option_words(options, "task_file", "task"), f"--load_run={run_dir}"])
+    """Return the options with which other scripts find a run, short enough for a line of a terminal."""
+    return shlex.join([*cli.option_words(options, "task_file", "log_root"), f"--load_run={Path(run_dir).name}"])
 
 
 if __name__ == "__main__":

@@ -342,7 +342,7 @@ def main() -> None:
         planes = PlanePerFoot(spec, env.foot_names, ground)
         model, pose = open_motors(planes.model), planes.pose
         model.opt.timestep = env.cfg.sim.dt
-    print(f"{args.task} on {device_name(env.device)}: errors of the velocities after one step [m/s, rad/s]")
+    print(f"{run.task} on {device_name(env.device)}: errors of the velocities after one step [m/s, rad/s]")
     print(f"of {args.worlds} worlds each; {limits[0]} iterations of the solver, {limits[1]} of its line search")
     titles = ("kind", "engine", "median", "99.9%", "max", f"> {TOLERANCE:g}", "left out", "iterations")
     print("{:<21} | {:<11} | {:>7} | {:>7} | {:>7} | {:>7} | {:>8} | {:>10}".format(*titles))

@@ -1,19 +1,17 @@
-"""Speed and memory of training, and the time until a robot walks."""
+"""Speed and memory of training."""
 
 from __future__ import annotations
 
 import contextlib
-import csv
 import gc
 import os
 import resource
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from statistics import mean, median
+from statistics import median
 from typing import Any
 from unittest.mock import patch
 
@@ -25,9 +23,7 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.sim.graph import CudaGraph, prepare_device
-from legged_torque.utils.errors import TrainingError
 from legged_torque.utils.progress import CompileProgress
-from legged_torque.utils.runs import EVALUATIONS_FILE
 from legged_torque.utils.task_registry import set_seed
 
 WARM_UP = 2  # iterations before timing begins: the first one compiles, the second one captures the rollout
@@ -36,8 +32,6 @@ PHYSICS_STEPS = 5
 """Control steps of physics timed in a row: enough to hide the cost of the reset before them, and no robot falls yet."""
 ACTION_SCALE = 0.5  # standard deviation of the random actions while env.step is timed
 GPU_CALLS = 20  # calls per timing on a GPU, where a single one is short; on the CPU one call is timed
-TRACKING = (0.70, 0.75)
-"""Shares of the commanded velocity, by ``track_percentage`` of the evaluations during training."""
 _MIB = 2**20
 _MS = 1e3
 
@@ -79,13 +73,10 @@ class MemoryMeter:
             torch.cuda.empty_cache()
 
 
-def measure(
-    task_name: str, cfgs: tuple, memory: MemoryMeter, rounds: int, endurance: int, trace: Path | None
-) -> dict[str, Any]:
+def measure(task_name: str, cfgs: tuple, memory: MemoryMeter, rounds: int, trace: Path | None) -> dict[str, Any]:
     """Measure one task of one size; ``cfgs`` are the settings of the task and of its training.
 
-    Timed are ``rounds`` iterations, and physics and step as often. ``endurance`` is the number of iterations in a row
-    to look for slow-down and growth, ``trace`` a file for some iterations; 0 and None leave them out.
+    Timed are ``rounds`` iterations, and physics and step as often. ``trace`` is a file for some iterations, or None.
 
     Returns:
         The numbers, by names that end in their units; see :func:`summarize`. "build_s" is the time for task and runner,
@@ -102,8 +93,6 @@ def measure(
         peak = max(*used, memory.used())
         row = summarize(times, *time_physics(task, rounds), task.num_envs, cfgs[1].runner.num_steps_per_env)
         row |= {"peak_memory_mib": peak, "build_s": built - start, "startup_s": startup}
-        if endurance:
-            row["endurance"] = measure_endurance(runner, endurance, memory)
         if trace:
             row["profile"] = trace_iterations(runner, trace)
     return row
@@ -213,21 +202,6 @@ def summarize(times: Times, physics: float, step: float, num_envs: int, num_step
     }
 
 
-def measure_endurance(runner: OnPolicyRunner, count: int, memory: MemoryMeter) -> dict[str, float]:
-    """Run many iterations in a row and compare the first tenth with the last, in mean time and in memory at its end."""
-    tenth, used = max(1, count // 10), list[float]()
-
-    def look(number: int) -> None:
-        """Note the memory in use after the first tenth and at the end."""
-        if number in (tenth, count):
-            used.append(memory.used())
-
-    times = time_iterations(runner, count, look)["iteration"]
-    first, last = mean(times[:tenth]), mean(times[-tenth:])
-    result = {"iterations": count, "first_ms": first, "last_ms": last, "slowdown": last / first - 1.0}
-    return result | {"first_memory_mib": used[0], "last_memory_mib": used[-1], "growth_mib": used[-1] - used[0]}
-
-
 def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[str]:
     """Write a trace of two iterations for Perfetto or Chrome (.json or .json.gz).
 
@@ -243,40 +217,3 @@ def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[str]:
     profiler.export_chrome_trace(str(file))
     order = "self_device_time_total" if cuda else "self_cpu_time_total"
     return profiler.key_averages().table(sort_by=order, row_limit=10).splitlines()
-
-
-def time_training(command: list[str]) -> dict[str, Any]:
-    """Run a whole training, a command to which the folder of its logs is added, and return its wall clock [s].
-
-    Returns:
-        "start_s" from the command to the first iteration, "total_s" to the end of the process, "steps" of the last
-        evaluation, and "reached" for each of :data:`TRACKING`, see :func:`first_reaching`.
-
-    Raises:
-        TrainingError: The process has failed.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        began = time.time()
-        status = subprocess.run([*command, f"--log_root={folder}"], stdout=subprocess.DEVNULL).returncode
-        total = time.time() - began
-        if status:
-            raise TrainingError(f"the training of --learn has ended with status {status}")
-        (file,) = Path(folder).glob(f"*/*/{EVALUATIONS_FILE}")
-        lines, written = file.read_text(encoding="utf-8").splitlines(), file.stat().st_mtime - began
-    rows = [{name: float(number) for name, number in row.items()} for row in csv.DictReader(lines)]
-    start = written - rows[-1]["seconds"]
-    reached = [first_reaching(share, rows, start) for share in TRACKING]
-    return {"start_s": start, "total_s": total, "steps": int(rows[-1]["steps"]), "reached": reached}
-
-
-def first_reaching(share: float, rows: list[dict[str, float]], start: float) -> dict[str, float | None]:
-    """Return when tracking was first at or above a share, of the rows of evaluations; None if it never was.
-
-    "training_s" is the time since the first iteration, which began ``start`` seconds after the command, and "command_s"
-    that since the command.
-    """
-    row = next((row for row in rows if row["track_percentage"] >= share), None)  # NaN reaches none
-    if row is None:
-        return {"share": share, "steps": None, "training_s": None, "command_s": None}
-    times = {"training_s": row["seconds"], "command_s": start + row["seconds"]}
-    return {"share": share, "steps": int(row["steps"]), **times}

@@ -9,6 +9,7 @@ import importlib
 import pkgutil
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from legged_torque.envs import robots
@@ -19,7 +20,8 @@ from legged_torque.envs.approaches import torque_gravity
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 from legged_torque.envs.grounds.rough import RoughCfg, RoughCfgPPO, RoughScanCfg
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.options import DEFAULT_TASK
 from legged_torque.utils.task_registry import task_registry
 
 
@@ -168,6 +170,45 @@ def further_robots() -> Iterator[tuple[str, Any, Any]]:
                     raise UserError(f"'{module.name}.py' in envs/robots must have one class of this kind, not {names}")
             if settings and training:
                 yield module.name, settings[0], training[0]
+
+
+PURPOSES = {
+    "position": "joint positions under PD control",
+    "torque": "joint torques",
+    "torque_gravity": "torques, from a policy that stands",
+    "torque_curriculum": "torques, nominal pose comes first",
+    "torque_multihead": "positions + torques, PD down to 0",
+    "multihead": "positions + torques, PD down to 0.1",
+    "torque_curriculum_multihead": "curriculum, torque multi-head",
+    "torque_gravity_curriculum": "pre-training + curriculum",
+    "torque_gravity_multihead": "pre-training + torque multi-head",
+    "torque_curriculum_high": "curriculum with a higher pose",
+    "multihead_two_rates": "positions 50 Hz, torques 200 Hz",
+}
+"""What the tasks of an approach are, for lists."""
+
+
+def list_tasks(part: str) -> list[str]:
+    """Return lines on all tasks, or on those with ``part`` in their names, by robot and ground.
+
+    A UserError if there is none.
+    """
+    groups: dict[str, list[str]] = {}
+    robots = dict[str, None]()
+    for name in task_registry.names():
+        cfg, _ = task_registry.get_cfgs(name)
+        scan = "_scan" if cfg.terrain.measure_heights else ""
+        ground = f"on rough ground, {'with a height scan' if scan else 'blind'}"
+        robots[robot := Path(cfg.asset.file).stem] = None
+        approach = name.removeprefix(f"{robot}_").removeprefix("rough_").removesuffix(scan)
+        purpose = PURPOSES.get(approach) or str(cfg.__doc__).partition("\n")[0]
+        if part in name:
+            title = f"{robot} {'on a plane' if cfg.terrain.mesh_type == 'plane' else ground}:"
+            groups.setdefault(title, []).append(f"{'*' if name == DEFAULT_TASK else ' '} {name:<42} {purpose}")
+    if not groups:
+        raise unknown_name("part of a task's name", part, robots)
+    lines = [line for title, names in groups.items() for line in (title, *names)]
+    return [*lines, f"* the default of --task, which is recommended ({len(lines) - len(groups)} tasks)"]
 
 
 def on_ground(ground: type, task: type) -> Any:

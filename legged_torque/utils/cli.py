@@ -19,20 +19,23 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from legged_torque import SCRIPTS_DIR
+from legged_torque.utils.config import flat, section_keys, to_dict
 from legged_torque.utils.devices import disable_renderer
 from legged_torque.utils.errors import TrainingError, UserError, is_out_of_memory, unknown_name
 from legged_torque.utils.files import write_errors
 from legged_torque.utils.limits import check_value, describe, types_of
-from legged_torque.utils.options import Options
+from legged_torque.utils.options import DEFAULT_TASK, Options
 from legged_torque.utils.task_registry import task_registry
 
 COMMAND = "legged-torque"  # the console command that runs every script
-SETTINGS = ("task", "task_file", "seed", "perturbation", "ranges", "device", "set")  # options of every task
-RUNS = ("log_root", "experiment_name", "load_run", "checkpoint")  # of scripts that keep or load runs
-TRAINING = ("max_iterations", "resume", "run_name", "preset", "logger", "verbose")  # of trainings alone
-_GROUPS = {"task and settings": (*SETTINGS, "num_envs"), "runs": RUNS, "training": TRAINING}
+SETTINGS = ("task", "set", "perturbation", "seed", "device", "ranges", "task_file")  # options of every task
+RUNS = ("load_run", "checkpoint", "log_root", "experiment_name")  # of scripts that keep or load runs
+TRAINING = ("max_iterations", "resume", "preset", "run_name", "logger", "verbose")  # of trainings alone
+_GROUPS = {"task and settings": ("task", "num_envs", *SETTINGS[1:]), "training": TRAINING, "runs": RUNS}
+_TASK_OF_RUN = f"name of the task, see train.py --list; default: that of the run, or {DEFAULT_TASK} for a new one"
+_COMPLETED = ("task", "preset", "perturbation", "ranges", "set", "terrain")
 _SCRIPT = re.compile(r"python scripts/(\w+)\.py")
-_EXAMPLE = re.compile(r": ``(python scripts/[^`]+)``")
+_EXAMPLE = re.compile(r": ``(python scripts/[^`]+)``\.")
 
 
 def script_command(script: str) -> str:
@@ -51,18 +54,24 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, description: str) -> None:
         """Create a parser; abbreviations of options are not accepted.
 
-        ``description`` is the docstring of a script. The example in its first line, or those below a line "Examples:",
-        stand at the end of the help.
+        ``description`` is the docstring of a script, with which the help begins. Its examples, in the first line or
+        below a line "Examples:", keep their lines.
         """
-        text, _, examples = description.partition("\nExamples:\n")
-        examples += "".join(f"    {example}\n" for example in _EXAMPLE.findall(text))
         width = max(shutil.get_terminal_size().columns - 2, 20)  # argparse's own
+        text = _EXAMPLE.sub(r".\n\nExamples:\n    \1", description.strip())
+        parts = (part if part.startswith("Examples:") else textwrap.fill(part, width) for part in text.split("\n\n"))
         super().__init__(
-            description="\n\n".join(textwrap.fill(part, width) for part in _EXAMPLE.sub("", text).split("\n\n")),
-            epilog=examples and "examples:\n" + _SCRIPT.sub(lambda found: script_command(found[1]), examples.rstrip()),
+            description=_SCRIPT.sub(lambda found: script_command(found[1]), "\n\n".join(parts)),
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
+
+    def format_help(self) -> str:
+        """Return the text of ``--help``, which names options once: below the examples."""
+        places = [action for action in self._actions if not action.option_strings]
+        words = [f"[{place.dest}]" if place.nargs == "?" else place.dest for place in places]
+        self.usage = " ".join(["%(prog)s", *words, "[options]"])
+        return super().format_help()
 
     def error(self, message: str) -> NoReturn:
         """Report a mistake in the arguments."""
@@ -76,6 +85,9 @@ class Parser(argparse.ArgumentParser):
         if "_ARGCOMPLETE" in os.environ:
             import argcomplete
 
+            for action in self._actions:
+                if action.dest in _COMPLETED:
+                    action.completer = complete  # type: ignore[attr-defined]
             argcomplete.autocomplete(self)
         words = sys.argv[1:] if args is None else list(args)
         for before, word in zip(["", *words], words, strict=False):
@@ -84,8 +96,12 @@ class Parser(argparse.ArgumentParser):
                 raise UserError(f"the value of {name} is empty" if name else "an argument is empty")
         namespace, unknown = self.parse_known_args(words, namespace)
         if unknown:
+            before = words[: words.index(unknown[0])] if unknown[0] in words else []
+            option, key = ["", "", *before][-2:]
+            if option == "--set" and "=" not in key:
+                raise UserError(f"--set takes KEY=VALUE: give --set {key}={unknown[0]}")
             options = [option for action in self._actions for option in action.option_strings]
-            raise unknown_name("option", unknown[0], options)
+            raise unknown_name("option", unknown[0].partition("=")[0], options)
         return namespace
 
 
@@ -112,6 +128,8 @@ def add_options(parser: Parser, *names: str) -> None:
     for title, members in _GROUPS.items():
         chosen = [name for name in members if name in names]
         group = parser.add_argument_group(title) if chosen else parser
+        if "task" in chosen:  # above the script's own options
+            parser._action_groups.insert(1, parser._action_groups.pop())
         for name in chosen:
             hint, how = types[name], {**fields[name].metadata, "default": getattr(defaults, name)}
             if hint is bool:
@@ -120,11 +138,26 @@ def add_options(parser: Parser, *names: str) -> None:
                 how["action"] = "append"
             elif hint not in (str, str | None):
                 how |= {"type": int, "help": f"{how['help']}; {describe(hint).removesuffix(' or null')}"}
+            if name == "task" and "load_run" in names:
+                how |= {"default": "", "help": _TASK_OF_RUN}
             if aliases := how.pop("aliases", ()):
                 how["action"] = _OneValue
-            action = group.add_argument(f"--{name}", *aliases, **how)
-            if name == "task":
-                action.completer = lambda **_: task_registry.names()  # type: ignore[attr-defined] # for argcomplete
+            group.add_argument(f"--{name}", *aliases, **how)
+
+
+def complete(action: argparse.Action, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+    """Return the words that a shell offers as values of an option, which may depend on the task."""
+    tasks, task = task_registry.names(), getattr(parsed_args, "task", "")
+    env_cfg, train_cfg = task_registry.get_cfgs(task if task in tasks else DEFAULT_TASK)
+    words = {
+        "task": tasks,
+        "preset": train_cfg.presets(),
+        "perturbation": env_cfg.perturbations(),
+        "ranges": env_cfg.parameter_ranges(),
+        "set": [f"{path}=" for path in flat(to_dict(env_cfg) | to_dict(train_cfg))],
+        "terrain": ["all", *section_keys(env_cfg.terrain.terrain_proportions)],
+    }
+    return list(words[action.dest])
 
 
 class _OneValue(argparse.Action):
@@ -142,8 +175,7 @@ class _OneValue(argparse.Action):
 def add_task_args(parser: Parser) -> None:
     """Add the options of scripts that build a task and keep or load runs of it."""
     add_options(parser, *SETTINGS, "num_envs", *RUNS)
-    hint = "for legged_gym's sake: no window is opened, which none is unless it is asked for"
-    parser.add_argument("--headless", action="store_true", help=hint)
+    parser.add_argument("--headless", action="store_true", help=argparse.SUPPRESS)  # of legged_gym: no window opens
 
 
 def options_of(args: argparse.Namespace) -> Options:

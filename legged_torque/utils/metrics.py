@@ -28,7 +28,7 @@ Array: TypeAlias = Any  # a numpy array or a torch tensor
 
 
 UNITS = {
-    "track_percentage": "",
+    "track_percentage": "share",
     "track_xy": "m^2/s^2",
     "track_angular": "rad^2/s^2",
     "collision_force": "N",

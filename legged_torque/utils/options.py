@@ -12,6 +12,7 @@ from legged_torque.utils.limits import Count, Number, Worlds, check_value, types
 from legged_torque.utils.successors import successor
 
 DEFAULT_PRESET = "parallel"
+DEFAULT_TASK = "a1_torque_multihead"
 
 
 def _option(text: str, default: Any = None, **how: Any) -> Any:
@@ -26,7 +27,7 @@ class Options:
     The type of a field bounds its values, see ``utils.limits``, and makes it a number, a flag or a list for argparse.
     """
 
-    task: str = _option("name of the task, see train.py --list; default: %(default)s", "a1_torque_multihead")
+    task: str = _option("name of the task, see train.py --list; default: %(default)s", DEFAULT_TASK)
     device: str = _option(
         "auto, cpu or cuda:N; auto takes the GPU if there is one, with torchrun one for each process",
         "auto",

@@ -15,6 +15,7 @@ from typing import TextIO
 import warp as wp
 
 from legged_torque.utils.display import LINE_EVERY, Display
+from legged_torque.utils.words import counted
 
 COMPILING = "compiling kernels, once per machine"
 SHOW_AFTER = 2.0  # seconds of compilation before it is reported
@@ -72,7 +73,8 @@ class CompileProgress(threading.Thread):
             return
         self.modules |= builds
         self._seconds += seconds
-        line = f"{COMPILING}: {len(self.modules)} modules, {self._seconds:.0f} s"
+        what = f"{counted(len(self.modules), 'module')}, " if self.modules else ""  # torch's have no folders
+        line = f"{COMPILING}: {what}{self._seconds:.0f} s"
         if view is not None and self._seconds >= SHOW_AFTER:
             view.activity = line
         elif view is None and self._seconds >= self._next_line:

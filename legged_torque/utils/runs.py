@@ -61,20 +61,27 @@ def evaluations_file(run_dir: Path, environment: str = "") -> Path:
     return file.with_stem(tagged(file.stem, environment))
 
 
-def find_run(log_root: Path, load_run: str | None) -> Path:
-    """Return the folder of a run of an experiment, or raise a UserError if there is none.
+def find_run(root: Path, load_run: str | None, pattern: str = "*") -> Path:
+    """Return the folder of a run, or raise a UserError if there is none.
 
-    ``load_run`` is the name of the run's folder, or a path to it; None is the newest one that has a whole checkpoint.
+    Args:
+        root: Folder of an experiment.
+        load_run: Name of the run's folder, or a path to it; None is the newest one that has a whole checkpoint.
+        pattern: Where runs are in the folder: "*/*" in that of all experiments.
     """
     if load_run and Path(load_run).is_dir():
         return Path(load_run)
-    runs = sorted(path.name for path in log_root.glob("*") if checkpoint_numbers(path))
+    runs = sorted((path for path in root.glob(pattern) if checkpoint_numbers(path)), key=lambda path: (path.name, path))
     if not runs:
-        raise UserError(f"there is no run with a checkpoint in '{log_root}'; train first")
-    if load_run and load_run not in runs:
-        raise unknown_name("run", load_run, runs)
-    whole = (name for name in reversed(runs) if newest_checkpoint(log_root / name))
-    return log_root / (load_run or next(whole, runs[-1]))
+        raise UserError(f"there is no run with a checkpoint in '{root}'; train first")
+    if not load_run:
+        return next(filter(newest_checkpoint, reversed(runs)), runs[-1])
+    named = [path for path in runs if path.name == load_run]
+    if not named:
+        raise unknown_name("run", load_run, (path.name for path in runs))
+    if len(named) > 1:
+        raise UserError(f"there are several runs '{load_run}'; give the path of one: {', '.join(map(str, named))}")
+    return named[0]
 
 
 def find_checkpoint(run_dir: Path, checkpoint: int | None) -> Path:

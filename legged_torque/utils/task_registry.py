@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from rsl_rl.env import VecEnv
     from rsl_rl.runners import OnPolicyRunner
 
+LOGS = "logs"  # default folder of all experiments
 ENTRY_POINTS = "legged_torque.tasks"
 """Group of the entry points of installed packages, each of a module that registers tasks."""
 
@@ -58,6 +59,11 @@ class LoadedRun:
     def iterations(self) -> int:
         """Iterations after which the checkpoint was saved."""
         return checkpoint_number(self.checkpoint)
+
+    @property
+    def task(self) -> str:
+        """Name of its task."""
+        return str(self.config["task"])
 
 
 class TaskRegistry:
@@ -188,22 +194,29 @@ class TaskRegistry:
         return runner, train_cfg
 
     def load_run(self, options: Options) -> LoadedRun:
-        """Return the run that the options name; a UserError if there is none, it is unreadable or of another task."""
-        _, train_cfg = self.get_cfgs(options.task)
-        train_cfg.runner.experiment_name = options.experiment_name or train_cfg.runner.experiment_name
-        root = experiment_dir(train_cfg, options.log_root)
-        folder = find_run(root, options.load_run)
+        """Return the run that the options name, by default the last one; one of all tasks if they name none.
+
+        A UserError if there is none, it is unreadable or of another task.
+        """
+        experiment = options.experiment_name
+        if options.task and not experiment:
+            experiment = self.get_cfgs(options.task)[1].runner.experiment_name
+        root, pattern = Path(options.log_root or LOGS, experiment or ""), "*" if experiment else "*/*"
+        folder = find_run(root, options.load_run, pattern)
         config = load_config(folder)
-        if config["task"] != options.task:
-            raise UserError(f"the run '{folder}' is of task '{config['task']}', not '{options.task}'")
-        cfgs = self.get_cfgs(options.task, options, config)
+        task = str(config["task"])
+        if options.task and task != options.task:
+            raise UserError(f"the run '{folder}' is of task '{task}', not '{options.task}'")
+        cfgs = self.get_cfgs(task, options, config)
         robot, trained = cfgs[0].asset.file, config["env"].get("asset", {}).get("file", cfgs[0].asset.file)
         if robot != trained:
             from legged_torque.utils.mjcf import robot_notes  # which imports mujoco
 
             print_notes(robot_notes(resource_path(robot), resource_path(trained)))
         file = find_checkpoint(folder, options.checkpoint)
-        newer_runs = not options.load_run and any(checkpoint_numbers(run) for run in root.glob("*") if run > folder)
+        newer_runs = not options.load_run and any(
+            run.name > folder.name and checkpoint_numbers(run) for run in root.glob(pattern)
+        )
         if newer_runs or (options.checkpoint is None and checkpoint_number(file) != checkpoint_numbers(folder)[-1]):
             print(f"Newer checkpoints than '{file}' are damaged; taking this one.")
         return LoadedRun(folder, config, *cfgs, file)
@@ -214,8 +227,8 @@ class TaskRegistry:
         ``env_cfg`` are settings of the task in place of the run's; its critic may see other things, as it is not
         loaded. A UserError if the checkpoint cannot be read or is of another kind of policy.
         """
-        env, _ = self.make_env(options.task, options, env_cfg or run.env_cfg)
-        runner, _ = self.make_alg_runner(env, options.task, train_cfg=run.train_cfg, log_root=None)
+        env, _ = self.make_env(run.task, options, env_cfg or run.env_cfg)
+        runner, _ = self.make_alg_runner(env, run.task, train_cfg=run.train_cfg, log_root=None)
         runner.load(str(run.checkpoint), {"actor": True, "iteration": True})
         return env, runner
 
@@ -224,7 +237,7 @@ class TaskRegistry:
         if name not in self._tasks:
             self._import_installed()
         if name not in self._tasks:
-            raise unknown_name("task", name, self._tasks)
+            raise UserError(f"{unknown_name('task', name, self._tasks)}; one of your own needs its --task_file")
         return self._tasks[name]
 
     def _import_installed(self) -> None:
@@ -272,8 +285,8 @@ def print_notes(notes: Iterable[str]) -> None:
 
 
 def experiment_dir(train_cfg: Any, log_root: str | None = None) -> Path:
-    """Return the folder that holds the runs of an experiment; the default of ``log_root`` is ``logs``."""
-    return Path(log_root or "logs") / train_cfg.runner.experiment_name
+    """Return the folder that holds the runs of an experiment; the default of ``log_root`` is :data:`LOGS`."""
+    return Path(log_root or LOGS) / train_cfg.runner.experiment_name
 
 
 def num_iterations(env: VecEnv, train_cfg: Any) -> int:

@@ -157,7 +157,7 @@ def read_experiment(folder: Path) -> Experiment:
         UserError: If the folder or its plan cannot be read, or it has neither a plan nor a run.
     """
     if not folder.is_dir():
-        raise UserError(f"there is no folder '{folder}'")
+        raise UserError(f"there is no folder '{folder}'; experiment.py or train.py makes it")
     if not (folder / SETTINGS_FILE).is_file():
         problems: list[str] = []
         trainings = find_trainings(folder, problems)

@@ -17,7 +17,7 @@ from legged_torque.paper.plotting import load_pyplot
 from legged_torque.paper.report.evaluations import LEVEL
 from legged_torque.paper.report.experiment import Experiment
 from legged_torque.paper.report.figures_curves import SEED_MARK, draw_curves
-from legged_torque.paper.report.style import name_of, style
+from legged_torque.paper.report.style import in_words, name_of, style
 from legged_torque.paper.values import ENVIRONMENTS, task_on_plane
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def rough_figures(experiment: Experiment) -> dict[str, Draw]:
         return {}
     figures: dict[str, Draw] = {"Levels": partial(draw_curves, experiment, LEVEL.name)}
     names = experiment.plan.environments
-    return figures | {f"Success in {name}": partial(draw_success, experiment, name) for name in names}
+    return figures | {f"Success in {in_words(name)}": partial(draw_success, experiment, name) for name in names}
 
 
 def draw_all(experiment: Experiment, figures: dict[str, Draw], out: Path) -> list[str]:
@@ -109,7 +109,7 @@ def draw_bars(experiment: Experiment, table: pd.DataFrame, names: Sequence[str],
     for row, column in zip(axes, columns, strict=True):
         for axis, metric in zip(row, PAPER_METRICS, strict=True):
             draw_metric(axis, experiment, table.loc[column].xs(metric.name, level="metric"), column, metric)
-        row[0].set_ylabel(ENVIRONMENTS.get(column, column))
+        row[0].set_ylabel(ENVIRONMENTS.get(column, in_words(column)))
     draw_legend(figure, experiment.plan.tasks, table.loc[columns]["paper"].notna().any())
     figure.suptitle(title, fontsize=11)
     return figure
@@ -118,8 +118,9 @@ def draw_bars(experiment: Experiment, table: pd.DataFrame, names: Sequence[str],
 def draw_metric(axis: Axes, experiment: Experiment, cells: pd.DataFrame, column: str, metric: Metric) -> None:
     """Draw a metric, by task, in a column of Table I. Bars far beyond the others are cut off."""
     tops = [max(cell["values"], default=np.nan) for _, cell in cells.iterrows()]  # of the highest seeds
-    shown = np.array([*tops, *cells["paper"], 1e-9])
-    highest = min(1.12 * np.nanmax(shown), CUT_AT * np.nanmedian(shown[shown > 0.0]))
+    values = np.array([*tops, *cells["paper"]])
+    shown = values[values > 0.0]
+    highest = min(1.12 * shown.max(), CUT_AT * np.median(shown)) if len(shown) else 1.0
     notes = []
     for place, ((task, cell), top) in enumerate(zip(cells.iterrows(), tops, strict=True)):
         planned = experiment.num_expected(str(task), experiment.columns()[column][0])

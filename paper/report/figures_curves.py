@@ -11,7 +11,7 @@ import pandas as pd
 from legged_torque.paper.plotting import load_pyplot
 from legged_torque.paper.report.evaluations import CURVE_METRICS, LEVEL, MILLION, read_curves
 from legged_torque.paper.report.experiment import LAST_SHARE, Experiment
-from legged_torque.paper.report.style import name_of, style
+from legged_torque.paper.report.style import in_words, name_of, style
 from legged_torque.paper.values import ENVIRONMENTS
 
 if TYPE_CHECKING:
@@ -20,9 +20,11 @@ if TYPE_CHECKING:
 
 AXES = {"steps": (MILLION, "environment steps [millions]"), "seconds": (1.0, "time of training [s]")}
 """Horizontal axes of curves: unit and label."""
+FEW = 0.1  # million steps, below which single steps are counted
 SINGLE_CURVES = ("track_percentage", "track_xy", "cost_of_transport")  # metrics shown for single trainings
 SEED_LINES = ("-.", "-", "--", ":")  # line styles of single trainings, by seed modulo four
 LABELS = {metric.name: metric.label for metric in (*CURVE_METRICS, LEVEL)}
+HEADROOM = 1.06  # of a linear axis, so that curves do not touch the frame
 STRIP = 0.03  # width of a task's place in the strip of single seeds, as a share of the axis
 SEED_MARK: dict[str, Any] = {"marker": "o", "markersize": 4.0, "markeredgecolor": "white", "markeredgewidth": 0.6}
 
@@ -78,10 +80,14 @@ def draw_curves(
         axis.axvline(end * (1.0 + STRIP / 2), color="#999999", linewidth=0.8)
         axis.set_xlim(0, end * (1.0 + STRIP * (len(tasks) + 0.7)))
         axis.set_xticks([tick for tick in axis.get_xticks() if 0 <= tick <= end])
-        axis.set(xlabel=AXES[over][1], title=ENVIRONMENTS.get(environment, environment))
+        is_short = over == "steps" and end < FEW
+        if is_short:
+            axis.xaxis.set_major_formatter(lambda steps, _: f"{steps * MILLION:,.0f}")
+        axis.set_xlabel("environment steps" if is_short else AXES[over][1])
+        axis.set_title(ENVIRONMENTS.get(environment, in_words(environment)))
         axis.grid(alpha=0.3)
     if scale == "linear":
-        axes[0, 0].set_ylim(0, None)
+        axes[0, 0].set_ylim(0, HEADROOM * axes[0, 0].get_ylim()[1])
     else:
         axes[0, 0].yaxis.set_major_formatter("{x:g}")  # powers would be written in TeX
     axes[0, 0].set_ylabel(LABELS[metric])

@@ -18,16 +18,18 @@ from markupsafe import Markup
 
 from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE
 from legged_torque.experiments.times import describe, read_times
-from legged_torque.paper.metrics import PAPER_METRICS
+from legged_torque.paper.metrics import COMPARED, PAPER_METRICS
 from legged_torque.paper.report import tables
 from legged_torque.paper.report.evaluations import MILLION
 from legged_torque.paper.report.experiment import LAST_SHARE, Experiment, Training, is_of_paper
 from legged_torque.paper.report.figures import draw_all, file_name, planned_figures, rough_figures
-from legged_torque.paper.report.style import name_of
+from legged_torque.paper.report.figures_curves import FEW
+from legged_torque.paper.report.style import in_words, name_of
 from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
-from legged_torque.paper.values import ENVIRONMENTS, TABLE_I
+from legged_torque.paper.values import ENVIRONMENTS, PAPER_TASKS
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import portable_path, without_machine
+from legged_torque.utils.words import counted
 
 MEDIA_TYPES = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
 VIDEOS = [".gif", ".mp4", ".webm"]
@@ -61,7 +63,7 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
         "from_step": from_step,
         "columns": list(filter(is_of_paper, experiment.columns())),
         "other_columns": [name for name in experiment.columns() if not is_of_paper(name)],
-        "signs": signs | {"missing": len(TABLE_I) * len(ENVIRONMENTS) - sum(signs.values())},
+        "signs": signs | {"missing": len(COMPARED) * len(PAPER_TASKS) * len(ENVIRONMENTS) - sum(signs.values())},
         "best_torque": best_torque,
         "num_reached": sum(row[-1].startswith(BETTER) for row in best_torque),
         "missing": missing_lines(experiment, from_step),
@@ -73,8 +75,9 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
         "folders": [portable_path(experiment.folder), portable_path(out)],
         "configs": configs,
     }
-    filters = {"table": markdown_table, "fenced": fenced, "cell": cell, "one_line": one_line}
-    markdown = render("report.md.jinja", values, filters | {"file_name": file_name, "name_of": name_of})
+    filters = {"table": markdown_table, "fenced": fenced, "cell": cell, "one_line": one_line, "file_name": file_name}
+    filters |= {"name_of": name_of, "in_words": in_words, "steps": steps_text}
+    markdown = render("report.md.jinja", values, filters)
     body, headings = to_html(markdown, {file_name(title): out / file_name(title) for title in drawn})
     sources = {name_of(task): data_uri(file) for task, file in videos.items()}
     texts = {task: yaml.safe_dump(config, sort_keys=False) for task, config in configs.items()}
@@ -103,14 +106,14 @@ def missing_lines(experiment: Experiment, from_step: float) -> list[str]:
     """Return a line for everything planned that is missing, unfinished or unreadable."""
     lines, plan = list(experiment.problems), experiment.plan
     for environment, task in product(plan.environments, plan.tasks):
-        place, runs = f"`{task}` in {environment}", experiment.runs_of(task, environment)
+        where, runs = f"`{task}` in {in_words(environment)}", experiment.runs_of(task, environment)
         absent = sorted(set(plan.seeds if experiment.is_planned else ()) - {run.cell.seed for run in runs})
         if absent and runs:
-            lines.append(f"{place}: no training has begun with seed {', '.join(map(str, absent))}.")
+            lines.append(f"{where}: no training has begun with seed {', '.join(map(str, absent))}.")
         elif absent:
-            lines.append(f"{place}: no data, no training has begun.")
+            lines.append(f"{where}: no data, no training has begun.")
         problems = {run.cell.seed: "; ".join(run_problems(run, from_step)) for run in runs}
-        lines += [f"{place}, seed {seed}: {text}." for seed, text in problems.items() if text]
+        lines += [f"{where}, seed {seed}: {text}." for seed, text in problems.items() if text]
     if experiment.unplanned:
         lines.append(f"Left out, as experiment.yaml does not name them: {', '.join(experiment.unplanned)}.")
     return lines
@@ -126,15 +129,15 @@ def run_problems(run: Training, from_step: float) -> list[str]:
     if len(run.rows) and run.steps < from_step:
         end = f"ends before {from_step / MILLION:g} million steps"
         problems.append(f"{end}; its number is the mean of its last {LAST_SHARE:.0%}")
-    counted = run.counted(run.cell.environment, from_step)
-    for name, count in counted[[metric.name for metric in PAPER_METRICS]].isna().sum().items():
-        problems += [f"{count} of the {len(counted)} evaluations that count have no {name}"] if count else []
+    rows = run.counted(run.cell.environment, from_step)
+    for name, count in rows[[metric.name for metric in PAPER_METRICS]].isna().sum().items():
+        problems += [f"{count} of the {len(rows)} evaluations that count have no {name}"] if count else []
     for name in (name for name in run.cell.evaluated_in if name != run.cell.environment):
-        counted = run.counted(name, from_step)
-        if counted.empty:
-            problems.append(f"not evaluated in {name}")
-        elif not run.is_finished(steps := counted["steps"].iloc[-1]):
-            problems.append(f"evaluated in {name} after {steps / MILLION:.4g} of {total}")
+        rows = run.counted(name, from_step)
+        if rows.empty:
+            problems.append(f"not evaluated in {in_words(name)}")
+        elif not run.is_finished(steps := rows["steps"].iloc[-1]):
+            problems.append(f"evaluated in {in_words(name)} after {steps / MILLION:.4g} of {total}")
     if run.cell.crosses and run.crossings is None:
         problems.append(f"not evaluated on {ROUGH_GROUND}")
     return problems
@@ -153,10 +156,10 @@ def setup_lines(experiment: Experiment) -> list[str]:
     ends = pd.DataFrame([run.rows.iloc[-1] for run in experiment.runs if len(run.rows)])
     ends = ends[ends["seconds"] > 0.0] if len(ends) else ends
     if len(ends):
-        total, speed = ends["seconds"].sum(), ends["steps"].sum() / ends["seconds"].sum() / MILLION
+        total, speed = ends["seconds"].sum(), ends["steps"].sum() / ends["seconds"].sum()
         lines.append(
-            f"{len(ends)} trainings took {timedelta(seconds=round(total))} in all, with their evaluations: "
-            f"{total / len(ends):.4g} s and {speed:.3g} million steps/s each on average; those that shared a device "
+            f"{counted(len(ends), 'training')} took {timedelta(seconds=round(total))} in all, with their evaluations: "
+            f"{total / len(ends):.4g} s and {steps_text(speed)} steps/s each on average; those that shared a device "
             "were slower for it"
         )
     return lines
@@ -190,6 +193,11 @@ def write_tables(experiment: Experiment, table: pd.DataFrame, out: Path) -> None
     (out / "evaluations.csv.gz").write_bytes(gzip.compress(text.encode(), mtime=0))  # the same bytes every time
     if experiment.has_rough_ground():
         experiment.crossings().to_csv(out / "grounds.csv", index=False, lineterminator="\n")
+
+
+def steps_text(steps: float) -> str:
+    """Return a number of steps in words: in millions, unless it is small."""
+    return f"{steps / MILLION:.4g} million" if steps >= FEW * MILLION else f"{steps:,.0f}"
 
 
 def one_line(text: str) -> str:

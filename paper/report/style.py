@@ -39,6 +39,11 @@ def style(tasks: Sequence[str], task: str) -> Style:
     return (color, "--", 2 * hatch or "oo") if task.endswith("_scan") else (color, "-", hatch)
 
 
+def in_words(column: str) -> str:
+    """Return the name of a column or an environment in text: "none" is no perturbations, and might mean no data."""
+    return " -> ".join("no perturbations" if name == "none" else name for name in column.split(" -> "))
+
+
 def name_of(task: str) -> str:
     """Return the name of a task in figures: the paper's, or else its own."""
     return MODELS.get(task, task)

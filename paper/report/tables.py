@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from legged_torque.paper.metrics import PAPER_METRICS, Metric
+from legged_torque.paper.metrics import COMPARED, PAPER_METRICS, Metric
 from legged_torque.paper.report.evaluations import CURVE_METRICS, METRIC_NAMES
-from legged_torque.paper.report.experiment import MEASURES, Experiment
-from legged_torque.paper.report.style import method
+from legged_torque.paper.report.experiment import MEASURES, PAPER_STEPS, Experiment
+from legged_torque.paper.report.style import in_words, method
 from legged_torque.paper.values import MODELS, PAPER_TASKS, paper_column, paper_value
 from legged_torque.utils.config import flat
 
@@ -21,6 +21,8 @@ SIGNIFICANT = 0.05
 BETTER, WITHIN, WORSE = "✓", "≈", "✗"
 TARGET = 0.05
 """By how much the best torque method should be better than the paper's best, as a share of it."""
+MIN_TRACKING, MIN_STEPS = 0.5, PAPER_STEPS // 10
+"""Tracking and steps of training from which on a task is compared with the paper: who stands has a low cost, too."""
 BASELINES = ["a1_position", "a1_torque"]
 NOTHING = "–"
 
@@ -31,22 +33,27 @@ def summarize(experiment: Experiment, from_step: float) -> pd.DataFrame:
     Returns:
         A row for each column of the report's tables, task and metric (the index), with the columns ``values`` (a list,
         one number per seed), ``mean``, ``standard_error`` (NaN with one seed), ``seeds`` (how many), ``is_final``
-        (whether all seeds are there and finished), ``paper`` (the mean in Table I, or NaN) and ``sign`` (the
-        :func:`verdict`).
+        (whether all seeds are there and finished), ``is_compared`` (whether they walk), ``paper`` (the mean in Table I,
+        or NaN; also where nothing is compared) and ``sign`` (the :func:`verdict`, or nothing).
     """
     rows = []
     for (column, (trained, evaluated)), task in product(experiment.columns().items(), experiment.plan.tasks):
         counted = [(run, run.counted(evaluated, from_step)) for run in experiment.runs_of(task, trained)]
         is_finished = all(run.is_finished(part["steps"].iloc[-1]) for run, part in counted if len(part))
         seeds = pd.DataFrame([part[METRIC_NAMES].mean() for _, part in counted], columns=METRIC_NAMES)
+        steps = min((part["steps"].iloc[-1] for _, part in counted if len(part)), default=0)
+        is_compared = bool(seeds["track_percentage"].mean() >= MIN_TRACKING and steps >= MIN_STEPS)
         for metric in CURVE_METRICS:
-            values, paper = seeds[metric.name].dropna(), paper_value(task, column, metric.name)
+            values = seeds[metric.name].dropna()
+            paper = paper_value(task, column, metric.name) if is_compared or values.empty else None
             is_final = is_finished and len(values) == experiment.num_expected(task, trained)
             numbers = values.mean(), values.sem(), len(values)
-            sign = verdict(metric, values.mean(), values.sem(), paper) if paper is not None and len(values) else ""
-            rows.append([column, task, metric.name, values.tolist(), *numbers, is_final, paper, sign])
-    names = ["column", "task", "metric", "values", "mean", "standard_error", "seeds", "is_final", "paper", "sign"]
-    return pd.DataFrame(rows, columns=names).astype({"paper": float}).set_index(names[:3])
+            sign = ""
+            if metric in COMPARED and paper is not None and len(values):
+                sign = verdict(metric, values.mean(), values.sem(), paper)
+            rows.append([column, task, metric.name, values.tolist(), *numbers, is_final, is_compared, paper, sign])
+    names = ["column", "task", "metric", "values", "mean", "standard_error", "seeds", "is_final", "is_compared"]
+    return pd.DataFrame(rows, columns=[*names, "paper", "sign"]).astype({"paper": float}).set_index(names[:3])
 
 
 def verdict(metric: Metric, mean: float, standard_error: float, paper: float) -> str:
@@ -68,7 +75,7 @@ def best_of(cells: pd.DataFrame, metric: Metric) -> str:
 
 def significantly_best(cells: pd.DataFrame, metric: Metric) -> str | None:
     """Return the task that is significantly better than every other one, if there is one."""
-    if len(cells) < 2:
+    if len(cells) < 2 or metric not in COMPARED:
         return None
     best, pairs = best_of(cells, metric), list(combinations(cells.index, 2))
     own = [p for pair, p in zip(pairs, compare(cells, pairs), strict=True) if best in pair]
@@ -121,7 +128,7 @@ def metric_table(experiment: Experiment, table: pd.DataFrame, columns: list[str]
     planned = len(experiment.plan.seeds) if experiment.is_planned else 0  # 0: every entry has its number of seeds
     papers = table["paper"].dropna().index.unique("column")
     names = [name for column in columns for name in ([column, "paper"] if column in papers else [column])]
-    rows = [["metric", "method", *names]]
+    rows = [["metric", "method", *map(in_words, names)]]
     for metric in PAPER_METRICS:
         best = {column: significantly_best(cells_of(table, column, metric), metric) for column in columns}
         for task in tasks:
@@ -138,13 +145,13 @@ def metric_table(experiment: Experiment, table: pd.DataFrame, columns: list[str]
 
 
 def best_torque(table: pd.DataFrame) -> Rows:
-    """Return the best torque method and the paper's best, by metric and environment of training."""
+    """Return the best torque method that is compared and the paper's best, by metric and environment of training."""
     rows = [["metric", "environment", "paper's best", "our best torque method", "ours", "better by"]]
-    for metric, column in product(PAPER_METRICS, ("low", "high", "high_frequency")):
+    for metric, column in product(COMPARED, ("low", "high", "high_frequency")):
         papers = pd.DataFrame({"mean": paper_column(column, metric.name)})
         paper = papers.loc[model := best_of(papers, metric), "mean"]
         row = [metric.label, column, f"{paper:.{metric.digits}f} ({MODELS[model]})", "no data", "", ""]
-        cells = cells_of(table, column, metric).drop("a1_position", errors="ignore")
+        cells = cells_of(table, column, metric).query("is_compared").drop("a1_position", errors="ignore")
         if len(cells):
             cell = cells.loc[task := best_of(cells, metric)]
             share = metric.gain(cell["mean"], paper) / paper

@@ -24,9 +24,9 @@ PARTS = ("rollout", "update", "log")
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """Output and file of the script for two sizes, with a run of endurance."""
+    """Output and file of the script for two sizes."""
     root = tmp_path_factory.mktemp("root")
-    words = [*SMALL, "--num_envs", "2", "4", "--endurance=4", f"--json={root / 'new' / 'numbers.json'}"]
+    words = [*SMALL, "--num_envs", "2", "4", f"--json={root / 'new' / 'numbers.json'}"]
     status, output, error = run_here("benchmark.py", *words, root=root)
     assert (status, error) == (0, "")
     assert [path.name for path in root.iterdir()] == ["new"]  # it leaves no run behind
@@ -68,37 +68,6 @@ def test_table(measured):
     for line, row in zip(rows, result["rows"], strict=True):
         cells = [cell.strip() for cell in line.split("|")]
         assert cells[0] == str(row["num_envs"]) and f"{row['iteration_steps_per_s']:.0f}" in cells
-
-
-def test_against_an_earlier_run(measured, tmp_path):
-    """Old and new numbers are printed with their ratios; a whole training is timed on demand."""
-    old = measured[1]
-    more = ["runner.total_steps=12", "evaluation.interval=6", "evaluation.num_samples=4"]
-    (tmp_path / "old.json").write_text(json.dumps(old | {"set": CHANGES + more, "device": "another GPU"}))
-    words = [*SMALL, *(f"--set={change}" for change in more), "--num_envs=2", "--learn"]
-    files = ["--baseline=old.json", f"--json={tmp_path / 'new.json'}"]
-    status, output, error = run_here("benchmark.py", *words, *files, root=tmp_path)
-    assert (status, error) == (0, "")
-    assert "train.py, 12 steps: " in output
-    assert "tracking 70% was not reached" in output and "tracking 75% was not reached" in output
-    (new,) = json.loads((tmp_path / "new.json").read_text())["rows"]
-    assert 0 < new["learn"]["start_s"] < new["learn"]["total_s"]
-    notes, table = output.split("Against old.json\n")[1].split(" worlds | ")
-    assert "its device was 'another GPU', is 'CPU" in notes
-    lines = [[cell.strip() for cell in line.split("|")] for line in table.splitlines()[1:]]
-    assert [cells[1] for cells in lines][:3] == ["physics ms", "step ms", "rollout ms"] and len(lines) == 8
-    ratios = {cells[1]: float(cells[4]) for cells in lines}
-    assert ratios["update ms"] == pytest.approx(new["update_ms"] / old["rows"][0]["update_ms"], abs=1e-3)
-
-
-def test_endurance(measured):
-    """The first and the last tenth of many iterations are compared."""
-    output, result = measured
-    assert output.count("4 iterations in a row") == 2
-    for numbers in (row["endurance"] for row in result["rows"]):
-        assert numbers["iterations"] == 4
-        assert numbers["slowdown"] == pytest.approx(numbers["last_ms"] / numbers["first_ms"] - 1)
-        assert numbers["growth_mib"] == numbers["last_memory_mib"] - numbers["first_memory_mib"] >= 0
 
 
 def test_trace(runner, tmp_path):
@@ -179,9 +148,7 @@ def test_out_of_memory():
     [
         ("--task=a1_positon", "unknown task 'a1_positon'; did you mean 'a1_position'?"),
         ("--rounds=0", "--rounds must be at least 1, not 0"),
-        ("--endurance=-1", "--endurance must be at least 0, not -1"),
         ("--set=sim.solver_iteration=3", "did you mean 'sim.solver_iterations'?"),
-        ("--learn --set=evaluation.interval=0", "needs evaluations during training: evaluation.interval is 0, of 110"),
         ("--num_envs 2 4 --profile=trace.json", "--profile writes one trace: give one number of worlds"),
     ],
 )

@@ -226,7 +226,7 @@ def test_groups_in_the_scripts(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setitem(OBSERVATIONS, "lean", None)  # undone after the test
     (tmp_path / "lean_robot.py").write_text(TASK)
-    words = ["--task_file=lean_robot.py", "--task=a1_lean", "--device=cpu", "--num_envs=2"]
+    words = ["--task_file=lean_robot.py", "--task=a1_lean", "--device=cpu"]
     words += ["--set=runner.num_steps_per_env=4", "--set=algorithm.symmetry_cfg.use_data_augmentation=false"]
     results = []
     for groups in ("[policy,lean]", "[lean]"):

@@ -196,7 +196,7 @@ MISTAKES = [
     ("--steps=0", "--steps must be at least 1, not 0"),
     ("--push_probability=0.1", "--push_probability needs --push_velocity"),
     ("--push_velocity=1 --push_probability=2", "--push_probability must be from 0 to 1"),
-    ("--step=3", "unknown option '--step=3'; did you mean '--steps'?"),
+    ("--step=3", "unknown option '--step'; did you mean '--steps'?"),
     ("--viewer", "MuJoCo's window needs a screen; --video works without one"),
     ("--xml=nothing.xml", "cannot load the robot 'nothing.xml': there is no such file"),
 ]

@@ -338,9 +338,10 @@ def test_options_of_commands(page, monkeypatch, tmp_path):
     def parse_only(parser, *words):
         args = parse(parser, *words)
         is_yours = YOURS in calls[len(parsed)][0]
-        if getattr(args, "set", None) is not None and (args.task in task_registry.names() or not is_yours):
+        task = getattr(args, "task", "") or Options().task
+        if getattr(args, "set", None) is not None and (task in task_registry.names() or not is_yours):
             named = {name: getattr(args, name, None) for name in ("preset", "perturbation", "ranges")}
-            task_registry.get_cfgs(args.task, Options(set=args.set, **named))
+            task_registry.get_cfgs(task, Options(set=args.set, **named))
         parsed.append(args)
         raise SystemExit(0)
 

@@ -177,9 +177,12 @@ def test_breakdown_by_hand(task):
     table = breakdown.table()
     assert list(table) == list(expected)
     for name, parts in table.items():
-        assert [list(part) for part in parts] == [["from", "to", "share", "track_percentage", "error"]] * len(parts)
-        assert np.array([list(part.values()) for part in parts]) == pytest.approx(np.array(expected[name]), abs=1e-6)
+        columns = [[part[key] for key in ("from", "to", "share", "track_percentage", "error")] for part in parts]
+        assert np.array(columns) == pytest.approx(np.array(expected[name]), abs=1e-6)
         assert sum(part["share"] for part in parts) == pytest.approx(1.0, abs=1e-9)
+    # two of five worlds are in the first part of x for two steps each: their errors of 1.0 and 0.0 in all differ by 0.5
+    # from the 2 x 0.25 of the mean
+    assert table["lin_vel_x"][0]["error_standard_error"] == pytest.approx(np.sqrt(2 * 0.5**2 * 5 / 4) / 4)
 
 
 def test_breakdown_of_a_fixed_command(make_task):
@@ -193,6 +196,7 @@ def test_breakdown_of_a_fixed_command(make_task):
     for (name, value), error in zip(fixed.items(), (0.25, 0.5, 0.1), strict=True):
         (part,) = breakdown.table()[name]
         expected = {"from": value, "to": value, "share": 1.0, "track_percentage": 0.5, "error": error}
+        expected |= {"track_percentage_standard_error": 0.0, "error_standard_error": 0.0}
         assert part == pytest.approx(expected, abs=1e-6)
 
 

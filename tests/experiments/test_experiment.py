@@ -139,7 +139,8 @@ def test_mistakes_in_the_file(change, message, tmp_path):
     [
         ([], "the following arguments are required: file"),
         (["nothing.yaml"], "there is no file 'nothing.yaml'"),
-        (["{file}", "--job=2"], "unknown option '--job=2'; did you mean '--jobs'?"),
+        (["experiments/papr.yaml"], "unknown file 'experiments/papr.yaml'; did you mean 'experiments/paper.yaml'?"),
+        (["{file}", "--job=2"], "unknown option '--job'; did you mean '--jobs'?"),
         (["{file}", "--device=cpu", "--jobs=0"], "--jobs must be at least 1, not 0"),
         (["{file}", "--device=cpu", "--mps"], "--mps is for GPUs, and this experiment would run on the CPU"),
         (["{file}", "--device=cuda:99"], "there is no device 'cuda:99'"),

@@ -23,7 +23,8 @@ from support.reports import (
 
 from legged_torque.experiments.times import write_times
 from legged_torque.paper.report.evaluations import METRIC_NAMES, read_curves
-from legged_torque.paper.report.figures_curves import smoothed
+from legged_torque.paper.report.experiment import read_experiment
+from legged_torque.paper.report.figures_curves import draw_curves, smoothed
 from legged_torque.paper.report.report import fenced, markdown_table, to_html
 from legged_torque.paper.report.tables import welch
 
@@ -51,7 +52,7 @@ def folder(tmp_path_factory):
         write_part(cell / "2026-01-01_00-00-00", whole_run(tracking), **settings["a1_position"])
         write_result(cell, "high", tracking - 0.1)
         run = folder / f"a1_position-high_frequency-s{seed}" / "2026-01-01_00-00-00"
-        write_part(run, whole_run(tracking - 0.2), **settings["a1_position"])
+        write_part(run, whole_run(tracking - 0.2, cost_of_transport=0.5), **settings["a1_position"])
         rows = [line(80, 0.1), line(90, tracking - 0.4), line(110, tracking - 0.4 + 0.02 * seed)]
         write_rows(run / "evaluations_doubled.csv", rows)
     run = folder / "a1_torque-low-s1" / "2026-01-01_00-00-00"
@@ -94,7 +95,7 @@ def test_table(report):
     assert len(rows) == len(table) == 3 * 4 * len(METRIC_NAMES)
     for key, mean, error, *others in (
         (("a1_position", "low", "track_percentage"), 0.75, 0.05, "2", "0.7642"),  # sqrt(0.005 / 2)
-        (("a1_position", "doubled", "track_xy"), 3.65, 0.55, "2", "0.1602"),  # 3.1 and 4.2, while it trained
+        (("a1_position", "doubled", "track_xy"), 3.65, 0.55, "2", ""),  # 3.1 and 4.2, while it trained; it tracks 0.365
         (("a1_position", "low -> high", "track_xy"), 0.65, 0.05, "2", ""),  # of the last checkpoint
     ):
         assert list(map(float, rows[key][:2])) == pytest.approx([mean, error]) and rows[key][2:] == others
@@ -112,10 +113,13 @@ def test_text(text, folder):
     """Numbers stand beside the paper's, marked if not final; test, devices and commands are named, no folder is."""
     words = " ".join(text.split())
     low, often = "≈ 0.7500 ± 0.0500 | 0.7642", "✗ 0.5500 ± 0.0500 | 0.7163"
-    assert "**4 of 80 numbers are at least as good" in words and "3 are better, 1 within it, 11 worse, 65 mi" in words
-    assert f"| Track % [share] | PD | {low} | {often} |" in words
+    assert (
+        "**2 of 8 numbers are at least as good" in words
+        and "(better: 1, within it: 1, worse: 6; missing or not compared: 56)" in words
+    )
+    assert f"| Tracking [share] | PD | {low} | {often} |" in words
     assert "| | Default torque | 0.5000 (1) † | – | – | – |" in words  # after those of the paper
-    assert "| Track % [share] | PD | 0.6500 ± 0.0500 |" in words.partition("## In other environments")[2]
+    assert "| Tracking [share] | PD | 0.6500 ± 0.0500 |" in words.partition("## In other environments")[2]
     assert "python scripts/experiment.py paper/experiment.yaml --out paper_again" in words
     assert str(folder.parent) not in words
     assert "| `env.control.what` | a1_position | a1_torque |" in text and "`env.control.same`" not in text
@@ -128,6 +132,20 @@ def test_missing_parts(text):
     assert "- `a1_multihead` in low: no data, no training has begun." in top
     assert "- `a1_torque` in low: no training has begun with seed 2." in top
     assert "not finished, 50 of 110 million steps (45%)" in top and "`a1_position`" not in top
+
+
+@pytest.mark.parametrize(("tracking", "million"), [(0.02, 110), (0.9, 10)])
+def test_comparisons_that_mean_nothing(tmp_path, tracking, million):
+    """Robots that do not walk, and trainings of less than a tenth of the paper's, are compared with nobody."""
+    write_experiment(tmp_path / "e", {"low": ["low"]}, seeds=(1,))
+    for task in ("a1_position", "a1_torque", "a1_multihead"):  # with little cost, and less force than the weight
+        rows = [line(i, tracking, collision_force=99.0, cost_of_transport=0.01) for i in (million // 2, million)]
+        write_part(tmp_path / "e" / f"{task}-low-s1" / "2026-01-01_00-00-00", rows, max_iterations=million)
+    assert run_script(tmp_path / "e", "--out", tmp_path / "out") == 0
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "Nothing is compared with the paper" in text and "Best torque method" not in text
+    assert not re.findall("[✓≈✗]", text) and "0.7642" not in text
+    assert f"| Tracking [share] | PD | {tracking:.4f} |" in text and "| Collision forces [N] | PD | 99.0 |" in text
 
 
 def test_significant_differences(tmp_path):
@@ -197,6 +215,22 @@ def test_mistakes(tmp_path, capsys, plan, words, message):
 # -------------------------------------------------------------------------------------------------------- figures
 
 
+def test_figure_of_a_short_training(tmp_path):
+    """Few steps are counted one by one, "none" is said in words, and no curve touches the frame."""
+    write_experiment(tmp_path / "e", {"none": ["none"]}, seeds=(1,), tasks=["a1_torque"])
+    rows = [line(i, i / 10).replace("000000,", "00,", 1) for i in (1, 2, 3)]  # 100 to 300 steps
+    write_part(tmp_path / "e" / "a1_torque-none-s1" / "2026-01-01_00-00-00", rows)
+    assert run_script(tmp_path / "e", "--out", tmp_path / "out") == 0
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "| metric | method | no perturbations |" in text and "### no perturbations" in text
+    figure = draw_curves(read_experiment(tmp_path / "e"), "track_percentage", "Tracking")
+    figure.canvas.draw()
+    (axis,) = figure.axes
+    labels = [tick.get_text() for tick in axis.get_xticklabels()]
+    assert axis.get_xlabel() == "environment steps" and labels[0] == "0" and "200" in labels
+    assert axis.get_title() == "no perturbations" and axis.get_ylim()[1] > 0.3 * 1.05
+
+
 def test_running_medians():
     """A single outlier vanishes; at the ends the window holds fewer evaluations; nothing is drawn beyond an end."""
     curves = pd.DataFrame({1: [1.0, 9.0, 2.0, 3.0], 2: [1.0, 1.0, None, None]}, index=[0.0, 1.0, 2.0, 3.0])
@@ -216,7 +250,8 @@ def test_tables_of_the_page(text, page):
     assert page.tables == tables and len(tables) == 5
     assert re.findall(r"^## (.*)", text, re.M)[:2] == ["Table I", "Best torque method against the paper's best"]
     assert page.tables[1][0] == ["metric", "method", "low", "paper", "high_frequency", "paper", "doubled", "paper"]
-    assert page.tables[1][1][6:] == ["✗ 0.3650 ± 0.0550", "0.6765"]
+    assert page.tables[1][1][6:] == ["0.3650 ± 0.0550", "–"]  # it tracks too little to be compared
+    assert all(cell[:1].isdecimal() for row in page.tables[1] if row[0].startswith("Collision") for cell in row[2:4])
     assert {"better", "within", "worse", None} == set(page.kinds)
 
 

@@ -134,19 +134,19 @@ def test_holm_by_hand():
 
 
 def test_best_torque_methods():
-    """The best mean of all tasks but position, against the best of all models: 0.7866, 0.0316 and 135.1 in low."""
+    """The best mean of all tasks but position, against the best of all models: 0.7866, 0.0316 and 0.6977 in low."""
     numbers = {("doubled", task, name): values[3] for (name, task), values in TABLE_I.items()}
     numbers |= {("low", task, name): values[0] for (name, task), values in TABLE_I.items()}
     numbers |= {("low", "a1_position", "track_percentage"): 0.99, ("low", "a1_new", "track_percentage"): 0.84}
     table = pd.DataFrame({"mean": numbers}).rename_axis(["column", "task", "metric"])
-    table = table.assign(standard_error=0.01, seeds=2, is_final=True)
-    table.loc[("low", "a1_new", "track_xy"), :] = [0.0310, np.nan, 1, False]
+    table = table.assign(standard_error=0.01, seeds=2, is_final=True, is_compared=True)
+    table.loc[("low", "a1_new", "track_xy"), :] = [0.0310, np.nan, 1, False, True]
+    table.loc[("low", "a1_lying", "cost_of_transport"), :] = [0.0, 0.0, 2, True, False]
     header, *rows = best_torque(table)
-    assert len(header) == 6 and len(rows) == 15
+    assert len(header) == 6 and len(rows) == 12  # without collision forces
     found = {(row[0], row[1]): row[2:] for row in rows}
     expected = ["0.7866 (Torque curriculum)", "`a1_new`", "0.8400 ± 0.0100 (2)", "✓ +6.8%"]
-    assert found["Track % [share]", "low"] == expected
+    assert found["Tracking [share]", "low"] == expected
     assert found["Track xy [m²/s²]", "low"][1:] == ["`a1_new`", "0.0310 (1) †", "≈ +1.9%"]
-    force = found["Collision forces [N]", "low"]
-    assert force[0] == "135.1 (PD)" and force[1] == "Torque curriculum" and force[3] == "✗ -0.7%"  # 136.0
-    assert found["Track % [share]", "high"][1:] == ["no data", "", ""]
+    assert found["Cost of transport", "low"][:2] == ["0.6977 (Multi-head)", "Multi-head"]  # not the one that lies
+    assert found["Tracking [share]", "high"][1:] == ["no data", "", ""]

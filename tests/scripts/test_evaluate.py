@@ -65,12 +65,13 @@ def test_fixed_command_with_one_world(root, tmp_path, monkeypatch):
     for name, value in {"lin_vel_x": 0.5, "lin_vel_y": 0.0, "ang_vel_yaw": -0.2}.items():
         (part,) = result["by_command"][name]
         assert (part["from"], part["to"], part["share"]) == pytest.approx((value, value, 1.0), abs=1e-6)
-        assert re.search(rf"(?m)^  error of {name} +{part['error']:.3f}$", output)
+        unit = "rad/s" if name == "ang_vel_yaw" else "m/s"
+        assert re.search(rf"(?m)^  error of {name} \[{unit}\] +{part['error']:.3f} \+- nan$", output)
     metrics = result["metrics"]
     assert list(metrics) == list(UNITS) and all(entry["standard_error"] is None for entry in metrics.values())
     for name, unit in UNITS.items():
         assert re.search(rf"(?m)^  {name} +{metrics[name]['mean']:.4f} \+- nan {re.escape(unit)}$", output), name
-    assert "model_3.pt, after 24 steps of training, 1 worlds x 9 steps:" in output
+    assert "model_3.pt, after 24 steps of training, 1 world x 9 steps:" in output
 
 
 def test_crossing_tiles_after_training_on_a_plane(root, tmp_path):

@@ -30,9 +30,10 @@ def line(million, tracking, **others):
     return f"{million * 1_000_000},{million},{million}.5," + ",".join(str(values[name]) for name in METRIC_NAMES)
 
 
-def whole_run(tracking):
+def whole_run(tracking, **others):
     """Lines of a finished training: bad before step 90 million, then around the given value."""
-    return [line(10, 0.1), line(80, 0.2), line(90, tracking - 0.05), line(100, tracking), line(110, tracking + 0.05)]
+    values = {10: 0.1, 80: 0.2, 90: tracking - 0.05, 100: tracking, 110: tracking + 0.05}
+    return [line(million, value, **others) for million, value in values.items()]
 
 
 def write_rows(file, lines):

@@ -4,9 +4,9 @@ import yaml
 from support.scripts import run_here
 
 LOADING = {
-    "train.py": ["--resume", "--max_iterations=2", "--logger=none"],
-    "play.py": ["--steps=1"],
-    "evaluate.py": ["--steps=1"],
+    "train.py": ["--resume", "--num_envs=2", "--max_iterations=2", "--logger=none"],
+    "play.py": ["--steps=1", "--num_envs=2"],
+    "evaluate.py": ["--steps=1", "--num_envs=2"],
     "export.py": [],
 }
 """Scripts that load a run, and words that make it short."""
@@ -24,7 +24,7 @@ class Payload:
 
 def load_run(script, run, *words):
     """Load a run with a script, in the folder of its logs."""
-    all_words = ["--task=a1_position", "--device=cpu", "--num_envs=2", *LOADING[script], *words]
+    all_words = ["--task=a1_position", "--device=cpu", *LOADING[script], *words]
     return run_here(script, *all_words, root=run.parents[2])
 
 

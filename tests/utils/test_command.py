@@ -9,7 +9,9 @@ from support.command import command, complete
 from support.scripts import ROOT, assert_told_in_one_line, run_here
 from support.settings import error_of, get_cfgs, parse
 
+from legged_torque.envs import task_registry
 from legged_torque.utils.cli import run_script, script_command
+from legged_torque.utils.options import Options
 
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("[!_]*.py"))
 
@@ -18,7 +20,7 @@ def test_command_runs_scripts():
     """A script's name and its own words; what it prints of other commands is for the same command."""
     status, output, error = command("train", "--help")
     assert (status, error) == (0, "") and output.startswith("usage: legged-torque train ")
-    assert "    legged-torque train --task=a1_torque_multihead" in output and "python scripts/train.py" not in output
+    assert "\n    legged-torque train --task=a1_torque " in output and "python scripts/train.py" not in output
     assert not output.endswith("}")  # nothing heavy
 
 
@@ -40,6 +42,52 @@ def test_completion(tmp_path):
     assert complete("legged-torque plot curves --o", tmp_path / "5") == ["--out"]
 
 
+WORDS = {
+    "train --preset pap": ["paper"],
+    "play --perturbation hi": ["high", "high_frequency"],
+    "evaluate --ranges h": ["hard"],
+    "train --task a1_torque --set rewards.scales.torq": ["rewards.scales.torques="],
+    "sim2sim --terrain stairs_u": ["stairs_up"],
+}
+"""What a shell offers for a command line."""
+
+
+@pytest.mark.parametrize("line", WORDS)
+def test_completion_of_values(line, tmp_path):
+    """Names of presets, perturbations, ranges, settings and kinds of ground."""
+    assert complete(f"legged-torque {line}", tmp_path / "words") == WORDS[line]
+
+
+def test_list_of_tasks(tmp_path):
+    """Every task is once in the list, by robot and ground, on a line of a terminal; a part of the names chooses."""
+    _, output, _ = run_here("train.py", "--list", root=tmp_path)
+    assert re.findall(r"^[* ] (\w+_\w+) +\S", output, re.MULTILINE) == sorted(task_registry.names(), key=output.index)
+    assert max(map(len, output.splitlines())) <= 80
+    assert re.findall(r"^\* (\w+) ", output, re.MULTILINE)[0] == Options().task == "a1_torque_multihead"
+    _, output, _ = run_here("train.py", "--list", "go2", root=tmp_path)
+    groups = dict(re.findall(r"^(go2 .+):\n((?:  .+\n)+)", output, re.MULTILINE))
+    assert {title: lines.count("go2_") for title, lines in groups.items()} == {
+        "go2 on a plane": 8,
+        "go2 on rough ground, blind": 8,
+        "go2 on rough ground, with a height scan": 8,
+    }
+    assert all("_scan" in line for line in groups["go2 on rough ground, with a height scan"].splitlines())
+    assert_told_in_one_line(run_here("train.py", "--list", "g02", root=tmp_path), "did you mean 'go2'?")
+
+
+def test_values_in_a_word_of_their_own(tmp_path):
+    """``--set KEY VALUE`` and a misspelt ``--taks=x`` are told what they should be."""
+    result = run_here("train.py", "--set", "rewards.scales.torques", "-1e-4", root=tmp_path)
+    assert_told_in_one_line(result, "give --set rewards.scales.torques=-1e-4")
+    assert_told_in_one_line(run_here("train.py", "--taks=a1_torque", root=tmp_path), "did you mean '--task'?")
+
+
+def test_options_that_do_something(tmp_path):
+    """export.py has no worlds, seeds and perturbations."""
+    _, output, _ = run_here("export.py", "--help", root=tmp_path)
+    assert not set(re.findall(r"  --(\w+)", output)) & {"num_envs", "seed", "perturbation", "ranges"}
+
+
 def test_command_of_other_scripts(monkeypatch, tmp_path):
     """What a script prints for the user to type is how the script itself was started."""
     monkeypatch.setattr(sys, "argv", ["scripts/train.py"])
@@ -53,14 +101,15 @@ def test_command_of_other_scripts(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_help_has_examples(script, tmp_path):
-    """Options are in groups, and the help ends with examples of the script itself, whose options exist."""
+    """The help begins with examples of the script itself, whose options exist; the task is the first option."""
     _, output, _ = run_here(f"{script}.py", "--help", root=tmp_path)
-    head, _, examples = output.partition("\nexamples:\n")
+    examples, _, head = output.partition("\nExamples:\n")[2].partition("\n\n")
+    assert "options:" not in examples and "headless" not in output
     assert all(line.startswith(f"    python {ROOT}/scripts/{script}.py") for line in examples.splitlines()) and examples
     for option in re.findall(r"--\w+", examples) if script != "plot" else ():  # whose figures have their own
         assert f"  {option}" in head, option
     if "--set KEY" in head:
-        assert head.index("\noptions:\n") < head.index("\ntask and settings:\n") < head.index("\n  --set KEY=VALUE")
+        assert head.index("\n  --task TASK") < head.index("\n  --set KEY=VALUE") < head.index("\noptions:\n")
 
 
 # ---- flags of legged_gym ---------------------------------------------------------------------------------------------

@@ -70,7 +70,7 @@ def test_a_named_file(tmp_path):
     status, output, error = run_here("train.py", *words, *SMALL, root=tmp_path)
     assert (status, error) == (0, "")
     (run,) = (tmp_path / "logs" / "a1_quiet_walker").iterdir()
-    assert f"--task_file={FILE} --task=a1_quiet_walker --load_run=" in output
+    assert f"--task_file={FILE} --load_run=" in output
     assert yaml.safe_load((run / "config.yaml").read_text())["task"] == "a1_quiet_walker"
 
 

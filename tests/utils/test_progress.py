@@ -51,7 +51,7 @@ def test_a_view_has_the_line(cache, monkeypatch):
     monkeypatch.setattr(Display, "shown", shown)
     progress = CompileProgress(stream)
     look(progress, 3, cache / f"wp_a{OURS}")
-    assert shown.activity == f"{COMPILING}: 1 modules, 3 s" and stream.getvalue() == ""
+    assert shown.activity == f"{COMPILING}: 1 module, 3 s" and stream.getvalue() == ""
     look(progress, 1)
     assert shown.activity == ""
 
@@ -63,7 +63,7 @@ def test_torch_compiles_without_a_cache(monkeypatch):
     with torch_compiles():
         look(progress, 3)
     look(progress, 60)
-    assert stream.getvalue() == f"{COMPILING}: 0 modules, 2 s\n"
+    assert stream.getvalue() == f"{COMPILING}: 2 s\n"
 
 
 def test_the_thread(cache):

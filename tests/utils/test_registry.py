@@ -30,7 +30,7 @@ def test_unknown_task(function):
     """The nearest task is proposed, and of so many only the nearest are listed."""
     line = error_of(getattr(task_registry, function), "a1-position")
     assert line.startswith("unknown task 'a1-position'; did you mean 'a1_position'? allowed: ")
-    assert line.endswith(" others") and len(line) < 300
+    assert " others; " in line and len(line) < 300
     assert str(unknown_name("task", "xyz", ["b", "a"])) == "unknown task 'xyz'; allowed: a, b"
 
 

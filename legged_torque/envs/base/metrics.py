@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -95,7 +94,7 @@ class CommandBreakdown:
         self._task = task
         ranges = task.cfg.commands.ranges
         self._ranges = torch.tensor([getattr(ranges, name) for name in COMMANDS], device=task.device)
-        self._sums = torch.zeros(4, len(COMMANDS), NUM_BINS, device=task.device)
+        self._sums = torch.zeros(4, task.num_envs, len(COMMANDS), NUM_BINS, device=task.device)
 
     def add_step(self, commands: Tensor) -> None:
         """Add the step that the task has just made; arguments as for :meth:`WalkingMetrics.add_step`."""
@@ -108,30 +107,34 @@ class CommandBreakdown:
         place = ((commands - low) / (high - low).clamp(min=1e-6) * NUM_BINS).long().clamp(0, NUM_BINS - 1)
         member = torch.nn.functional.one_hot(place, NUM_BINS) * ~task.state.reset_buf.view(-1, 1, 1)
         rows = torch.stack([torch.ones_like(error), error, *tracking.unsqueeze(2).expand(-1, *error.shape)])
-        self._sums += (rows.unsqueeze(3) * member).sum(dim=1)
+        self._sums += rows.unsqueeze(3) * member
 
     def table(self) -> dict[str, list[dict[str, float]]]:
         """Return for each command its parts that occurred.
 
         Returns:
             Per part: "from" and "to" of the command, "share" of the steps, "track_percentage" (of all that are tracked,
-            NaN if all were 0), and "error": mean |v - v*| of this command [m/s or rad/s].
+            NaN if all were 0), and "error": mean |v - v*| of this command [m/s or rad/s]; both have their standard
+            errors under the names with "_standard_error".
         """
         result: dict[str, list[dict[str, float]]] = {}
+        sums = self._sums.double().cpu().numpy()
         for i, name in enumerate(COMMANDS):
             low, high = self._ranges[i].tolist()
-            count, error, percentage, commanded = self._sums[:, i].tolist()
-            result[name] = [
-                {
+            result[name] = []
+            for part in range(NUM_BINS):
+                count, error, percentage, commanded = sums[:, :, i, part]
+                if not count.any():
+                    continue
+                entry = {
                     "from": low + (high - low) * part / NUM_BINS,
                     "to": low + (high - low) * (part + 1) / NUM_BINS,
-                    "share": count[part] / sum(count),
-                    "track_percentage": percentage[part] / commanded[part] if commanded[part] else math.nan,
-                    "error": error[part] / count[part],
+                    "share": count.sum() / sums[0, :, i].sum(),
                 }
-                for part in range(NUM_BINS)
-                if count[part]
-            ]
+                for key, ratio in {"track_percentage": (percentage, commanded), "error": (error, count)}.items():
+                    estimate = metrics.estimate(*ratio)
+                    entry |= {key: estimate.mean, f"{key}_standard_error": estimate.standard_error}
+                result[name].append(entry)
         return result
 
 
