@@ -339,7 +339,7 @@ def test_options_of_commands(page, monkeypatch, tmp_path):
 
     def parse_only(parser, *words):
         args = parse(parser, *words)
-        is_yours = YOURS in calls[len(parsed)][0]
+        is_yours = YOURS in calls[len(parsed)][0] or getattr(args, "task_file", [])
         task = getattr(args, "task", "") or Options().task
         if getattr(args, "set", None) is not None and (task in task_registry.names() or not is_yours):
             named = {name: getattr(args, name, None) for name in ("preset", "perturbation", "ranges")}
