@@ -82,10 +82,10 @@ Tensors of `self.state` and `self.control` are attributes of the task too, under
 
 Methods that a subclass may override. Call `super()` to keep what the base does.
 
-| method | of | what it does |
-|---|---|---|
-| `_reward_<term>()` | | A reward term, not weighted, used if `rewards.scales.<term>` is not 0. Shape: (num_envs,). |
-| `_termination_<term>()` | | An end of episodes, used if `terminations.<term>` is not 0. Shape: (num_envs,), bool. |
+| method | what it does |
+|---|---|
+| `_reward_<term>()` | A reward term, not weighted, used if `rewards.scales.<term>` is not 0. Shape: (num_envs,). |
+| `_termination_<term>()` | An end of episodes, used if `terminations.<term>` is not 0. Shape: (num_envs,), bool. |
 """
 NAMES_HEAD = """# Old names
 
@@ -262,7 +262,8 @@ def task_page() -> str:
     for cls, name in HOOKS:
         method = getattr(cls, name)
         arguments = ", ".join(list(inspect.signature(method).parameters)[1:])
-        parts.append(f"| `{name}({arguments})` | `{cls.__name__}` | {plain(inspect.getdoc(method) or '')} |")
+        where = f"In `{cls.__name__}`: " if not hasattr(LeggedRobot, name) else ""
+        parts.append(f"| `{name}({arguments})` | {where}{plain(inspect.getdoc(method) or '')} |")
     parts += ["", "## Methods and properties", "", "| name | what it does |", "|---|---|"]
     for name in METHODS:
         member = inspect.getattr_static(RobotState if name in COMPUTED else LeggedRobot, name)
