@@ -1,4 +1,4 @@
-"""Write settings.md and scripts.md beside this file from the code: ``python docs/reference/generate.py``."""
+"""Write the generated pages of docs/ from code, README and others: ``python docs/reference/generate.py``."""
 
 from __future__ import annotations
 
@@ -17,12 +17,19 @@ from types import ModuleType
 os.environ["MUJOCO_GL"] = "disable"
 
 from legged_torque import SCRIPTS_DIR
+from legged_torque.envs import LeggedRobot, TorqueRobot
 from legged_torque.envs.approaches import multi_head_config, torque_config, torque_curriculum_config, torque_gravity
 from legged_torque.envs.base import commands_config, legged_robot_config
+from legged_torque.envs.base.actions import ControlParameters
+from legged_torque.envs.base.base_task import BaseTask
+from legged_torque.envs.base.state import RobotState
 from legged_torque.envs.robots import a1, anymal_c, g1, go1, go2
+from legged_torque.sim.engine import Engine
 from legged_torque.utils.limits import describe, types_of
+from legged_torque.utils.successors import successors
 
 HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
 CONFIGS = (
     (legged_robot_config, "LinearChange"),
     (legged_robot_config, "LeggedRobotCfg"),
@@ -60,6 +67,79 @@ SCRIPTS_HEAD = """# Scripts
 Made by `python docs/reference/generate.py` from the scripts. In an installed package without a clone, use
 `python -m legged_torque.scripts.train` in place of `python scripts/train.py`, and so on.
 """
+
+
+TASK_HEAD = """# Task attributes and hooks
+
+Made by `python docs/reference/generate.py` from docstrings. `self` is the task in a method of a task class; from Python
+it is what [`make_env`](../howto/python.md) returns. Every row of a tensor is a world. The world frame has z up. The
+trunk's frame has x forwards, y to the left and z up, and moves with the trunk. Inside a step,
+write only in place (`copy_`, `masked_fill_`), see [the rules](../concepts.md#code-inside-a-step).
+
+Tensors of `self.state` and `self.control` are attributes of the task too, under the same names.
+
+## Hooks
+
+Methods that a subclass may override. Call `super()` to keep what the base does.
+
+| method | what it does |
+|---|---|
+| `_reward_<term>()` | A reward term, not weighted, used if `rewards.scales.<term>` is not 0. Shape: (num_envs,). |
+| `_termination_<term>()` | An end of episodes, used if `terminations.<term>` is not 0. Shape: (num_envs,), bool. |
+"""
+NAMES_HEAD = """# Old names
+
+Made by `python docs/reference/generate.py` from `legged_torque/utils/successors.yaml`: names of
+[legged_gym](../howto/migrate.md), and of this library before settings were renamed. A task that uses one is refused in
+these words.
+"""
+HOOKS = (
+    (LeggedRobot, "action_terms"),
+    (LeggedRobot, "_compute_torques"),
+    (LeggedRobot, "observation_terms"),
+    (LeggedRobot, "random_parameters"),
+    (LeggedRobot, "curriculum_values"),
+    (BaseTask, "update_curriculum"),
+    (BaseTask, "_post_physics_step_callback"),
+    (BaseTask, "state_dict"),
+    (BaseTask, "load_state_dict"),
+    (TorqueRobot, "actions_for"),
+)
+"""Methods that a subclass may override, of the class that has them."""
+COMPUTED = ("base_height", "foot_pos", "foot_vel", "foot_contact_force", "body_pos", "body_vel")
+"""Members of the state that are computed where they are used."""
+METHODS = ("step", "get_observations", "reset", "set_state", "keep", "mirror", "episode_length_buf", *COMPUTED)
+"""Methods and properties of tasks that others call."""
+OWNERS = (
+    ("self", LeggedRobot, "Task"),
+    ("self", BaseTask, "Learning"),
+    ("self.state", RobotState, "State"),
+    ("self.control", ControlParameters, "Constants of the control laws"),
+    ("self.sim", Engine, "Physics engine"),
+)
+"""How to get at an object, its class, whose docstring lists attributes, and a title; tensors are also the task's."""
+UNLISTED = {
+    "num_envs": "Number of worlds.",
+    "num_dof": "Number of joints.",
+    "num_actions": "Number of actions.",
+    "dof_names": "Names of the joints, in the order of all vectors of joints.",
+    "foot_names": "Names of the feet, in the order of all vectors of feet.",
+    "dt": "Control step [s].",
+    "max_episode_length": "Control steps of an episode that ends by time.",
+    "cfg": "The settings.",
+    "reward_names": "Names of the reward terms with a scale that is not 0.",
+    "episode_sums": "Weighted sums of each term over the episode so far. Shape: (terms, num_envs).",
+    "command_generator": "What draws the commands.",
+    "terrain": "The ground.",
+    "asset": "What was read from the robot's file.",
+    "symmetry": "Mirror images of joints and feet.",
+    "motor_strength": "Factors on torques. Shape: (num_envs, num_dof).",
+    "dof_pos_limits": "Joint limits, narrowed by `rewards.soft_dof_pos_limit` [rad]. Shape: (num_dof, 2).",
+    "penalized_contact_indices": "Places of the geoms of `asset.penalize_contacts_on` in contacts. Shape: (geoms,).",
+    "termination_contact_indices": "Those of `asset.terminate_after_contacts_on`. Shape: (geoms,).",
+    "held_joints": "1 for each joint of `rewards.held_joints`, else 0. Shape: (num_dof,).",
+}
+"""Attributes of tasks that no docstring lists."""
 
 
 def comments(source: str) -> dict[int, str]:
@@ -152,8 +232,91 @@ def scripts_page() -> str:
     return "\n".join([SCRIPTS_HEAD, *parts])
 
 
+def plain(text: str) -> str:
+    """Return text of a docstring as a cell of a table."""
+    text = re.sub(r":\w+:`~?[\w.]*?(\w+)`", r"`\1`", text).replace("``", "`").replace("|", "\\|")
+    return " ".join(text.split())
+
+
+def attribute_rows(owner: str, cls: type) -> list[str]:
+    """Return rows of the attributes that a class's docstring lists."""
+    text = (inspect.getdoc(cls) or "").partition("Attributes:\n")[2].partition("\n\n")[0]
+    found = re.findall(r"^    (\w[\w, ]*): (.*(?:\n     +.*)*)", text, re.MULTILINE)
+    result = []
+    for names, meaning in found:
+        path = "self" if cls in (RobotState, ControlParameters) and "Shape" in meaning else owner
+        result.append(attribute_row([f"{path}.{name}" for name in names.split(", ")], meaning))
+    return result
+
+
+def attribute_row(names: list[str], meaning: str) -> str:
+    """Return the row of attributes that share a meaning; what follows "Shape:" in it is the last column."""
+    text, _, shape = plain(meaning).partition("Shape: ")
+    text, _, shapes = text.partition("Shapes: ")
+    return f"| {', '.join(f'`{name}`' for name in names)} | {text.strip()} | {(shape or shapes).rstrip('.')} |"
+
+
+def task_page() -> str:
+    """Return task.md."""
+    parts = [TASK_HEAD.rstrip()]
+    for cls, name in HOOKS:
+        method = getattr(cls, name)
+        arguments = ", ".join(list(inspect.signature(method).parameters)[1:])
+        where = f"In `{cls.__name__}`: " if not hasattr(LeggedRobot, name) else ""
+        parts.append(f"| `{name}({arguments})` | {where}{plain(inspect.getdoc(method) or '')} |")
+    parts += ["", "## Methods and properties", "", "| name | what it does |", "|---|---|"]
+    for name in METHODS:
+        member = inspect.getattr_static(RobotState if name in COMPUTED else LeggedRobot, name)
+        is_method = inspect.isfunction(member)
+        signature = f"({', '.join(list(inspect.signature(member).parameters)[1:])})" if is_method else ""
+        parts.append(f"| `{name}{signature}` | {plain(inspect.getdoc(member) or '')} |")
+    for owner, cls, title in OWNERS:
+        parts += ["", f"## {title}", "", "| attribute | meaning [unit] | shape |", "|---|---|---|"]
+        if cls is LeggedRobot:
+            parts += [attribute_row([f"self.{name}"], meaning) for name, meaning in UNLISTED.items()]
+        parts += [row for row in attribute_rows(owner, cls) if row not in parts]
+    return "\n".join([*parts, ""])
+
+
+def names_page() -> str:
+    """Return old_names.md."""
+    parts = [NAMES_HEAD.rstrip()]
+    for kind in ("settings", "methods", "attributes"):
+        parts += ["", f"## {kind.capitalize()}", "", "| old name | what to use |", "|---|---|"]
+        parts += [f"| `{name}` | {plain(text)} |" for name, text in successors(kind).items()]
+    return "\n".join([*parts, ""])
+
+
+def of_site(file: str) -> str:
+    """Return a document of the root as a page of the site, with links that lead to pages."""
+    text = (ROOT / file).read_text("utf-8")
+    text = re.sub(r"^!\[[^\]]*\]\(https:.*\n+", "", text, flags=re.MULTILINE)  # nothing is loaded from elsewhere
+    text = text.replace("](docs/", "](")
+    for name, page in OF_SITE.items():
+        text = text.replace(f"]({name}", f"]({page}")
+    return text
+
+
+OF_SITE = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+"""Documents of the root, and the pages that the site has of them."""
+OF_CODE = {
+    "reference/settings.md": settings_page,
+    "reference/scripts.md": scripts_page,
+    "reference/task.md": task_page,
+    "reference/old_names.md": names_page,
+}
+"""Pages by what makes them."""
+PAGES = (*OF_SITE.values(), *OF_CODE)
+"""Paths of the generated pages in docs/."""
+
+
+def pages() -> dict[str, str]:
+    """Return the generated pages by their paths in docs/."""
+    return {page: of_site(file) for file, page in OF_SITE.items()} | {page: make() for page, make in OF_CODE.items()}
+
+
 if __name__ == "__main__":
     os.chdir(SCRIPTS_DIR.parent)  # whence examples are written
-    for name, text in {"settings.md": settings_page(), "scripts.md": scripts_page()}.items():
-        (HERE / name).write_text(text, encoding="utf-8")
-        print(HERE / name)
+    for page, text in pages().items():
+        (HERE.parent / page).write_text(text, encoding="utf-8")
+        print(HERE.parent / page)

@@ -1,12 +1,15 @@
 """The code of the how-to pages and the README, run as it stands there."""
 
+import importlib
 import math
 import re
 import runpy
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -14,12 +17,11 @@ from support.command import command
 from support.scripts import run_here
 
 from legged_torque.envs import task_registry
-from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.utils.cli import Parser
 from legged_torque.utils.options import Options
 
 ROOT = Path(__file__).resolve().parents[2]
-GENERATED = ("docs/reference/", "docs/results/")
+GENERATED = ("docs/reference/", "docs/results/", "docs/index.md", "docs/changelog.md", "docs/contributing.md")
 FILES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [name for name in (str(file.relative_to(ROOT)) for file in FILES) if not name.startswith(GENERATED)]
 RUN_PYTHON = {"README.md", "docs/terrain.md"} | {page for page in PAGES if page.startswith("docs/howto/")}
@@ -30,21 +32,30 @@ YOURS = "yours"
 """Word in the mark of a block whose tasks and files a reader has made."""
 
 
-def blocks(page, language):
-    """The code blocks of a page in one language."""
-    return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / page).read_text(), flags=re.MULTILINE | re.DOTALL)
+def python_files(page):
+    """A page's files of Python that are run, a block each: name, given in the first line or made up, and text."""
+    texts = [block for _, mark, language, block in fences(page) if language == "python" and not mark]
+    texts = ["\n".join(texts)] if page == "docs/howto/python.md" else texts  # a program, as it says
+    names = [re.match(r"# (\w+)\.py\n", text) for text in texts]
+    made_up = (f"block_{i}_of_a_page" for i in range(len(texts)))
+    return [(name[1] if name else other, text) for name, other, text in zip(names, made_up, texts, strict=True)]
 
 
 @pytest.fixture
 def run_page(monkeypatch, tmp_path):
-    """Run a page's Python as one file, which Warp reads; its tasks are forgotten afterwards."""
+    """Import a page's blocks of Python, each a file of its own; tasks and modules are forgotten afterwards."""
     monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
 
     def run(page):
-        file = tmp_path / "page.py"
-        file.write_text("\n".join(blocks(page, "python")))
-        return runpy.run_path(str(file))
+        names = {}
+        for name, text in python_files(page):
+            (tmp_path / f"{name}.py").write_text(text)
+            monkeypatch.delitem(sys.modules, name, raising=False)
+            names |= vars(importlib.import_module(name))
+            monkeypatch.setitem(sys.modules, name, sys.modules.pop(name))  # taken out again afterwards
+        return names
 
     return run
 
@@ -69,24 +80,69 @@ def train(task, name):
 
 
 @pytest.mark.parametrize(
-    ("page", "name"), [("README.md", "a1_quiet_torque"), ("docs/howto/reward.md", "a1_quiet_torque")]
+    ("page", "name"),
+    [
+        ("README.md", "a1_quiet_torque"),
+        ("docs/howto/reward.md", "a1_slow_joints"),
+        ("docs/howto/reward.md", "a1_slow_joints_later"),
+    ],
 )
 def test_reward(run_page, page, name):
-    """The new term counts with its weight."""
-    names = run_page(page)
+    """The new term counts with its weight, which a curriculum changes from none to all."""
+    run_page(page)
     task = make(name)
     assert "dof_vel" in task.reward_names
     task.dof_vel.copy_(torch.arange(48.0).view(4, 12))
     expected = np.square(np.arange(48.0).reshape(4, 12)).sum(axis=1)
     np.testing.assert_allclose(task._reward_dof_vel().numpy(), expected, rtol=1e-6)
     weights = dict(zip(task.reward_names, task.reward_weights().tolist(), strict=True))
-    assert weights["dof_vel"] == pytest.approx(-1e-4 * 0.02)
-    if "FadedCfg" in names:
-        assert "torques" not in task.reward_names
-        factor = LinearCurriculum([names["FadedCfg"]().rewards.curriculum.dof_vel], "cpu")
-        assert [factor(torch.tensor(steps)).item() for steps in (0, 5_000_000, 20_000_000)] == [0.0, 0.5, 1.0]
-    else:
-        assert task.cfg.control.torque_scale == 5.0
+    assert weights["dof_vel"] == pytest.approx(-1e-4 * 0.02 * (name != "a1_slow_joints_later"))
+    assert ("torques" in task.reward_names) == (page == "README.md")
+    if name == "a1_slow_joints_later":
+        for steps, share in ((5_000_000, 0.5), (20_000_000, 1.0)):
+            task.total_steps.fill_(steps)
+            column = task.reward_names.index("dof_vel")
+            assert task.reward_weights()[column].item() == pytest.approx(-1e-4 * 0.02 * share)
+
+
+def test_feet(run_page):
+    """Clearance and slip are those of MuJoCo's kinematics."""
+    run_page("docs/howto/reward.md")
+    task = make("a1_foot_clearance")
+    for _ in range(10):
+        task.step(0.3 * torch.randn(4, 12))
+    model, data, clearance, slip = task.sim.mj_model, mujoco.MjData(task.sim.mj_model), np.zeros(4), np.zeros(4)
+    for world in range(4):
+        data.qpos[:], data.qvel[:] = task.sim.qpos[world], task.sim.qvel[world]
+        mujoco.mj_forward(model, data)
+        for foot, on_ground in zip(task.foot_names, task.feet_contact[world].tolist(), strict=True):
+            geom, velocity = model.geom(foot).id, np.zeros(6)
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_GEOM, geom, velocity, 0)
+            speed = np.linalg.norm(velocity[3:5])
+            clearance[world] += (data.geom_xpos[geom, 2] - 0.08) ** 2 * speed
+            slip[world] += speed * on_ground
+    np.testing.assert_allclose(task._reward_foot_clearance(), clearance, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(task._reward_foot_slip(), slip, rtol=1e-3, atol=1e-4)
+
+
+def test_commands_and_ends(run_page):
+    """Commands lead forwards and weave; fast joints and a leaning trunk end an episode, and only those."""
+    run_page("docs/howto/command.md")
+    task = make("a1_weaving", num_envs=64)
+    for _ in range(30):
+        task.step(torch.zeros(64, 12))
+        times = task.episode_length_buf.numpy() * 0.02
+        np.testing.assert_allclose(task.commands[:, 2], 0.5 * np.sin(times * np.pi / 2.0), atol=1e-5)
+        assert (task.commands[:, 0] >= 0.0).all() and task.commands[:, 1].min() < 0.0
+    task = make("a1_careful", "init_state.pos=[0, 0, 5]")
+    task.sim.qvel.zero_()
+    task.sim.qvel[0, 8] = -31.0
+    task.sim.qvel[1, 8] = -29.0
+    angles = torch.tensor([0.0, 0.0, 0.95, 1.05])
+    task.sim.qpos[:, 3:7] = torch.stack([torch.cos(angles / 2), torch.sin(angles / 2), 0 * angles, 0 * angles], dim=1)
+    task.state.update()
+    task.check_termination()
+    assert task.reset_buf.tolist() == [True, False, False, True] and not task.time_out_buf.any()
 
 
 def test_observation(run_page):
@@ -125,7 +181,7 @@ def test_parameter(run_page):
 def test_learner(tmp_path, monkeypatch):
     """The page's learner trains, resumes and is evaluated by the scripts."""
     file = tmp_path / "random_search.py"
-    file.write_text("\n".join(blocks("docs/howto/learner.md", "python")))
+    file.write_text(python_files("docs/howto/learner.md")[0][1])
     monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
     words = ["--task=a1_search", f"--task_file={file}", "--device=cpu"]
     settings = [*TINY, "--logger=none", "--set=actor.hidden_dims=[8]", "--set=evaluation.interval=8"]
@@ -184,8 +240,7 @@ def test_sensor(run_page):
 
 def test_robot(run_page):
     """The page's robot stands under PD control and can be trained."""
-    (xml,) = blocks("docs/howto/robot.md", "xml")
-    Path("minidog.xml").write_text(xml)
+    shutil.copy(ROOT / "examples" / "minidog.xml", "minidog.xml")
     run_page("docs/howto/robot.md")
     task = make("minidog_position")
     assert task.num_dof == 8 and task.foot_names == ["FR_foot", "FL_foot", "RR_foot", "RL_foot"]
@@ -233,19 +288,36 @@ def calls_of(page):
     return calls
 
 
+def test_python(run_page):
+    """The page makes a task, trains it, loads the run, rolls it out and measures it."""
+    names = run_page("docs/howto/python.md")
+    assert names["heights"][0].shape == (4,) and names["pair"].num_envs == 2
+    assert 0.0 <= names["metrics"].means()["track_percentage"] <= 1.0
+
+
+def test_names_differ():
+    """No two pages name a file or a task alike, so that what a reader has copied stays."""
+    files = [name for page in sorted(RUN_PYTHON) for name, _ in python_files(page) if not name.startswith("block_")]
+    code = "".join(text for page in sorted(RUN_PYTHON) for _, text in python_files(page))
+    tasks = re.findall(r"register\(\s*\"(\w+)\"", code)
+    assert len(tasks) > 10 and len({*tasks}) == len(tasks) and len({*files}) == len(files)
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_marks(page):
-    """Python that no test runs says so in the line above, and no other does; tests that marks name are there."""
+    """Python that no test runs says so in the line above; tests that marks name are there."""
     for line, mark, language, block in fences(page):
-        assert language == "bash" or bool(mark) != (page in RUN_PYTHON), f"{page}:{line}"
+        assert language == "bash" or mark or page in RUN_PYTHON, f"{page}:{line}"
         for test in re.findall(r"tests/\w+\.py", mark + block):
             assert (ROOT / test).is_file(), f"{page}:{line}"
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_commands(page, tmp_path):
+def test_commands(page, tmp_path, monkeypatch):
     """Bash that is not marked is run, in its order, trainings with few worlds; so it calls nothing but scripts."""
-    (tmp_path / "experiments").symlink_to(ROOT / "experiments")
+    monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
+    for folder in ("experiments", "examples"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
     for line, mark, language, block in fences(page):
         if language == "bash" and not mark:
             calls = script_calls(block)
@@ -267,7 +339,7 @@ def test_options_of_commands(page, monkeypatch, tmp_path):
 
     def parse_only(parser, *words):
         args = parse(parser, *words)
-        is_yours = YOURS in calls[len(parsed)][0]
+        is_yours = YOURS in calls[len(parsed)][0] or getattr(args, "task_file", [])
         task = getattr(args, "task", "") or Options().task
         if getattr(args, "set", None) is not None and (task in task_registry.names() or not is_yours):
             named = {name: getattr(args, name, None) for name in ("preset", "perturbation", "ranges")}

@@ -1,10 +1,12 @@
 """The reference pages agree with the code."""
 
+import operator
 import re
 import runpy
 from pathlib import Path
 
 import pytest
+import torch
 from support.runners import build_runner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -28,12 +30,32 @@ def flat(values, path=""):
         yield from flat(value, f"{path}{key}.") if is_section else [f"{path}{key}"]
 
 
-@pytest.mark.parametrize("page", ["settings", "scripts"])
-def test_pages_are_up_to_date(generator, page, monkeypatch):
+def test_pages_are_up_to_date(generator, monkeypatch):
     """If it fails: ``python docs/reference/generate.py``."""
     monkeypatch.chdir(REFERENCE.parents[1])  # for the paths in examples
-    written, made = (REFERENCE / f"{page}.md").read_text(), generator[f"{page}_page"]()
-    assert written.split() == made.split()  # line breaks of --help depend on the version of Python
+    made = generator["pages"]()
+    written = {page: (REFERENCE.parent / page).read_text("utf-8") for page in made}
+    for page, text in made.items():  # line breaks of --help depend on the version of Python
+        assert written[page].split() == text.split(), page
+
+
+def test_every_tensor_of_a_task_is_explained(make_task):
+    """Rows name attributes that a task has, with the dimensions that they say, and leave out no public tensor."""
+    task, text = make_task("a1_torque_multihead"), (REFERENCE / "task.md").read_text("utf-8")
+    rows = re.findall(r"^\| (`self\..*?`) \| .*? \| (.*) \|$", text, re.MULTILINE)
+    named = {}
+    for names, shapes in rows:
+        paths = re.findall(r"`self\.([\w.]+)`", names)
+        each = re.findall(r"\(([^)]*)\)", shapes)
+        named |= {path: each[min(i, len(each) - 1)] if each else None for i, path in enumerate(paths)}
+    for path, shape in named.items():
+        value = operator.attrgetter(path)(task)
+        if shape:
+            assert value.dim() == len([part for part in shape.split(",") if part.strip()]), path
+    tensors = {name for name, value in vars(task).items() if isinstance(value, torch.Tensor) and name[0] != "_"}
+    tensors |= {"state." + name for name in vars(task.state) if isinstance(getattr(task.state, name), torch.Tensor)}
+    unnamed = {name for name in tensors if "._" not in name and name.removeprefix("state.") not in named}
+    assert unnamed <= {"mixing"}, unnamed
 
 
 def test_every_setting_is_explained():

@@ -19,6 +19,7 @@ from legged_torque.terrain.height_map import HeightMap
 from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.tiles import TILES, Grid
 from legged_torque.utils.config import to_dict
+from legged_torque.utils.task_registry import task_registry
 
 GRID = Grid(160, 0.05)
 MIDDLE = 80
@@ -164,7 +165,8 @@ def test_a_kind_of_ones_own(monkeypatch):
 
     A kind that is not in TILES, or returns what is no tile, is an error.
     """
-    monkeypatch.setitem(TILES, "ramp", None)  # to be forgotten afterwards
+    monkeypatch.setitem(TILES, "ramp", None)  # to be forgotten afterwards, as is the task
+    monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
     page = (Path(__file__).parents[2] / "docs" / "terrain.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
     names = {"__name__": "page"}
