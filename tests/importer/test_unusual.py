@@ -1,11 +1,11 @@
-"""Published robots, and robots of unusual build: what is imported moves like its source, and stands on its feet."""
+"""Robots of unusual build: what is imported moves like its source, and stands on its feet."""
 
 import re
 
 import mujoco
 import numpy as np
 import pytest
-from support.published_facts import FACTS, published, urdf_of
+from support.urdf import urdf_of
 
 from legged_torque.importer.check import check
 from legged_torque.importer.mjcf import mjcf
@@ -84,24 +84,6 @@ def check_mirrored(robot, model, tolerance):
     for pair in robot.mirrored:
         right, left = (data.geom(f"{leg}_foot").xpos * [1, side, 1] for leg, side in zip(pair, (-1, 1), strict=True))
         np.testing.assert_allclose(right, left, atol=tolerance)
-
-
-IMPOSSIBLE = {"anymal_c", "hyq"}  # fixed links with inertias that MuJoCo refuses
-FALLING = {"bolt", "tron1_sole", "tron1_wheel", "t1", "op3", "h1"}  # two legs that nothing balances
-
-
-@pytest.mark.parametrize("name", FACTS)
-def test_published(imported, name):
-    """Masses, inertias and axes are those of the source; a robot stands on all its feet and nothing else."""
-    text = published(name)
-    robot, model, data, verdict = imported(text)
-    if name not in IMPOSSIBLE:
-        check_motion(text, robot, model)
-    check_mirrored(robot, model, tolerance=0.005)
-    if name in FALLING:
-        return
-    assert verdict.startswith("it stands"), verdict
-    assert feet_share(model, data) == (1.0, len(robot.legs))
 
 
 def legged(places, joints, foot, calf=True):
