@@ -89,10 +89,12 @@ class TaskRegistry:
             raise UserError(f"the name of a task must be a text, not {name!r}")
         if name in self._tasks:
             raise UserError(f"'{name}' is a task already; choose another name")
-        for cfg, member in ((env_cfg, "env"), (train_cfg, "runner")):
-            if not isinstance(cfg, BaseConfig) or not hasattr(cfg, member):
-                raise UserError(f"the settings of task '{name}' must be instances of configurations, not {cfg!r}")
-        type(env_cfg).refuse_mistakes(type(train_cfg))
+        wrong = [cfg for cfg in (env_cfg, train_cfg) if not isinstance(cfg, BaseConfig)]
+        if not wrong:
+            type(env_cfg).refuse_mistakes(type(train_cfg))
+            wrong = [cfg for cfg, section in ((env_cfg, "env"), (train_cfg, "runner")) if not hasattr(cfg, section)]
+        if wrong:
+            raise UserError(f"the settings of task '{name}' must be instances of configurations, not {wrong[0]!r}")
         self._tasks[name] = (task_class, env_cfg, train_cfg)
 
     def import_files(self, files: Iterable[str | Path]) -> None:

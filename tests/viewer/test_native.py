@@ -62,6 +62,6 @@ def test_missing_extra(monkeypatch):
     for name in [name for name in sys.modules if name.startswith("legged_torque.viewer.")]:
         monkeypatch.delitem(sys.modules, name)
     play = runpy.run_path(str(SCRIPTS_DIR / "play.py"))
-    args = argparse.Namespace(viewer="web", task="a1_torque", host="127.0.0.1", port=8080)
+    args = argparse.Namespace(viewer="web", host="127.0.0.1", port=8080)
     with pytest.raises(UserError, match=r"pip install 'legged_torque\[viewer\]'"):
-        play["import_viewer"](args)
+        play["import_viewer"](args, "a1_torque")

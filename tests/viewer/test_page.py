@@ -51,6 +51,7 @@ def page(request, tmp_path_factory):
         session.set_paused(False)
         yield page
         page.close()
+    task_registry._tasks.pop("imported", None)
 
 
 def status(page):
