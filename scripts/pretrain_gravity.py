@@ -10,12 +10,14 @@ The policy is kept where ``train.py`` looks for it, which also makes it itself i
 import argparse
 import shlex
 from pathlib import Path
+from typing import Any
 
 from legged_torque.envs import task_registry
 from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import without_machine, write_json
+from legged_torque.utils.options import Options
 
 
 def main() -> None:
@@ -30,36 +32,29 @@ def main() -> None:
     hint = "count how often the controller and the policy made before stand up from random states; makes no policy"
     parser.add_argument("--check_standing", action="store_true", help=hint)
     args = parser.parse_args()
-    if args.check_standing:
-        check(args)
-    else:
-        pretrain(args)
-
-
-def check(args: argparse.Namespace) -> None:
-    """Count how often controller and policy stand up."""
-    for name in ("num_configurations", "num_steps", "json"):
+    for name in ("num_configurations", "num_steps", "json") if args.check_standing else ():
         if getattr(args, name) is not None:
             raise UserError(f"--{name} is for making a policy, which --check_standing does not do")
-    options = cli.options_of(args)
-    with cli.slow_imports():
-        env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
-        from legged_torque.paper.gravity.trials import check_standing
-        from legged_torque.utils.progress import CompileProgress
-    with CompileProgress():
-        check_standing(options, env_cfg, train_cfg)
-
-
-def pretrain(args: argparse.Namespace) -> None:
-    """Make the policy, print what it learned, and the command that trains from it."""
-    for name in ("num_configurations", "num_steps", "seed"):
+    for name in () if args.check_standing else ("num_configurations", "num_steps", "seed"):
         if getattr(args, name) is not None:
             args.set.append(f"pretraining.{name}={getattr(args, name)}")
     options = cli.options_of(args)
     with cli.slow_imports():
-        env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
-        from legged_torque.paper.gravity.pretrained import make_pretrained, pretrained_file
+        cfgs = task_registry.get_cfgs(options.task, options)
+        from legged_torque.paper.gravity.trials import check_standing
         from legged_torque.utils.progress import CompileProgress
+    if args.check_standing:
+        with CompileProgress():
+            check_standing(options, *cfgs)
+    else:
+        pretrain(args, options, *cfgs)
+
+
+def pretrain(args: argparse.Namespace, options: Options, env_cfg: Any, train_cfg: Any) -> None:
+    """Make the policy, print what it learned, and the command that trains from it."""
+    from legged_torque.paper.gravity.pretrained import make_pretrained, pretrained_file
+    from legged_torque.utils.progress import CompileProgress
+
     file, device = pretrained_file(options.task, train_cfg, options.log_root), resolve_device(options.device)
     if args.json:
         cli.check_output(args.json)

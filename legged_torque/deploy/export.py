@@ -183,9 +183,8 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
         file = file.relative_to(RESOURCES_DIR.parent)
     joints = {}  # for comparison with other files of the robot
     for joint, axis in zip(task.dof_names, task.asset.dof_axes(), strict=True):
-        passive = {
-            key: float(getattr(mj_model.joint(joint), key)[0]) for key in ("damping", "armature", "frictionloss")
-        }
+        own, keys = mj_model.joint(joint), ("damping", "armature", "frictionloss")
+        passive = {key: float(getattr(own, key)[0]) for key in keys}
         joints[joint] = {"axis": [round(float(part), 6) + 0.0 for part in axis], **passive}
     observations = {"history_length": cfg.env.history_length, "terms": _observation_terms(task, model)}
     description: dict[str, Any] = {
@@ -297,10 +296,8 @@ def differences(task: LeggedRobot, model: MLPModel, policy: Policy) -> list[str]
     for world in range(task.num_envs):
         rates, angles, speeds, gravity, position, quat = (part[world].cpu().numpy() for part in parts)
         points = np.pad(policy.scan_places(position, quat), [(0, 0), (0, 1)], constant_values=position[2])
-        state, in_world = (
-            State(rates, angles, speeds, gravity),
-            torch.as_tensor(points, dtype=torch.float32, device=task.device),
-        )
+        in_world = torch.as_tensor(points, dtype=torch.float32, device=task.device)
+        state = State(rates, angles, speeds, gravity)
         state.terms = {name: of_worlds[world] for name, of_worlds in values.items()}
         state.heights = task.terrain.height_above(in_world).cpu().numpy()
         policy.reset()

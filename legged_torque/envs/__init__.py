@@ -8,12 +8,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfgPPO as Leg
 from legged_torque.envs.base.legged_robot_config import LinearChange as LinearChange
 from legged_torque.envs.robots.a1 import A1Cfg as A1Cfg
 from legged_torque.envs.robots.a1 import A1CfgPPO as A1CfgPPO
-from legged_torque.envs.tasks import A1CurriculumMultiHeadCfg as A1CurriculumMultiHeadCfg
 from legged_torque.envs.tasks import A1GravityMultiHeadCfgPPO as A1GravityMultiHeadCfgPPO
-from legged_torque.envs.tasks import A1MultiHeadCfg as A1MultiHeadCfg
-from legged_torque.envs.tasks import A1MultiHeadCfgPPO as A1MultiHeadCfgPPO
-from legged_torque.envs.tasks import A1MultiHeadTwoRatesCfg as A1MultiHeadTwoRatesCfg
-from legged_torque.envs.tasks import A1MultiHeadTwoRatesCfgPPO as A1MultiHeadTwoRatesCfgPPO
 from legged_torque.envs.tasks import A1TorqueCfg as A1TorqueCfg
 from legged_torque.envs.tasks import A1TorqueCfgPPO as A1TorqueCfgPPO
 from legged_torque.envs.tasks import A1TorqueCurriculumCfg as A1TorqueCurriculumCfg

@@ -74,28 +74,8 @@ class A1TorqueMultiHeadCfg(multi_head.TorqueMultiHeadCfg, A1Cfg):
     """A1 with positions and torques; the PD part fades to 0."""
 
 
-class A1CurriculumMultiHeadCfg(multi_head.CurriculumMultiHeadCfg, A1Cfg):
-    """A1 with positions and torques that is first rewarded for its nominal pose; the PD part fades to 0."""
-
-
-class A1MultiHeadCfg(multi_head.MultiHeadCfg, A1Cfg):
-    """A1 with positions and torques; the PD part fades to 0.1."""
-
-
-class A1MultiHeadCfgPPO(multi_head.MultiHeadCfgPPO, A1CfgPPO):
-    """Training of all of them."""
-
-
-class A1GravityMultiHeadCfgPPO(torque_gravity.TorqueGravityCfgPPO, A1MultiHeadCfgPPO):
+class A1GravityMultiHeadCfgPPO(torque_gravity.TorqueGravityCfgPPO, multi_head.MultiHeadCfgPPO, A1CfgPPO):
     """Training from a policy whose torque head stands."""
-
-
-class A1MultiHeadTwoRatesCfg(multi_head.MultiHeadTwoRatesCfg, A1Cfg):
-    """A1 with positions at 50 Hz and torques at 200 Hz; the PD part fades to 0.1."""
-
-
-class A1MultiHeadTwoRatesCfgPPO(multi_head.MultiHeadTwoRatesCfgPPO, A1CfgPPO):
-    """Its training."""
 
 
 _ROBOT = "legged_torque.envs.base.legged_robot:LeggedRobot"
@@ -105,20 +85,14 @@ _MULTI_HEAD = "legged_torque.envs.approaches.multi_head:MultiHeadRobot"
 _CURRICULUM_MULTI_HEAD = "legged_torque.envs.approaches.multi_head:CurriculumMultiHeadRobot"
 _TWO_RATES = "legged_torque.envs.approaches.multi_head:MultiHeadTwoRatesRobot"
 
-TASKS: tuple[tuple[str, str, type[LeggedRobotCfg], type[LeggedRobotCfgPPO]], ...] = (
-    ("a1_position", _ROBOT, A1Cfg, A1CfgPPO),
+A1_TASKS: tuple[tuple[str, str, type[LeggedRobotCfg], type[LeggedRobotCfgPPO]], ...] = (
     ("a1_torque", _TORQUE, A1TorqueCfg, A1TorqueCfgPPO),
     ("a1_torque_gravity", _TORQUE, A1TorqueCfg, A1TorqueGravityCfgPPO),
-    ("a1_torque_curriculum", _CURRICULUM, A1TorqueCurriculumCfg, A1TorqueCurriculumCfgPPO),
-    ("a1_torque_multihead", _MULTI_HEAD, A1TorqueMultiHeadCfg, A1MultiHeadCfgPPO),
-    ("a1_multihead", _MULTI_HEAD, A1MultiHeadCfg, A1MultiHeadCfgPPO),
-    ("a1_torque_curriculum_multihead", _CURRICULUM_MULTI_HEAD, A1CurriculumMultiHeadCfg, A1MultiHeadCfgPPO),
     ("a1_torque_gravity_curriculum", _CURRICULUM, A1TorqueCurriculumCfg, A1TorqueGravityCfgPPO),
     ("a1_torque_gravity_multihead", _MULTI_HEAD, A1TorqueMultiHeadCfg, A1GravityMultiHeadCfgPPO),
     ("a1_torque_curriculum_high", _CURRICULUM, A1TorqueCurriculumHighCfg, A1TorqueCurriculumCfgPPO),
-    ("a1_multihead_two_rates", _TWO_RATES, A1MultiHeadTwoRatesCfg, A1MultiHeadTwoRatesCfgPPO),
 )
-"""Tasks of the A1 on a plane: name, class, settings and training."""
+"""Tasks of the A1 on a plane that no other robot has, or in another way: name, class, settings and training."""
 
 APPROACHES: tuple[tuple[str, str, type, type], ...] = (
     ("torque", _TORQUE, torque.TorqueCfg, torque.TorqueCfgPPO),
@@ -138,7 +112,7 @@ APPROACHES: tuple[tuple[str, str, type, type], ...] = (
 
 
 def tasks_of(name: str, cfg: Any, train_cfg: Any) -> list[tuple[str, str, Any, Any]]:
-    """Return the tasks of a robot with all approaches on a plane, as in :data:`TASKS`."""
+    """Return the tasks of a robot with all approaches on a plane, as in :data:`A1_TASKS`."""
     tasks = [(f"{name}_position", _ROBOT, cfg, train_cfg)]
     for approach, robot, approach_cfg, approach_train_cfg in APPROACHES:
         text = {"__doc__": f"{cfg.__doc__} Approach: {approach_cfg.__doc__}"}
@@ -235,6 +209,6 @@ def _register(robot_name: str, tasks: Sequence[tuple[str, str, Any, Any]]) -> No
         task_registry.register(f"{rough_name}_scan", robot, on_ground(RoughScanCfg, env_cfg), training)
 
 
-_register("a1", TASKS)
+_register("a1", list({task[0]: task for task in (*tasks_of("a1", A1Cfg, A1CfgPPO), *A1_TASKS)}.values()))
 for robot_parts in further_robots():
     register_robot(*robot_parts)

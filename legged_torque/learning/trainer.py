@@ -160,18 +160,16 @@ class Trainer:
         """
         steps, most_steps = int(self.env.total_steps), int(LAST_SHARE * ended * self.cfg["num_steps_per_env"])
         before = steps - self._log.steps_per_iteration
-        chosen = [each for each in self._evaluators if each.due(before, steps, ended > 0)]
+        chosen = {each: each.due(before, steps) for each in self._evaluators if each.due(before, steps, ended > 0)}
         if self.logger.writer is None or not chosen:
             return {}
+        self._log.display.activity = "evaluating" if any(chosen.values()) else "evaluating at the end of training"
         start = time.perf_counter()
         seconds = self._seconds_before + self.logger.tot_time + start - begin
         when = {"steps": steps, "iteration": self.current_learning_iteration + 1, "seconds": seconds}
         critic = {name: numbers[name] for name in ("critic_gradient_norm",) if name in numbers}
         logged: dict[str, float] = {}
-        for evaluator in chosen:
-            is_due = evaluator.due(before, steps)
-            at_end = f" at the end of training, at most {most_steps} steps of each world"
-            self._log.display.activity = f"evaluating{'' if is_due else at_end}"
+        for evaluator, is_due in chosen.items():
             metrics, levels = evaluator.evaluate() if is_due else evaluator.evaluate_at_end(most_steps)
             logged |= {f"{tagged('Evaluation', evaluator.name)}/{metric}": value for metric, value in metrics.items()}
             file = evaluations_file(Path(str(self.log_dir)), evaluator.name)

@@ -114,9 +114,9 @@ class TrainingDisplay(Display):
         entries |= {name: Text(f"{count:,}", "yellow" if count else "") for name, count in self._bad.items()}
         cells = [Text.assemble((f"{name:<{NAME}}", "dim"), text) for name, text in entries.items()]
         curricula = {name.partition("/")[2]: f"{n:.3g}" for name, n in self._numbers.items() if "Curriculum/" in name}
-        below = (
-            [Text.assemble(("curricula: ", "dim"), ", ".join(map(" ".join, curricula.items())))] if curricula else []
-        )
+        below: list[Text] = []
+        if curricula:
+            below.append(Text.assemble(("curricula: ", "dim"), ", ".join(map(" ".join, curricula.items()))))
         largest = sorted(self._terms, key=lambda name: -abs(self._terms[name]))
         shown = largest[: 2 * max(0, self._console.height - OTHER_ROWS)]  # two in a row, at worst
         if shown:

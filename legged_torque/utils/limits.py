@@ -75,8 +75,6 @@ Number = Annotated[int, Limits(lowest=0)]
 Worlds = Annotated[int, Limits(1, 10_000_000)]
 Sizes = Annotated[list[int], Limits(lowest=1, highest=1e6, nonempty=True)]
 Interval = Annotated[list[float], Limits(ordered=True)]
-PositiveInterval = Annotated[list[float], Limits(above=0, ordered=True)]
-NotNegativeInterval = Annotated[list[float], Limits(lowest=0, ordered=True)]
 Draw = dict[Literal["set", "add", "scale", "scale_per_joint"], Interval]
 Ranges = Annotated[Draw, DrawLimits()]
 

@@ -17,9 +17,7 @@ def quat_multiply(first: Tensor, second: Tensor) -> Tensor:
 
 def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
     """Turn vectors (..., 3) of bodies with unit quaternions (..., 4) into the world's frame, see the inverse."""
-    w, xyz = quat[..., :1], quat[..., 1:]
-    t = 2.0 * torch.linalg.cross(xyz, vec)
-    return vec + w * t + torch.linalg.cross(xyz, t)
+    return quat_rotate_inverse(torch.cat([-quat[..., :1], quat[..., 1:]], dim=-1), vec)
 
 
 def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:

@@ -41,10 +41,9 @@ class ControlParameters:
         zeros = torch.zeros(num_envs, len(dof_names), device=device)
         self.default_dof_pos = torch.tensor(pose, dtype=torch.float32, device=device)
         self.joint_offset = zeros.clone()
-        gains = {
-            name: by_joint(f"control.{name}", getattr(control, name), dof_names) for name in ("stiffness", "damping")
-        }
-        self.p_gains, self.d_gains = (zeros + torch.tensor(values, device=device) for values in gains.values())
+        names = ("stiffness", "damping")
+        gains = [by_joint(f"control.{name}", getattr(control, name), dof_names) for name in names]
+        self.p_gains, self.d_gains = (zeros + torch.tensor(values, device=device) for values in gains)
         self.action_scale, self.torque_scale = zeros[:, :1] + control.action_scale, zeros[:, :1] + control.torque_scale
         self.torque_per_position = control.torque_scale / control.action_scale
 

@@ -136,10 +136,8 @@ class Observations:
         self._scales = torch.tensor([*chain(*scales)], dtype=torch.float32, device=device)
         self.policy_size = sum(self.sizes[term.name] for term in self.policy_terms())
         self._noise = torch.tensor([*chain(*errors)][: self.policy_size], dtype=torch.float32, device=device)
-        shapes: dict[str, tuple[int, ...]] = {
-            "policy": (self.policy_size * history_length,),
-            "critic": (len(self._scales),),
-        }
+        seen, critic = self.policy_size * history_length, len(self._scales)
+        shapes: dict[str, tuple[int, ...]] = {"policy": (seen,), "critic": (critic,)}
         self.groups: dict[str, ObservationTerm] = {}
         for term in (term for term in terms if term.group):
             if term.group in shapes:

@@ -111,9 +111,8 @@ def robot_parameters(
 def ground_parameters(draws: Mapping[str, Any], model: mujoco.MjModel) -> list[RandomParameter]:
     """Return the parameters of the ground, the same for all geoms of a world; arguments as of robot_parameters."""
     geoms = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
-    kinds = list(
-        (model.geom_friction[geoms] / model.geom_friction[geoms, :1]).ravel()
-    )  # tangential, torsional, rolling
+    friction = model.geom_friction[geoms]  # tangential, torsional, rolling
+    kinds = list((friction / friction[:, :1]).ravel())
     stiffness, damping = [2 * geom for geom in geoms], [2 * geom + 1 for geom in geoms]
     solref: dict[str, Any] = {"shared": True, "set_unit": -1.0}  # MuJoCo's direct format has negative numbers
     shared: dict[str, Any] = {"shared": True, "set_unit": kinds}

@@ -69,10 +69,8 @@ class RobotState(Buffers):
         self.last_dof_vel, self.commands = self.buffer("last_dof_vel", num_dof), self.buffer("commands", 3)
         self.actions, self.last_actions = self.buffer("actions", num_actions), self.buffer("last_actions", num_actions)
         self.contacts = self.buffer("contacts", self._contact_found.shape[1])
-        self.feet_contact, self.feet_air_time = (
-            self.buffer("feet_contact", num_feet),
-            self.buffer("feet_air_time", num_feet),
-        )
+        self.feet_contact = self.buffer("feet_contact", num_feet)
+        self.feet_air_time = self.buffer("feet_air_time", num_feet)
         self.episode_length = self.buffer("episode_length", dtype=torch.long)
         self.episode_return = self.buffer("episode_return")
         self.reset_buf = self.buffer("reset_buf", dtype=torch.bool)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -110,16 +110,8 @@ class Mirror:
         return values[:, order] * signs
 
 
-class Mirrored(Protocol):
-    """A task that knows mirror images."""
-
-    @property
-    def mirror(self) -> Mirror:
-        """Reflects its observations and actions."""
-
-
 def with_mirror_images(
-    env: Mirrored, obs: TensorDict | None, actions: Tensor | None
+    env: Any, obs: TensorDict | None, actions: Tensor | None
 ) -> tuple[TensorDict | None, Tensor | None]:
     """Return observations and actions followed by their mirror images: rsl_rl's ``data_augmentation_func``.
 
