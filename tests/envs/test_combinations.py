@@ -203,25 +203,6 @@ def test_observations_of_two_rates(make_task):
     np.testing.assert_array_equal(np.stack(seen), expected)
 
 
-def test_two_rates_behind_a_delay(make_task):
-    """Held positions and torques are delayed together."""
-    delay = 3
-    task = make_task(TWO_RATES, 2, **HIGH_UP, **{"motors.delay.range": [delay, delay]})
-    torques_in_torch(task)
-    states, step = [], task.sim.step
-
-    def noted_step(sense=True):
-        states.append([part.numpy().copy() for part in (task.torques, task.dof_pos, task.dof_vel)])
-        step(sense)
-
-    task.sim.step = noted_step
-    sent = held(send(task, 12, 2))
-    for i, (torques, q, qd) in enumerate(states):
-        action = sent[i - delay] if i >= delay else np.zeros((2, 24))
-        expected = np.clip(pd_by_hand(action[:, :12], q, qd) + 4.0 * action[:, 12:], -TORQUE_LIMIT, TORQUE_LIMIT)
-        np.testing.assert_allclose(torques, expected, rtol=1e-4, atol=1e-4)
-
-
 def test_two_rates_in_the_mirror(make_task):
     """The phase is the same in the mirror; the rest is reflected, in every step of a history."""
     task = make_task(TWO_RATES, 2, **{"env.history_length": 2})

@@ -5,11 +5,7 @@ import math
 
 import mujoco
 import numpy as np
-import pytest
 import torch
-
-from legged_torque.sim.randomization import Randomization, RandomParameter
-from legged_torque.utils.errors import UserError
 
 WIDE = {
     "domain_rand.trunk_mass": {"add": [-1.0, 1.0], "scale": [0.75, 1.25]},
@@ -30,14 +26,6 @@ def edited_model(sim, world):
     mujoco.mj_setConst(model, mujoco.MjData(model))
     model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
     return model
-
-
-def check_constants(sim):
-    """Compare the inverse weights of all worlds with those of mj_setConst."""
-    for world in range(sim.num_envs):
-        model = edited_model(sim, world)
-        np.testing.assert_allclose(sim.field("body_invweight0")[world, 1:], model.body_invweight0[1:], rtol=1e-5)
-        np.testing.assert_allclose(sim.field("dof_invweight0")[world], model.dof_invweight0, rtol=1e-5)
 
 
 def uniformity(values, low, high):
@@ -82,19 +70,6 @@ def test_worlds_move_as_their_models(make_task):
         np.testing.assert_allclose(task.sim.qvel[world], data[world].qvel, atol=3e-3)
         moved += np.abs(plain.qvel - data[world].qvel).max() > 1e-4
     assert moved >= 5 and not torch.equal(task.sim.qvel, before)
-
-
-def test_derived_constants(make_task):
-    """Inverse weights are those of mj_setConst, in the worlds that were drawn anew and only there."""
-    task = make_task("a1_torque", 6, **ON, **{"domain_rand.resampling_probability": 0.0})
-    check_constants(task.sim)
-    before = {name: task.sim.field(name).clone() for name in (*FIELDS, "body_invweight0", "dof_invweight0")}
-    mask = torch.tensor([True, False, True, False, False, False])
-    task.events.apply(mask)
-    for name, old in before.items():
-        new = task.sim.field(name)
-        assert torch.equal(new[~mask], old[~mask]), name
-        assert not torch.equal(new[mask], old[mask]), name
 
 
 def test_distributions(make_task):
@@ -255,12 +230,3 @@ def test_initial_velocities(make_task):
     task = make_task("a1_torque", 1000, **{f"domain_rand.{key}": value for key, value in ranges.items()})
     assert uniformity(task.dof_vel, -10.5, 10.5) < 1.0
     assert uniformity(task.sim.qvel[:, :3], -0.5, 0.5) < 1.0 and uniformity(task.base_ang_vel, -0.4, 0.4) < 1.0
-
-
-def test_tensors_that_the_kernel_cannot_write():
-    """Numbers of another type are refused at once, a tensor without a row per world when it is drawn."""
-    with pytest.raises(UserError, match="'wide' must be float32"):
-        Randomization([RandomParameter("wide", torch.zeros(3, 2, dtype=torch.float64), [0], {})], {}.get, 3, "cpu")
-    shared = Randomization([RandomParameter("shared", torch.ones(1, 2), [0], {})], {}.get, 3, "cpu")
-    with pytest.raises(UserError, match="without a row per world: shared"):
-        shared.draw(torch.ones(3, dtype=torch.bool))

@@ -1,15 +1,9 @@
 """Parameters of the fused step, one after another, against plain MuJoCo."""
 
-import mujoco
 import numpy as np
 import pytest
-import torch
 from support.fused import assert_alike, compiled, draw_states, make_a1, step_fused, step_mujoco
 from support.fused import random as random  # for the edits
-
-from legged_torque.sim.registry import make_engine
-from legged_torque.terrain.height_map import HeightMap
-from legged_torque.utils.errors import UserError
 
 
 def edited_a1(edit):
@@ -112,20 +106,3 @@ def test_slippery_floors(friction):
     error = np.abs(step_fused(model, states)[0] - velocities).max(axis=1)
     change = np.sqrt(np.square(velocities - states["qvel"]).mean())
     assert np.median(error) < 1e-4 * change and error.max() < 0.1 * change
-
-
-def test_derived_constants_on_a_hfield():
-    """With MuJoCo Warp a hfield is a floor like any other: inverse weights follow the masses, as by mj_setConst."""
-    spec = make_a1()
-    HeightMap(np.random.default_rng(0).uniform(size=(4, 5)), 1.0, (-2.0, -2.0), "cpu").add_to(spec, "floor")
-    model = compiled(spec)
-    sim = make_engine("mujoco_warp", model, 2, "cpu")
-    sim.field("body_mass")[1, 1] *= 1.7
-    sim.update_constants(torch.tensor([False, True]))
-    before = model.body_invweight0.copy()
-    model.body_mass[1] *= 1.7
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-    for found, exact in zip(sim.field("body_invweight0"), (before, model.body_invweight0), strict=True):
-        np.testing.assert_allclose(found, exact, rtol=2e-5)
-    with pytest.raises(UserError, match="it needs one plane"):
-        make_engine("fused", model, 1, "cpu")

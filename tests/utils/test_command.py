@@ -82,12 +82,6 @@ def test_values_in_a_word_of_their_own(tmp_path):
     assert_told_in_one_line(run_here("train.py", "--taks=a1_torque", root=tmp_path), "did you mean '--task'?")
 
 
-def test_options_that_do_something(tmp_path):
-    """export.py has no worlds, seeds and perturbations."""
-    _, output, _ = run_here("export.py", "--help", root=tmp_path)
-    assert not set(re.findall(r"  --(\w+)", output)) & {"num_envs", "seed", "perturbation", "ranges"}
-
-
 def test_command_of_other_scripts(monkeypatch, tmp_path):
     """What a script prints for the user to type is how the script itself was started."""
     monkeypatch.setattr(sys, "argv", ["scripts/train.py"])

@@ -78,9 +78,7 @@ def test_page_goes_on(page):
     assert page._plots._gait.content.count("<svg") == len(feet) == len(page._plots._feet)
 
 
-@pytest.mark.parametrize(
-    ("owner", "name"), [("_plots", "update"), ("", "_draw_status"), ("_scene", "update"), ("session", "push")]
-)
+@pytest.mark.parametrize(("owner", "name"), [("_plots", "update"), ("_scene", "update"), ("session", "push")])
 def test_error_of_a_part(page, monkeypatch, capsys, owner, name):
     """It is shown in red until it is over, whatever it is; robots and commands are not concerned."""
 
