@@ -3,10 +3,8 @@
 import fcntl
 import json
 import os
-import re
 import signal
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -18,7 +16,6 @@ from legged_torque.experiments import matrix as experiment
 from legged_torque.experiments import run as experiment_run
 from legged_torque.experiments.local_launcher import GPU_JOBS, LocalLauncher
 from legged_torque.experiments.matrix import CellState, read_matrix
-from legged_torque.experiments.run import time_left
 
 
 @pytest.fixture
@@ -272,30 +269,3 @@ def test_devices(places, monkeypatch):
         assert sorted(variables[::2]) == sorted(names * 2) and variables[1::2] == ["3"] * 4
     assert places(LocalLauncher("cuda:1", 1), 1) == (["cuda:1"], ["5", "None"])
     assert LocalLauncher("auto", None).room() == 2 * GPU_JOBS
-
-
-def test_device_time(stage, tmp_path):
-    """Two that share a device count half each; steps are those of the trainings; all calls are added up."""
-    (stage / "behaviour").write_text("slow")
-    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
-    words, start = [file, f"--out={out}", "--device=cpu"], time.monotonic()
-    threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGTERM)).start()
-    assert experiment_here(*words, "--jobs=2", tmp_path=tmp_path)[0] == 130
-    took = time.monotonic() - start
-    (stage / "behaviour").write_text("")
-    files = [out / f"{task}-low-s1" / "times.json" for task in SMALL["tasks"]]
-    first = [json.loads(file.read_text()) for file in files]
-    output = experiment_here(*words, tmp_path=tmp_path)[1]
-    second = [json.loads(file.read_text()) for file in files]
-    assert [times["steps"] for times in first + second] == [3 * 2 * 5] * 2 + [4 * 2 * 5] * 2
-    shares, sums = ([times["seconds"]["cpu training"] for times in each] for each in (first, second))
-    assert shares[0] == pytest.approx(shares[1], abs=0.1) and 0.5 < sum(shares) < took
-    assert all(more > less for more, less in zip(sums, shares, strict=True))
-    assert re.search(r"of CPU time for training; 80 steps of training, \d+ per second of their device time\n", output)
-
-
-def test_time_left():
-    """It is the mean duration of a finished cell, times the cells that are left, over those worked on at a time."""
-    assert time_left([], 5, 1) is None
-    assert time_left([10.0, 20.0], 4, 2) == 30.0
-    assert time_left([10.0], 1.5, 4) == 10.0

@@ -24,11 +24,9 @@ REFUSED = [
     ("spec.delete(spec.joint('root'))", "its trunk is not free"),
     ("spec.joint('root').type = JOINT.mjJNT_HINGE", "its trunk is not free"),
     ("spec.joint('RL_calf_joint').type = JOINT.mjJNT_SLIDE", HINGES),
-    ("spec.body('FL_hip').add_joint(axis=(0, 0, 1), range=(-1, 1))", HINGES),
     (f"spec.body('FL_hip').add_body(name='b').add_geom({SPHERE})", HINGES),
     ("spec.geom('floor').contype = 0", "it needs one plane and no other obstacle"),
     (f"spec.worldbody.add_geom({SPHERE}, pos=(0, 0, -1), condim=3)", "it needs one plane and no other obstacle"),
-    ("spec.worldbody.add_geom(type=GEOM.mjGEOM_PLANE, size=(1, 1, 1), pos=(0, 0, -9))", "it needs one plane"),
     (
         "spec.geom('FR_hip').type = GEOM.mjGEOM_ELLIPSOID; spec.geom('FR_hip').size = (0.1, 0.1, 0.2)",
         "only spheres, capsules, cylinders and boxes may collide, unlike 'FR_hip'",
@@ -38,7 +36,6 @@ REFUSED = [
     (f"spec.geom('FR_calf').contype = 2; {AIRBORNE}.margin = 0.1", "geoms have margins or gaps"),
     (f"spec.geom('FR_calf').contype = 2; {AIRBORNE}.solref = (-9, 0.7)", "a solref mixes its two formats"),
     ("spec.geom('RR_foot').condim = 4", "condim of contacts with the floor must be 3"),
-    ("spec.geom('RR_foot').condim = 1", "condim of contacts with the floor must be 3"),
     ("spec.geom('RR_foot').margin = 0.01", "geoms have margins or gaps"),
     ("spec.geom('floor').gap = 0.01", "geoms have margins or gaps"),
     ("spec.joint('FR_calf_joint').margin = 0.01", "joint limits have margins"),
@@ -51,7 +48,6 @@ REFUSED = [
     ("spec.add_pair(geomname1='floor', geomname2='FR_foot')", "a <pair> with the ground"),
     ("spec.add_pair(geomname1='FL_foot', geomname2='FR_foot', condim=1)", "other than condim 3"),
     ("spec.option.density = 1.2", "it moves through a fluid"),
-    ("spec.option.viscosity = 1.2", "it moves through a fluid"),
     ("spec.body('FR_calf').gravcomp = 0.5", "bodies are compensated for gravity"),
     (SITE, "actuators must be motors"),
     ("spec.actuator('FR_hip').set_to_position(kp=10.0)", "actuators must be motors"),
@@ -68,11 +64,8 @@ REFUSED = [
     ("spec.actuators[0].damping = [1.0, 0.0, 0.0]", "actuators must be motors"),
     ("spec.actuators[0].armature = 0.1", "actuators must be motors"),
     ("spec.joint('FR_calf_joint').stiffness = [1.0, 40.0, 30.0]", "springs or dampers are not linear"),
-    ("spec.joint('FR_calf_joint').damping = [1.0, 4.0, 3.0]", "springs or dampers are not linear"),
     ("spec.joint('root').damping = [5.0, 0.0, 0.0]", "the trunk's free joint has passive forces or armature"),
-    ("spec.joint('root').armature = 1.0", "the trunk's free joint has passive forces or armature"),
     ("spec.joint('root').frictionloss = 5.0", "the trunk's free joint has passive forces or armature"),
-    ("spec.joint('root').stiffness = [50.0, 0.0, 0.0]", "the trunk's free joint has passive forces or armature"),
     ("spec.add_exclude(bodyname1='world', bodyname2='FR_calf')", "some contacts are excluded"),
     (f"spec.geom('floor').contype = 0; spec.worldbody.add_geom({SPHERE}, condim=3)", "it needs one plane"),
     ("spec.geom('floor').surfacevel = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]", "surfaces move or stick"),
@@ -81,7 +74,6 @@ REFUSED = [
     ("for _ in range(13): branch(spec.body('trunk'))", "it has 17 legs, not 1 to 16"),
     ("spec.geom('FR_foot').solref = (-500, 0.7)", "a solref mixes its two formats"),
     ("spec.joint('FR_calf_joint').solref_limit = (0.02, -1)", "a solref mixes its two formats"),
-    ("spec.actuators[0].damping = [0.0, 1.0, 0.0]", "actuators must be motors"),
 ]
 
 

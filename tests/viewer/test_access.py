@@ -48,11 +48,12 @@ def test_only_choices_count(monkeypatch, capfd, caplog, recwarn):
     }
     before = {name: vars(each._impl).copy() for name, each in controls.items()}
     capfd.readouterr()
-    with contextlib.suppress(ConnectionClosed), visitor(server) as send:
+    with visitor(server) as send:
         for name, forged in FORGED.items():
             for updates in forged:
                 send(type="GuiUpdateMessage", uuid=before[name]["uuid"], updates=updates)
         send(type="ShareUrlRequest")
+    with contextlib.suppress(ConnectionClosed), visitor(server) as send:
         for number in range(20):
             send(type="ViewerCameraMessage", wxyz=f"{number}" * 10_000)
     for message in ({"type": "x" * 10_000}, {"type": "GuiUpdateMessage", "uuid": "x" * 1_000_000}):

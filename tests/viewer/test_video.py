@@ -41,9 +41,6 @@ assert frames == [(1, 3), (2, 3), (3, 3)], frames
 """
 
 
-VELOCITIES = np.array([[0.5, -0.25, 0.0], [0.3, 0.4, -0.001]])  # commanded and actual
-
-
 @pytest.mark.parametrize(("robots", "width", "height"), [(1, 960, 540), (4, 1280, 720)])
 def test_frames(tmp_path, robots, width, height):
     """An mp4 has every second step, and its size is that of all tiles; all of them show a robot."""
