@@ -152,27 +152,3 @@ def test_lines_of_the_package():
     assert folders <= set(LINES)
     total = sum(sum(lines(ROOT / folder).values()) for folder in ("legged_torque", "scripts"))
     assert total <= MAX_PACKAGE
-
-
-def test_reading_of_imports():
-    """Imports are found wherever they stand."""
-    tree = ast.parse(
-        "import legged_torque.utils.math\n"
-        "from legged_torque.sim import graph, missing\n"
-        "if TYPE_CHECKING:\n    from legged_torque.envs.base.legged_robot import LeggedRobot\n"
-        "def later():\n    from legged_torque import learning\n    import numpy\n"
-    )
-    known = {"legged_torque.sim.graph", "legged_torque.learning"}
-    assert sorted(imports(tree, known)) == [
-        ("legged_torque.envs.base.legged_robot", 4),
-        ("legged_torque.learning", 6),
-        ("legged_torque.sim", 2),
-        ("legged_torque.sim.graph", 2),
-        ("legged_torque.utils.math", 1),
-    ]
-    assert [part_of(f"legged_torque.{name}") for name in ("envs", "envs.base.x", "envs.base.state", "z")] == [
-        "legged_torque.envs",
-        "legged_torque.envs.base",
-        "legged_torque.envs.base.state",
-        None,
-    ]

@@ -184,22 +184,12 @@ def test_groups_of_the_actor(make_task, tmp_path, monkeypatch):
     for offset, is_right in ((0.1, False), (0.2, True)):
         rays = lambda policy, state, command, offset=offset: state.joint_positions[:3] + offset  # noqa: E731
         monkeypatch.setitem(OBSERVATIONS, "rays", rays)
-        task, model = export_random(make_task, "a1_position", tmp_path / "out", True, is_right, groups, **changes)
+        export_random(make_task, "a1_position", tmp_path / "out", True, is_right, groups, **changes)
         if not is_right:
             assert "observations of LeggedRobot differ by 0.05" in read_yaml(tmp_path / "out")["unsupported"][0]
     description = read_yaml(tmp_path / "out")
     assert description["network"]["num_observations"] == 2 * 45 + 3
     assert description["observations"]["terms"][-1] == RAYS | {"size": 3, "clip": [-100.0, 100.0]}
-    policy, scripted, obs = Policy(tmp_path / "out"), torch.jit.load(str(tmp_path / "out" / "policy.pt")), task.reset()
-    for _ in range(3):
-        seen = policy.observation(measured(task, 1), task.commands[1].numpy())
-        np.testing.assert_allclose(seen, torch.cat([obs["policy"], obs["rays"]], dim=1)[1], rtol=1e-5, atol=1e-5)
-        with torch.inference_mode():
-            actions = model(obs)
-            np.testing.assert_allclose(scripted(torch.from_numpy(seen)[None])[0], actions[1], rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(policy.act(seen), actions[1], rtol=1e-5, atol=1e-5)
-        obs = task.step(actions)[0]
-        assert not task.reset_buf[1]
 
 
 class FeelingRobot(TorqueRobot):

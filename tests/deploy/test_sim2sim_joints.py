@@ -94,16 +94,6 @@ def test_differences_of_the_scene(policy, changed):
     assert robot.has_fallen() and robot.contact_force() > 10.0
 
 
-def test_geoms(policy, changed):
-    """Geoms that should end episodes and are missing, and a robot that no view would draw."""
-    hidden = setting(".//default[@class='visual']/geom", group="5")
-    description = policy.description | {"episode": {"length": 20.0, "ends_on_contact_of": ["trunk", "head"]}}
-    assert MujocoRobot(changed(hidden), description).notes == [
-        "no view draws the robot: its geoms are in group 3, 5; put those to be seen into group 0, 1 or 2",
-        "no geom's name contains head: it ends no episode",
-    ]
-
-
 def test_all_problems_are_reported(policy, changed):
     """Actuators that are not motors are reported together, and so are missing joints; the trunk must be free."""
     message = error_of(MujocoRobot, changed(servo(3, 7)), policy.description)

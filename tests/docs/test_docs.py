@@ -45,16 +45,6 @@ def test_links(page):
     assert not broken_links(page)
 
 
-def test_broken_links_are_found(tmp_path):
-    """A file, an image, a heading of another page and one of the page itself that are not there."""
-    (tmp_path / "other.md").write_text("# A heading: of `two` words\n```bash\n# no heading\n```\n")
-    good = "[a](other.md#a-heading-of-two-words) [b](https://x.org) `[c](code.md)` [d](#here)\n# Here\n"
-    bad = ["none.md", "none.png", "other.md#no-heading", "#there"]
-    page = tmp_path / "page.md"
-    page.write_text(good + " ".join(f"[x]({link})" for link in bad))
-    assert broken_links(page) == bad
-
-
 def test_files_that_are_named():
     """Every path in the documents exists, and a name followed by its file in parentheses is in that file."""
     wrong = []

@@ -34,17 +34,6 @@ def test_joint_dynamics(model):
     np.testing.assert_allclose(model.jnt_stiffness, 0.0)
 
 
-def test_options(model):
-    """Time step, solver, cone and integrator are the project's, the iteration limits MuJoCo's own."""
-    fresh = mujoco.MjOption()
-    assert model.opt.timestep == pytest.approx(0.005)
-    assert model.opt.impratio == pytest.approx(100)
-    assert model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
-    assert model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    assert (model.opt.iterations, model.opt.ls_iterations) == (fresh.iterations, fresh.ls_iterations)
-
-
 def test_collision_geoms(model):
     """There are exactly the named collision geoms, hidden by default, with the published contact parameters."""
     geoms = named_geoms(model)

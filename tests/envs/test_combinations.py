@@ -18,7 +18,6 @@ from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.paper.gravity import pretraining as gravity_pretraining
 from legged_torque.paper.gravity.pretraining import pretrain
 from legged_torque.paper.gravity.standing import check_torques
-from legged_torque.utils.config import to_dict
 
 CURRICULUM, GRAVITY_CURRICULUM = "a1_torque_curriculum_multihead", "a1_torque_gravity_curriculum"
 GRAVITY, HIGH, TWO_RATES = "a1_torque_gravity_multihead", "a1_torque_curriculum_high", "a1_multihead_two_rates"
@@ -53,14 +52,6 @@ def test_curriculum_with_multi_head(make_task):
 
 
 # ------------------------------------------------------------------------------------------- gravity with the others
-
-
-def test_gravity_with_curriculum():
-    """The task is that of the curriculum, the training that of gravity pre-training."""
-    env_cfg, train_cfg = map(to_dict, get_cfgs(task=GRAVITY_CURRICULUM))
-    others = to_dict(get_cfgs(task="a1_torque_curriculum")[0]), to_dict(get_cfgs(task="a1_torque_gravity")[1])
-    others[1]["runner"]["experiment_name"] = GRAVITY_CURRICULUM
-    assert (env_cfg, train_cfg) == others
 
 
 @pytest.mark.parametrize("total_steps", [0, 25_000_000, 60_000_000])
@@ -133,14 +124,6 @@ def test_higher_pose(make_task):
 # ---------------------------------------------------------------------------------------------------------- two rates
 
 
-def send(task, count, num_worlds, seed=0):
-    """Act at random for some control steps; return the actions. Shape: (steps, worlds, 24)."""
-    sent = 2.0 * torch.randn(count, num_worlds, 24, generator=torch.Generator().manual_seed(seed))
-    for actions in sent:
-        task.step(actions)
-    return sent.numpy()
-
-
 def held(sent):
     """The actions in force: positions of every fourth control step of an episode, torques of each."""
     result = sent.copy()
@@ -201,25 +184,6 @@ def test_observations_of_two_rates(make_task):
     expected[6:, 0] = held(sent[6:])[:, 0]
     expected[5, 0] = 0.0
     np.testing.assert_array_equal(np.stack(seen), expected)
-
-
-def test_two_rates_behind_a_delay(make_task):
-    """Held positions and torques are delayed together."""
-    delay = 3
-    task = make_task(TWO_RATES, 2, **HIGH_UP, **{"motors.delay.range": [delay, delay]})
-    torques_in_torch(task)
-    states, step = [], task.sim.step
-
-    def noted_step(sense=True):
-        states.append([part.numpy().copy() for part in (task.torques, task.dof_pos, task.dof_vel)])
-        step(sense)
-
-    task.sim.step = noted_step
-    sent = held(send(task, 12, 2))
-    for i, (torques, q, qd) in enumerate(states):
-        action = sent[i - delay] if i >= delay else np.zeros((2, 24))
-        expected = np.clip(pd_by_hand(action[:, :12], q, qd) + 4.0 * action[:, 12:], -TORQUE_LIMIT, TORQUE_LIMIT)
-        np.testing.assert_allclose(torques, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_two_rates_in_the_mirror(make_task):

@@ -55,16 +55,6 @@ def test_torques_are_clipped(make_task, name):
     np.testing.assert_array_equal(task.sim.ctrl.numpy(), TORQUE_LIMIT * signs[:, :12])
 
 
-def test_actions_are_clipped(make_task):
-    """Actions beyond +-clip_actions count as that, in the torques, in the buffer and in the observation."""
-    task = make_task("a1_torque", 2, **IN_THE_AIR, **{"normalization.clip_actions": 2.0})
-    obs, *_ = task.step(torch.tensor([3.0, -5.0, 1.5] * 4).repeat(2, 1))
-    expected = np.tile([2.0, -2.0, 1.5], (2, 4))
-    np.testing.assert_array_equal(task.actions, expected)
-    np.testing.assert_array_equal(obs["policy"][:, -12:], expected)
-    np.testing.assert_allclose(task.torques, 8.0 * expected)
-
-
 @pytest.mark.parametrize(("name", "refresh"), [("a1_position", True), ("a1_position", False), ("a1_multihead", True)])
 def test_step_is_four_physics_steps(make_task, name, refresh):
     """One step moves each world as plain MuJoCo under PD torques that are computed anew before each physics step.

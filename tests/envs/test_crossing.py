@@ -91,27 +91,6 @@ def test_standing_robots_do_not_cross():
     assert abs(result.metrics["speed"].mean) < 0.1 and 0.2 < result.metrics["height"].mean < 0.4
 
 
-def test_headings_are_kept():
-    """Robots that have turned are commanded to turn back by half the angle per second, at most 1 rad/s."""
-    grounds = Grounds.of(["flat"], [0.0], FAST)
-    task = make_crossing(grounds, 4)
-    turned, commanded = torch.tensor([0.0, 0.3, -0.8, 2.5]), []
-
-    def turn(obs):
-        """Turn robots in the air, as soon as they have begun: headings are 0, 90, 180 and 270 degrees."""
-        commanded.append(task.commands.clone())
-        qpos = task.sim.qpos.clone()
-        angle = torch.arange(4) * math.pi / 2 + turned
-        qpos[:, 2], qpos[:, 3], qpos[:, 4:6], qpos[:, 6] = 2.0, (angle / 2).cos(), 0.0, (angle / 2).sin()
-        task.set_state(qpos, torch.zeros_like(task.sim.qvel))
-        return torch.zeros(4, 12)
-
-    cross(task, turn, grounds)
-    torch.testing.assert_close(commanded[0], torch.tensor(FAST).expand(4, 3), atol=0.01, rtol=0.0)
-    torch.testing.assert_close(commanded[5][:, 2], torch.tensor([0.0, -0.15, 0.4, -1.0]), atol=0.01, rtol=0.0)
-    assert (commanded[5][:, :2] == torch.tensor(FAST[:2])).all()
-
-
 def test_a_trial_by_default():
     """Robots have twice as long as 4 m take at 0.6 m/s; kinds and levels are sets."""
     grounds = Grounds.of(["flat", "all"], [0.3, 0.1, 0.3])

@@ -65,21 +65,6 @@ def test_time_out(make_task):
         assert ((task.base_pos[:, 2] == 2.0) == torch.tensor(expected)).all()
 
 
-def test_termination(make_task):
-    """A trunk on the ground ends its episode, which is no time-out, even in the very last step; others go on."""
-    task = make_task("a1_torque", 4, **IN_THE_AIR, **{"env.episode_length_s": 0.1})
-    task.episode_length_buf = torch.tensor([1, 1, 4, 4])
-    low = torch.tensor([False, True, False, True])
-    task.base_quat.copy_(torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4, 4))
-    task.dof_pos.copy_(torch.tensor([0.0, 2.6, -0.95] * 4).expand(4, 12))  # legs up
-    task.base_pos[low, 2] = 0.05
-    _, _, dones, extras = task.step(torch.zeros(4, 12))
-    assert dones.tolist() == [False, True, True, True]
-    assert extras["time_outs"].tolist() == [False, False, True, False]
-    assert task.episode_length_buf.tolist() == [2, 0, 0, 0]
-    np.testing.assert_array_equal(task.base_pos[1:], [[0.0, 0.0, 2.0]] * 3)
-
-
 @pytest.mark.parametrize("part", ["feet", "knees"])
 def test_no_termination_by_legs(make_task, part):
     """Feet, calves and thighs on the ground end no episode."""
@@ -107,17 +92,6 @@ def test_reset_clears_what_belongs_to_the_episode(make_task):
         assert (buffer[0] == 0).all()
     assert (task.contacts[1] != 0).any() and (task.sim.qvel[1] != 0).any()
     assert (obs["policy"][0, 21:] == 0).all() and (obs["critic"][0, -121:-117] == 0).all()
-
-
-def test_reset_of_all_worlds(make_task):
-    """reset() starts every world anew, at rest, and clears counters and sums."""
-    task = make_task("a1_torque", 2, **IN_THE_AIR)
-    for _ in range(3):
-        task.step(torch.ones(2, 12))
-    obs = task.reset()
-    np.testing.assert_allclose(task.base_pos, [[0.0, 0.0, 2.0]] * 2)
-    assert (task.sim.qvel == 0).all() and (obs["policy"][:, 21:] == 0).all()
-    assert (task.episode_length_buf == 0).all() and (task.episode_sums == 0).all() and (task.episode_return == 0).all()
 
 
 # --------------------------------------------------------------------------------------------------- initial states

@@ -79,14 +79,3 @@ def test_observations_are_clipped_and_copied(make_task):
     kept = first.clone()
     second, *_ = task.step(-torch.ones(1, 12))
     assert torch.equal(first["critic"], kept["critic"]) and not torch.equal(first["critic"], second["critic"])
-
-
-def test_observations_follow_the_step(make_task):
-    """A step returns the state after it, its action and the commands in force."""
-    task = make_task("a1_torque", 3, **IN_THE_AIR)
-    action = torch.randn(3, 12)
-    policy = task.step(action)[0]["policy"]
-    np.testing.assert_allclose(policy[:, 9:21], task.sim.qpos[:, 7:].numpy() - NOMINAL, atol=1e-6)
-    np.testing.assert_allclose(policy[:, 21:33], 0.05 * task.sim.qvel[:, 6:], atol=1e-6)
-    np.testing.assert_allclose(policy[:, 33:], action)
-    np.testing.assert_allclose(policy[:, 6:9], task.commands * torch.tensor([2.0, 2.0, 0.25]))

@@ -1,7 +1,5 @@
 """The sets of random ranges and perturbations, and ranges that make no sense."""
 
-import math
-
 import numpy as np
 import pytest
 from support.settings import error_of, get_cfgs
@@ -163,15 +161,10 @@ def test_sums_that_make_no_sense(make_task, name, limits, message):
     ("key", "value"),
     [
         ("domain_rand.gravity", {"set": [10.0, 9.0]}),
-        ("domain_rand.gravity", [9.0, 10.0]),
         ("domain_rand.gravity", {"set": [9.0, 10.0], "add": [0.0, 1.0]}),
         ("domain_rand.dof_damping", {"set": [-0.1, 0.2]}),
         ("domain_rand.trunk_mass", {"scale": [-0.5, 1.0]}),
-        ("domain_rand.gravity", {"set": [9.0, math.nan]}),
-        ("domain_rand.motor_strength", {"scale_per_joint": []}),
-        ("domain_rand.push_probability", 1.1),
         ("domain_rand.keep_fixed", ["gravitation"]),
-        ("domain_rand.keep_fixed", ["push_velocity"]),
         ("noise.noise_scales.dof_vel", -1.0),
     ],
 )

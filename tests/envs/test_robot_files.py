@@ -186,17 +186,6 @@ def test_all_problems_at_once(changed):
         assert part in message
 
 
-def test_fused_names_all(changed, make_task):
-    """The fused step names everything about a robot that it cannot simulate."""
-    file = changed(
-        setting("option", integrator="RK4", cone="elliptic"),
-        setting(".//geom[@name='FL_hip']", type="ellipsoid", size="0.04 0.04 0.02"),
-    )
-    message = error_of(make_task, "a1_torque", 1, **{"asset.file": file})
-    for reason in ("integrator must be implicitfast", "cone must be pyramidal", "boxes may collide, unlike 'FL_hip'"):
-        assert reason in message
-
-
 # --------------------------------------------------------------------------------------------------- notes
 
 

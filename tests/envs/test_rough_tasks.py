@@ -57,15 +57,6 @@ def test_a_held_command_has_no_heading(make_task):
     assert not (task.commands == torch.tensor([0.5, -0.2, 0.3])).any()
 
 
-def test_headings_are_drawn(make_task):
-    """Headings are uniform."""
-    task = make_task("a1_rough_position", 2000, **SMALL)
-    headings = task.command_generator.headings
-    assert headings.abs().max() <= math.pi
-    assert headings.mean().abs() < 4 * math.pi / math.sqrt(3 * 2000)
-    assert headings.std().item() == pytest.approx(math.pi / math.sqrt(3), rel=0.05)
-
-
 def test_places_of_starts(make_task):
     """Episodes start within a metre of the middle of their tile, along x and y each; on a plane at 0."""
     task = make_task("a1_rough_position", 2000, **SMALL)

@@ -184,25 +184,6 @@ def test_mirror_loss(make_runner, augmentation):
     assert loss_now() < 1e-10
 
 
-def test_mirror_loss_makes_policies_symmetric(make_runner):
-    """With nothing but the mirror loss to learn from, a policy becomes symmetric."""
-    settings = {"value_loss_coef": 0.0, "entropy_coef": 0.0, "num_learning_epochs": 50, "learning_rate": 1e-3}
-    settings |= {"symmetry_cfg.mirror_loss_coeff": 1.0}
-    runner = make_runner(
-        augmentation=False, loss=True, **{f"algorithm.{key}": value for key, value in settings.items()}
-    )
-    obs = roll_out(runner).observations["policy"]
-    runner.alg.storage.advantages.zero_()
-    mlp = runner.alg.actor.mlp
-
-    def asymmetry():
-        return float((mlp(mirror_policy(obs)) - mirror_joints(mlp(obs))).square().mean().detach())
-
-    before = asymmetry()
-    runner.alg.update()
-    assert asymmetry() < 0.3 * before
-
-
 @pytest.mark.parametrize(("words", "expected"), [((), True), (("--preset=paper",), False)])
 def test_augmentation_is_the_default(words, expected):
     """Tasks learn from mirror images, unless the paper's settings are asked for."""

@@ -1,14 +1,10 @@
 """Order, failures, locks and signals of an experiment, with stand-ins for the scripts."""
 
-import contextlib
 import fcntl
-import io
 import json
 import os
-import re
 import signal
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -20,7 +16,6 @@ from legged_torque.experiments import matrix as experiment
 from legged_torque.experiments import run as experiment_run
 from legged_torque.experiments.local_launcher import GPU_JOBS, LocalLauncher
 from legged_torque.experiments.matrix import CellState, read_matrix
-from legged_torque.experiments.run import ExperimentRun, time_left
 
 
 @pytest.fixture
@@ -137,28 +132,12 @@ def test_a_cell_that_another_process_works_on(stage, tmp_path):
     assert trained(stage) == ["a1_torque-low-s1", "a1_position-low-s1"]
 
 
-def test_two_experiments_share_a_folder(stage, tmp_path):
-    """Each cell is trained once, and both end when all is done."""
-    file, out = write(tmp_path / "m.yaml", SMALL | {"seeds": [1, 2, 3]}), tmp_path / "out"
-    matrix, statuses = read_matrix(file), []
-    runs = [ExperimentRun(matrix, out, LocalLauncher("cpu", 1)) for _ in range(2)]
-    threads = [threading.Thread(target=lambda run=run: statuses.append(run.run())) for run in runs]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert statuses == [0, 0]
-    assert sorted(trained(stage)) == sorted(cell.name for cell in matrix.cells(out))
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"train": {"runner.total_steps": 64}}, "train.runner.total_steps is 64, was 128; give another --out"),
         ({"train": {}}, "train.runner.total_steps is not set, was 128"),
-        ({"evaluation": {"num_steps": 100}}, "evaluation.num_steps is 100, was 2000"),
         ({"environments": {"low": ["low"]}}, "environments.low had high as well"),
-        ({"seeds": [2]}, "seeds had 1 as well"),
     ],
 )
 def test_changed_settings_are_refused(change, message, tmp_path):
@@ -250,27 +229,6 @@ def test_results_of_another_training_are_not_kept(stage, tmp_path):
     assert json.loads((out / "a1_torque-low-s1" / "result_low.json").read_text())["perturbation"] == "low"
 
 
-def test_display(stage, tmp_path):
-    """On a terminal a bar shows how far the cell is, how well it tracks, and what is done; lines stay above it."""
-    (stage / "behaviour").write_text("slow")
-    file, out = write(tmp_path / "m.yaml", SMALL | {"tasks": ["a1_position"]}), tmp_path / "out"
-    stream, run = io.StringIO(), ExperimentRun(read_matrix(file), out, LocalLauncher("cpu", 1))
-    stream.isatty = lambda: True
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(stream):
-        patch.setenv("TERM", "xterm")
-        patch.setenv("COLUMNS", "100")
-        thread = threading.Thread(target=run.run)
-        thread.start()
-        wait_for(lambda: "75%" in stream.getvalue(), 20)
-        (stage / "behaviour").write_text("")
-        thread.join()
-    lines = re.sub(r"\033\[[\d;?]*[A-Za-z]", "", stream.getvalue()).splitlines()
-    (head, row) = next((lines[i - 1], line) for i, line in enumerate(lines) if "75%" in line and "training" in line)
-    assert re.fullmatch(r"0 of 1 cells done +[╸━╺]+ +75% 0:00:\d\d, time left unknown *", head)
-    assert re.fullmatch(r"a1_position-low-s1 on cpu: training +[╸━╺]+ +75% tracking 0.530, 0:00:02 left *", row)
-    assert any(re.match(r"\d{4}-.*  a1_position-low-s1: evaluation in high on cpu took", line) for line in lines)
-
-
 @pytest.fixture
 def places(stage, tmp_path, monkeypatch):
     """Start evaluations of a launcher: their devices, and the variables by which they see one GPU and some cores."""
@@ -311,30 +269,3 @@ def test_devices(places, monkeypatch):
         assert sorted(variables[::2]) == sorted(names * 2) and variables[1::2] == ["3"] * 4
     assert places(LocalLauncher("cuda:1", 1), 1) == (["cuda:1"], ["5", "None"])
     assert LocalLauncher("auto", None).room() == 2 * GPU_JOBS
-
-
-def test_device_time(stage, tmp_path):
-    """Two that share a device count half each; steps are those of the trainings; all calls are added up."""
-    (stage / "behaviour").write_text("slow")
-    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
-    words, start = [file, f"--out={out}", "--device=cpu"], time.monotonic()
-    threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGTERM)).start()
-    assert experiment_here(*words, "--jobs=2", tmp_path=tmp_path)[0] == 130
-    took = time.monotonic() - start
-    (stage / "behaviour").write_text("")
-    files = [out / f"{task}-low-s1" / "times.json" for task in SMALL["tasks"]]
-    first = [json.loads(file.read_text()) for file in files]
-    output = experiment_here(*words, tmp_path=tmp_path)[1]
-    second = [json.loads(file.read_text()) for file in files]
-    assert [times["steps"] for times in first + second] == [3 * 2 * 5] * 2 + [4 * 2 * 5] * 2
-    shares, sums = ([times["seconds"]["cpu training"] for times in each] for each in (first, second))
-    assert shares[0] == pytest.approx(shares[1], abs=0.1) and 0.5 < sum(shares) < took
-    assert all(more > less for more, less in zip(sums, shares, strict=True))
-    assert re.search(r"of CPU time for training; 80 steps of training, \d+ per second of their device time\n", output)
-
-
-def test_time_left():
-    """It is the mean duration of a finished cell, times the cells that are left, over those worked on at a time."""
-    assert time_left([], 5, 1) is None
-    assert time_left([10.0, 20.0], 4, 2) == 30.0
-    assert time_left([10.0], 1.5, 4) == 10.0

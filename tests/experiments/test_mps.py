@@ -41,10 +41,3 @@ def test_service_that_refuses(program):
     program.with_name("notes.no").touch()
     with pytest.raises(UserError, match=f"--mps: {MPS} says: it is -d"), multi_process_service():
         raise AssertionError("the service has not started")
-
-
-def test_without_the_program(tmp_path, monkeypatch):
-    """The program that is missing is named."""
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(UserError, match=f"--mps needs the program {MPS}"), multi_process_service():
-        raise AssertionError("there is no service")

@@ -31,7 +31,7 @@ WORLDS, STEPS = 2, 4
 ALL_STEPS = 2 * WORLDS * STEPS
 """Environment steps of an iteration of both processes."""
 SMALL = [f"--num_envs={WORLDS}", f"--set=runner.num_steps_per_env={STEPS}", "--set=algorithm.num_mini_batches=2"]
-SMALL += ["--set=algorithm.annealing_start=1"]  # trainings of other lengths are compared
+SMALL += ["--set=algorithm.annealing_start=1", "--set=evaluation.interval=0"]  # trainings of other lengths are compared
 SCRIPT = ["--task=a1_position", "--device=cpu", "--logger=none", "--set=runner.save_interval=20", "--verbose", *SMALL]
 FORMULA = {"num_mini_batches": 1, "schedule": "adaptive", "max_grad_norm": 1e6, "learning_rate": 1e-3}
 MULTI_GPU = {"world_size": 2, "local_rank": 0}

@@ -10,7 +10,6 @@ from support.runners import build_runner
 from support.settings import error_of, flatten, get, get_cfgs
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from legged_torque.learning import evaluator
 from legged_torque.learning.evaluator import TrainingEvaluator
 from legged_torque.utils.metrics import UNITS
 
@@ -123,18 +122,6 @@ def test_training_does_not_notice(make_runner):
         results.append({name: value.detach().clone() for name, value in result.items()})
     assert all(torch.equal(result[name], value) for result in results[1:] for name, value in results[0].items())
     assert rows[0] is None and len(rows[1]) == 3 and rows[1] == rows[2]  # further evaluations change no other
-
-
-def test_warm_up_before_the_first_evaluation(make_runner, noted, monkeypatch):
-    """It takes whole evaluations of at least that time, which do not count."""
-    monkeypatch.setattr(evaluator, "WARM_UP_TIME", 0.1)  # 5 steps, of an evaluation's 3
-    runner = make_runner(**{"evaluation.num_samples": 9, "evaluation.num_envs": 3, "evaluation.interval": 16})
-    runner.learn(2)
-    evaluations, rows = by_evaluation(noted, runner.env), rows_of(runner)
-    assert [len(notes) for notes in evaluations] == [9, 3]
-    for notes, row in zip(evaluations, rows, strict=True):
-        kept = ~torch.stack([note.reset for note in notes[-3:]])
-        assert row["height"] == pytest.approx(float(torch.stack([n.height for n in notes[-3:]])[kept].mean()), rel=1e-5)
 
 
 def test_curricula_are_those_of_the_training(make_runner, noted):

@@ -1,13 +1,9 @@
 """Settings of trainings: what they refuse, and the names of code that they may have."""
 
-from typing import get_args
-
 import pytest
-from rsl_rl.utils import resolve_nn_activation
 from support.settings import error_of, get_cfgs, parse
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.envs.base.training_config import Activation
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.utils.task_registry import TaskRegistry
 
@@ -25,15 +21,6 @@ from legged_torque.utils.task_registry import TaskRegistry
 def test_settings_that_do_not_go_together(change, message):
     """They are refused by name."""
     assert message in error_of(get_cfgs, f"--set={change}")
-
-
-def test_activations():
-    """Those of rsl_rl, and no others."""
-    for name in get_args(Activation):
-        resolve_nn_activation(name)
-    with pytest.raises(ValueError, match="Valid activations") as error:
-        resolve_nn_activation("none")
-    assert str(list(get_args(Activation))) in str(error.value)
 
 
 def test_names_of_a_users_own_task():

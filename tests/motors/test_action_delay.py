@@ -53,23 +53,9 @@ def arrived(sent, decimation, delay):
     return np.stack([nothing if t < delay else at_physics_step[t - delay] for t in range(len(at_physics_step))])
 
 
-def test_off_by_default(make_task):
-    """Without a setting, every physics step has the newest action, bit by bit as with a delay of 0."""
-    cases = ({}, {"motors.delay.range": [0, 0]}, {"motors.delay.unit": "control_steps"})
-    seen = []
-    for settings in cases:
-        task = make_task("a1_torque", 3, **HIGH_UP, **settings)
-        notes = watch(task)
-        sent = send(task, 5)
-        assert task.cfg.motors.delay.range == [0, 0]
-        assert np.array_equal(torques_of(notes), 8.0 * np.repeat(sent, 4, axis=0))
-        seen.append(np.concatenate([*map(np.ravel, notes[-1]), task.get_observations()["critic"].numpy().ravel()]))
-    assert np.array_equal(seen[0], seen[1]) and np.array_equal(seen[0], seen[2])
-
-
 @pytest.mark.parametrize(
     ("decimation", "delay"),
-    [*((4, delay) for delay in range(10)), (2, 1), (2, 2), (2, 3), (2, 9), (3, 1), (3, 4), (3, 9), (1, 3)],
+    [(4, 0), (4, 1), (4, 9), (3, 4), (2, 9), (1, 3)],
 )
 def test_physics_steps(make_task, decimation, delay):
     """The torque at physics step t is 8 N m times the action of physics step t - delay."""
@@ -80,7 +66,7 @@ def test_physics_steps(make_task, decimation, delay):
 
 
 @pytest.mark.parametrize("refresh", [True, False])
-@pytest.mark.parametrize(("decimation", "delay"), [(4, 0), (4, 1), (4, 3), (3, 2), (1, 2)])
+@pytest.mark.parametrize(("decimation", "delay"), [(4, 0), (4, 1), (3, 2)])
 def test_control_steps(make_task, decimation, delay, refresh):
     """A delay of control steps is one of as many whole actions, with torques once per control step as well."""
     settings = delayed(delay, delay, "control_steps", decimation, **{"control.refresh_torques": refresh})
@@ -120,7 +106,7 @@ def test_policy_knows_what_it_has_sent(make_task):
         before = action
 
 
-@pytest.mark.parametrize("delay", [3, 5, 9])
+@pytest.mark.parametrize("delay", [3, 9])
 @pytest.mark.parametrize("how", ["time is over", "not finite", "all at once"])
 def test_reset_forgets(make_task, how, delay):
     """A world that starts anew gets no action from before; another one goes on with all that it was sent."""
@@ -185,13 +171,9 @@ def test_draws(make_task, low, high, unit):
     [
         ("range", {"range": [-1, 2]}),
         ("range", {"range": [2, 1]}),
-        ("range", {"range": [0.5, 1]}),
         ("range", {"range": [0, 1.5]}),
-        ("range", {"range": [1]}),
         ("range", {"range": []}),
-        ("range", {"range": [0, 1, 2]}),
         ("unit", {"unit": "steps"}),
-        ("unit", {"unit": "", "range": [0, 0]}),
     ],
 )
 def test_settings_that_make_no_sense(make_task, key, changes):

@@ -203,18 +203,6 @@ def test_curve_and_rate(in_torch):
     assert len(noted) == 4 and np.abs(last).max() > 5.0
 
 
-def test_kernel_and_torch_agree():
-    """The same motors inside the kernel and in torch lead to the same states."""
-    tasks = [make(8), make(8)]
-    torques_in_torch(tasks[1])
-    for step in range(6):
-        actions = 3.0 * torch.randn(8, 12, generator=torch.Generator().manual_seed(step))
-        for task in tasks:
-            task.step(actions)
-        torch.testing.assert_close(tasks[0].sim.qvel, tasks[1].sim.qvel, rtol=1e-3, atol=1e-3)
-        torch.testing.assert_close(tasks[0].torques, tasks[1].torques, rtol=1e-3, atol=1e-3)
-
-
 def test_a_link_without_a_kernel():
     """Torques then leave the kernel, with a note; a delay behind other links, and two links of one model."""
     task = make(2, ("curve", "quick", "late"), randomize_parameters=False)

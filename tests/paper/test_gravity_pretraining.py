@@ -17,7 +17,6 @@ from legged_torque.paper.gravity.pretraining import (
     Collection,
     act_by_controller,
     follow,
-    learn_to_stand,
     make_controller,
     select,
     supervise,
@@ -222,27 +221,3 @@ def test_the_last_action_is_no_help(task):
     observations[:, LAST_ACTION] = actions
     errors = supervise(task, actor, collection_of(observations, actions), settings_of(num_epochs=10, batch_size=50))
     assert errors["held_out"][-1] > 0.95 * TORQUE_SCALE
-
-
-def test_rounds(task, controller):
-    """Rounds share the configurations; in the first the controller moves the robot, in the others the policy does."""
-    actor, acted = make_actor(task), []
-    changes = {"num_configurations": 20, "num_steps": 5, "num_rounds": 3, "num_epochs": 2, "batch_size": 32}
-    nothing_dropped = {"max_mean_torque": 1e6, "max_residual": 1e6, "held_out": 0.3}
-
-    def note(module, inputs, output):
-        if "critic" in inputs[0]:  # asked by the task: supervision has no such observations
-            acted.append(output.clone())
-
-    with actor.register_forward_hook(note):
-        collection, errors = learn_to_stand(task, controller, actor, settings_of(**changes, **nothing_dropped))
-    assert {name: len(values) for name, values in errors.items()} == {"training": 6, "held_out": 6}
-    assert len(acted) == 2 * 5
-    everything = collection.everything.flatten()
-    last = everything["observations"][:, LAST_ACTION]
-
-    def found_in(actions):
-        return torch.isclose(last.unsqueeze(1), actions.unsqueeze(0), rtol=0, atol=1e-6).all(dim=2).any(dim=1)
-
-    given = (last == 0.0).all(dim=1), found_in(torch.cat(acted)), found_in(everything["actions"])
-    assert [int(mask.sum()) for mask in given] == [20, 14 * 4, 6 * 4]  # none, by the policy, by the controller

@@ -22,9 +22,8 @@ from support.reports import (
 )
 
 from legged_torque.experiments.times import write_times
-from legged_torque.paper.report.evaluations import METRIC_NAMES, read_curves
-from legged_torque.paper.report.experiment import read_experiment
-from legged_torque.paper.report.figures_curves import draw_curves, smoothed
+from legged_torque.paper.report.evaluations import METRIC_NAMES
+from legged_torque.paper.report.figures_curves import smoothed
 from legged_torque.paper.report.report import fenced, markdown_table, to_html
 from legged_torque.paper.report.tables import welch
 
@@ -101,12 +100,6 @@ def test_table(report):
         assert list(map(float, rows[key][:2])) == pytest.approx([mean, error]) and rows[key][2:] == others
     assert rows["a1_torque", "low", "track_percentage"] == ["0.5", "", "1", ""]
     assert rows["a1_multihead", "low", "track_percentage"] == ["", "", "0", "0.7669"]
-
-
-def test_evaluations(report):
-    """All evaluations during training are in one table, from which curves can be drawn."""
-    table = read_curves(report / "evaluations.csv.gz")
-    assert len(table) == 4 * 5 + 2 * 3 + 5 and set(table["environment"]) == {"low", "high_frequency", "doubled"}
 
 
 def test_text(text, folder):
@@ -213,22 +206,6 @@ def test_mistakes(tmp_path, capsys, plan, words, message):
 
 
 # -------------------------------------------------------------------------------------------------------- figures
-
-
-def test_figure_of_a_short_training(tmp_path):
-    """Few steps are counted one by one, "none" is said in words, and no curve touches the frame."""
-    write_experiment(tmp_path / "e", {"none": ["none"]}, seeds=(1,), tasks=["a1_torque"])
-    rows = [line(i, i / 10).replace("000000,", "00,", 1) for i in (1, 2, 3)]  # 100 to 300 steps
-    write_part(tmp_path / "e" / "a1_torque-none-s1" / "2026-01-01_00-00-00", rows)
-    assert run_script(tmp_path / "e", "--out", tmp_path / "out") == 0
-    text = (tmp_path / "out" / "report.md").read_text()
-    assert "| metric | method | no perturbations |" in text and "### no perturbations" in text
-    figure = draw_curves(read_experiment(tmp_path / "e"), "track_percentage", "Tracking")
-    figure.canvas.draw()
-    (axis,) = figure.axes
-    labels = [tick.get_text() for tick in axis.get_xticklabels()]
-    assert axis.get_xlabel() == "environment steps" and labels[0] == "0" and "200" in labels
-    assert axis.get_title() == "no perturbations" and axis.get_ylim()[1] > 0.3 * 1.05
 
 
 def test_running_medians():

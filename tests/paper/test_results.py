@@ -1,6 +1,5 @@
 """Results of experiments: what is read from files, means over seeds, and tests of differences."""
 
-import json
 import math
 from pathlib import Path
 
@@ -8,10 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
-from support.reports import HEADER, SETTINGS, line, whole_run, write_experiment, write_part, write_run
+from support.reports import HEADER, SETTINGS, line, whole_run, write_experiment, write_part
 
 from legged_torque.experiments.matrix import Cell, Matrix
-from legged_torque.paper.report.evaluations import METRIC_NAMES, read_curves, read_evaluations
+from legged_torque.paper.report.evaluations import read_evaluations
 from legged_torque.paper.report.experiment import Experiment, Training, read_experiment
 from legged_torque.paper.report.report import run_problems
 from legged_torque.paper.report.tables import best_torque, holm, summarize, welch
@@ -40,19 +39,6 @@ def test_rows_of_a_run(tmp_path):
     assert rows["height"].isna().tolist() == [True, False, True] and math.isnan(rows["speed"].iloc[0])
     assert problems == [f"row {number} of '{file}' cannot be read" for number in (3, 5)]
     assert read_evaluations(tmp_path / "none.csv", problems).empty and len(problems) == 2
-
-
-def test_learning_curves(tmp_path):
-    """Files of runs and of evaluate.py give task, seed and evaluations."""
-    lines = [line(1, 0.1), line(2, 0.2)]
-    write_run(tmp_path / "run", lines, {"task": "a1_torque", "env": {}, "train": {"seed": 3}, "versions": {}})
-    points = [{"steps": 1e6 * i, **dict.fromkeys(METRIC_NAMES, 1.0 * i), "track_percentage": 0.1 * i} for i in (1, 2)]
-    (tmp_path / "curve.json").write_text(json.dumps({"task": "a1_torque", "seed": 3, "points": points}))
-    for name in ("run/evaluations.csv", "curve.json"):
-        table = read_curves(tmp_path / name)
-        assert set(table["task"]) == {"a1_torque"} and set(table["seed"]) == {3}
-        assert table["steps"].tolist() == [1_000_000, 2_000_000]
-        assert table["track_percentage"].tolist() == pytest.approx([0.1, 0.2])
 
 
 def test_parts_are_merged(tmp_path):

@@ -10,7 +10,6 @@ from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.tasks import A1TorqueCfg
 from legged_torque.sim import compiled as module
-from legged_torque.sim.compiled import compiled
 from legged_torque.sim.randomization import Randomization, RandomParameter
 from legged_torque.utils.progress import TORCH_COMPILES
 
@@ -143,15 +142,6 @@ def test_mistakes_of_a_user_stay_theirs(graphs, capsys, monkeypatch, shape):
     assert line == f"reward term 'rough' has the shape {shape}, not (3,)"
     assert error_of(compiled_task(task).step, torch.zeros(3, 12)) == line
     assert "runs uncompiled" in capsys.readouterr().err
-
-
-def test_a_cpu_compiles_nothing():
-    """There, a function stays what it is."""
-
-    def function():
-        pass
-
-    assert compiled(function, "cpu") is function
 
 
 def test_draws_of_a_step_are_independent(make_task):

@@ -148,17 +148,6 @@ def test_too_many_contacts_are_reported():
         assert said is None if warning is None else warning in said
 
 
-def test_worlds_do_not_see_each_other(thrown):
-    """A world moves alone as among others, to the bit, and the same again in a second run."""
-    model, states, touches = thrown
-    most = int(np.argmax([len(found) for found in touches]))
-    together = step_fused(model, states)
-    alone = step_fused(model, {name: values[most : most + 1] for name, values in states.items()})
-    for ours, again, single in zip(together, step_fused(model, states), alone, strict=True):
-        np.testing.assert_array_equal(ours, again)
-        np.testing.assert_array_equal(ours[most], single[0])
-
-
 # ------------------------------------------------------------------------------------------------------ the option
 
 

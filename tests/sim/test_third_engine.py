@@ -5,12 +5,10 @@ import numpy as np
 import pytest
 import torch
 from support.engine_suite import EngineSuite
-from support.fused import compiled, make_a1
 from support.scripts import assert_told_in_one_line, run_here
 
 from legged_torque.sim.engine import Engine, check_mask
 from legged_torque.sim.registry import ENGINES
-from legged_torque.terrain.height_grid import HeightGrid
 
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl")
 
@@ -121,14 +119,3 @@ def test_a_task_moves_as_mujoco(make_task):
 def test_refusals(tmp_path, change, message):
     """What a task needs and the engine lacks is one line."""
     assert_told_in_one_line(run_here("train.py", *WORDS, change, root=tmp_path), message)
-
-
-def test_rough_ground():
-    """Without the capability for maps, the ground is a hfield of the model, as for MuJoCo Warp."""
-    spec = make_a1()
-    HeightGrid(np.zeros((40, 40)), 0.1, (-2.0, -2.0)).add_to(spec, "floor")
-    sim = PlainMuJoCo(compiled(spec), 1, "cpu")
-    sim.qpos[0] = torch.tensor(sim.mj_model.key_qpos[0])
-    for _ in range(40):
-        sim.step()
-    assert sim.contact_found.any()

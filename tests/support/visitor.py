@@ -15,7 +15,8 @@ CAMERA = {"type": "ViewerCameraMessage", "wxyz": (1, 0, 0, 0), "up_direction": (
 def visitor(server, position=(3.0, 0.0, 1.0), aspect=1.0):
     """A function that sends messages as a browser does, whose camera looks at the origin, almost; see CAMERA."""
     others = set(server.get_clients())
-    with connect(f"ws://127.0.0.1:{server.get_port()}", subprotocols=[PROTOCOL], max_size=None) as socket:
+    how = {"subprotocols": [PROTOCOL], "max_size": None, "close_timeout": 0.5}  # it reads nothing, and so ends late
+    with connect(f"ws://127.0.0.1:{server.get_port()}", **how) as socket:
 
         def send(**message):
             socket.send(msgspec.msgpack.encode(message))

@@ -11,15 +11,12 @@ from support.scripts import SMALL, run_here
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.registry import ENGINES, make_engine
-from legged_torque.terrain.height_map import HeightMap
 from tools.accuracy import (
     KINDS,
-    PlanePerFoot,
     copy_state,
     make_states,
     measure_accuracy,
     open_motors,
-    put_on_floor,
     reference_step,
 )
 
@@ -80,35 +77,6 @@ def test_slopes_do_not_creep(friction, impratio):
         sim.step()
     creep = np.linalg.norm(np.subtract(*places), axis=2).mean(axis=1)
     assert abs(creep[1] - creep[0]) < 1e-4 and creep[0] < 5e-3
-
-
-def test_a_plane_per_foot():
-    """On a slope it is the robot on MuJoCo's tilted plane; states near edges, or with more parts near, are left out."""
-    axis = 0.05 * np.arange(-40, 41)
-    ramp = HeightMap(0.3 * axis[:, None] + 0.0 * axis, 0.05, (-2.0, -2.0), "cpu")
-    step = HeightMap(np.where(axis > 0.1, 0.02, 0.0)[:, None] + 0.0 * axis, 0.05, (-2.0, -2.0), "cpu")
-    tilted, feet = make_a1(), [f"{leg}_foot" for leg in ("FR", "FL", "RR", "RL")]
-    tilted.geom("floor").quat = [1.0, 0.0, -math.tan(0.5 * math.atan(0.3)), 0.0]
-    tilted = compiled(tilted)
-    planes = PlanePerFoot(make_a1(), feet, ramp)
-    planes.model.opt.timestep = tilted.opt.timestep
-    state = {name: np.zeros((20, size)) for name, size in (("qvel", 18), ("qacc_warmstart", 18), ("ctrl", 12))}
-    state["qpos"], rng = np.tile(tilted.key_qpos[0], (20, 1)), np.random.default_rng(0)
-    state["qpos"][:, 7:] += rng.normal(0.0, 0.05, (20, 12))
-    put_on_floor(tilted, state, rng.uniform(-1e-3, 5e-3, 20))
-    states = {name: torch.tensor(values) for name, values in state.items()}
-    expected, _ = reference_step(tilted, states)
-    found, comparable = reference_step(planes.model, states, planes.pose)
-    assert comparable.all() and (expected[:, 2] > -0.9 * 9.81 * tilted.opt.timestep).mean() > 0.5  # the ground holds
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
-    states["qpos"][:, 2] -= 0.2  # until trunks are in the ground
-    assert not reference_step(planes.model, states, planes.pose)[1].any()
-    planes = PlanePerFoot(make_a1(), feet, step)
-    data = mujoco.MjData(planes.model)
-    for x, is_exact in ((-1.0, True), (0.0, False), (1.0, True)):  # front feet are at 0.18 m, and a step up is at 0.1 m
-        data.qpos[:] = planes.model.key_qpos[0]
-        data.qpos[:3] = x, 0.0, data.qpos[2] + (0.02 if x > 0.0 else 0.0)
-        assert planes.pose(planes.model, data) == is_exact
 
 
 def test_script(tmp_path):

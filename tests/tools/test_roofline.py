@@ -46,11 +46,6 @@ def test_flop_as_pytorch_counts_them(tmp_path, task, changes):
     assert roofline.update_flop(alg) == counter.get_total_flops() > 0
 
 
-def test_physics_by_hand(tmp_path):
-    """An A1 without parameters of its own: 67 floats read, 55 written, and 17 sensors of 4 once in a control step."""
-    assert roofline.physics_bytes(make_runner(tmp_path).env.sim, 4) == 4 * 2 * (4 * (67 + 55) + 17 * 4)
-
-
 def test_script(tmp_path):
     """It prints three rates with their peaks, each share being the one over the other."""
     words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--rounds=1", "--set=runner.num_steps_per_env=3"]

@@ -1,6 +1,5 @@
 """The display of long work: a view on a terminal, lines elsewhere, and nothing that harms the work."""
 
-import io
 import re
 import signal
 import time
@@ -11,7 +10,7 @@ from support.clock import Clock
 from support.terminal import in_a_terminal
 
 from legged_torque.learning.training_display import TrainingDisplay, read_tracking
-from legged_torque.utils.display import REDRAW_EVERY, Counter, is_terminal, read_progress
+from legged_torque.utils.display import REDRAW_EVERY, Counter, read_progress
 
 STYLES = re.compile(r"\033\[[\d;?]*[A-Za-z]")
 NUMBERS = {"kl": 0.0123, "action_std": 0.5, "learning_rate": 1e-3, "Health/diverged_worlds": 0.0}
@@ -185,13 +184,6 @@ def test_lines_of_a_counter(capsys):
     texts = [f"evaluating, step {i} of 10, 0:00:{t}, 0:00:{left} left" for i, t, left in ((3, 12, 42), (5, 24, 30))]
     assert capsys.readouterr().err.splitlines() == texts
     assert read_progress(f"a line\n{texts[1]}; more") == ("evaluating, step", 5, 10, "0:00:30")
-
-
-def test_files_are_no_terminals(monkeypatch):
-    """Whatever the environment says."""
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("TERM", "xterm")
-    assert not is_terminal(io.StringIO())
 
 
 def test_quiet(capsys):

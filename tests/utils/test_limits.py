@@ -9,7 +9,7 @@ from support.settings import COMBINATIONS, TASKS, error_of, flatten, get, get_cf
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.utils.config import Section, set_by_path, to_dict
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.limits import Count, Interval, Limits, Positive, check_value, describe
+from legged_torque.utils.limits import Count, Interval, Limits, Positive
 
 
 def with_bad_number(value, bad):
@@ -87,18 +87,3 @@ def test_a_type_that_is_not_known():
         length: "Length" = 1.0  # noqa: F821
 
     assert error_of(Variant().check).endswith("Variant is not known: name 'Length' is not defined")
-
-
-@pytest.mark.parametrize(
-    ("hint", "words", "value", "problem"),
-    [
-        (Positive, "greater than 0", 0, "greater than 0, not 0.0"),
-        (Annotated[int, Limits(1, 10_000_000)], "from 1 to 10000000 (integer)", 2.5, "an integer, not 2.5"),
-        (Annotated[list[float], Limits(-1, length=3)], "3 numbers, at least -1", [1, 2], "3 numbers, at least -1, not"),
-        (float | dict[str, float], "a number or numbers by name", "x", "a number, not 'x'"),
-    ],
-)
-def test_words(hint, words, value, problem):
-    """Help and reference page say what is allowed, an error what of that a value is not."""
-    assert describe(hint) == words
-    assert problem in error_of(check_value, "x", value, hint)

@@ -132,14 +132,6 @@ def test_installed_packages(tmp_path, capsys):
     assert "Note: the entry point 'faulty = faulty' cannot be imported: line 1 of 'faulty.py': ModuleNotFound" in told
 
 
-def test_a_file_that_is_installed_as_well(tmp_path, capsys):
-    """It is imported once."""
-    install(tmp_path, offered=REGISTER.format("their_task"))
-    for _ in range(2):
-        task_registry.import_files([tmp_path / "offered.py"])
-    assert task_registry.names().count("their_task") == 1 and capsys.readouterr().err == ""
-
-
 def test_experiments_pass_the_file_on(tmp_path):
     """Each step gets the file, by its absolute path; a cluster, whose machines lack it, is refused."""
     plan = {"tasks": ["a1_quiet_walker"], "environments": {"none": ["none"]}, "seeds": [1]}

@@ -7,7 +7,6 @@ import time
 import pytest
 import warp as wp
 
-from legged_torque.utils.display import Display
 from legged_torque.utils.progress import COMPILING, CompileProgress, torch_compiles
 
 OURS, OTHERS = f"_p{os.getpid()}_t7", "_p1_t7"
@@ -42,18 +41,6 @@ def test_lines(cache):
     look(progress, 60, cache / f"wp_d{OTHERS}")
     assert stream.getvalue().splitlines() == [f"{COMPILING}: 2 modules, 2 s", f"{COMPILING}: 3 modules, 12 s"]
     assert progress.modules == {"wp_a", "wp_b", "wp_c"}
-
-
-def test_a_view_has_the_line(cache, monkeypatch):
-    """On the same terminal, while kernels are compiled."""
-    stream, shown = io.StringIO(), Display("step", 2)
-    monkeypatch.setattr(stream, "isatty", lambda: True)
-    monkeypatch.setattr(Display, "shown", shown)
-    progress = CompileProgress(stream)
-    look(progress, 3, cache / f"wp_a{OURS}")
-    assert shown.activity == f"{COMPILING}: 1 module, 3 s" and stream.getvalue() == ""
-    look(progress, 1)
-    assert shown.activity == ""
 
 
 def test_torch_compiles_without_a_cache(monkeypatch):

@@ -81,18 +81,6 @@ def test_choice_of_the_renderer(asked, installed, gpu, chosen, monkeypatch):
         assert asked is None or asked in reason
 
 
-CORES = os.cpu_count() or 1
-
-
-@pytest.mark.parametrize(
-    ("others", "threads", "is_noted"), [(CORES, 2, True), (CORES, 1, False), (0.1, CORES + 2, False)]
-)
-def test_note_of_busy_cores(others, threads, is_noted, monkeypatch):
-    """It is given if threads must share cores with others; a single thread waits for no other."""
-    monkeypatch.setattr(devices, "busy_cores", lambda: others)
-    assert ("other processes use" in (devices.busy_cores_note(threads) or "")) == is_noted
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="the counts are Linux's")
 def test_busy_cores(monkeypatch):
     """A process that computes without end is seen."""

@@ -53,6 +53,7 @@ def test_only_choices_count(monkeypatch, capfd, caplog, recwarn):
             for updates in forged:
                 send(type="GuiUpdateMessage", uuid=before[name]["uuid"], updates=updates)
         send(type="ShareUrlRequest")
+    with contextlib.suppress(ConnectionClosed), visitor(server) as send:
         for number in range(20):
             send(type="ViewerCameraMessage", wxyz=f"{number}" * 10_000)
     for message in ({"type": "x" * 10_000}, {"type": "GuiUpdateMessage", "uuid": "x" * 1_000_000}):

@@ -8,7 +8,6 @@ import pytest
 import torch
 from support.ground import make_ground, rays
 
-from legged_torque.terrain.colors import NEUTRAL, color_of
 from legged_torque.viewer.drawing import CLEARANCE, DISTANCE, Camera, Ground, drawn_model, patches, size_of
 
 XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
@@ -56,18 +55,6 @@ def test_patches(terrain, kind):
             np.testing.assert_allclose(line, np.linspace(line[0], line[-1], len(line)), atol=2e-3)
     assert (covered == 1).all()
     assert kind != "plane" or len(found) == 3 * 2
-
-
-def test_picture(terrain, ground):
-    """The middle of each tile has the color of its kind, with y upwards from the first row; around it is neutral."""
-    picture, layout = ground.picture(), terrain.layout
-    pixels = np.array(picture.shape[:2]) / terrain.map.size[::-1]
-    for row in range(layout.num_rows):
-        for col, kind in enumerate(layout.kinds()):
-            place = np.array([col, row]) * layout.tile_size + layout.border_size + 2.5  # between two lines
-            assert tuple(picture[tuple((place * pixels).astype(int))]) == color_of(kind)
-    assert tuple(picture[5, 5]) == NEUTRAL and color_of("my own") not in map(color_of, KINDS)
-    assert ground.tile_text(1, 3) == "pits, level 1 (difficulty 0.50)"
 
 
 @pytest.mark.parametrize("azimuth", np.radians([0.0, 50.0, 90.0, 180.0, 300.0]))

@@ -3,7 +3,6 @@
 import re
 import threading
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import import_robot
 from legged_torque.importer.settings import settings
 from legged_torque.viewer import scene
-from legged_torque.viewer.plots import foot_labels, gait_html, joints_by_leg
+from legged_torque.viewer.plots import gait_html, joints_by_leg
 from legged_torque.viewer.video import VideoRecorder
 from legged_torque.viewer.web import RECORD, Page, watch
 
@@ -79,9 +78,7 @@ def test_page_goes_on(page):
     assert page._plots._gait.content.count("<svg") == len(feet) == len(page._plots._feet)
 
 
-@pytest.mark.parametrize(
-    ("owner", "name"), [("_plots", "update"), ("", "_draw_status"), ("_scene", "update"), ("session", "push")]
-)
+@pytest.mark.parametrize(("owner", "name"), [("_plots", "update"), ("_scene", "update"), ("session", "push")])
 def test_error_of_a_part(page, monkeypatch, capsys, owner, name):
     """It is shown in red until it is over, whatever it is; robots and commands are not concerned."""
 
@@ -203,14 +200,6 @@ def test_gait():
     text = gait_html(["FR", "FL"], contacts, 250, 5.0)
     assert 'd="M170 0V1H220V0zM240 0V1H250V0z"' in text and 'd=""' in text
     assert "60 %" in text and "0 %" in text and "last 5 s" in text
-
-
-def test_foot_labels(make_task):
-    """One per foot, also of feet with several geoms."""
-    assert foot_labels(make_task("a1_torque", num_envs=1).asset) == ["FR", "FL", "RR", "RL"]
-    assert foot_labels(make_task("g1_torque", num_envs=1).asset) == ["left", "right"]
-    same = SimpleNamespace(foot_of=[0, 1, 1], foot_names=["foot_r", "foot_l", "foot_l2"])
-    assert foot_labels(same) == ["foot_r", "foot_l"]
 
 
 def test_joints_by_leg():

@@ -12,7 +12,7 @@ from support.sessions import new_session
 from support.tilted import tilted
 
 from legged_torque.viewer import session as session_module
-from legged_torque.viewer.session import AS_LOADED, FASTEST, SCAN_INTERVAL, SLOWEST
+from legged_torque.viewer.session import AS_LOADED, SCAN_INTERVAL
 
 NUM_ENVS = 2
 STEPS = (10_000_000, 20_000_000)  # of the checkpoints 0 and 1
@@ -270,13 +270,3 @@ def test_unexpected_errors(make_session, monkeypatch, capsys):
     ask(session.push, 0.0, 1.0, count=2)
     assert session.message.is_error and "TypeError: 'NoneType'" in session.message.text
     assert len(session.history) == 3 and "Traceback" in capsys.readouterr().err
-
-
-def test_speed(make_session):
-    """The speed stays within its limits, and the clock shows it."""
-    session, clock = make_session("a1_torque")
-    for asked, speed in ((0.5, 0.5), (0.0, SLOWEST), (9.0, FASTEST)):
-        ask(session.set_speed, asked)
-        start = clock.now
-        ticks(session, 3)
-        assert session.pacer.speed == speed == pytest.approx(3 * session.task.dt / (clock.now - start))

@@ -15,10 +15,9 @@ pytest.importorskip("PIL", reason="Pillow is not installed: pip install -e .[vid
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from legged_torque.utils.errors import UserError
 from legged_torque.viewer import video
 from legged_torque.viewer.drawing import Drawing
-from legged_torque.viewer.video import TaskRecorder, VideoRecorder
+from legged_torque.viewer.video import TaskRecorder
 
 XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
 
@@ -40,9 +39,6 @@ recorder.steps = 5 * [[np.tile(qpos, (robots, 1)), np.ones((robots, 3)), np.zero
 recorder.write(Path(sys.argv[2]), None, lambda *frame: frames.append(frame))
 assert frames == [(1, 3), (2, 3), (3, 3)], frames
 """
-
-
-VELOCITIES = np.array([[0.5, -0.25, 0.0], [0.3, 0.4, -0.001]])  # commanded and actual
 
 
 @pytest.mark.parametrize(("robots", "width", "height"), [(1, 960, 540), (4, 1280, 720)])
@@ -69,14 +65,6 @@ def test_frames(tmp_path, robots, width, height):
         for tile in np.split(rows, side, axis=1):
             h, w = tile.shape[:2]
             assert tile[h // 3 : -h // 4, w // 3 : -w // 3].min() < 40 < 150 < tile.mean()  # black robot, light ground
-
-
-def test_numbers():
-    """Time, command and velocity with two digits, without the flicker of a negative zero."""
-    words = [row for _, row in video.velocity_rows(3.14159, *VELOCITIES)]
-    assert words[0] == ["3.14 s", "v_x", "v_y", "yaw"]
-    assert words[1:3] == [["command", "+0.50", "-0.25", "+0.00"], ["actual", "+0.30", "+0.40", "+0.00"]]
-    assert [row for _, row in video.speed_rows(*VELOCITIES)] == [["command", "0.56 m/s"], ["actual", "0.50 m/s"]]
 
 
 def test_recorded_worlds(make_task):
@@ -111,15 +99,6 @@ def test_arrows_of_velocities():
     ways = [geom.mat[:, 2] for geom in scene.geoms[: scene.ngeom]]
     np.testing.assert_allclose(ways, [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]], atol=1e-6)
     assert scene.geoms[0].size[2] == pytest.approx(2.0 * scene.geoms[1].size[2])
-
-
-def test_missing_extra(monkeypatch, tmp_path):
-    """Without an encoder the extra is named."""
-    monkeypatch.setitem(sys.modules, "imageio", None)
-    recorder = VideoRecorder(None, 0.02)
-    recorder.steps = [[np.zeros((1, 19)), *VELOCITIES[:, None]]]
-    with pytest.raises(UserError, match=r"videos need the extra: pip install 'legged_torque\[video\]'"):
-        recorder.write(tmp_path / "out.mp4", None)
 
 
 def test_videos_in_tensorboard(tmp_path):
