@@ -250,7 +250,8 @@ def test_keys_and_hints(opened, session):
     click(opened, control(opened, "random"))
 
 
-CURVES = """return Object.values(window.__viserTestpoints.uplots).filter(({chart}) => chart.scales.y.max >= 1.6)
+CURVES = """return Object.values(window.__viserTestpoints.uplots).filter(
+    ({chart}) => chart.data.length > 2 && chart.scales.y.max >= 1.6)
     .map(({chart}) => [chart.axes[0].label, chart.scales.y.max, Math.max(...chart.data[2])])"""
 
 
@@ -258,7 +259,7 @@ def test_no_curve_is_cut(opened, session):
     """Scales of velocities grow with large values, and are no smaller than at first; axes of time have a label."""
     session.push(0.0, 4.0)
     walk(session, 0.2)
-    wait_for(lambda: max(largest for *_, largest in opened.execute_script(CURVES)) > 2.5)
+    wait_for(lambda: any(largest > 2.5 for *_, largest in opened.execute_script(CURVES)))
     for label, high, largest in opened.execute_script(CURVES):
         assert label == "time [s]" and high >= largest
 

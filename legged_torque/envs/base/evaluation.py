@@ -13,7 +13,7 @@ from legged_torque.utils.config import section_keys
 from legged_torque.utils.options import apply_perturbation
 
 
-class WalkingEvaluation(WalkingMetrics):
+class WalkingEvaluation:
     """A copy of a task, without rewards, in which the steps of a policy are measured while it trains.
 
     Attributes:
@@ -25,14 +25,22 @@ class WalkingEvaluation(WalkingMetrics):
         self._source = source
         self.task = type(source)(evaluation_cfg(source.cfg, num_envs, perturbation), source.device)
         self.task.step_graph.enabled = source.step_graph.enabled
-        super().__init__(self.task)
+        self._metrics = WalkingMetrics(self.task)
 
     def step(self, actions: Tensor) -> TensorDict:
         """Make a control step, measure it, and return the observations."""
         commands = self.task.state.commands.clone()
         obs = self.task.step(actions)[0]
-        self.add_step(commands)
+        self._metrics.add_step(commands)
         return obs
+
+    def clear(self) -> None:
+        """Forget the steps so far."""
+        self._metrics.clear()
+
+    def means(self) -> dict[str, float]:
+        """Return the metrics of the steps so far, see :class:`WalkingMetrics`."""
+        return self._metrics.means()
 
     def levels(self) -> dict[str, float]:
         """Return the mean level of the training's ground, if it has levels."""

@@ -1,14 +1,16 @@
-"""Metrics of a walking policy, in all and by command. A task is a ``LeggedRobot``, which builds on this module."""
+"""Metrics of a walking policy, in all and by command."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.envs.base.state import RobotState
+from legged_torque.sim.engine import Engine
 from legged_torque.utils import metrics
 from legged_torque.utils.display import Counter
 
@@ -16,10 +18,27 @@ COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")
 NUM_BINS = 4  # into how many equal parts the range of each command is split
 
 
+class WalkingTask(Protocol):
+    """What is measured of a task; see :class:`~legged_torque.envs.base.legged_robot.LeggedRobot`."""
+
+    cfg: Any
+    sim: Engine
+    state: RobotState
+    num_envs: int
+    device: str
+    dt: float
+
+    def reset(self) -> TensorDict:
+        """Start a new episode in every world, and return the observations."""
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+        """Make a control step, and return the observations first."""
+
+
 class WalkingMetrics:
     """Sums of :mod:`legged_torque.utils.metrics` over the steps of a task, per world and kept on the device."""
 
-    def __init__(self, task: Any) -> None:
+    def __init__(self, task: WalkingTask) -> None:
         """Start with empty sums."""
         self._task = task
         model = task.sim.mj_model
@@ -70,7 +89,7 @@ class WalkingMetrics:
 class CommandBreakdown:
     """Tracking by commanded velocity: each command's range is split into :data:`NUM_BINS` equal parts."""
 
-    def __init__(self, task: Any) -> None:
+    def __init__(self, task: WalkingTask) -> None:
         """Start with empty sums."""
         self._task = task
         ranges = task.cfg.commands.ranges
@@ -119,13 +138,13 @@ class CommandBreakdown:
         return result
 
 
-def num_tracked(task: Any) -> int:
+def num_tracked(task: WalkingTask) -> int:
     """Return how many of a task's commands count for the tracking percentage, the yaw rate being the last."""
     return 2 if task.cfg.commands.heading_command else 3
 
 
 def measure(
-    task: Any,
+    task: WalkingTask,
     policy: Callable[[TensorDict], Tensor],
     num_steps: int,
     on_step: Callable[[Tensor], None] = lambda commands: None,
