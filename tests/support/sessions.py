@@ -26,7 +26,7 @@ def new_session(folder, name, num_envs=2, ground=None, steps=(0,), clock=None, *
         clock: In place of the real one.
         settings: By dotted paths.
     """
-    env_cfg, train_cfg = task_registry.get_cfgs(name)
+    env_cfg, train_cfg = task_registry.get_cfgs(name, Options(perturbation="none"))
     if ground:
         ground_cfg(env_cfg, **ground)
     for path, value in {"env.num_envs": num_envs, **settings}.items():

@@ -38,7 +38,7 @@ def imported_task(folder):
     return "imported"
 
 
-@pytest.fixture(scope="module", params=["g1_torque_multihead", "go2_rough_torque", "imported"])
+@pytest.fixture(scope="module", params=["g1_position", "go2_rough_position", "imported"])
 def page(request, tmp_path_factory):
     """The page of a running session: of a robot with several geoms per foot, one of rough ground, and a stranger's."""
     folder, name = tmp_path_factory.mktemp("run"), request.param
