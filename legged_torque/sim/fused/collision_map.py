@@ -71,7 +71,8 @@ def is_geom_clear(
 def is_part_clear(surface: Surface, middle: wp.vec3, half: wp.vec3, point: Point) -> bool:
     """Return whether a part of a point's geom, by its middle and half sizes, is known to be above the ground."""
     lowest = middle[2] - reach_along(point.turn, half, 2) - point.radius
-    return is_clear(surface, middle, lowest, wp.length(half) + point.radius)
+    reach = wp.max(reach_along(point.turn, half, 0), reach_along(point.turn, half, 1))
+    return is_clear(surface, middle, lowest, reach + point.radius)
 
 
 @wp.func
@@ -104,10 +105,11 @@ def find_map_contacts(
             else:
                 part = wp.cw_mul(model.point_half[b, index], point.half)
                 point.centre = point.middle + point.turn * wp.cw_mul(model.point_offset[b, index], point.half)
-                if part[2] > 0.0 and point.radius > 0.0:
-                    point.centre = lowest_of_capsule(surface, origin, point)
-                size = wp.where(point.radius > 0.0, wp.vec3(), part)
-                is_near = not is_part_clear(surface, origin + point.centre, size, point)
+                is_near = not is_part_clear(surface, origin + point.centre, part, point)
+                if is_near and part[2] > 0.0 and point.radius > 0.0:
+                    is_between, lowest = lowest_of_capsule(surface, origin, point, part)
+                    is_near = is_between
+                    point.centre = lowest
                 index += 1
         if is_near:
             touch = SphereContacts()

@@ -3,10 +3,13 @@
 import warp as wp
 
 from legged_torque.sim.fused.collision import Point
-from legged_torque.sim.fused.surface import FAR_AWAY, SphereContacts, Surface, place_on_map, sample
+from legged_torque.sim.fused.surface import FAR_AWAY, SphereContacts, Surface, height_at, place_on_map, sample
 
 UPWARDS = wp.constant(0.5)
 """Nothing leaves the ground through a face of a box whose normal's z is greater: it looks up by over 30 degrees."""
+
+MOST_CLEARANCE = wp.constant(2.0)
+"""An axis that is this many radii above the ground, vertically, does not touch it: slopes are less steep than 60 degrees."""
 
 
 @wp.func
@@ -16,16 +19,18 @@ def reach_along(turn: wp.mat33, half: wp.vec3, k: int) -> float:
 
 
 @wp.func
-def lowest_of_capsule(surface: Surface, origin: wp.vec3, point: Point) -> wp.vec3:
-    """Return the point of a capsule's axis, from the trunk's origin, that is lowest above the ground, or deepest in it.
+def lowest_of_capsule(surface: Surface, origin: wp.vec3, point: Point, part: wp.vec3):
+    """Return whether the axis of a part of a capsule is lowest above the ground, or deepest in it, between its ends.
 
-    If that is between the ends, the axis crosses an edge of two triangles there. Without edges it is an end.
+    Also that place, from the trunk's origin: there the axis crosses an edge of two triangles. Places that are too high
+    to touch do not count.
     """
-    along = 2.0 * (point.turn * point.half)
-    start = point.middle - 0.5 * along
-    place = surface.density * place_on_map(surface, origin + start, 0.0)
-    way = surface.density * along
-    best, least = float(0.0), float(FAR_AWAY)
+    along = 2.0 * (point.turn * part)
+    start = point.centre - 0.5 * along
+    first = place_on_map(surface, origin + start, 0.0)
+    place, way = surface.density * first, surface.density * along
+    ends = wp.min(first[2] - height_at(surface, place), first[2] + along[2] - height_at(surface, place + way))
+    best, least = float(-1.0), wp.min(ends, MOST_CLEARANCE * point.radius)
     k = int(0)  # edges of one x, of one y, diagonals; not unrolled, as in nearest_point
     while k < 3:
         at = wp.where(k == 0, place[0], wp.where(k == 1, place[1], place[0] - place[1]))
@@ -38,13 +43,13 @@ def lowest_of_capsule(surface: Surface, origin: wp.vec3, point: Point) -> wp.vec
             i = wp.where(k == 0, line, cell)
             j = wp.where(k == 0, cell, wp.where(k == 1, line, cell - line))
             low, high = sample(surface, i, j), sample(surface, i + wp.min(k, 1), j + wp.where(k == 1, 0, 1))
-            above = share * along[2] - low - (beside - float(cell)) * (high - low)
+            above = first[2] + share * along[2] - low - (beside - float(cell)) * (high - low)
             if above < least:
                 least = above
                 best = share
             line += 1
         k += 1
-    return start + best * along
+    return best >= 0.0, start + best * along
 
 
 @wp.func

@@ -8,10 +8,10 @@ import warp as wp
 from legged_torque.sim.engine import HeightMap
 from legged_torque.sim.fused.math import inverse_sqrt
 
-NEAR, FAR = 0.05, 0.2
-"""A sphere up to the first size, or a geom up to the second [m], is known to be clear of the ground from one number."""
+NEAR, MIDDLE, FAR = 0.05, 0.1, 0.2
+"""What reaches as far along x and y [m] is known to be clear of the ground from one number."""
 BLOCK = wp.constant(2)
-"""Cells along a side of a block that shares such a number for geoms."""
+"""Cells along a side of a block that shares such a number for the larger two."""
 MAX_REACH = wp.constant(0.2)
 """Range in which the shortest way out is searched for a sphere whose centre is below the surface [m]."""
 ALIKE = wp.constant(0.999)
@@ -35,14 +35,16 @@ class Surface:
     corner: wp.vec2  # x and y of the first height [m]
     ceiling: wp.array2d(dtype=wp.float32)  # the greatest height near each cell [m]. Shape: (rows - 1, cols - 1)
     near: wp.float32  # radius of that neighbourhood [m]
-    far_ceiling: wp.array2d(dtype=wp.float32)  # the greatest height in a wider neighbourhood of each block of cells [m]
-    far: wp.float32  # radius of that neighbourhood [m]
+    middle_ceiling: wp.array2d(dtype=wp.float32)  # the greatest height around each block of cells [m]
+    middle: wp.float32
+    far_ceiling: wp.array2d(dtype=wp.float32)
+    far: wp.float32
 
 
 def make_surface(height_map: HeightMap) -> Surface:
     """Return a height map on the current device."""
     heights, scale = np.asarray(height_map.heights, np.float32), height_map.horizontal_scale
-    near, far = math.ceil(NEAR / scale), math.ceil(FAR / scale)
+    near, middle, far = (math.ceil(reach / scale) for reach in (NEAR, MIDDLE, FAR))
     surface = Surface()
     surface.heights = wp.array(heights.flatten(), dtype=wp.float32)
     surface.shape = wp.vec2i(*heights.shape)
@@ -51,6 +53,8 @@ def make_surface(height_map: HeightMap) -> Surface:
     surface.corner = wp.vec2(*height_map.corner)
     surface.ceiling = wp.array(_greatest(heights, 1, near), dtype=wp.float32)
     surface.near = near * scale
+    surface.middle_ceiling = wp.array(_greatest(heights, BLOCK, middle), dtype=wp.float32)
+    surface.middle = middle * scale
     surface.far_ceiling = wp.array(_greatest(heights, BLOCK, far), dtype=wp.float32)
     surface.far = far * scale
     return surface
@@ -129,6 +133,16 @@ def sample(surface: Surface, i: int, j: int) -> float:
     """Return the height of a sample, or of the nearest one for places outside of the map."""
     row = wp.clamp(i, 0, surface.shape[0] - 1) * surface.shape[1]
     return surface.heights[row + wp.clamp(j, 0, surface.shape[1] - 1)]
+
+
+@wp.func
+def height_at(surface: Surface, place: wp.vec3) -> float:
+    """Return the height of the surface at a place on the map, whose x and y are in cells from its corner."""
+    i, j = int(wp.floor(place[0])), int(wp.floor(place[1]))
+    x, y = place[0] - float(i), place[1] - float(j)
+    low, high = sample(surface, i, j), sample(surface, i + 1, j + 1)
+    third = sample(surface, i + wp.where(x >= y, 1, 0), j + wp.where(x >= y, 0, 1))
+    return low + wp.max(x, y) * (third - low) + wp.min(x, y) * (high - third)
 
 
 @wp.func
@@ -343,6 +357,8 @@ def is_clear(surface: Surface, centre: wp.vec3, lowest: float, radius: float) ->
     out = bool(False)
     if radius <= surface.near:
         out = lowest > surface.ceiling[i, j]
+    elif radius <= surface.middle:
+        out = lowest > surface.middle_ceiling[i // BLOCK, j // BLOCK]
     elif radius <= surface.far:
         out = lowest > surface.far_ceiling[i // BLOCK, j // BLOCK]
     return out

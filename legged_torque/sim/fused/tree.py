@@ -103,10 +103,13 @@ def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:
 def _parts(kind: mujoco.mjtGeom, size: np.ndarray) -> list[tuple[Place, Place]]:
     """Return middles and half sizes of the parts of a geom that a height map can stick into between its points.
 
-    A box is halved across its longest side until its parts are small and enough.
+    A box is halved across its longest side until its parts are small and enough, a capsule until they are small.
     """
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        count = next((count for count in range(1, MIN_PARTS) if size[0] + size[1] / count <= NEAR), MIN_PARTS)
+        return [((0.0, 0.0, (2 * i + 1) / count - 1.0), (0.0, 0.0, 1.0 / count)) for i in range(count)]
     if kind != mujoco.mjtGeom.mjGEOM_BOX:
-        return [((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else []
+        return []
     counts = np.ones(3, int)
     while (radius := np.linalg.norm(size / counts)) > FAR or (radius > NEAR and counts.prod() < MIN_PARTS):
         counts[np.argmax(size / counts)] *= 2
