@@ -91,6 +91,8 @@ def find_map_contacts(
     point = Point()
     point.geom = -1
     part = wp.vec3()
+    is_part = bool(False)
+    parts = int(0)  # the first of the geom
     deepest = float(0.0)  # of the geom's corners or ends
     is_above = bool(False)
     while index < model.point_count[b]:
@@ -99,21 +101,27 @@ def find_map_contacts(
             if model.point_geom[b, index] != point.geom:
                 point = load_geom(model, world, b, index, poses[model.point_depth[b, index]], cylinders)
                 is_above = is_geom_clear(model, b, index, origin, point, surface, cylinders)
+                parts = model.point_parts[b, index]
                 deepest = 0.0
             if is_above:
                 index = model.point_next[b, index]
             else:
-                part = wp.cw_mul(model.point_half[b, index], point.half)
                 point.centre = point.middle + point.turn * wp.cw_mul(model.point_offset[b, index], point.half)
-                is_near = not is_part_clear(surface, origin + point.centre, part, point)
-                if is_near and part[2] > 0.0 and point.radius > 0.0:
-                    is_between, lowest = lowest_of_capsule(surface, origin, point, part)
-                    is_near = is_between
-                    point.centre = lowest
+                is_part = index >= parts
+                if is_part:
+                    part = wp.cw_mul(model.point_half[b, index], point.half)
+                    is_near = not is_part_clear(surface, origin + point.centre, part, point)
+                    if is_near and point.radius > 0.0:
+                        is_between, lowest = lowest_of_capsule(surface, origin, point, part)
+                        is_near = is_between
+                        point.centre = lowest
+                else:
+                    centre = origin + point.centre
+                    is_near = not is_clear(surface, centre, centre[2] - point.radius, point.radius)
                 index += 1
         if is_near:
             touch = SphereContacts()
-            if part[2] > 0.0 and point.radius == 0.0:
+            if is_part and point.radius == 0.0:
                 touch, place = touch_part(surface, origin, point, part)
                 point.centre = place
             else:
@@ -121,11 +129,11 @@ def find_map_contacts(
             for i in range(touch.count):
                 normal = wp.where(i == 0, touch.first, touch.second)
                 dist = wp.where(i == 0, touch.dist[0], touch.dist[1])
-                if part[2] > 0.0:
+                if is_part:
                     dist = dist + deepest
                 else:
                     deepest = wp.max(deepest, -dist)
-                if part[2] == 0.0 or dist < -MIN_EXCESS:
+                if not is_part or dist < -MIN_EXCESS:
                     contacts.normal[first + count] = normal
                     pose = poses[point.depth]
                     contacts.found[first + count] = make_contact(model, world, point, pose, dist, normal)

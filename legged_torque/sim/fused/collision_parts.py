@@ -9,7 +9,7 @@ UPWARDS = wp.constant(0.5)
 """Nothing leaves the ground through a face of a box whose normal's z is greater: it looks up by over 30 degrees."""
 
 MOST_CLEARANCE = wp.constant(2.0)
-"""An axis that is this many radii above the ground, vertically, does not touch it: slopes are less steep than 60 degrees."""
+"""An axis this many radii above the ground, vertically, does not touch it: slopes are less steep than 60 degrees."""
 
 
 @wp.func

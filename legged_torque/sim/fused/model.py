@@ -68,8 +68,9 @@ class Model:
     point_depth: wp.array2d(dtype=wp.int32)  # (branch, point), 0 is the trunk
     point_offset: wp.array2d(dtype=wp.vec3)  # (branch, point), in half sizes of the geom
     point_radius: wp.array2d(dtype=wp.float32)  # (branch, point), in first sizes of the geom
+    point_parts: wp.array2d(dtype=wp.int32)  # (branch, point), the first one of its geom's parts
     point_next: wp.array2d(dtype=wp.int32)  # (branch, point), the first one of the next geom
-    point_half: wp.array2d(dtype=wp.vec3)  # (branch, point), of the part around it, in half sizes of the geom
+    point_half: wp.array2d(dtype=wp.vec3)  # (branch, point), of the part, in half sizes of the geom
     point_count: wp.array(dtype=wp.int32)  # (branch)
     floor: wp.int32  # its geom
     # Options:
@@ -178,10 +179,10 @@ def make_model(mj_model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree) -> M
     model.joint_count = wp.array((tree.joints >= 0).sum(axis=1), dtype=wp.int32)
     model.branch_joint = wp.array(tree.joints, dtype=wp.int32)
     model.branch_actuator = wp.array(np.vectorize(lambda j: actuator_of.get(j, -1))(tree.joints), dtype=wp.int32)
-    none = (0, 0, (0.0, 0.0, 0.0), 0.0, 0, (0.0, 0.0, 0.0))
+    none = (0, 0, (0.0, 0.0, 0.0), 0.0, 0, 0, (0.0, 0.0, 0.0))
     padded = [points + [none] * (tree.most_points - len(points)) for points in tree.points]
-    dtypes = {"geom": wp.int32, "depth": wp.int32, "offset": wp.vec3, "radius": wp.float32, "next": wp.int32}
-    dtypes["half"] = wp.vec3
+    dtypes = {"geom": wp.int32, "depth": wp.int32, "offset": wp.vec3, "radius": wp.float32}
+    dtypes |= {"parts": wp.int32, "next": wp.int32, "half": wp.vec3}
     for place, (name, dtype) in enumerate(dtypes.items()):
         values = [[point[place] for point in points] for points in padded]
         setattr(model, f"point_{name}", wp.array(values, dtype=dtype))

@@ -51,12 +51,12 @@ class Tree:
     """A robot's structure: a floating trunk and branches of hinge joints.
 
     ``points`` are, per branch, those that can touch the floor: geom, depth of its body (0 is the trunk), position in
-    half sizes of the geom, radius in first sizes of the geom, number of the first point of the branch's next geom, half
-    sizes of the part of the geom around it, in the same units: 0 but for parts that only a height map touches.
+    half sizes of the geom, radius in first sizes of the geom, numbers of the geom's first part and of the next geom's
+    first point, half sizes of the part in half sizes of the geom. Parts are points that only a height map touches.
     """
 
     joints: np.ndarray  # joint of each place, -1 behind the end of a branch. Shape: (branches, most joints of one)
-    points: list[list[tuple[int, int, Place, float, int, Place]]]
+    points: list[list[tuple[int, int, Place, float, int, int, Place]]]
     has_cylinders: bool  # whether any of these geoms is one
     floor: int  # the geom that the robot stands on
     geom_places: list[tuple[int, int]]  # branch and depth of each geom's body; 0 and 0 of the trunk's and the world's
@@ -93,19 +93,21 @@ def read_tree(model: mujoco.MjModel, floors: Sequence[mujoco.mjtGeom] = FLOORS[:
         if on_map and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER:
             offsets = _AROUND_CIRCLES
         pieces = [(offset, (0.0, 0.0, 0.0)) for offset in offsets]
+        parts = len(of_branch) + len(pieces)
         if on_map:
-            pieces += _parts(mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom])
+            pieces += _parts(mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom], depth == 0)
         end = len(of_branch) + len(pieces)
-        of_branch += [(geom, depth, offset, radius, end, half) for offset, half in pieces]
+        of_branch += [(geom, depth, offset, radius, parts, end, half) for offset, half in pieces]
     return Tree(joints, points, mujoco.mjtGeom.mjGEOM_CYLINDER in model.geom_type[geoms], floor, places)
 
 
-def _parts(kind: mujoco.mjtGeom, size: np.ndarray) -> list[tuple[Place, Place]]:
+def _parts(kind: mujoco.mjtGeom, size: np.ndarray, of_trunk: bool) -> list[tuple[Place, Place]]:
     """Return middles and half sizes of the parts of a geom that a height map can stick into between its points.
 
-    A box is halved across its longest side until its parts are small and enough, a capsule until they are small.
+    A box is halved across its longest side until its parts are small and enough, a capsule of the trunk until they are
+    small. Capsules of legs have none: these would take a fifth of a physics step.
     """
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE and of_trunk:
         count = next((count for count in range(1, MIN_PARTS) if size[0] + size[1] / count <= NEAR), MIN_PARTS)
         return [((0.0, 0.0, (2 * i + 1) / count - 1.0), (0.0, 0.0, 1.0 / count)) for i in range(count)]
     if kind != mujoco.mjtGeom.mjGEOM_BOX:
