@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from support.settings import error_of
+from support.settings import error_of, torques_in_torch
 
 from legged_torque import resource_path
 from legged_torque.envs import task_registry
@@ -114,6 +114,7 @@ def tasks():
             settings = ["domain_rand.init_roll=[0, 0]", "domain_rand.init_pitch=[0, 0]"]
             options = Options(device="cpu", num_envs=4, set=settings, perturbation="none")
             made[name] = task_registry.make_env(f"{name}_position", options)[0]
+            torques_in_torch(made[name])  # with the kernel that others have compiled
         return made[name]
 
     return get

@@ -46,7 +46,7 @@ TIMEOUT = 90.0  # seconds that the page may take for something
 OPTIONS = (
     "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
     "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
-    "--window-size=1280,800"
+    "--window-size=900,600"
 )
 
 
