@@ -3,7 +3,7 @@
 import warp as wp
 
 from legged_torque.sim.fused.collision import Point
-from legged_torque.sim.fused.surface import FAR_AWAY, SphereContacts, Surface, height_at, place_on_map, sample
+from legged_torque.sim.fused.surface import FAR_AWAY, SphereContacts, Surface, height_at, load_row, place_on_map, sample
 
 UPWARDS = wp.constant(0.5)
 """Nothing leaves the ground through a face of a box whose normal's z is greater: it looks up by over 30 degrees."""
@@ -87,9 +87,11 @@ def touch_part(surface: Surface, origin: wp.vec3, point: Point, part: wp.vec3):
     from_box = wp.vec3()
     i, j = int(wp.ceil(first[0])), int(wp.ceil(first[1]))
     while i <= int(wp.floor(last[0])) and wp.ceil(first[1]) <= last[1]:
-        height = sample(surface, i, j)
-        if height > place[2] - reach[2]:
-            arm = wp.vec3(float(i) * surface.scale, float(j) * surface.scale, height) - place
+        row = load_row(surface, i, j)  # three at once: a thread waits for each access to memory
+        b = wp.where(wp.max(row) > place[2] - reach[2], 0, 3)
+        while b < 3:
+            height = wp.where(b == 0, row[0], wp.where(b == 1, row[1], row[2]))
+            arm = wp.vec3(float(i) * surface.scale, float(j + b) * surface.scale, height) - place
             in_box = wp.transpose(point.turn) * (middle + arm)
             way = point.turn * way_out(point, in_box)
             is_inside = wp.min(part - wp.abs(wp.transpose(point.turn) * arm)) > 0.0
@@ -98,7 +100,8 @@ def touch_part(surface: Surface, origin: wp.vec3, point: Point, part: wp.vec3):
                 touch.dist[0] = -wp.length(way)
                 touch.first = way / touch.dist[0]
                 from_box = middle + arm + way
-        j += 1
+            b += 1
+        j += 3
         if j > int(wp.floor(last[1])):
             j = int(wp.ceil(first[1]))
             i += 1
